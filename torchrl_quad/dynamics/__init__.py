@@ -1,0 +1,24 @@
+"""The drone as pure functions on plain tensors: no TorchRL, no TensorDict, differentiable in everything."""
+
+from torchrl_quad.dynamics.control import FlightController, Setpoint
+from torchrl_quad.dynamics.integrators import INTEGRATORS, euler, rk4, semi_implicit_euler
+from torchrl_quad.dynamics.parameters import QuadrotorParams, available_drones, load_drone
+from torchrl_quad.dynamics.quadrotor import QuadrotorState, control_step, physics_step
+from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
+
+__all__ = [
+    "INTEGRATORS",
+    "FlightController",
+    "QuadrotorParams",
+    "QuadrotorState",
+    "RigidBodyState",
+    "Setpoint",
+    "accelerations",
+    "available_drones",
+    "control_step",
+    "euler",
+    "load_drone",
+    "physics_step",
+    "rk4",
+    "semi_implicit_euler",
+]

@@ -1,0 +1,60 @@
+"""Fixed-step integrators of the rigid body under given accelerations.
+
+Their order of convergence is 1, 1 and 4 under a prescribed wrench. With the rate controller and the rotors in the
+loop the wrench is held over each physics step, and all three are of first order.
+"""
+
+from collections.abc import Callable
+
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchrl_quad.dynamics import quaternion
+from torchrl_quad.dynamics.rigid_body import RigidBodyState
+
+Accelerations = Callable[[RigidBodyState], tuple[Tensor, Tensor]]
+
+
+def euler(state: RigidBodyState, accelerations: Accelerations, dt: float) -> RigidBodyState:
+    """Explicit Euler: everything moves along its derivative at the start of the step."""
+    return _normalized(_moved(state, _derivative(state, accelerations), dt))
+
+
+def semi_implicit_euler(state: RigidBodyState, accelerations: Accelerations, dt: float) -> RigidBodyState:
+    """Symplectic Euler: velocities first, then position and attitude with the new velocities."""
+    linear, angular = accelerations(state)
+    velocity = state.velocity + dt * linear
+    angular_velocity = state.angular_velocity + dt * angular
+    position = state.position + dt * velocity
+    attitude = state.quaternion + dt * _quaternion_rate(state.quaternion, angular_velocity)
+    return _normalized(RigidBodyState(position, attitude, velocity, angular_velocity))
+
+
+def rk4(state: RigidBodyState, accelerations: Accelerations, dt: float) -> RigidBodyState:
+    """The classical Runge-Kutta method."""
+    k1 = _derivative(state, accelerations)
+    k2 = _derivative(_moved(state, k1, 0.5 * dt), accelerations)
+    k3 = _derivative(_moved(state, k2, 0.5 * dt), accelerations)
+    k4 = _derivative(_moved(state, k3, dt), accelerations)
+    mean = RigidBodyState(*((a + 2.0 * b + 2.0 * c + d) / 6.0 for a, b, c, d in zip(k1, k2, k3, k4, strict=True)))
+    return _normalized(_moved(state, mean, dt))
+
+
+INTEGRATORS = {"euler": euler, "semi_implicit_euler": semi_implicit_euler, "rk4": rk4}
+
+
+def _derivative(state: RigidBodyState, accelerations: Accelerations) -> RigidBodyState:
+    linear, angular = accelerations(state)
+    return RigidBodyState(state.velocity, _quaternion_rate(state.quaternion, state.angular_velocity), linear, angular)
+
+
+def _quaternion_rate(q: Tensor, angular_velocity: Tensor) -> Tensor:
+    return 0.5 * quaternion.multiply(q, pad(angular_velocity, (1, 0)))
+
+
+def _moved(state: RigidBodyState, derivative: RigidBodyState, dt: float) -> RigidBodyState:
+    return RigidBodyState(*(x + dt * dx for x, dx in zip(state, derivative, strict=True)))
+
+
+def _normalized(state: RigidBodyState) -> RigidBodyState:
+    return state._replace(quaternion=quaternion.normalize(state.quaternion))

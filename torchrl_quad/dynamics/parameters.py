@@ -1,0 +1,163 @@
+"""What a drone is: its physical parameters, and the presets that ship with the package."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from torch import Tensor
+
+_DRONES = resources.files(__package__) / "drones"
+
+# Per field: the shape of one drone's value, and the rule its numbers obey.
+_FIELDS = {
+    "mass": ((1,), "positive"),
+    "inertia": ((3,), "positive"),
+    "rotor_positions": ((4, 2), "finite"),
+    "rotor_spin": ((4,), "+1 or -1"),
+    "torque_to_thrust": ((1,), "positive"),
+    "thrust_map": ((3,), "finite, k2 positive"),
+    "rotor_speed_min": ((1,), "zero or positive"),
+    "rotor_speed_max": ((1,), "positive"),
+    "motor_time_constant": ((1,), "positive"),
+    "linear_drag": ((3,), "zero or positive"),
+    "quadratic_drag": ((3,), "zero or positive"),
+    "rate_gain": ((3,), "positive"),
+    "rate_damping": ((3,), "zero or positive"),
+    "max_body_rate": ((3,), "positive"),
+    "max_thrust_to_weight": ((1,), "positive"),
+    "gravity": ((1,), "positive"),
+}
+_RULES = {
+    "finite": lambda x: x.isfinite(),
+    "positive": lambda x: x > 0,
+    "zero or positive": lambda x: x >= 0,
+    "+1 or -1": lambda x: x.abs() == 1,
+    "finite, k2 positive": lambda x: torch.cat((x[..., :1] > 0, x[..., 1:].isfinite()), -1),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class QuadrotorParams:
+    """The physical parameters of a quadrotor, SI units, body frame x forward, y left, z up.
+
+    Each field is a tensor that broadcasts over environments: the shape given below for one drone, or the same with a
+    leading dimension of num_envs. A number without dimensions is stored as (1,). Gradients flow through every field.
+
+    Raises:
+        ValueError: a value has the wrong shape, is not finite, or breaks the rule of its field.
+    """
+
+    mass: Tensor  # (1) [kg]
+    inertia: Tensor  # (3) [kg m2], principal axes
+    rotor_positions: Tensor  # (4, 2) [m], x and y of each rotor
+    rotor_spin: Tensor  # (4), sign of the yaw torque that each rotor exerts on the body
+    torque_to_thrust: Tensor  # (1) [m], kappa: yaw torque per thrust
+    thrust_map: Tensor  # (3), k2 [N s2], k1 [N s], k0 [N]: thrust = k2 w^2 + k1 w + k0
+    rotor_speed_min: Tensor  # (1) [rad/s]
+    rotor_speed_max: Tensor  # (1) [rad/s]
+    motor_time_constant: Tensor  # (1) [s]
+    linear_drag: Tensor  # (3) [N s/m]
+    quadratic_drag: Tensor  # (3) [N s2/m2]
+    rate_gain: Tensor  # (3) [1/s], times the inertia
+    rate_damping: Tensor  # (3) [kg m2], on the angular acceleration
+    max_body_rate: Tensor  # (3) [rad/s], commanded at full stick
+    max_thrust_to_weight: Tensor  # (1), commanded at full stick
+    gravity: Tensor  # (1) [m/s2]
+
+    def __post_init__(self) -> None:
+        for name, value in self.fields().items():
+            value = value if value.dim() else value.reshape(1)
+            object.__setattr__(self, name, value)
+            _check(name, value, "QuadrotorParams")
+        if not (self.rotor_speed_min < self.rotor_speed_max).all():
+            raise ValueError("QuadrotorParams: rotor_speed_min must be below rotor_speed_max.")
+
+    def fields(self) -> dict[str, Tensor]:
+        """The fields by name, in the order of their declaration."""
+        return {name: getattr(self, name) for name in _FIELDS}
+
+    def replace(self, **changes: Tensor | float) -> QuadrotorParams:
+        """A copy with some fields changed: ``params.replace(mass=0.5)``.
+
+        A tensor keeps its graph, so that a parameter can be fitted through the simulator.
+        """
+        unknown = sorted(set(changes) - set(_FIELDS))
+        if unknown:
+            raise ValueError(f"QuadrotorParams has no field {unknown[0]!r}. Choose from: {', '.join(_FIELDS)}.")
+        like = self.mass
+        return dataclasses.replace(
+            self, **{k: torch.as_tensor(v, dtype=like.dtype, device=like.device) for k, v in changes.items()}
+        )
+
+    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> QuadrotorParams:
+        """A copy on another device or with another floating-point type; gradients flow through the copy."""
+        return self._map(lambda value: value.to(device=device, dtype=dtype))
+
+    def detach(self) -> QuadrotorParams:
+        """A copy that shares the values and carries no gradient."""
+        return self._map(Tensor.detach)
+
+    def _map(self, function) -> QuadrotorParams:
+        return QuadrotorParams(**{name: function(value) for name, value in self.fields().items()})
+
+
+def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torch.float32) -> QuadrotorParams:
+    """Load a preset by name, a YAML file by path, or a mapping of field names to numbers.
+
+    Args:
+        drone: one of :func:`available_drones`, the path of a file that ends in .yaml, or a mapping.
+        dtype: floating-point type of the fields.
+
+    Raises:
+        ValueError: the preset is unknown, or a field is missing, unknown, of the wrong shape, or out of its range.
+        FileNotFoundError: the path does not exist.
+    """
+    if isinstance(drone, Mapping):
+        source, values = "drone", drone
+    elif isinstance(drone, Path) or str(drone).endswith((".yaml", ".yml")):
+        source, values = str(drone), yaml.safe_load(Path(drone).read_text())
+    elif drone in available_drones():
+        source, values = f"{drone}.yaml", yaml.safe_load((_DRONES / f"{drone}.yaml").read_text())
+    else:
+        names = ", ".join(available_drones())
+        raise ValueError(f"Unknown drone {drone!r}. Choose from: {names}; or give the path of a .yaml file.")
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{source}: expected a mapping of field names to numbers, got {type(values).__name__}.")
+    missing = [name for name in _FIELDS if name not in values]
+    unknown = sorted(str(name) for name in values if name not in _FIELDS)
+    if missing:
+        raise ValueError(f"{source}: missing field {missing[0]!r}. Required: {', '.join(_FIELDS)}.")
+    if unknown:
+        raise ValueError(f"{source}: unknown field {unknown[0]!r}. Allowed: {', '.join(_FIELDS)}.")
+    fields = {}
+    for name in _FIELDS:
+        try:
+            fields[name] = torch.from_numpy(np.array(values[name], dtype=np.float64))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{source}: field {name!r} is not a number or a list of numbers: {values[name]!r}.") from error
+        _check(name, fields[name] if fields[name].dim() else fields[name].reshape(1), source)
+    return QuadrotorParams(**fields).to(dtype=dtype)
+
+
+def available_drones() -> list[str]:
+    """The names of the presets that ship with the package."""
+    return sorted(entry.name.removesuffix(".yaml") for entry in _DRONES.iterdir() if entry.name.endswith(".yaml"))
+
+
+def _check(name: str, value: Tensor, source: str) -> None:
+    shape, rule = _FIELDS[name]
+    if value.shape != shape and value.shape[1:] != shape:
+        batched = ("num_envs", *shape)
+        raise ValueError(
+            f"{source}: field {name!r} has shape {tuple(value.shape)}; it must be {shape} for one drone, "
+            f"or {batched} for one per environment."
+        )
+    with torch.no_grad():
+        if not (value.isfinite() & _RULES[rule](value)).all():
+            raise ValueError(f"{source}: field {name!r} must be {rule}, got {value.tolist()}.")

@@ -1,0 +1,64 @@
+"""Unit quaternions (w, x, y, z) that turn body-frame vectors into world-frame vectors.
+
+All functions broadcast over leading dimensions and have finite derivatives for every finite input.
+"""
+
+import torch
+from torch import Tensor
+
+
+def multiply(p: Tensor, q: Tensor) -> Tensor:
+    """Hamilton product p q, (*, 4): the rotation q followed, in the outer frame, by p."""
+    pw, pv = p[..., :1], p[..., 1:]
+    qw, qv = q[..., :1], q[..., 1:]
+    scalar = pw * qw - (pv * qv).sum(-1, keepdim=True)
+    vector = pw * qv + qw * pv + torch.linalg.cross(pv, qv)
+    return torch.cat((scalar, vector), -1)
+
+
+def conjugate(q: Tensor) -> Tensor:
+    """The inverse rotation of a unit quaternion, (*, 4)."""
+    return torch.cat((q[..., :1], -q[..., 1:]), -1)
+
+
+def normalize(q: Tensor) -> Tensor:
+    """Scale to unit norm, (*, 4). A norm below 1e-6 is treated as 1e-6, so that zero stays zero instead of NaN."""
+    return q * (q * q).sum(-1, keepdim=True).clamp_min(1e-12).rsqrt()
+
+
+def rotate(q: Tensor, v: Tensor) -> Tensor:
+    """Body to world: the vector v (*, 3) turned by the unit quaternion q (*, 4)."""
+    w, u = q[..., :1], q[..., 1:]
+    t = 2.0 * torch.linalg.cross(u, v)
+    return v + w * t + torch.linalg.cross(u, t)
+
+
+def rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
+    """World to body: the vector v (*, 3) turned by the inverse of the unit quaternion q (*, 4)."""
+    return rotate(conjugate(q), v)
+
+
+def from_axis_angle(axis_angle: Tensor) -> Tensor:
+    """The rotation by |axis_angle| [rad] about the axis axis_angle (*, 3), as a unit quaternion (*, 4)."""
+    half = 0.5 * axis_angle
+    angle = (half * half).sum(-1, keepdim=True).clamp_min(1e-24).sqrt()
+    return torch.cat((angle.cos(), half * angle.sin() / angle), -1)
+
+
+def distance(p: Tensor, q: Tensor) -> Tensor:
+    """Attitude error min(|p - q|, |p + q|), (*, 1): 0 for the same attitude, sqrt(2) for half a turn.
+
+    p and -p are one attitude, so the error does not depend on either sign.
+    """
+    flip = torch.where((p * q).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    return torch.linalg.vector_norm(p - flip * q, dim=-1, keepdim=True)
+
+
+def to_xyzw(q: Tensor) -> Tensor:
+    """Reorder (w, x, y, z) into the (x, y, z, w) that ROS and SciPy use, (*, 4)."""
+    return q.roll(-1, -1)
+
+
+def from_xyzw(q_xyzw: Tensor) -> Tensor:
+    """Reorder (x, y, z, w) into (w, x, y, z), (*, 4)."""
+    return q_xyzw.roll(1, -1)

@@ -1,0 +1,339 @@
+"""What every task shares: state, specs, resets, time limit, gradients that stay where they belong."""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_quad.dynamics import (
+    INTEGRATORS,
+    FlightController,
+    QuadrotorParams,
+    QuadrotorState,
+    control_step,
+    load_drone,
+)
+
+State = dict[str, Tensor]  # the Markov state by name, each entry (num_envs, ...)
+
+# Beyond these the model means nothing and its numbers may overflow: such a state ends its episode.
+_MAX_SPEED = 1e3  # [m/s] and [rad/s]
+
+
+class QuadrotorEnv(EnvBase):
+    """Base of all tasks: a batch of quadrotors, stateless and differentiable.
+
+    A step is a pure function of its tensordict: the complete Markov state stands under ``"state"``, and gradients flow
+    from every entry of ``"next"`` to the actions, to the state, and to ``env.params``. A task subclasses this and says
+    what it starts from, observes, rewards and ends; see :class:`~torchrl_quad.envs.HoveringEnv` for the pattern.
+
+    =============================  ===========  =========================================================
+    entry of ``"state"``           shape        meaning
+    =============================  ===========  =========================================================
+    ``position``                   (3)          [m], world frame, z up
+    ``quaternion``                 (4)          (w, x, y, z), body to world, unit norm
+    ``velocity``                   (3)          [m/s], world frame
+    ``angular_velocity``           (3)          [rad/s], body frame
+    ``rotor_speed``                (4)          [rad/s]
+    ``action_queue``               (delay, 4)   commands on their way, oldest first; absent when the delay is 0
+    ``step``                       (1)          control steps since the start of the episode
+    =============================  ===========  =========================================================
+
+    The action is (4) in [-1, 1]: collective thrust (-1..1 maps to 0..max_thrust_to_weight times the nominal weight),
+    then roll, pitch and yaw rate in units of the drone's max_body_rate.
+
+    Args:
+        num_envs: number of drones that fly in parallel.
+        device: device of all tensors.
+        dtype: torch.float32 or torch.float64.
+        seed: seed of the environment's own random generator.
+        drone: name of a preset, path of a YAML file, mapping, or :class:`QuadrotorParams`.
+        dt: physics step [s].
+        control_dt: control step [s], a whole multiple of dt.
+        action_delay: control steps between an action and its effect.
+        integrator: "euler", "semi_implicit_euler" or "rk4".
+        max_episode_steps: control steps after which an episode is truncated.
+        observe_last_action: append the commands that are still on their way to the observation, which makes the delay
+            visible to the policy. Off in the paper.
+        compile: compile one control step with its observation, reward and termination into one graph.
+
+    Raises:
+        ValueError: an argument is out of its range, with the allowed values.
+    """
+
+    batch_locked = True
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        num_envs: int = 64,
+        *,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+        seed: int = 0,
+        drone: Any = "visfly",
+        dt: float = 0.005,
+        control_dt: float = 0.02,
+        action_delay: int = 1,
+        integrator: str = "semi_implicit_euler",
+        max_episode_steps: int = 256,
+        observe_last_action: bool = False,
+    ) -> None:
+        _require(num_envs >= 1, f"num_envs must be at least 1, got {num_envs}.")
+        _require(dtype in (torch.float32, torch.float64), f"dtype must be torch.float32 or torch.float64, got {dtype}.")
+        _require(dt > 0, f"dt must be positive, got {dt}.")
+        substeps = round(control_dt / dt)
+        _require(
+            substeps >= 1 and math.isclose(substeps * dt, control_dt, rel_tol=1e-6),
+            f"control_dt must be a whole multiple of dt, got {control_dt} and {dt}; try control_dt={max(substeps, 1) * dt:g}.",
+        )
+        _require(action_delay >= 0, f"action_delay must be zero or more control steps, got {action_delay}.")
+        _require(integrator in INTEGRATORS, f"Unknown integrator {integrator!r}. Choose from: {', '.join(INTEGRATORS)}.")
+        _require(max_episode_steps >= 1, f"max_episode_steps must be at least 1, got {max_episode_steps}.")
+        _require(
+            action_delay > 0 or not observe_last_action,
+            "observe_last_action shows the commands that are on their way; with action_delay=0 there are none.",
+        )
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        self.num_envs, self.dtype = num_envs, dtype
+        self.dt, self.control_dt, self.substeps = dt, control_dt, substeps
+        self.action_delay, self.integrator, self.max_episode_steps = action_delay, integrator, max_episode_steps
+        self.observe_last_action = observe_last_action
+        self.initial_state_source: Callable[[int], TensorDictBase] | None = None
+        self._transition_function = self._transition
+        params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone)
+        self.params = params.to(device=self.device, dtype=dtype)
+        self.nominal = self.params.detach()
+        self.controller = FlightController(self.nominal)
+        self.set_seed(seed)
+        # Stands in for a state that is not finite, so that its environment computes on with harmless numbers.
+        self._fallback = self.sample_initial_state(1)
+        self._make_specs()
+
+    # -- what a task says ----------------------------------------------------------------------------------------------
+
+    @abc.abstractmethod
+    def initial_state(self, n: int) -> State:
+        """Draw n starts: what :meth:`hover_state` gives, moved and turned at will, and the entries the task adds."""
+
+    @abc.abstractmethod
+    def observe(self, state: State) -> Tensor:
+        """The observation (num_envs, k) of a state."""
+
+    @abc.abstractmethod
+    def reward_terms(self, state: State) -> State:
+        """The weighted reward terms by name, each (num_envs, 1), of the state a step has led to."""
+
+    @abc.abstractmethod
+    def is_terminated(self, state: State) -> Tensor:
+        """Where the episode has ended for good (a crash), bool (num_envs, 1)."""
+
+    @abc.abstractmethod
+    def is_success(self, state: State) -> Tensor:
+        """Where the state, by itself, fulfils the task, bool (num_envs, 1)."""
+
+    # -- what a task may use -------------------------------------------------------------------------------------------
+
+    @property
+    def hover_action(self) -> Tensor:
+        """The action (4) that holds the nominal drone where it is."""
+        return self.controller.hover_action
+
+    def hover_state(self, position: Tensor) -> State:
+        """Level, at rest, rotors at hover speed, at the given positions (n, 3) [m]."""
+        n = position.shape[0]
+        return {
+            "position": position,
+            "quaternion": self.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            "velocity": torch.zeros_like(position),
+            "angular_velocity": torch.zeros_like(position),
+            "rotor_speed": self.controller.hover_speed.expand(n, 4).clone(),
+        }
+
+    def sample_initial_state(self, n: int) -> State:
+        """Draw n complete Markov states from the task's own starts."""
+        state = self.initial_state(n)
+        if self.action_delay:
+            state["action_queue"] = self.hover_action.expand(n, self.action_delay, 4).clone()
+        state["step"] = torch.zeros(n, 1, dtype=torch.int64, device=self.device)
+        return state
+
+    def tensor(self, values: Any) -> Tensor:
+        """A tensor with the environment's device and floating-point type."""
+        return torch.tensor(values, device=self.device, dtype=self.dtype)
+
+    def uniform(self, *shape: int) -> Tensor:
+        """Uniform random numbers in [-1, 1] from the environment's own generator."""
+        return torch.rand(shape, generator=self.rng, device=self.device, dtype=self.dtype) * 2.0 - 1.0
+
+    # -- TorchRL's side ------------------------------------------------------------------------------------------------
+
+    def compile(self, **kwargs: Any) -> QuadrotorEnv:
+        """Compile the control step with its observation, reward and termination; the keywords go to torch.compile."""
+        kwargs.pop("warmup", None)  # TorchRL's option for steps whose input changes its layout: ours never does
+        self._transition_function = torch.compile(self._transition, fullgraph=True, **kwargs)
+        return self
+
+    def eager(self) -> QuadrotorEnv:
+        """Undo :meth:`compile`."""
+        self._transition_function = self._transition
+        return self
+
+    def to(self, device: torch.device | str) -> QuadrotorEnv:
+        super().to(device)
+        self.params, self.nominal = self.params.to(device=self.device), self.nominal.to(device=self.device)
+        self.controller = FlightController(self.nominal)
+        self._fallback = {key: value.to(self.device) for key, value in self._fallback.items()}
+        self.set_seed(self._seed)
+        return self
+
+    def set_initial_state_source(self, source: Callable[[int], TensorDictBase] | None) -> None:
+        """Set :attr:`initial_state_source`; as a method it can be called through a TransformedEnv as well.
+
+        ``source(n)`` returns n complete states (the content of ``td["state"]``); resets then start from them. None
+        goes back to the task's own starts.
+        """
+        self.initial_state_source = source
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = seed
+        self.rng = torch.Generator(device=self.device)
+        if seed is not None:
+            self.rng.manual_seed(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False) -> TensorDictBase:
+        if set_state and tensordict is not None and "state" in tensordict.keys():
+            state = self._checked_state(tensordict.get("state"), "reset(..., set_state=True)")
+        elif self.initial_state_source is not None:
+            state = self._checked_state(self.initial_state_source(self.num_envs), "initial_state_source")
+        else:
+            state = self.sample_initial_state(self.num_envs)
+        no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+        terms = self.reward_terms(state)
+        return self._tensordict(
+            {
+                "observation": self._observe(state),
+                "state": state,
+                "reward_terms": {name: torch.zeros_like(term) for name, term in terms.items()},
+                "success": self.is_success(state),
+                "done": no,
+                "terminated": no.clone(),
+                "truncated": no.clone(),
+            }
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        state = dict(tensordict.get("state").items())
+        action = tensordict.get("action")
+        needs_grad = torch.is_grad_enabled() and any(
+            x.requires_grad for x in (action, *state.values(), *self.params.fields().values())
+        )
+        if needs_grad and self._transition_function != self._transition:
+            # One compiled graph serves the first step of a horizon and all others.
+            state = {k: v if v.requires_grad or not v.is_floating_point() else v.detach().requires_grad_() for k, v in state.items()}
+        with torch.set_grad_enabled(needs_grad):
+            return self._tensordict(self._transition_function(state, action))
+
+    def _transition(self, state: State, action: Tensor) -> dict[str, Any]:
+        state, valid = self._replace_invalid(state, action)
+        action = torch.where(valid, action, self.hover_action)
+        applied, queue = action, {}
+        if self.action_delay:
+            applied = state["action_queue"][:, 0]
+            queue["action_queue"] = torch.cat((state["action_queue"][:, 1:], action.unsqueeze(1)), 1)
+        flown = control_step(
+            QuadrotorState(*(state[name] for name in QuadrotorState._fields)),
+            applied,
+            self.params,
+            self.controller,
+            self.dt,
+            self.substeps,
+            self.integrator,
+        )
+        state = {**state, **flown._asdict(), **queue, "step": state["step"] + 1}
+        state, still_valid = self._replace_invalid(state)
+        terms = self.reward_terms(state)
+        terminated = self.is_terminated(state) | ~valid | ~still_valid
+        truncated = state["step"] >= self.max_episode_steps
+        return {
+            "observation": self._observe(state),
+            "state": state,
+            "reward_terms": terms,
+            "reward": sum(terms.values()),
+            "success": self.is_success(state),
+            "done": terminated | truncated,
+            "terminated": terminated,
+            "truncated": truncated,
+        }
+
+    def _observe(self, state: State) -> Tensor:
+        observation = self.observe(state)
+        if self.observe_last_action:
+            observation = torch.cat((observation, state["action_queue"].flatten(1)), -1)
+        return observation
+
+    def _replace_invalid(self, state: State, *inputs: Tensor) -> tuple[State, Tensor]:
+        """Put the fallback in the place of states that are not finite, or beyond what the model can compute.
+
+        Selecting before the physics keeps both values and gradients of the others clean: 0 * inf never happens.
+        """
+        everything = [*(x for x in state.values() if x.is_floating_point()), *inputs]
+        finite = sum(x.flatten(1).sum(-1, keepdim=True) for x in everything).isfinite()
+        speed = torch.cat((state["velocity"], state["angular_velocity"]), -1).abs().amax(-1, keepdim=True)
+        valid = finite & (speed < _MAX_SPEED)
+        replaced = {
+            key: torch.where(valid.view(-1, *[1] * (x.dim() - 1)), x, self._fallback[key]) for key, x in state.items()
+        }
+        return replaced, valid
+
+    def _checked_state(self, state: TensorDictBase, source: str) -> State:
+        expected = self._fallback
+        missing = [key for key in expected if key not in state.keys()]
+        _require(
+            not missing,
+            f"{source}: the state lacks {', '.join(missing)}. A state is restored whole: take it from a tensordict of this "
+            f"environment, which holds {', '.join(expected)}.",
+        )
+        checked = {}
+        for key, like in expected.items():
+            value = state.get(key)
+            shape = (self.num_envs, *like.shape[1:])
+            _require(value.shape == shape, f"{source}: state {key!r} has shape {tuple(value.shape)}, expected {shape}.")
+            checked[key] = value.to(device=like.device, dtype=like.dtype)
+        return checked
+
+    def _tensordict(self, entries: dict[str, Any]) -> TensorDict:
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+
+    def _make_specs(self) -> None:
+        def unbounded(x: Tensor) -> Unbounded:
+            return Unbounded((self.num_envs, *x.shape[1:]), device=self.device, dtype=x.dtype)
+
+        def composite(**entries: Any) -> Composite:
+            return Composite(**entries, shape=self.batch_size, device=self.device)
+
+        def flag() -> Binary:
+            return Binary(1, (self.num_envs, 1), device=self.device, dtype=torch.bool)
+
+        state = composite(**{key: unbounded(x) for key, x in self._fallback.items()})
+        terms = composite(**{name: unbounded(x) for name, x in self.reward_terms(self._fallback).items()})
+        observation = unbounded(self._observe(self._fallback))
+        # A key that stands in the state spec alone would never be carried on: it stands in both.
+        self.observation_spec = composite(observation=observation, state=state, reward_terms=terms, success=flag())
+        self.state_spec = composite(state=state.clone())
+        self.action_spec = Bounded(-1.0, 1.0, (self.num_envs, 4), device=self.device, dtype=self.dtype)
+        self.reward_spec = unbounded(torch.zeros(1, 1, dtype=self.dtype))
+        self.done_spec = composite(done=flag(), terminated=flag(), truncated=flag())
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)

@@ -1,0 +1,96 @@
+"""Multi-layer perceptrons that read their sizes from an environment's specs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from tensordict.utils import NestedKey
+from torch import nn
+from torchrl.envs import EnvBase
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+
+OBSERVATION = ("observation",)
+
+
+def make_actor(
+    env: EnvBase,
+    num_cells: Sequence[int] = (64, 64),
+    *,
+    in_keys: Sequence[NestedKey] = OBSERVATION,
+    activation: type[nn.Module] = nn.ELU,
+    scale_init: float = 0.1,
+    return_log_prob: bool = False,
+) -> ProbabilisticActor:
+    """A tanh-Gaussian policy a = tanh(mu(s) + sigma(s) noise), stretched to the bounds of the action.
+
+    Its last layer starts near zero: the first actions are close to the middle of their range, with noise of about
+    ``scale_init`` (before the tanh, in units of half the range).
+
+    Args:
+        env: gives the sizes of observation and action, the action's bounds, device and floating-point type.
+        num_cells: widths of the hidden layers.
+        in_keys: the entries that are concatenated into the network's input, each (*, k).
+        activation: of the hidden layers; smooth ones give smooth policy gradients.
+        scale_init: standard deviation at the start.
+        return_log_prob: write the log-probability of the action as well, which an entropy bonus and PPO need.
+    """
+    spec = env.action_spec_unbatched
+    net = _mlp(env, in_keys, 2 * spec.shape[-1], num_cells, activation)
+    with torch.no_grad():
+        net[-1].weight.mul_(0.01)
+    params = TensorDictModule(
+        nn.Sequential(net, NormalParamExtractor(scale_mapping=f"biased_softplus_{scale_init}")),
+        in_keys=list(in_keys),
+        out_keys=["loc", "scale"],
+    )
+    low, high = spec.space.low, spec.space.high
+    bounds = {} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high}
+    return ProbabilisticActor(
+        params,
+        in_keys=["loc", "scale"],
+        spec=spec,
+        distribution_class=TanhNormal,
+        distribution_kwargs=bounds,
+        return_log_prob=return_log_prob,
+    )
+
+
+def make_value(
+    env: EnvBase,
+    num_cells: Sequence[int] = (64, 64),
+    *,
+    in_keys: Sequence[NestedKey] = OBSERVATION,
+    activation: type[nn.Module] = nn.ELU,
+) -> ValueOperator:
+    """A state value V(s), written to ``state_value``, (*, 1). The arguments are those of :func:`make_actor`.
+
+    With in_keys such as ``("observation", ("state", "rotor_speed"))`` the critic sees more than the actor.
+    """
+    return ValueOperator(_mlp(env, in_keys, 1, num_cells, activation), in_keys=list(in_keys))
+
+
+def make_qvalue(
+    env: EnvBase,
+    num_cells: Sequence[int] = (64, 64),
+    *,
+    in_keys: Sequence[NestedKey] = OBSERVATION,
+    activation: type[nn.Module] = nn.ELU,
+) -> ValueOperator:
+    """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); as :func:`make_value` otherwise."""
+    in_keys = [*in_keys, "action"]
+    return ValueOperator(_mlp(env, in_keys, 1, num_cells, activation), in_keys=in_keys)
+
+
+def _mlp(
+    env: EnvBase, in_keys: Sequence[NestedKey], out_features: int, num_cells: Sequence[int], activation: type[nn.Module]
+) -> MLP:
+    specs = [env.action_spec if key == "action" else env.observation_spec[key] for key in in_keys]
+    return MLP(
+        in_features=sum(spec.shape[-1] for spec in specs),
+        out_features=out_features,
+        num_cells=list(num_cells),
+        activation_class=activation,
+        device=env.device,
+    ).to(specs[0].dtype)

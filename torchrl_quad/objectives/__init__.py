@@ -1,0 +1,8 @@
+"""First-order policy losses as TorchRL LossModules; they work on any differentiable environment."""
+
+from torchrl_quad.objectives.abpt import ABPTLoss
+from torchrl_quad.objectives.bptt import BPTTLoss
+from torchrl_quad.objectives.pathwise import PathwiseCriticLoss, PathwiseLoss
+from torchrl_quad.objectives.shac import SHACLoss
+
+__all__ = ["ABPTLoss", "BPTTLoss", "PathwiseCriticLoss", "PathwiseLoss", "SHACLoss"]

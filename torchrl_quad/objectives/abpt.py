@@ -1,0 +1,125 @@
+"""Amended backpropagation through time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_quad.objectives.pathwise import PathwiseCriticLoss
+
+
+class ABPTLoss(PathwiseCriticLoss):
+    """Amended backpropagation through time: the N-step and the 0-step return together (paper, equations 6 to 8).
+
+    For each segment of a rollout, J = (J_N + J_0) / 2 with
+
+    - J_N, the discounted rewards plus gamma^n Q(s_n, a_n): exact where the reward is differentiable;
+    - J_0 = Q(s_0, a_0): what the critic has learned of the whole reward, differentiable or not.
+
+    Q is the least of the critics. a_n, and the actions in the critics' targets, are sampled anew from the policy. Q
+    keeps its gradient in state and action and has none in the critics' parameters. With one of the two returns
+    switched off the other has weight 1.
+
+    Args:
+        actor_network: the policy that has made the rollout.
+        qvalue_network: the critic Q(s, a), which writes ``state_action_value`` (see ``set_keys``); or a list of critics.
+        num_qvalue_nets: how many critics to make of a single one, each initialised anew.
+        n_step_return: include J_N.
+        zero_step_return: include J_0.
+        delay_qvalue: keep target networks, to be updated with :class:`torchrl.objectives.SoftUpdate`.
+        **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
+
+    Raises:
+        ValueError: both returns are switched off, or there is no critic.
+    """
+
+    @dataclass
+    class _AcceptedKeys(PathwiseCriticLoss._AcceptedKeys):
+        """As for every pathwise loss with a critic, and where the critics write their predictions."""
+
+        state_action_value: NestedKey = "state_action_value"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    critic_name = "qvalue_network"
+    critic_loss_key = "loss_qvalue"
+    out_keys = ["loss_actor", "loss_qvalue", "pred_value", "target_value", "explained_variance"]
+
+    qvalue_network: TensorDictModule
+    qvalue_network_params: TensorDictParams
+    target_qvalue_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        num_qvalue_nets: int = 2,
+        n_step_return: bool = True,
+        zero_step_return: bool = True,
+        delay_qvalue: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        if not (n_step_return or zero_step_return):
+            raise ValueError("ABPTLoss needs n_step_return or zero_step_return: with both off there is no objective.")
+        several = isinstance(qvalue_network, Sequence)
+        num_qvalue_nets = len(qvalue_network) if several else num_qvalue_nets
+        if num_qvalue_nets < 1:
+            raise ValueError(f"ABPTLoss needs at least one critic, got num_qvalue_nets={num_qvalue_nets}.")
+        super().__init__(actor_network, **kwargs)
+        self.n_step_return, self.zero_step_return = n_step_return, zero_step_return
+        switched = {"n_step_return": n_step_return, "zero_step_return": zero_step_return}
+        self.out_keys = [*self.out_keys, *(name for name, on in switched.items() if on)]
+        self.convert_to_functional(
+            list(qvalue_network) if several else qvalue_network,
+            "qvalue_network",
+            expand_dim=num_qvalue_nets,
+            create_target_params=delay_qvalue,
+        )
+
+    def loss_qvalue(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The critics' loss (paper, equation 9), summed over critics, on a rollout or on samples with their targets.
+
+        Returns:
+            the loss, and a dictionary of what is worth logging.
+        """
+        return self._critic_loss(tensordict)
+
+    def _objective(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        returns = {}
+        if self.n_step_return:
+            returns["n_step_return"] = self._n_step_return(tensordict)
+        if self.zero_step_return:
+            returns["zero_step_return"] = self._zero_step_return(tensordict)
+        objective = sum(returns.values()) / len(returns)
+        return objective, {name: value.detach().mean() for name, value in returns.items()}
+
+    def _zero_step_return(self, tensordict: TensorDictBase) -> Tensor:
+        """Q(s_0, a_0) of each segment, summed over the segments: (*)."""
+        action = tensordict.get(self.tensor_keys.action)
+        self._require_graph(action, self.tensor_keys.action)
+        start, _ = self._segments(tensordict)
+        first = tensordict.select(*self.qvalue_network.in_keys)[start.squeeze(-1)]
+        value = self._critics(first, self._critic_params(target=False)).amin(0)
+        return torch.zeros_like(start, dtype=value.dtype).masked_scatter(start, value).sum((-2, -1))
+
+    def _value(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        with set_exploration_type(ExplorationType.RANDOM), self.actor_network_params.to_module(self.actor_network):
+            tensordict = self.actor_network(tensordict.select(*self._critic_inputs()))
+        return super()._value(tensordict, params)
+
+    def _critics(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        inputs = tensordict.select(*self.qvalue_network.in_keys)
+        values = []
+        for critic in params.unbind(0):
+            with critic.to_module(self.qvalue_network):
+                values.append(self.qvalue_network(inputs.copy()).get(self.tensor_keys.state_action_value))
+        return torch.stack(values)

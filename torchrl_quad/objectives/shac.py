@@ -1,0 +1,67 @@
+"""Short-horizon actor-critic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from tensordict import TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_quad.objectives.pathwise import PathwiseCriticLoss
+
+
+class SHACLoss(PathwiseCriticLoss):
+    """Short-horizon actor-critic (Xu et al. 2022, arXiv:2204.07137).
+
+    The objective of a segment is its discounted rewards plus gamma^n V(s_n), where the terminal value keeps its
+    gradient in the state and has none in the critic. The critic regresses to TD(lambda) targets of a target network.
+
+    Args:
+        actor_network: the policy that has made the rollout.
+        value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
+        delay_value: keep a target network, to be updated with :class:`torchrl.objectives.SoftUpdate`.
+        **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
+    """
+
+    @dataclass
+    class _AcceptedKeys(PathwiseCriticLoss._AcceptedKeys):
+        """As for every pathwise loss with a critic, and where the critic writes its prediction."""
+
+        value: NestedKey = "state_value"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    critic_name = "value_network"
+    critic_loss_key = "loss_value"
+    out_keys = ["loss_actor", "loss_value", "n_step_return", "pred_value", "target_value", "explained_variance"]
+
+    value_network: TensorDictModule
+    value_network_params: TensorDictParams
+    target_value_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        value_network: TensorDictModule,
+        *,
+        delay_value: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(actor_network, **kwargs)
+        self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
+
+    def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The critic's loss (paper, equation 9) on a rollout, or on samples of one that holds its targets.
+
+        Returns:
+            the loss, and a dictionary of what is worth logging.
+        """
+        return self._critic_loss(tensordict)
+
+    def _critics(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        inputs = tensordict.select(*self.value_network.in_keys)
+        with params.to_module(self.value_network):
+            return self.value_network(inputs).get(self.tensor_keys.value).unsqueeze(0)

@@ -46,4 +46,4 @@ def differentiable_rollout(
     carry = env.reset() if carry is None else carry.copy()
     with set_exploration_type(exploration_type):
         rollout = env.rollout(horizon, actor, tensordict=carry, auto_reset=False, break_when_any_done=False)
-    return rollout, env.maybe_reset(env.step_mdp(rollout[..., -1]).detach())
+    return rollout, env.maybe_reset(env.step_mdp(rollout[..., -1]).detach().clone())

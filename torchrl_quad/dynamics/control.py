@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from torchrl_quad.dynamics import rotors
 from torchrl_quad.dynamics.parameters import QuadrotorParams
-from torchrl_quad.dynamics.rigid_body import angular_acceleration, gyroscopic_torque
+from torchrl_quad.dynamics.rigid_body import gyroscopic_torque
+from torchrl_quad.dynamics.rotors import Rotors, apply, thrust_limits
 
 
 class Setpoint(NamedTuple):
@@ -27,38 +28,32 @@ class FlightController:
     """
 
     def __init__(self, nominal: QuadrotorParams) -> None:
+        nominal = nominal.detach()
         self.nominal = nominal
-        self.allocation = rotors.allocation_matrix(nominal)
-        self.mixer = torch.linalg.inv(self.allocation)
-        self.thrust_min, self.thrust_max = rotors.thrust_limits(nominal)
-        self.weight = nominal.mass * nominal.gravity
-        # Yaw torque balances in hover, and roll and pitch too for a centred layout: the mixer gives each rotor's share.
-        hover_thrust = rotors.apply(self.mixer, torch.cat((self.weight, torch.zeros_like(nominal.inertia)), -1))
-        self.hover_speed = rotors.speed_from_thrust(hover_thrust, nominal)
-        thrust = 2.0 / nominal.max_thrust_to_weight - 1.0
-        self.hover_action = torch.cat((thrust, torch.zeros_like(nominal.max_body_rate)), -1)
+        self.rotors = Rotors(nominal)
+        self.mixer = torch.linalg.inv(self.rotors.allocation)
+        self.thrust_min, self.thrust_max = thrust_limits(nominal)
+        self.gain = nominal.inertia * nominal.rate_gain
+        weight = nominal.mass * nominal.gravity
+        self.half_range = 0.5 * nominal.max_thrust_to_weight * weight
+        self.hover_speed = self.rotors.speed(apply(self.mixer, pad(weight, (0, 3))))
+        self.hover_action = pad(2.0 / nominal.max_thrust_to_weight - 1.0, (0, 3))
 
     def setpoint(self, action: Tensor) -> Setpoint:
         """Decode an action (*, 4) in [-1, 1]; values outside are clamped."""
         action = action.clamp(-1.0, 1.0)
-        thrust = 0.5 * (action[..., :1] + 1.0) * self.nominal.max_thrust_to_weight * self.weight
-        return Setpoint(thrust, action[..., 1:] * self.nominal.max_body_rate)
+        return Setpoint((action[..., :1] + 1.0) * self.half_range, action[..., 1:] * self.nominal.max_body_rate)
 
-    def rotor_speed(self, setpoint: Setpoint, angular_velocity: Tensor, rotor_speed: Tensor) -> Tensor:
-        """Commanded rotor speed (*, 4) [rad/s] for a setpoint, the body rates (*, 3), and the present speeds (*, 4).
+    def rotor_speed(self, setpoint: Setpoint, angular_velocity: Tensor, wrench: Tensor) -> Tensor:
+        """Commanded rotor speed (*, 4) [rad/s] for a setpoint, the body rates (*, 3), and the present wrench (*, 4).
 
-        Torque = J K (desired rate - rate) - D (angular acceleration) + w x J w, where the angular acceleration is
-        computed from the present rotor speeds. The paper prints a derivative of the desired rate as well; a setpoint
-        that is held for a control step has none.
+        Torque = J K (desired rate - rate) - D (angular acceleration) + w x J w, where the angular acceleration follows
+        from the wrench that the controller believes the rotors to exert. The paper prints a derivative of the desired
+        rate as well; a setpoint that is held for a control step has none.
         """
-        drone = self.nominal
-        torque_now = rotors.apply(self.allocation, rotors.thrust_from_speed(rotor_speed, drone))[..., 1:]
-        acceleration = angular_acceleration(angular_velocity, torque_now, drone.inertia)
-        torque = (
-            drone.inertia * drone.rate_gain * (setpoint.body_rate - angular_velocity)
-            - drone.rate_damping * acceleration
-            + gyroscopic_torque(angular_velocity, drone.inertia)
-        )
-        thrust = rotors.apply(self.mixer, torch.cat((setpoint.thrust, torque), -1))
-        thrust = torch.minimum(torch.maximum(thrust, self.thrust_min), self.thrust_max)
-        return rotors.speed_from_thrust(thrust, drone)
+        inertia = self.nominal.inertia
+        gyroscopic = gyroscopic_torque(angular_velocity, inertia)
+        acceleration = (wrench[..., 1:] - gyroscopic) / inertia
+        torque = self.gain * (setpoint.body_rate - angular_velocity) - self.nominal.rate_damping * acceleration + gyroscopic
+        thrust = apply(self.mixer, torch.cat((setpoint.thrust, torque), -1))
+        return self.rotors.speed(torch.minimum(torch.maximum(thrust, self.thrust_min), self.thrust_max))

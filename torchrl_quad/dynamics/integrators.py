@@ -7,7 +7,6 @@ loop the wrench is held over each physics step, and all three are of first order
 from collections.abc import Callable
 
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.rigid_body import RigidBodyState
@@ -26,7 +25,7 @@ def semi_implicit_euler(state: RigidBodyState, accelerations: Accelerations, dt:
     velocity = state.velocity + dt * linear
     angular_velocity = state.angular_velocity + dt * angular
     position = state.position + dt * velocity
-    attitude = state.quaternion + dt * _quaternion_rate(state.quaternion, angular_velocity)
+    attitude = state.quaternion + dt * quaternion.derivative(state.quaternion, angular_velocity)
     return _normalized(RigidBodyState(position, attitude, velocity, angular_velocity))
 
 
@@ -45,11 +44,7 @@ INTEGRATORS = {"euler": euler, "semi_implicit_euler": semi_implicit_euler, "rk4"
 
 def _derivative(state: RigidBodyState, accelerations: Accelerations) -> RigidBodyState:
     linear, angular = accelerations(state)
-    return RigidBodyState(state.velocity, _quaternion_rate(state.quaternion, state.angular_velocity), linear, angular)
-
-
-def _quaternion_rate(q: Tensor, angular_velocity: Tensor) -> Tensor:
-    return 0.5 * quaternion.multiply(q, pad(angular_velocity, (1, 0)))
+    return RigidBodyState(state.velocity, quaternion.derivative(state.quaternion, state.angular_velocity), linear, angular)
 
 
 def _moved(state: RigidBodyState, derivative: RigidBodyState, dt: float) -> RigidBodyState:

@@ -100,7 +100,9 @@ class QuadrotorParams:
         return self._map(lambda value: value.to(device=device, dtype=dtype))
 
     def detach(self) -> QuadrotorParams:
-        """A copy that shares the values and carries no gradient."""
+        """The same values without gradient; itself where there is none to lose."""
+        if not any(value.requires_grad for value in self.fields().values()):
+            return self
         return self._map(Tensor.detach)
 
     def _map(self, function) -> QuadrotorParams:

@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from torchrl_quad.dynamics import rotors
 from torchrl_quad.dynamics.control import FlightController, Setpoint
 from torchrl_quad.dynamics.integrators import INTEGRATORS
 from torchrl_quad.dynamics.parameters import QuadrotorParams
 from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
+from torchrl_quad.dynamics.rotors import Rotors
 
 
 class QuadrotorState(NamedTuple):
@@ -25,15 +25,21 @@ def physics_step(
     state: QuadrotorState,
     setpoint: Setpoint,
     params: QuadrotorParams,
+    rotors: Rotors,
     controller: FlightController,
     dt: float,
     integrator: str = "semi_implicit_euler",
 ) -> QuadrotorState:
-    """One physics step of dt [s]: the present rotor speeds make the wrench, and the controller sets their next target."""
-    wrench = rotors.apply(rotors.allocation_matrix(params), rotors.thrust_from_speed(state.rotor_speed, params))
-    commanded = controller.rotor_speed(setpoint, state.angular_velocity, state.rotor_speed)
+    """One physics step of dt [s]: the present rotor speeds make the wrench, and the controller sets their next target.
+
+    ``rotors`` are those of ``params``; the controller knows its own, and flies by them.
+    """
+    speed = state.rotor_speed
+    wrench = rotors.wrench(speed)
+    believed = wrench if rotors is controller.rotors else controller.rotors.wrench(speed)
+    commanded = controller.rotor_speed(setpoint, state.angular_velocity, believed)
     body = INTEGRATORS[integrator](RigidBodyState(*state[:4]), lambda s: accelerations(s, wrench, params), dt)
-    return QuadrotorState(*body, rotors.lagged_speed(state.rotor_speed, commanded, params, dt))
+    return QuadrotorState(*body, commanded + (speed - commanded) * rotors.lag(dt))
 
 
 def control_step(
@@ -45,8 +51,9 @@ def control_step(
     substeps: int,
     integrator: str = "semi_implicit_euler",
 ) -> QuadrotorState:
-    """Hold an action (*, 4) in [-1, 1] over ``substeps`` physics steps of dt [s]."""
+    """Hold an action (*, 4) in [-1, 1] over ``substeps`` physics steps of dt [s], with the drone ``params``."""
     setpoint = controller.setpoint(action)
+    rotors = controller.rotors if params is controller.nominal else Rotors(params)
     for _ in range(substeps):
-        state = physics_step(state, setpoint, params, controller, dt, integrator)
+        state = physics_step(state, setpoint, params, rotors, controller, dt, integrator)
     return state

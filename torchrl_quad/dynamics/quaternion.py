@@ -35,7 +35,16 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
 
 def rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
     """World to body: the vector v (*, 3) turned by the inverse of the unit quaternion q (*, 4)."""
-    return rotate(conjugate(q), v)
+    w, u = q[..., :1], q[..., 1:]
+    t = 2.0 * torch.linalg.cross(u, v)
+    return v - w * t + torch.linalg.cross(u, t)
+
+
+def derivative(q: Tensor, angular_velocity: Tensor) -> Tensor:
+    """Time derivative (*, 4) [1/s] under the body-frame angular velocity (*, 3) [rad/s]: half of q (0, w)."""
+    w, u = 0.5 * q[..., :1], 0.5 * q[..., 1:]
+    scalar = -(u * angular_velocity).sum(-1, keepdim=True)
+    return torch.cat((scalar, w * angular_velocity + torch.linalg.cross(u, angular_velocity)), -1)
 
 
 def from_axis_angle(axis_angle: Tensor) -> Tensor:

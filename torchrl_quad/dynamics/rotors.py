@@ -9,45 +9,58 @@ from torch import Tensor
 from torchrl_quad.dynamics.parameters import QuadrotorParams
 
 
-def thrust_from_speed(speed: Tensor, params: QuadrotorParams) -> Tensor:
-    """Rotor thrust (*, 4) [N] at the rotor speed (*, 4) [rad/s]: k2 w^2 + k1 w + k0 (paper, section II-B)."""
-    k2, k1, k0 = params.thrust_map.split(1, -1)
-    return (k2 * speed + k1) * speed + k0
+class Rotors:
+    """The four rotors of a drone, with what follows from its parameters worked out once.
 
-
-def speed_from_thrust(thrust: Tensor, params: QuadrotorParams) -> Tensor:
-    """Rotor speed (*, 4) [rad/s] that gives the thrust (*, 4) [N]: the inverse of :func:`thrust_from_speed`.
-
-    The root is held at or above one thousandth of its value at full speed, where the slope of the inverse would be
-    infinite: an error of at most 0.1 % of the top speed, and only next to the lowest point of the thrust map.
+    The thrust map k2 w^2 + k1 w + k0 (paper, section II-B) is kept as k2 (w - w0)^2 + f0, which is quick both ways.
     """
-    k2, k1, k0 = params.thrust_map.split(1, -1)
-    floor = 1e-3 * (2.0 * k2 * params.rotor_speed_max + k1)
-    discriminant = k1 * k1 + 4.0 * k2 * (thrust - k0)
-    root = torch.maximum(discriminant, floor * floor).sqrt()
-    return (root - k1) / (2.0 * k2)
+
+    def __init__(self, params: QuadrotorParams) -> None:
+        k2, k1, k0 = params.thrust_map.split(1, -1)
+        self.curvature = k2
+        self.vertex_speed = -k1 / (2.0 * k2)
+        self.vertex_thrust = k0 - k1 * k1 / (4.0 * k2)
+        self.least_root = 1e-6 * (params.rotor_speed_max - self.vertex_speed).square()
+        self.time_constant = params.motor_time_constant
+        self.allocation = allocation_matrix(params)
+
+    def thrust(self, speed: Tensor) -> Tensor:
+        """Rotor thrust (*, 4) [N] at the rotor speed (*, 4) [rad/s]."""
+        return self.curvature * (speed - self.vertex_speed).square() + self.vertex_thrust
+
+    def speed(self, thrust: Tensor) -> Tensor:
+        """Rotor speed (*, 4) [rad/s] that gives the thrust (*, 4) [N]: the inverse of :meth:`thrust`.
+
+        Next to the lowest point of the thrust map, where the slope of the inverse is infinite, the speed is held one
+        thousandth of its range above that point, so that derivatives stay finite.
+        """
+        squared = (thrust - self.vertex_thrust) / self.curvature
+        return self.vertex_speed + torch.maximum(squared, self.least_root).sqrt()
+
+    def wrench(self, speed: Tensor) -> Tensor:
+        """The wrench (*, 4) on the body at the rotor speeds (*, 4) [rad/s]."""
+        return apply(self.allocation, self.thrust(speed))
+
+    def lag(self, dt: float) -> Tensor:
+        """The share of a speed error that is left after dt [s] of first-order lag: exact for any dt."""
+        return torch.exp(-dt / self.time_constant)
 
 
 def thrust_limits(params: QuadrotorParams) -> tuple[Tensor, Tensor]:
     """The least and the greatest thrust [N] that may be commanded of one rotor; the least is never negative."""
-    low = thrust_from_speed(params.rotor_speed_min, params).clamp_min(0.0)
-    return low, thrust_from_speed(params.rotor_speed_max, params)
-
-
-def lagged_speed(speed: Tensor, commanded: Tensor, params: QuadrotorParams, dt: float) -> Tensor:
-    """Rotor speed (*, 4) after dt [s] of first-order lag towards a constant command: exact for any dt."""
-    return commanded + (speed - commanded) * torch.exp(-dt / params.motor_time_constant)
+    rotors = Rotors(params)
+    return rotors.thrust(params.rotor_speed_min).clamp_min(0.0), rotors.thrust(params.rotor_speed_max)
 
 
 def allocation_matrix(params: QuadrotorParams) -> Tensor:
     """The matrix (*, 4, 4) that turns four rotor thrusts into a wrench, for any rotor layout.
 
-    Torque is r x F of each rotor, (y f, -x f), plus the drag torque kappa s f about z.
+    Torque is r x F of each rotor, (y f, -x f), plus the drag torque kappa s f about z. The paper prints the matrix of a
+    "+" frame; published drones are X frames.
     """
     x, y = params.rotor_positions.unbind(-1)
     yaw = params.torque_to_thrust * params.rotor_spin
-    rows = torch.broadcast_tensors(torch.ones_like(x), y, -x, yaw)
-    return torch.stack(rows, -2)
+    return torch.stack(torch.broadcast_tensors(torch.ones_like(x), y, -x, yaw), -2)
 
 
 def apply(matrix: Tensor, vector: Tensor) -> Tensor:

@@ -111,8 +111,7 @@ class QuadrotorEnv(EnvBase):
         self._transition_function = self._transition
         params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone)
         self.params = params.to(device=self.device, dtype=dtype)
-        self.nominal = self.params.detach()
-        self.controller = FlightController(self.nominal)
+        self.controller = FlightController(self.params)
         self.set_seed(seed)
         # Stands in for a state that is not finite, so that its environment computes on with harmless numbers.
         self._fallback = self.sample_initial_state(1)
@@ -141,6 +140,11 @@ class QuadrotorEnv(EnvBase):
         """Where the state, by itself, fulfils the task, bool (num_envs, 1)."""
 
     # -- what a task may use -------------------------------------------------------------------------------------------
+
+    @property
+    def nominal(self) -> QuadrotorParams:
+        """The drone that the flight controller believes to fly; ``params`` is the one that flies."""
+        return self.controller.nominal
 
     @property
     def hover_action(self) -> Tensor:
@@ -189,8 +193,8 @@ class QuadrotorEnv(EnvBase):
 
     def to(self, device: torch.device | str) -> QuadrotorEnv:
         super().to(device)
-        self.params, self.nominal = self.params.to(device=self.device), self.nominal.to(device=self.device)
-        self.controller = FlightController(self.nominal)
+        self.params = self.params.to(device=self.device)
+        self.controller = FlightController(self.nominal.to(device=self.device))
         self._fallback = {key: value.to(self.device) for key, value in self._fallback.items()}
         self.set_seed(self._seed)
         return self
@@ -237,8 +241,10 @@ class QuadrotorEnv(EnvBase):
             x.requires_grad for x in (action, *state.values(), *self.params.fields().values())
         )
         if needs_grad and self._transition_function != self._transition:
-            # One compiled graph serves the first step of a horizon and all others.
-            state = {k: v if v.requires_grad or not v.is_floating_point() else v.detach().requires_grad_() for k, v in state.items()}
+            # The first step of a horizon then looks like all others, and one compiled graph serves both.
+            for key, value in state.items():
+                if value.is_floating_point() and not value.requires_grad:
+                    state[key] = value.detach().requires_grad_()
         with torch.set_grad_enabled(needs_grad):
             return self._tensordict(self._transition_function(state, action))
 
@@ -285,10 +291,11 @@ class QuadrotorEnv(EnvBase):
 
         Selecting before the physics keeps both values and gradients of the others clean: 0 * inf never happens.
         """
-        everything = [*(x for x in state.values() if x.is_floating_point()), *inputs]
-        finite = sum(x.flatten(1).sum(-1, keepdim=True) for x in everything).isfinite()
-        speed = torch.cat((state["velocity"], state["angular_velocity"]), -1).abs().amax(-1, keepdim=True)
-        valid = finite & (speed < _MAX_SPEED)
+        with torch.no_grad():
+            everything = [*(x for x in state.values() if x.is_floating_point()), *inputs]
+            total = torch.cat([x.flatten(1) for x in everything], -1).sum(-1, keepdim=True)
+            speed = torch.cat((state["velocity"], state["angular_velocity"]), -1).abs().amax(-1, keepdim=True)
+            valid = total.isfinite() & (speed < _MAX_SPEED)
         replaced = {
             key: torch.where(valid.view(-1, *[1] * (x.dim() - 1)), x, self._fallback[key]) for key, x in state.items()
         }

@@ -1,5 +1,6 @@
 """The drone as pure functions on plain tensors: no TorchRL, no TensorDict, differentiable in everything."""
 
+from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Setpoint
 from torchrl_quad.dynamics.integrators import INTEGRATORS, euler, rk4, semi_implicit_euler
 from torchrl_quad.dynamics.parameters import QuadrotorParams, available_drones, load_drone
@@ -19,6 +20,7 @@ __all__ = [
     "euler",
     "load_drone",
     "physics_step",
+    "quaternion",
     "rk4",
     "semi_implicit_euler",
 ]

@@ -82,7 +82,7 @@ class QuadrotorParams:
         """The fields by name, in the order of their declaration."""
         return {name: getattr(self, name) for name in _FIELDS}
 
-    def replace(self, **changes: Tensor | float) -> QuadrotorParams:
+    def replace(self, **changes: Tensor | float | list) -> QuadrotorParams:
         """A copy with some fields changed: ``params.replace(mass=0.5)``.
 
         A tensor keeps its graph, so that a parameter can be fitted through the simulator.

@@ -114,7 +114,7 @@ class QuadrotorEnv(EnvBase):
         self.controller = FlightController(self.params)
         self.set_seed(seed)
         # Stands in for a state that is not finite, so that its environment computes on with harmless numbers.
-        self._fallback = self.sample_initial_state(1)
+        self._fallback = self.sample_initial_state(num_envs)
         self._make_specs()
 
     # -- what a task says ----------------------------------------------------------------------------------------------

@@ -1,0 +1,85 @@
+"""Loading drones: presets, files, mappings, and what is wrong with a bad one."""
+
+import pytest
+import torch
+import yaml
+
+from torchrl_quad import HoveringEnv, QuadrotorParams, available_drones, load_drone
+
+VISFLY = {name: value.squeeze().tolist() for name, value in load_drone("visfly").fields().items()}
+
+
+def test_the_four_presets_are_there():
+    assert available_drones() == ["crazyflie", "flightmare", "small_racer", "visfly"]
+
+
+@pytest.mark.parametrize("name", available_drones())
+def test_every_preset_can_hover_and_reach_its_commanded_thrust(name):
+    params = load_drone(name)
+    env = HoveringEnv(num_envs=1, drone=name)
+    _, highest = env.controller.thrust_min, env.controller.thrust_max
+    assert (params.rotor_speed_min < env.controller.hover_speed).all()
+    assert (4 * highest >= params.max_thrust_to_weight * params.mass * params.gravity).all()
+
+
+def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump({**VISFLY, "mass": 0.5}))
+    for source in (path, str(path), {**VISFLY, "mass": "5e-1"}):
+        assert load_drone(source).mass.item() == 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mass": None}, r"mine.yaml: missing field 'mass'. Required: mass, inertia"),
+        ({"colour": 3.0}, r"mine.yaml: unknown field 'colour'. Allowed: mass, inertia"),
+        ({"mass": -1.0}, r"mine.yaml: field 'mass' must be positive, got \[-1.0\]"),
+        ({"mass": float("nan")}, r"mine.yaml: field 'mass' must be positive"),
+        ({"inertia": [1e-3, float("inf"), 1e-3]}, r"mine.yaml: field 'inertia' must be positive"),
+        ({"inertia": [1e-3, 1e-3]}, r"mine.yaml: field 'inertia' has shape \(2,\); it must be \(3,\)"),
+        ({"linear_drag": [0.0, -0.1, 0.0]}, r"mine.yaml: field 'linear_drag' must be zero or positive"),
+        ({"rotor_spin": [1, 1, 0, -1]}, r"mine.yaml: field 'rotor_spin' must be \+1 or -1"),
+        ({"thrust_map": [0.0, 1.0, 0.0]}, r"mine.yaml: field 'thrust_map' must be finite, k2 positive"),
+        ({"mass": "heavy"}, r"mine.yaml: field 'mass' is not a number or a list of numbers: 'heavy'"),
+        ({"rotor_speed_min": 4000.0}, r"rotor_speed_min must be below rotor_speed_max"),
+    ],
+)
+def test_a_bad_file_is_told_which_field_and_what_is_allowed(tmp_path, change, message):
+    path = tmp_path / "mine.yaml"
+    values = {name: value for name, value in {**VISFLY, **change}.items() if value is not None}
+    path.write_text(yaml.safe_dump(values))
+    with pytest.raises(ValueError, match=message):
+        load_drone(path)
+
+
+def test_an_unknown_preset_lists_the_known_ones():
+    with pytest.raises(ValueError, match="Unknown drone 'visflu'. Choose from: crazyflie, flightmare, small_racer, visfly"):
+        load_drone("visflu")
+
+
+def test_a_file_that_is_no_mapping_is_refused(tmp_path):
+    path = tmp_path / "list.yaml"
+    path.write_text("- 1\n- 2\n")
+    with pytest.raises(ValueError, match="expected a mapping of field names to numbers, got list"):
+        load_drone(path)
+
+
+def test_replacing_an_unknown_field_lists_the_known_ones():
+    with pytest.raises(ValueError, match="QuadrotorParams has no field 'weight'. Choose from: mass,"):
+        load_drone().replace(weight=1.0)
+
+
+def test_a_value_per_environment_needs_its_trailing_dimension():
+    params = load_drone()
+    assert params.replace(mass=torch.full((5, 1), 0.4)).mass.shape == (5, 1)
+    with pytest.raises(ValueError, match=r"field 'mass' has shape \(5,\); it must be \(1,\) for one drone"):
+        params.replace(mass=torch.full((5,), 0.4))
+
+
+def test_gradients_flow_through_replace_to_and_construction():
+    mass = torch.tensor(0.5, requires_grad=True)
+    params = load_drone().replace(mass=mass).to(dtype=torch.float64)
+    QuadrotorParams(**params.fields()).mass.sum().backward()
+    assert mass.grad == 1.0
+    assert not params.detach().mass.requires_grad

@@ -1,0 +1,328 @@
+"""The environment: specs, resets, ends, seeds, delay, and what happens to broken states."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
+
+from torchrl_quad import HoveringEnv, load_drone, make_env
+from torchrl_quad.dynamics import quaternion
+
+
+def fly(env, td, actions):
+    """Step through a list of actions; returns the steps, stacked along time."""
+    steps = []
+    for action in actions:
+        td = td.copy().set("action", action)
+        steps.append(env.step(td))
+        td = env.step_mdp(steps[-1])
+    return torch.stack(steps, 1)
+
+
+def hold(env, steps):
+    return [env.hover_action.expand(env.num_envs, 4)] * steps
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("action_delay", [0, 1, 3])
+def test_specs_hold_with_any_precision_and_delay(dtype, action_delay):
+    env = HoveringEnv(num_envs=3, dtype=dtype, action_delay=action_delay, max_episode_steps=7)
+    check_env_specs(env, break_when_any_done="both")
+    assert env.rollout(2)["observation"].dtype is dtype
+    assert ("action_queue" in env.reset()["state"]) == (action_delay > 0)
+
+
+def test_specs_hold_with_the_other_options():
+    env = HoveringEnv(num_envs=2, integrator="rk4", drone="small_racer", control_dt=0.01, observe_last_action=True)
+    check_env_specs(env, break_when_any_done="both")
+    assert env.reset()["observation"].shape == (2, 13 + 4)
+
+
+def test_a_drone_that_hovers_stays_and_succeeds(env64):
+    td = env64.reset()
+    td["state", "position"] = td["state", "target"]
+    flight = fly(env64, env64.reset(td, set_state=True), hold(env64, 100))
+    torch.testing.assert_close(flight["next", "state", "position"][:, -1], td["state", "target"])
+    assert flight["next", "success"].all()
+    assert not flight["next", "done"].any()
+    torch.testing.assert_close(flight["next", "reward"], torch.full((4, 100, 1), 0.1, dtype=torch.float64))
+
+
+def test_the_reward_is_the_sum_of_its_terms_and_the_paper_s_formula(env64):
+    flight = env64.rollout(5)
+    terms = flight["next", "reward_terms"]
+    torch.testing.assert_close(sum(terms.values()), flight["next", "reward"])
+    state = flight["next", "state"]
+    level = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+
+    def norm(x):
+        return x.norm(dim=-1, keepdim=True)
+
+    expected = (
+        0.1
+        - 0.1 / 9 * norm(state["position"] - torch.tensor([1.0, 0.0, 1.5], dtype=torch.float64))
+        - 1e-5 * norm(state["quaternion"] - level)
+        - 0.002 * norm(state["velocity"])
+        - 0.002 * norm(state["angular_velocity"])
+    )
+    torch.testing.assert_close(flight["next", "reward"], expected)
+    assert all((term == 0).all() for term in env64.reset()["reward_terms"].values())
+
+
+def test_starts_lie_in_their_box_level_and_at_rest():
+    td = HoveringEnv(num_envs=2000, seed=3).reset()
+    offset = (td["state", "position"] - torch.tensor([1.0, 0.0, 1.5])).abs().amax(0)
+    assert (offset <= torch.tensor([1.0, 1.0, 0.5])).all()
+    assert (offset > torch.tensor([0.98, 0.98, 0.49])).all()
+    assert (td["state", "velocity"] == 0).all()
+    assert (td["state", "quaternion"] == torch.tensor([1.0, 0.0, 0.0, 0.0])).all()
+
+
+def test_the_observation_is_the_paper_s(env64):
+    td = env64.rollout(3)[:, -1]
+    state = td["state"]
+    expected = torch.cat(
+        ((state["target"] - state["position"]) / 10, state["quaternion"], state["velocity"] / 10, state["angular_velocity"] / 10), -1
+    )
+    torch.testing.assert_close(td["observation"], expected)
+
+
+def test_running_out_of_time_truncates_and_does_not_terminate():
+    env = HoveringEnv(num_envs=2, max_episode_steps=5)
+    flight = fly(env, env.reset(), hold(env, 5))["next"]
+    assert flight["truncated"][..., 0].tolist() == [[False] * 4 + [True]] * 2
+    assert torch.equal(flight["done"], flight["truncated"])
+    assert not flight["terminated"].any()
+
+
+@pytest.mark.parametrize("position", [(1, 0, -0.1), (1, 0, 6.1), (6.1, 0, 1.5), (-4.1, 0, 1.5), (1, 5.1, 1.5), (1, -5.1, 1.5)])
+def test_leaving_the_box_terminates_and_does_not_truncate(env, position):
+    td = env.reset()
+    td["state", "position"][2] = torch.tensor(position, dtype=torch.float32)
+    ends = fly(env, env.reset(td, set_state=True), hold(env, 1))["next"][:, 0]
+    assert ends["terminated"].flatten().tolist() == [False, False, True, False]
+    assert not ends["truncated"].any()
+    assert torch.equal(ends["done"], ends["terminated"])
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_an_action_takes_effect_after_the_delay(delay):
+    env = HoveringEnv(num_envs=1, action_delay=delay, dtype=torch.float64)
+    push = env.hover_action + torch.tensor([0.5, 0.0, 0.0, 0.0], dtype=torch.float64)
+    flight = fly(env, env.reset(), [push.expand(1, 4)] * (delay + 2))
+    speed = flight["next", "state", "rotor_speed"][0, :, 0] - env.controller.hover_speed[0]
+    assert (speed[:delay].abs() < 1e-9).all()
+    assert (speed[delay:] > 10).all()
+
+
+def test_flights_repeat_with_the_seed_whatever_the_global_generator_does():
+    def starts(seed, disturb):
+        env = HoveringEnv(num_envs=4, seed=seed)
+        torch.manual_seed(disturb)
+        first = env.reset()["state", "position"]
+        torch.rand(disturb)
+        return torch.stack((first, env.reset()["state", "position"]))
+
+    assert torch.equal(starts(5, 1), starts(5, 2))
+    assert not torch.equal(starts(5, 1), starts(6, 1))
+    before = torch.get_rng_state()
+    HoveringEnv(num_envs=4).reset()
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_setting_the_seed_starts_the_sequence_again(env):
+    env.set_seed(7)
+    first = env.reset()["state", "position"]
+    env.set_seed(7)
+    assert torch.equal(env.reset()["state", "position"], first)
+
+
+def test_a_partial_reset_leaves_the_others_alone(env):
+    td = env.step_mdp(env.rollout(3)[:, -1])
+    before = td["state"].clone()
+    td["_reset"] = torch.tensor([[True], [False], [True], [False]])
+    after = env.reset(td, set_state=False)["state"]
+    assert after["step"].flatten().tolist() == [0, 3, 0, 3]
+    for key, value in after.items():
+        assert torch.equal(value[[1, 3]], before[key][[1, 3]])
+    assert (after["velocity"][[0, 2]] == 0).all()
+
+
+def test_a_rollout_resets_only_those_that_are_done():
+    env = HoveringEnv(num_envs=2, max_episode_steps=10)
+    td = env.reset()
+    td["state", "step"][1] = 7
+    flight = env.rollout(5, tensordict=env.reset(td, set_state=True), auto_reset=False, break_when_any_done=False)
+    assert flight["state", "step"][..., 0].tolist() == [[0, 1, 2, 3, 4], [7, 8, 9, 0, 1]]
+
+
+def test_a_state_that_is_set_goes_on_as_if_it_had_never_stopped(env64):
+    actions = [torch.rand(4, 4, dtype=torch.float64) * 0.4 - 0.5 for _ in range(8)]
+    start = env64.reset()
+    whole = fly(env64, start, actions)
+    middle = TensorDict({"state": whole["next", "state"][:, 3].clone()}, [4])
+    rest = fly(env64, env64.reset(middle, set_state=True), actions[4:])
+    for key, value in rest["next"].items(include_nested=True, leaves_only=True):
+        assert torch.equal(value, whole["next", key][:, 4:]), key
+
+
+def test_a_state_has_to_be_complete_and_of_the_right_shape(env):
+    td = env.reset()
+    del td["state", "rotor_speed"]
+    with pytest.raises(ValueError, match=r"the state lacks rotor_speed. A state is restored whole"):
+        env.reset(td, set_state=True)
+    td = env.reset()
+    td["state", "velocity"] = torch.zeros(4, 2)
+    with pytest.raises(ValueError, match=r"state 'velocity' has shape \(4, 2\), expected \(4, 3\)"):
+        env.reset(td, set_state=True)
+
+
+@pytest.mark.parametrize("wrap", [False, True])
+def test_resets_draw_from_the_initial_state_source(wrap):
+    base = HoveringEnv(num_envs=2, max_episode_steps=3)
+    env = TransformedEnv(base, Compose(StepCounter(), RewardSum())) if wrap else base
+    state = base.reset()["state"].clone()
+    state["velocity"] += 1.0
+    asked = []
+
+    def source(n):
+        asked.append(n)
+        return state
+
+    env.set_initial_state_source(source)
+    flight = env.rollout(5, break_when_any_done=False)
+    assert asked == [2, 2]
+    for t in (0, 3):
+        assert torch.equal(flight["state", "velocity"][:, t], state["velocity"])
+    env.set_initial_state_source(None)
+    assert (env.reset()["state", "velocity"] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("velocity", float("nan")), ("position", float("inf")), ("velocity", 1e30), ("rotor_speed", float("nan"))]
+)
+def test_a_broken_state_terminates_and_leaks_nothing_into_the_others(env64, key, value):
+    action = (env64.hover_action.expand(4, 4) + 0.1).clone().requires_grad_()
+    mass = torch.tensor(0.46, dtype=torch.float64, requires_grad=True)
+    env64.params = env64.params.replace(mass=mass)
+
+    def gradients(td):
+        flight = fly(env64, td, [action] * 3)
+        for entry, x in flight["next"].items(include_nested=True, leaves_only=True):
+            assert x.isfinite().all(), entry
+        loss = flight["next", "reward"][[0, 1, 3]].sum() + 0.0 * flight["next", "reward"][2].sum()
+        return flight, torch.autograd.grad(loss, (action, mass))
+
+    td = env64.reset()
+    clean, (clean_action, clean_mass) = gradients(td)
+    broken = td.clone()
+    broken["state", key][2] = value
+    flight, (broken_action, broken_mass) = gradients(broken)
+    assert flight["next", "terminated"][2, 0] and not flight["next", "terminated"][[0, 1, 3]].any()
+    assert torch.equal(flight["next", "reward"][[0, 1, 3]], clean["next", "reward"][[0, 1, 3]])
+    assert torch.equal(broken_action[[0, 1, 3]], clean_action[[0, 1, 3]])
+    assert broken_action.isfinite().all()
+    torch.testing.assert_close(broken_mass, clean_mass)
+
+
+def test_an_action_that_is_not_finite_terminates_its_own_environment_only(env):
+    action = env.hover_action.expand(4, 4).clone()
+    action[1, 2] = float("nan")
+    action.requires_grad_()
+    flight = fly(env, env.reset(), [action] * 2)
+    assert flight["next", "terminated"][:, 0].flatten().tolist() == [False, True, False, False]
+    assert flight["next", "observation"].isfinite().all()
+    (grad,) = torch.autograd.grad(flight["next", "reward"].sum(), action)
+    assert grad.isfinite().all()
+    assert (grad[1] == 0).all()
+    assert (grad[[0, 2, 3]] != 0).any(-1).all()
+
+
+def test_gradients_stay_finite_after_a_crash(env64):
+    td = env64.reset()
+    td["state", "position"][0] = torch.tensor([9.0, 9.0, -3.0], dtype=torch.float64)
+    action = torch.ones(4, 4, dtype=torch.float64, requires_grad=True)
+    flight = fly(env64, env64.reset(td, set_state=True), [action] * 30)
+    flight["next", "reward"].sum().backward()
+    assert action.grad.isfinite().all()
+
+
+def test_a_drone_may_be_given_by_name_mapping_or_parameters():
+    params = load_drone("crazyflie")
+    for drone in ("crazyflie", params):
+        assert HoveringEnv(num_envs=1, drone=drone).params.mass == params.mass
+    per_env = params.replace(mass=torch.tensor([[0.027], [0.03]]))
+    env = HoveringEnv(num_envs=2, drone=per_env)
+    flight = fly(env, env.reset(), hold(env, 50))
+    torch.testing.assert_close(flight["next", "state", "velocity"][..., 2], torch.zeros(2, 50), atol=1e-4, rtol=0)
+
+
+def test_make_env_builds_by_name_and_lists_the_names():
+    assert isinstance(make_env("hovering", num_envs=2), HoveringEnv)
+    with pytest.raises(ValueError, match="Unknown task 'hover'. Choose from: hovering"):
+        make_env("hover")
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
+        ({"dtype": torch.int32}, "dtype must be torch.float32 or torch.float64"),
+        ({"dt": 0.0}, "dt must be positive"),
+        ({"control_dt": 0.012}, "control_dt must be a whole multiple of dt, got 0.012 and 0.005; try control_dt=0.01"),
+        ({"action_delay": -1}, "action_delay must be zero or more"),
+        ({"integrator": "heun"}, "Unknown integrator 'heun'. Choose from: euler, semi_implicit_euler, rk4"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be at least 1"),
+        ({"drone": "dji"}, "Unknown drone 'dji'. Choose from"),
+        ({"action_delay": 0, "observe_last_action": True}, "with action_delay=0 there are none"),
+    ],
+)
+def test_bad_arguments_say_what_is_allowed(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        HoveringEnv(**kwargs)
+
+
+def test_the_attitude_reward_does_not_depend_on_the_sign_of_the_quaternion(env):
+    td = env.reset()
+    td["state", "quaternion"] = quaternion.normalize(torch.randn(4, 4))
+    flipped = td.clone()
+    flipped["state", "quaternion"] = -td["state", "quaternion"]
+    a, b = (fly(env, env.reset(x, set_state=True), hold(env, 1)) for x in (td, flipped))
+    torch.testing.assert_close(a["next", "reward"], b["next", "reward"])
+
+
+def test_compiled_flights_equal_eager_ones_and_never_recompile():
+    from torch._dynamo.utils import counters
+
+    env = HoveringEnv(num_envs=4, max_episode_steps=6)
+    actions = [(env.hover_action + 0.3 * torch.randn(4, 4)).requires_grad_() for _ in range(10)]
+
+    def gradients():
+        env.set_seed(0)
+        td, rewards = env.reset(), []
+        for action in actions:
+            step, td = env.step_and_maybe_reset(td.set("action", action))
+            rewards.append(step["next", "reward"])
+        return torch.stack(rewards), torch.autograd.grad(torch.stack(rewards).sum(), actions, materialize_grads=True)
+
+    eager, eager_grad = gradients()
+    env.compile()
+    with torch.no_grad():
+        env.rollout(2)
+    gradients()
+    compiled_so_far = counters["stats"]["unique_graphs"]
+    compiled, compiled_grad = gradients()
+    with torch.no_grad():
+        env.rollout(3)
+    env.rollout(3)
+    assert counters["stats"]["unique_graphs"] == compiled_so_far
+    torch.testing.assert_close(compiled, eager)
+    torch.testing.assert_close(compiled_grad, eager_grad, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_everything_moves_to_the_gpu():
+    env = HoveringEnv(num_envs=4).to("cuda")
+    check_env_specs(env)
+    assert env.rollout(3)["next", "reward"].device.type == "cuda"
+    assert HoveringEnv(num_envs=4, device="cuda").rollout(3).device.type == "cuda"

@@ -45,7 +45,6 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         self.state_keys = tuple(state_keys)
         super().__init__(
             storage=LazyTensorStorage(capacity, device=device),
-            batch_size=1,
             generator=torch.Generator().manual_seed(seed),
         )
 

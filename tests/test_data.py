@@ -1,0 +1,219 @@
+"""Differentiable rollouts and the buffer of visited states."""
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import PendulumEnv, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_quad import HoveringEnv, VisitedStateBuffer, differentiable_rollout, make_actor
+
+
+@pytest.fixture
+def flight(env):
+    actor = make_actor(env)
+    return env, actor, *differentiable_rollout(env, actor, None, 5)
+
+
+def test_the_rollout_keeps_the_graph_and_the_carry_drops_it(flight):
+    env, actor, rollout, carry = flight
+    assert rollout.batch_size == (4, 5)
+    assert rollout["next", "reward"].requires_grad
+    assert not any(value.requires_grad for value in carry.values(include_nested=True, leaves_only=True))
+    rollout["next", "reward"].sum().backward()
+    assert all(p.grad is not None for p in actor.parameters())
+
+
+def test_the_carry_goes_on_where_the_rollout_ended_and_is_not_modified(flight):
+    env, actor, rollout, carry = flight
+    assert torch.equal(carry["state", "position"], rollout["next", "state", "position"][:, -1])
+    before = carry.clone()
+    following, _ = differentiable_rollout(env, actor, carry, 3)
+    assert torch.equal(following["state", "position"][:, 0], carry["state", "position"])
+    assert (carry == before).all()
+
+
+def test_it_equals_the_rollout_of_torchrl():
+    def fly(function):
+        env = HoveringEnv(num_envs=4, seed=1, max_episode_steps=4)
+        torch.manual_seed(3)
+        return function(env, make_actor(env))
+
+    ours = fly(lambda env, actor: differentiable_rollout(env, actor, None, 10)[0])
+    with set_exploration_type(ExplorationType.RANDOM):
+        theirs = fly(lambda env, actor: env.rollout(10, actor, break_when_any_done=False))
+    for key, value in theirs.items(include_nested=True, leaves_only=True):
+        assert torch.equal(value, ours[key]), key
+
+
+def test_it_samples_by_default_and_is_deterministic_on_request(env):
+    actor = make_actor(env)
+    carry = env.reset()
+    samples = [differentiable_rollout(env, actor, carry, 2)[0]["action"] for _ in range(2)]
+    assert not torch.equal(*samples)
+    modes = [
+        differentiable_rollout(env, actor, carry, 2, exploration_type=ExplorationType.DETERMINISTIC)[0]["action"]
+        for _ in range(2)
+    ]
+    assert torch.equal(*modes)
+
+
+def test_the_carry_of_a_finished_environment_is_reset():
+    env = HoveringEnv(num_envs=2, max_episode_steps=3)
+    rollout, carry = differentiable_rollout(env, make_actor(env), None, 3)
+    assert rollout["next", "done"][:, -1].all()
+    assert not carry["done"].any()
+    assert (carry["state", "step"] == 0).all()
+
+
+def test_it_flies_under_transforms_and_keeps_the_graph(env):
+    env = TransformedEnv(TransformedEnv(env, StepCounter()).base_env, RewardSum())
+    rollout, carry = differentiable_rollout(env, make_actor(env), None, 4)
+    assert rollout["next", "episode_reward"].requires_grad
+    torch.testing.assert_close(carry["episode_reward"], rollout["next", "reward"].sum(1).detach())
+
+
+def test_it_flies_any_differentiable_environment():
+    env = PendulumEnv(seed=0)
+    actor = TensorDictModule(torch.nn.Linear(1, 1), in_keys=["thdot"], out_keys=["action"])
+    wrapped = TensorDictModule(lambda x: x.unsqueeze(-1), in_keys=["thdot"], out_keys=["input"])
+    actor.in_keys = ["input"]
+    rollout, _ = differentiable_rollout(env, torch_sequence(wrapped, actor), None, 4)
+    assert rollout["next", "reward"].requires_grad
+
+
+def torch_sequence(*modules):
+    from tensordict.nn import TensorDictSequential
+
+    return TensorDictSequential(*modules)
+
+
+def test_bad_arguments_say_what_is_allowed(env):
+    with pytest.raises(ValueError, match="horizon must be at least 1 control step, got 0"):
+        differentiable_rollout(env, make_actor(env), None, 0)
+    with pytest.raises(TypeError, match="actor must be a TensorDictModule that writes the action, got Linear"):
+        differentiable_rollout(env, torch.nn.Linear(13, 4), None, 1)
+
+
+def test_the_buffer_keeps_complete_detached_states(flight):
+    env, _, rollout, _ = flight
+    buffer = VisitedStateBuffer()
+    buffer.extend(rollout)
+    assert len(buffer) == 20
+    stored = buffer[:]
+    assert set(stored["state"].keys()) == set(env.observation_spec["state"].keys())
+    assert not any(value.requires_grad for value in stored.values(include_nested=True, leaves_only=True))
+    assert torch.equal(stored["state", "position"], rollout["state", "position"].reshape(20, 3).detach())
+
+
+def test_the_buffer_leaves_out_terminated_and_broken_states(flight):
+    *_, rollout, _ = flight
+    rollout = rollout.detach().clone()
+    rollout["terminated"][0, 1] = True
+    rollout["state", "velocity"][2, 3, 0] = float("nan")
+    rollout["state", "rotor_speed"][3, 0, 1] = float("inf")
+    buffer = VisitedStateBuffer()
+    buffer.extend(rollout)
+    assert len(buffer) == 17
+    assert all(value.isfinite().all() for value in buffer[:].values(include_nested=True, leaves_only=True))
+
+
+def test_the_oldest_states_go_first(flight):
+    *_, rollout, _ = flight
+    buffer = VisitedStateBuffer(capacity=8)
+    buffer.extend(rollout[:2])
+    buffer.extend(rollout[2:, :3])
+    assert len(buffer) == 8
+    kept = {tuple(p.tolist()) for p in buffer[:]["state", "position"]}
+    assert {tuple(p.tolist()) for p in rollout[2:, :3]["state", "position"].reshape(6, 3)} <= kept
+
+
+def test_a_fraction_of_the_environments_starts_in_visited_states():
+    env = HoveringEnv(num_envs=1000)
+    rollout, _ = differentiable_rollout(env, make_actor(env), None, 3)
+    buffer = VisitedStateBuffer()
+    buffer.extend(rollout[:, 1:])  # step counts 1 and 2; fresh starts have 0
+    for fraction in (0.0, 0.7, 1.0):
+        carry = buffer.initial_state(env, fraction)
+        assert (carry["state", "step"] > 0).float().mean().item() == pytest.approx(fraction, abs=0.06)
+        assert not carry["done"].any()
+    carry = buffer.initial_state(env, 1.0)
+    torch.testing.assert_close(carry["observation"][:, :3], (carry["state", "target"] - carry["state", "position"]) / 10)
+
+
+def test_it_starts_environments_under_transforms(env):
+    env = TransformedEnv(env, StepCounter())
+    actor = make_actor(env)
+    rollout, _ = differentiable_rollout(env, actor, None, 3)
+    buffer = VisitedStateBuffer()
+    buffer.extend(rollout[:, 1:])
+    carry = buffer.initial_state(env, 1.0)
+    assert (carry["state", "step"] > 0).all() and (carry["step_count"] == 0).all()
+    differentiable_rollout(env, actor, carry, 2)
+
+
+@pytest.mark.parametrize("wrap", [False, True])
+def test_resets_inside_a_horizon_start_in_visited_states_too(wrap):
+    env = HoveringEnv(num_envs=50, max_episode_steps=4)
+    env = TransformedEnv(env, StepCounter()) if wrap else env
+    actor = make_actor(env)
+    rollout, _ = differentiable_rollout(env, actor, None, 3)
+    buffer = VisitedStateBuffer()
+    buffer.extend(rollout[:, 2:])
+    env.set_initial_state_source(buffer.source(env, fraction=1.0))
+    rollout, _ = differentiable_rollout(env, actor, None, 4)
+    assert (rollout["state", "step"][:, 0] == 2).all()
+    assert (rollout["state", "step"][:, 2] == 2).all()  # two steps on, the episode was truncated and began again
+
+
+def test_a_rollout_cut_in_two_by_way_of_the_buffer_equals_the_uncut_one_to_the_last_bit():
+    def actor_of(env):
+        torch.manual_seed(0)
+        return make_actor(env)
+
+    env = HoveringEnv(num_envs=1, action_delay=3)
+    actor = actor_of(env)
+    deterministic = {"exploration_type": ExplorationType.DETERMINISTIC}
+    start = env.reset()
+    whole, _ = differentiable_rollout(env, actor, start, 30, **deterministic)
+    first, carry = differentiable_rollout(env, actor, start, 15, **deterministic)
+    buffer = VisitedStateBuffer()
+    buffer.extend(carry)
+    second, _ = differentiable_rollout(env, actor, buffer.initial_state(env, 1.0), 15, **deterministic)
+    joined = torch.cat((first, second), 1)
+    for key, value in whole.items(include_nested=True, leaves_only=True):
+        if "reward_terms" not in key or key[0] == "next":  # a reset writes zeros there
+            assert torch.equal(value, joined[key]), key
+
+
+@pytest.mark.parametrize("way", ["state_dict", "dumps"])
+def test_the_buffer_is_saved_and_loaded_with_its_generator(flight, tmp_path, way):
+    env, _, rollout, _ = flight
+    buffer = VisitedStateBuffer(seed=4)
+    buffer.extend(rollout)
+    buffer.initial_state(env)
+    other = VisitedStateBuffer(seed=9)
+    if way == "state_dict":
+        torch.save(buffer.state_dict(), tmp_path / "buffer.pt")
+        other.load_state_dict(torch.load(tmp_path / "buffer.pt", weights_only=False))
+    else:
+        buffer.dumps(tmp_path / "buffer")
+        other.loads(tmp_path / "buffer")
+    assert len(other) == len(buffer)
+    env.set_seed(0)
+    a = buffer.initial_state(env, 0.5)
+    env.set_seed(0)
+    b = other.initial_state(env, 0.5)
+    assert (a == b).all()
+
+
+def test_an_empty_buffer_and_a_bad_fraction_are_refused(flight):
+    env, _, rollout, _ = flight
+    buffer = VisitedStateBuffer()
+    with pytest.raises(RuntimeError, match="The visited-state buffer is empty. Fly a first horizon"):
+        buffer.initial_state(env)
+    buffer.extend(rollout)
+    with pytest.raises(ValueError, match="fraction must lie between 0"):
+        buffer.initial_state(env, 1.5)
+    with pytest.raises(ValueError, match="capacity must be at least 1 state, got 0"):
+        VisitedStateBuffer(capacity=0)

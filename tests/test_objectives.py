@@ -1,0 +1,413 @@
+"""Losses against numbers worked by hand, and their manners as LossModules."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.envs import PendulumEnv
+from torchrl.objectives import SoftUpdate
+from torchrl.objectives.utils import ValueEstimators
+
+from torchrl_quad import (
+    ABPTLoss,
+    BPTTLoss,
+    HoveringEnv,
+    SHACLoss,
+    VisitedStateBuffer,
+    differentiable_rollout,
+    make_actor,
+    make_qvalue,
+    make_value,
+)
+
+GAMMA, LAMBDA = 0.5, 0.5
+
+
+class Scale(nn.Module):
+    """Multiplies its input by one weight."""
+
+    def __init__(self, weight):
+        super().__init__()
+        self.weight = nn.Parameter(torch.tensor(float(weight)))
+
+    def forward(self, x, *others):
+        return self.weight * x + sum(others)
+
+
+def make_networks(policy=2.0, critic=10.0):
+    """a = policy * s; V(s) = critic * s; Q(s, a) = critic * s + a."""
+    actor = TensorDictModule(Scale(policy), in_keys=["observation"], out_keys=["action"])
+    value = TensorDictModule(Scale(critic), in_keys=["observation"], out_keys=["state_value"])
+    qvalue = TensorDictModule(Scale(critic), in_keys=["observation", "action"], out_keys=["state_action_value"])
+    return actor, value, qvalue
+
+
+def make_rollout(actor):
+    """Two environments, four steps. Environment 0 is truncated at step 1; environment 1 terminates at step 2.
+
+    Observations are 1, 2, 3, 4 (next: 2, 9, 4, 5 with 9 the true last state before the reset), and the reward of each
+    step is its action: r = 2 s at policy weight 2.
+    """
+    observation = torch.tensor([1.0, 2.0, 3.0, 4.0]).view(1, 4, 1).repeat(2, 1, 1)
+    following = torch.tensor([[2.0, 9.0, 4.0, 5.0], [2.0, 3.0, 9.0, 5.0]]).unsqueeze(-1)
+    terminated = torch.zeros(2, 4, 1, dtype=torch.bool)
+    truncated = terminated.clone()
+    truncated[0, 1] = True
+    terminated[1, 2] = True
+    rollout = actor(TensorDict({"observation": observation}, [2, 4]))
+    rollout["next"] = TensorDict(
+        {
+            "observation": following,
+            "reward": rollout["action"] * 1.0,
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+        },
+        [2, 4],
+    )
+    return rollout
+
+
+# Rewards are 2, 4, 6, 8. Environment 0: [2 + 4/2] + [6 + 8/2] = 14; environment 1: [2 + 4/2 + 6/4] + [8] = 13.5.
+REWARDS = [14.0, 13.5]
+
+
+def test_bptt_sums_the_discounted_rewards_of_each_segment():
+    actor, *_ = make_networks()
+    loss = BPTTLoss(actor, reduction="none").make_value_estimator(gamma=GAMMA)
+    assert loss(make_rollout(actor))["loss_actor"].tolist() == [-x for x in REWARDS]
+    mean = BPTTLoss(actor).make_value_estimator(gamma=GAMMA)(make_rollout(actor))["loss_actor"]
+    assert mean.item() == -sum(REWARDS) / 2
+    mean.backward()
+    # every reward is proportional to the policy's weight of 2
+    assert actor.module.weight.grad.item() == -sum(REWARDS) / 2 / 2
+    total = BPTTLoss(actor, reduction="sum").make_value_estimator(gamma=GAMMA)(make_rollout(actor))["loss_actor"]
+    assert total.item() == -sum(REWARDS)
+
+
+def test_truncation_bootstraps_and_termination_does_not():
+    actor, value, _ = make_networks()
+    loss = SHACLoss(actor, value, reduction="none").make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
+    # environment 0: V(9) = 90 after two steps, V(5) = 50 after two; environment 1: none at step 2, V(5) after one.
+    expected = [14 + 90 / 4 + 50 / 4, 13.5 + 50 / 2]
+    assert loss.loss_actor(make_rollout(actor))[0].tolist() == [-x for x in expected]
+
+
+def test_abpt_averages_the_n_step_and_the_0_step_return():
+    actor, _, qvalue = make_networks()
+    critics = [qvalue, make_networks(critic=20.0)[2]]
+
+    def objective(**switches):
+        loss = ABPTLoss(actor, critics, reduction="none", **switches).make_value_estimator(gamma=GAMMA)
+        return [-x for x in loss.loss_actor(make_rollout(actor))[0].tolist()]
+
+    # The smaller critic wins: Q(s, pi(s)) = 10 s + 2 s. Segments start at s = 1 and 3 in environment 0, 1 and 4 in 1.
+    n_step = [14 + 12 * 9 / 4 + 12 * 5 / 4, 13.5 + 12 * 5 / 2]
+    zero_step = [12 * 1 + 12 * 3, 12 * 1 + 12 * 4]
+    assert objective(zero_step_return=False) == n_step
+    assert objective(n_step_return=False) == zero_step
+    assert objective() == [(a + b) / 2 for a, b in zip(n_step, zero_step, strict=True)]
+
+
+def test_the_bootstrap_of_abpt_has_its_gradient_through_state_and_action_and_none_in_the_critic():
+    actor, _, qvalue = make_networks()
+    loss = ABPTLoss(actor, [qvalue]).make_value_estimator(gamma=GAMMA)
+    rollout = make_rollout(actor)
+    shift = torch.zeros(2, 4, 1, requires_grad=True)
+    rollout["next", "observation"] = rollout["next", "observation"] + shift
+    loss.loss_actor(rollout)[0].backward()
+    # d/d(next observation) = mean over envs, half weight, discount gamma^n, of d(10 s + 2 s)/ds; none at a termination
+    expected = [[0, 12 / 4, 0, 12 / 4], [0, 0, 0, 12 / 2]]
+    assert (-shift.grad[..., 0] * 2 * 2).tolist() == expected
+    # policy weight: rewards give s * discount, the bootstraps' actions their state, the 0-step returns' actions too
+    rewards = sum(REWARDS) / 2
+    bootstraps = 9 / 4 + 5 / 4 + 5 / 2
+    starts = (1 + 3) + (1 + 4)
+    assert actor.module.weight.grad.item() == pytest.approx(-(rewards + bootstraps + starts) / 2 / 2)
+    assert qvalue.module.weight.grad is None
+    assert all(p.grad is None for p in loss.qvalue_network_params.values(True, True))
+
+
+def test_the_terminal_value_of_shac_has_its_gradient_in_the_state_and_none_in_the_critic():
+    actor, value, _ = make_networks()
+    loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA)
+    rollout = make_rollout(actor)
+    shift = torch.zeros(2, 4, 1, requires_grad=True)
+    rollout["next", "observation"] = rollout["next", "observation"] + shift
+    loss.loss_actor(rollout)[0].backward()
+    assert (-shift.grad[..., 0] * 2).tolist() == [[0, 10 / 4, 0, 10 / 4], [0, 0, 0, 10 / 2]]
+    assert value.module.weight.grad is None
+
+
+def td_lambda(rewards, next_values, ends, terminations):
+    """Backwards by definition: G = r + gamma ((1 - lambda) V' + lambda G'), V' = 0 when terminated, G' = V' at an end."""
+    targets, following = [], None
+    for r, v, end, terminated in reversed(list(zip(rewards, next_values, ends, terminations, strict=True))):
+        v = 0.0 if terminated else v
+        following = v if end or following is None else following
+        following = r + GAMMA * ((1 - LAMBDA) * v + LAMBDA * following)
+        targets.append(following)
+    return targets[::-1]
+
+
+def test_td_lambda_targets_come_from_the_target_network_and_respect_the_ends():
+    actor, value, _ = make_networks()
+    loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
+    value.module.weight.data.fill_(-3.0)  # the target network still says 10 s
+    target = loss.write_value_target(make_rollout(actor).detach())["value_target"]
+    rewards = [2.0, 4.0, 6.0, 8.0]
+    expected = [
+        td_lambda(rewards, [20, 90, 40, 50], [False, True, False, True], [False] * 4),
+        td_lambda(rewards, [20, 30, 90, 50], [False, False, True, True], [False, False, True, False]),
+    ]
+    # by hand: environment 0, step 1: 4 + 0.5 * 90 = 49; step 0: 2 + 0.5 (0.5 * 20 + 0.5 * 49) = 19.25
+    assert expected[0][:2] == [19.25, 49.0]
+    # environment 1, step 2: 6; step 1: 4 + 0.5 (0.5 * 30 + 0.5 * 6) = 13
+    assert expected[1][1:3] == [13.0, 6.0]
+    torch.testing.assert_close(target[..., 0], torch.tensor(expected))
+
+
+def test_td_lambda_targets_of_abpt_take_the_least_critic_with_a_new_action():
+    actor, _, qvalue = make_networks()
+    loss = ABPTLoss(actor, [qvalue, make_networks(critic=20.0)[2]]).make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
+    target = loss.write_value_target(make_rollout(actor).detach())["value_target"]
+    expected = td_lambda([2.0, 4.0, 6.0, 8.0], [24, 108, 48, 60], [False, True, False, True], [False] * 4)
+    torch.testing.assert_close(target[0, :, 0], torch.tensor(expected))
+
+
+def test_the_critic_s_loss_is_the_squared_error_and_reaches_the_critic_alone():
+    actor, value, qvalue = make_networks()
+    rollout = make_rollout(actor)
+    rollout["value_target"] = torch.zeros(2, 4, 1)
+    loss_value, metadata = SHACLoss(actor, value).loss_value(rollout)
+    # V = 10, 20, 30, 40 in both environments
+    assert loss_value.item() == pytest.approx((100 + 400 + 900 + 1600) / 4)
+    assert metadata["pred_value"].item() == 25.0
+    loss_value.backward()
+    assert value.module.weight.grad is not None and actor.module.weight.grad is None
+    # two critics, each (12 s)^2
+    loss_qvalue, _ = ABPTLoss(actor, [qvalue, make_networks()[2]]).loss_qvalue(rollout)
+    assert loss_qvalue.item() == pytest.approx(2 * 144 * (1 + 4 + 9 + 16) / 4)
+
+
+def test_the_critic_s_loss_computes_its_targets_when_they_are_missing():
+    actor, value, _ = make_networks()
+    loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA)
+    rollout = make_rollout(actor)
+    without = loss.loss_value(rollout)[0]
+    assert "value_target" not in rollout.keys()
+    assert without == loss.loss_value(loss.write_value_target(rollout.detach()))[0]
+
+
+def test_td0_is_offered_and_gae_is_not():
+    actor, value, _ = make_networks()
+    loss = SHACLoss(actor, value).make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+    target = loss.write_value_target(make_rollout(actor).detach())["value_target"]
+    assert target[1, :, 0].tolist() == [2 + 10, 4 + 15, 6, 8 + 25]
+    with pytest.raises(NotImplementedError, match="not implemented for loss SHACLoss"):
+        loss.make_value_estimator(ValueEstimators.GAE)
+
+
+def test_a_rollout_without_its_graph_is_refused_with_advice():
+    actor, value, qvalue = make_networks()
+    detached = make_rollout(actor).detach()
+    for loss in (BPTTLoss(actor), SHACLoss(actor, value), ABPTLoss(actor, qvalue), ABPTLoss(actor, qvalue, n_step_return=False)):
+        with pytest.raises(RuntimeError, match="carries no gradient.*Use differentiable_rollout"):
+            loss.loss_actor(detached)
+        with torch.no_grad():
+            loss.loss_actor(detached)
+
+
+def test_soft_update_moves_the_target_network():
+    actor, value, _ = make_networks()
+    loss = SHACLoss(actor, value)
+    updater = SoftUpdate(loss, tau=0.25)
+    value.module.weight.data.fill_(20.0)
+    updater.step()
+    assert loss.target_value_network_params["module", "weight"].item() == 12.5
+
+
+def test_without_delay_the_target_is_the_critic_itself():
+    actor, value, qvalue = make_networks()
+    for loss in (SHACLoss(actor, value, delay_value=False), ABPTLoss(actor, [qvalue], delay_qvalue=False)):
+        loss.make_value_estimator(gamma=GAMMA)
+        before = loss.write_value_target(make_rollout(actor).detach())["value_target"].clone()
+        for parameter in loss.parameters():
+            parameter.data.add_(1.0)
+        assert not torch.equal(loss.write_value_target(make_rollout(actor).detach())["value_target"], before)
+        for parameter in loss.parameters():
+            parameter.data.sub_(1.0)
+
+
+def test_keys_can_be_renamed():
+    actor, value, _ = make_networks()
+    loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA)
+    loss.set_keys(reward="gain", terminated="crashed", done="over", value_target="goal")
+    assert ("next", "gain") in loss.in_keys and ("next", "reward") not in loss.in_keys
+    rollout = make_rollout(actor)
+    expected = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA)(rollout)
+    for old, new in (("reward", "gain"), ("terminated", "crashed"), ("done", "over")):
+        rollout.rename_key_(("next", old), ("next", new))
+    result = loss(rollout)
+    assert result["loss_actor"] == expected["loss_actor"]
+    assert result["loss_value"] == expected["loss_value"]
+    assert "goal" in loss.write_value_target(rollout).keys()
+    with pytest.raises(ValueError, match="rewards"):
+        loss.set_keys(rewards="gain")
+
+
+@pytest.mark.parametrize("entropy", [0.0, 0.1, "auto"])
+def test_in_keys_suffice_and_out_keys_come_out(entropy):
+    env = HoveringEnv(num_envs=2)
+    actor = make_actor(env, return_log_prob=True)
+    for loss in (
+        BPTTLoss(actor, alpha=entropy),
+        SHACLoss(actor, make_value(env), alpha=entropy),
+        ABPTLoss(actor, make_qvalue(env), alpha=entropy),
+        ABPTLoss(actor, make_qvalue(env), alpha=entropy, zero_step_return=False),
+    ):
+        rollout, _ = differentiable_rollout(env, actor, None, 3)
+        out = loss(rollout.select(*loss.in_keys))
+        assert set(out.keys()) == set(loss.out_keys)
+        assert all(value.shape == () and value.isfinite() for value in out.values())
+        assert ("loss_alpha" in loss.out_keys) == (entropy == "auto")
+        sum(value for key, value in out.items() if key.startswith("loss_")).backward()
+        assert all(p.grad is not None and p.grad.isfinite().all() for p in loss.parameters() if p.requires_grad)
+        loss.zero_grad()
+
+
+def test_the_entropy_bonus_is_alpha_times_the_mean_of_minus_log_prob():
+    actor, *_ = make_networks()
+    rollout = make_rollout(actor)
+    log_prob = -torch.arange(8.0).view(2, 4)
+    rollout["action_log_prob"] = log_prob
+    plain = BPTTLoss(actor, reduction="none").make_value_estimator(gamma=GAMMA)(rollout)["loss_actor"]
+    out = BPTTLoss(actor, reduction="none", alpha=0.5).make_value_estimator(gamma=GAMMA)(rollout)
+    torch.testing.assert_close(out["loss_actor"], plain - 0.5 * torch.tensor([1.5, 5.5]))
+    assert out["entropy"].item() == 3.5
+
+
+def test_the_automatic_alpha_rises_when_the_entropy_is_too_low_and_falls_when_too_high():
+    actor, *_ = make_networks()
+    for log_prob, direction in ((3.0, -1.0), (-3.0, 1.0)):
+        loss = BPTTLoss(actor, alpha="auto", alpha_init=0.2, target_entropy=0.0).make_value_estimator(gamma=GAMMA)
+        rollout = make_rollout(actor)
+        rollout["action_log_prob"] = torch.full((2, 4), log_prob)
+        loss(rollout)["loss_alpha"].backward()
+        assert loss.alpha.item() == pytest.approx(0.2)
+        assert loss.log_alpha.grad.sign().item() == direction  # gradient descent moves alpha the other way
+    assert BPTTLoss(actor, alpha="auto")._target_entropy(make_rollout(actor)) == -1.0
+
+
+def test_the_entropy_bonus_needs_the_log_probability():
+    actor, *_ = make_networks()
+    with pytest.raises(RuntimeError, match="Build the actor with return_log_prob=True"):
+        BPTTLoss(actor, alpha=0.1).loss_actor(make_rollout(actor))
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"alpha": -1.0}, "alpha must be 'auto' or a number that is not negative, got -1.0"),
+        ({"alpha": "automatic"}, "alpha must be 'auto'"),
+        ({"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
+    ],
+)
+def test_bad_arguments_say_what_is_allowed(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        BPTTLoss(make_networks()[0], **kwargs)
+
+
+def test_abpt_needs_a_return_and_a_critic():
+    actor, _, qvalue = make_networks()
+    with pytest.raises(ValueError, match="with both off there is no objective"):
+        ABPTLoss(actor, qvalue, n_step_return=False, zero_step_return=False)
+    with pytest.raises(ValueError, match="at least one critic"):
+        ABPTLoss(actor, [])
+
+
+def test_a_critic_may_see_more_than_the_actor():
+    env = HoveringEnv(num_envs=2)
+    actor = make_actor(env)
+    value = make_value(env, in_keys=["observation", ("state", "rotor_speed")])
+    rollout, _ = differentiable_rollout(env, actor, None, 3)
+    loss = SHACLoss(actor, value)
+    assert ("next", "state", "rotor_speed") in loss.in_keys
+    assert loss(rollout)["loss_value"].isfinite()
+
+
+class CosSin(nn.Module):
+    def forward(self, th, thdot):
+        return torch.stack((th.cos(), th.sin(), thdot / 8), -1)
+
+
+def pendulum_networks(env):
+    spec = env.action_spec_unbatched
+    features = TensorDictModule(CosSin(), in_keys=["th", "thdot"], out_keys=["observation"])
+
+    def mlp(inputs, outputs):
+        return nn.Sequential(nn.Linear(inputs, 32), nn.Tanh(), nn.Linear(32, outputs))
+
+    class Policy(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.net = mlp(3, 1)
+
+        def forward(self, x):
+            return 2 * self.net(x).tanh()
+
+    class Critic(nn.Module):
+        def __init__(self, inputs):
+            super().__init__()
+            self.net = mlp(inputs, 1)
+
+        def forward(self, *x):
+            return self.net(torch.cat(x, -1))
+
+    def module(net, in_keys, out_key):
+        return TensorDictSequential(features, TensorDictModule(net, in_keys=in_keys, out_keys=[out_key]))
+
+    assert spec.shape == (1,)
+    return (
+        module(Policy(), ["observation"], "action"),
+        module(Critic(3), ["observation"], "state_value"),
+        module(Critic(4), ["observation", "action"], "state_action_value"),
+    )
+
+
+@pytest.mark.parametrize("name", ["bptt", "shac", "abpt"])
+def test_they_know_no_quadrotor_and_train_the_pendulum_of_torchrl(name):
+    env = PendulumEnv(seed=0)
+    torch.manual_seed(0)
+    actor, value, qvalue = pendulum_networks(env)
+    loss = {
+        "bptt": lambda: BPTTLoss(actor),
+        "shac": lambda: SHACLoss(actor, value),
+        "abpt": lambda: ABPTLoss(actor, qvalue),
+    }[name]()
+    loss.make_value_estimator(gamma=0.95)
+    updater = SoftUpdate(loss, tau=0.05) if name != "bptt" else None
+    optimizer = torch.optim.Adam(loss.parameters(), 1e-2)
+    buffer = VisitedStateBuffer(state_keys=("th", "thdot", "params"))
+
+    def fresh(n=32):
+        return env.reset(env.gen_params(batch_size=[n]), set_state=False)
+
+    def mean_reward():
+        env.set_seed(1)
+        with torch.no_grad():
+            return differentiable_rollout(env, actor, fresh(), 60)[0]["next", "reward"].mean().item()
+
+    before = mean_reward()
+    for _ in range(40):
+        rollout, _ = differentiable_rollout(env, actor, fresh(), 30)
+        buffer.extend(rollout)
+        out = loss(rollout)
+        optimizer.zero_grad()
+        sum(value for key, value in out.items() if key.startswith("loss_")).backward()
+        optimizer.step()
+        if updater:
+            updater.step()
+    assert len(buffer) == 40 * 32 * 30
+    assert mean_reward() > before + 0.7  # from about -5.9 per step; the torque is too weak to swing up in one go

@@ -54,7 +54,9 @@ def test_a_bad_file_is_told_which_field_and_what_is_allowed(tmp_path, change, me
 
 
 def test_an_unknown_preset_lists_the_known_ones():
-    with pytest.raises(ValueError, match="Unknown drone 'visflu'. Choose from: crazyflie, flightmare, small_racer, visfly"):
+    with pytest.raises(
+        ValueError, match="Unknown drone 'visflu'. Choose from: crazyflie, flightmare, small_racer, visfly"
+    ):
         load_drone("visflu")
 
 

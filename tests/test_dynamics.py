@@ -71,7 +71,9 @@ def test_free_fall_follows_the_parabola():
 def test_hover_action_keeps_every_drone_where_it_is(name, integrator):
     params = drone(name)
     controller = FlightController(params)
-    end = fly(hovering(controller), controller.hover_action.expand(1, 4), params, controller, 2.0, integrator=integrator)[-1]
+    end = fly(
+        hovering(controller), controller.hover_action.expand(1, 4), params, controller, 2.0, integrator=integrator
+    )[-1]
     torch.testing.assert_close(end.position, ZERO, atol=1e-9, rtol=0)
     torch.testing.assert_close(end.quaternion, LEVEL, atol=1e-9, rtol=0)
     torch.testing.assert_close(end.rotor_speed, controller.hover_speed.expand(1, 4))

@@ -82,7 +82,13 @@ def test_the_observation_is_the_paper_s(env64):
     td = env64.rollout(3)[:, -1]
     state = td["state"]
     expected = torch.cat(
-        ((state["target"] - state["position"]) / 10, state["quaternion"], state["velocity"] / 10, state["angular_velocity"] / 10), -1
+        (
+            (state["target"] - state["position"]) / 10,
+            state["quaternion"],
+            state["velocity"] / 10,
+            state["angular_velocity"] / 10,
+        ),
+        -1,
     )
     torch.testing.assert_close(td["observation"], expected)
 
@@ -95,7 +101,9 @@ def test_running_out_of_time_truncates_and_does_not_terminate():
     assert not flight["terminated"].any()
 
 
-@pytest.mark.parametrize("position", [(1, 0, -0.1), (1, 0, 6.1), (6.1, 0, 1.5), (-4.1, 0, 1.5), (1, 5.1, 1.5), (1, -5.1, 1.5)])
+@pytest.mark.parametrize(
+    "position", [(1, 0, -0.1), (1, 0, 6.1), (6.1, 0, 1.5), (-4.1, 0, 1.5), (1, 5.1, 1.5), (1, -5.1, 1.5)]
+)
 def test_leaving_the_box_terminates_and_does_not_truncate(env, position):
     td = env.reset()
     td["state", "position"][2] = torch.tensor(position, dtype=torch.float32)
@@ -199,7 +207,8 @@ def test_resets_draw_from_the_initial_state_source(wrap):
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("velocity", float("nan")), ("position", float("inf")), ("velocity", 1e30), ("rotor_speed", float("nan"))]
+    ("key", "value"),
+    [("velocity", float("nan")), ("position", float("inf")), ("velocity", 1e30), ("rotor_speed", float("nan"))],
 )
 def test_a_broken_state_terminates_and_leaks_nothing_into_the_others(env64, key, value):
     action = (env64.hover_action.expand(4, 4) + 0.1).clone().requires_grad_()

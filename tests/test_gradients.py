@@ -17,7 +17,9 @@ def flight(env, actions, state, steps=STEPS):
         step, td = env.step_and_maybe_reset(td.set("action", actions[:, t]))
         rewards.append(step["next", "reward"].flatten())
     last = step["next", "state"]
-    return torch.cat((*rewards, *(last[k].flatten() for k in ("position", "quaternion", "velocity", "angular_velocity"))))
+    return torch.cat(
+        (*rewards, *(last[k].flatten() for k in ("position", "quaternion", "velocity", "angular_velocity")))
+    )
 
 
 def setup(**kwargs):

@@ -43,6 +43,14 @@ def make_networks(policy=2.0, critic=10.0):
     return actor, value, qvalue
 
 
+def make_abpt(actor, *critics, **kwargs):
+    """ABPT with one critic Q(s, a) = critic * s + a for each of the weights."""
+    loss = ABPTLoss(actor, make_networks()[2], num_qvalue_nets=len(critics), **kwargs)
+    for params in (loss.qvalue_network_params, loss.target_qvalue_network_params):
+        params["module", "weight"].data.copy_(torch.tensor(critics))
+    return loss.make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
+
+
 def make_rollout(actor):
     """Two environments, four steps. Environment 0 is truncated at step 1; environment 1 terminates at step 2.
 
@@ -95,11 +103,10 @@ def test_truncation_bootstraps_and_termination_does_not():
 
 
 def test_abpt_averages_the_n_step_and_the_0_step_return():
-    actor, _, qvalue = make_networks()
-    critics = [qvalue, make_networks(critic=20.0)[2]]
+    actor, *_ = make_networks()
 
     def objective(**switches):
-        loss = ABPTLoss(actor, critics, reduction="none", **switches).make_value_estimator(gamma=GAMMA)
+        loss = make_abpt(actor, 10.0, 20.0, reduction="none", **switches)
         return [-x for x in loss.loss_actor(make_rollout(actor))[0].tolist()]
 
     # The smaller critic wins: Q(s, pi(s)) = 10 s + 2 s. Segments start at s = 1 and 3 in environment 0, 1 and 4 in 1.
@@ -111,8 +118,8 @@ def test_abpt_averages_the_n_step_and_the_0_step_return():
 
 
 def test_the_bootstrap_of_abpt_has_its_gradient_through_state_and_action_and_none_in_the_critic():
-    actor, _, qvalue = make_networks()
-    loss = ABPTLoss(actor, [qvalue]).make_value_estimator(gamma=GAMMA)
+    actor, *_ = make_networks()
+    loss = make_abpt(actor, 10.0)
     rollout = make_rollout(actor)
     shift = torch.zeros(2, 4, 1, requires_grad=True)
     rollout["next", "observation"] = rollout["next", "observation"] + shift
@@ -125,7 +132,6 @@ def test_the_bootstrap_of_abpt_has_its_gradient_through_state_and_action_and_non
     bootstraps = 9 / 4 + 5 / 4 + 5 / 2
     starts = (1 + 3) + (1 + 4)
     assert actor.module.weight.grad.item() == pytest.approx(-(rewards + bootstraps + starts) / 2 / 2)
-    assert qvalue.module.weight.grad is None
     assert all(p.grad is None for p in loss.qvalue_network_params.values(True, True))
 
 
@@ -141,7 +147,7 @@ def test_the_terminal_value_of_shac_has_its_gradient_in_the_state_and_none_in_th
 
 
 def td_lambda(rewards, next_values, ends, terminations):
-    """Backwards by definition: G = r + gamma ((1 - lambda) V' + lambda G'), V' = 0 when terminated, G' = V' at an end."""
+    """Backwards: G = r + gamma ((1 - lambda) V' + lambda G'), with V' = 0 when terminated and G' = V' at an end."""
     targets, following = [], None
     for r, v, end, terminated in reversed(list(zip(rewards, next_values, ends, terminations, strict=True))):
         v = 0.0 if terminated else v
@@ -169,15 +175,15 @@ def test_td_lambda_targets_come_from_the_target_network_and_respect_the_ends():
 
 
 def test_td_lambda_targets_of_abpt_take_the_least_critic_with_a_new_action():
-    actor, _, qvalue = make_networks()
-    loss = ABPTLoss(actor, [qvalue, make_networks(critic=20.0)[2]]).make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
+    actor, *_ = make_networks()
+    loss = make_abpt(actor, 10.0, 20.0)
     target = loss.write_value_target(make_rollout(actor).detach())["value_target"]
     expected = td_lambda([2.0, 4.0, 6.0, 8.0], [24, 108, 48, 60], [False, True, False, True], [False] * 4)
     torch.testing.assert_close(target[0, :, 0], torch.tensor(expected))
 
 
 def test_the_critic_s_loss_is_the_squared_error_and_reaches_the_critic_alone():
-    actor, value, qvalue = make_networks()
+    actor, value, _ = make_networks()
     rollout = make_rollout(actor)
     rollout["value_target"] = torch.zeros(2, 4, 1)
     loss_value, metadata = SHACLoss(actor, value).loss_value(rollout)
@@ -187,7 +193,7 @@ def test_the_critic_s_loss_is_the_squared_error_and_reaches_the_critic_alone():
     loss_value.backward()
     assert value.module.weight.grad is not None and actor.module.weight.grad is None
     # two critics, each (12 s)^2
-    loss_qvalue, _ = ABPTLoss(actor, [qvalue, make_networks()[2]]).loss_qvalue(rollout)
+    loss_qvalue, _ = make_abpt(actor, 10.0, 10.0).loss_qvalue(rollout)
     assert loss_qvalue.item() == pytest.approx(2 * 144 * (1 + 4 + 9 + 16) / 4)
 
 
@@ -196,7 +202,7 @@ def test_the_critic_s_loss_computes_its_targets_when_they_are_missing():
     loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA)
     rollout = make_rollout(actor)
     without = loss.loss_value(rollout)[0]
-    assert "value_target" not in rollout.keys()
+    assert "value_target" not in rollout
     assert without == loss.loss_value(loss.write_value_target(rollout.detach()))[0]
 
 
@@ -212,7 +218,12 @@ def test_td0_is_offered_and_gae_is_not():
 def test_a_rollout_without_its_graph_is_refused_with_advice():
     actor, value, qvalue = make_networks()
     detached = make_rollout(actor).detach()
-    for loss in (BPTTLoss(actor), SHACLoss(actor, value), ABPTLoss(actor, qvalue), ABPTLoss(actor, qvalue, n_step_return=False)):
+    for loss in (
+        BPTTLoss(actor),
+        SHACLoss(actor, value),
+        ABPTLoss(actor, qvalue),
+        ABPTLoss(actor, qvalue, n_step_return=False),
+    ):
         with pytest.raises(RuntimeError, match="carries no gradient.*Use differentiable_rollout"):
             loss.loss_actor(detached)
         with torch.no_grad():
@@ -230,7 +241,7 @@ def test_soft_update_moves_the_target_network():
 
 def test_without_delay_the_target_is_the_critic_itself():
     actor, value, qvalue = make_networks()
-    for loss in (SHACLoss(actor, value, delay_value=False), ABPTLoss(actor, [qvalue], delay_qvalue=False)):
+    for loss in (SHACLoss(actor, value, delay_value=False), ABPTLoss(actor, qvalue, delay_qvalue=False)):
         loss.make_value_estimator(gamma=GAMMA)
         before = loss.write_value_target(make_rollout(actor).detach())["value_target"].clone()
         for parameter in loss.parameters():
@@ -252,7 +263,7 @@ def test_keys_can_be_renamed():
     result = loss(rollout)
     assert result["loss_actor"] == expected["loss_actor"]
     assert result["loss_value"] == expected["loss_value"]
-    assert "goal" in loss.write_value_target(rollout).keys()
+    assert "goal" in loss.write_value_target(rollout)
     with pytest.raises(ValueError, match="rewards"):
         loss.set_keys(rewards="gain")
 
@@ -324,7 +335,7 @@ def test_abpt_needs_a_return_and_a_critic():
     with pytest.raises(ValueError, match="with both off there is no objective"):
         ABPTLoss(actor, qvalue, n_step_return=False, zero_step_return=False)
     with pytest.raises(ValueError, match="at least one critic"):
-        ABPTLoss(actor, [])
+        ABPTLoss(actor, qvalue, num_qvalue_nets=0)
 
 
 def test_a_critic_may_see_more_than_the_actor():

@@ -24,13 +24,14 @@ def differentiable_rollout(
     Args:
         env: the environment.
         actor: a TensorDictModule that writes the action.
-        carry: where to start, from ``env.reset()``, from the last call, or from a visited-state buffer; it is not
-            modified. None resets the environment.
+        carry: where to start: from ``env.reset()``, the last call, or a visited-state buffer. It is not modified. None
+            resets the environment.
         horizon: number of control steps, at least 1.
         exploration_type: RANDOM samples the policy, DETERMINISTIC takes its mode.
 
     Returns:
-        the rollout, (\\*env.batch_size, horizon), and the carry to go on from: detached, and reset where it was done.
+        the rollout, of batch size (env.batch_size, horizon), and the carry to go on from: detached, and reset where the
+        rollout ended done.
 
     Raises:
         ValueError: the horizon is less than 1.
@@ -40,8 +41,8 @@ def differentiable_rollout(
         raise ValueError(f"horizon must be at least 1 control step, got {horizon}.")
     if not isinstance(actor, TensorDictModuleBase):
         raise TypeError(
-            f"actor must be a TensorDictModule that writes the action, got {type(actor).__name__}. Wrap a plain module: "
-            'TensorDictModule(module, in_keys=["observation"], out_keys=["action"]).'
+            f"actor must be a TensorDictModule that writes the action, got {type(actor).__name__}. "
+            'Wrap a plain module: TensorDictModule(module, in_keys=["observation"], out_keys=["action"]).'
         )
     carry = env.reset() if carry is None else carry.copy()
     with set_exploration_type(exploration_type):

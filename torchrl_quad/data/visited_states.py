@@ -104,5 +104,3 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         visited = self.sample(fresh.numel()).select(*self.state_keys).to(fresh.device).reshape(fresh.shape)
         pick = torch.rand(fresh.shape, generator=self._rng) < fraction
         return visited.where(pick.to(fresh.device), fresh)
-
-

@@ -54,6 +54,8 @@ class FlightController:
         inertia = self.nominal.inertia
         gyroscopic = gyroscopic_torque(angular_velocity, inertia)
         acceleration = (wrench[..., 1:] - gyroscopic) / inertia
-        torque = self.gain * (setpoint.body_rate - angular_velocity) - self.nominal.rate_damping * acceleration + gyroscopic
+        torque = (
+            self.gain * (setpoint.body_rate - angular_velocity) - self.nominal.rate_damping * acceleration + gyroscopic
+        )
         thrust = apply(self.mixer, torch.cat((setpoint.thrust, torque), -1))
         return self.rotors.speed(torch.minimum(torch.maximum(thrust, self.thrust_min), self.thrust_max))

@@ -44,7 +44,9 @@ INTEGRATORS = {"euler": euler, "semi_implicit_euler": semi_implicit_euler, "rk4"
 
 def _derivative(state: RigidBodyState, accelerations: Accelerations) -> RigidBodyState:
     linear, angular = accelerations(state)
-    return RigidBodyState(state.velocity, quaternion.derivative(state.quaternion, state.angular_velocity), linear, angular)
+    return RigidBodyState(
+        state.velocity, quaternion.derivative(state.quaternion, state.angular_velocity), linear, angular
+    )
 
 
 def _moved(state: RigidBodyState, derivative: RigidBodyState, dt: float) -> RigidBodyState:

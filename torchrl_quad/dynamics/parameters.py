@@ -142,7 +142,9 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
         try:
             fields[name] = torch.from_numpy(np.array(values[name], dtype=np.float64))
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{source}: field {name!r} is not a number or a list of numbers: {values[name]!r}.") from error
+            raise ValueError(
+                f"{source}: field {name!r} is not a number or a list of numbers: {values[name]!r}."
+            ) from error
         _check(name, fields[name] if fields[name].dim() else fields[name].reshape(1), source)
     return QuadrotorParams(**fields).to(dtype=dtype)
 

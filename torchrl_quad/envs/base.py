@@ -93,10 +93,13 @@ class QuadrotorEnv(EnvBase):
         substeps = round(control_dt / dt)
         _require(
             substeps >= 1 and math.isclose(substeps * dt, control_dt, rel_tol=1e-6),
-            f"control_dt must be a whole multiple of dt, got {control_dt} and {dt}; try control_dt={max(substeps, 1) * dt:g}.",
+            f"control_dt must be a whole multiple of dt, got {control_dt} and {dt}; "
+            f"try control_dt={max(substeps, 1) * dt:g}.",
         )
         _require(action_delay >= 0, f"action_delay must be zero or more control steps, got {action_delay}.")
-        _require(integrator in INTEGRATORS, f"Unknown integrator {integrator!r}. Choose from: {', '.join(INTEGRATORS)}.")
+        _require(
+            integrator in INTEGRATORS, f"Unknown integrator {integrator!r}. Choose from: {', '.join(INTEGRATORS)}."
+        )
         _require(max_episode_steps >= 1, f"max_episode_steps must be at least 1, got {max_episode_steps}.")
         _require(
             action_delay > 0 or not observe_last_action,
@@ -178,6 +181,29 @@ class QuadrotorEnv(EnvBase):
         """Uniform random numbers in [-1, 1] from the environment's own generator."""
         return torch.rand(shape, generator=self.rng, device=self.device, dtype=self.dtype) * 2.0 - 1.0
 
+    # -- what an evaluation asks ---------------------------------------------------------------------------------------
+
+    def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
+        """What the first episode of each environment came to, in a rollout (num_envs, time) from fresh starts.
+
+        Returns:
+            by name, each (num_envs): ``return``, the undiscounted sum of rewards; ``crash`` and ``success``, 0 or 1.
+            Here success means that the last state fulfils the task and that there was no crash; a task may ask more.
+        """
+        ends = rollout["next"]
+        first = self.first_episode(rollout)
+        crash = (ends["terminated"] & first).any(1)
+        last = first.sum(1, keepdim=True) - 1
+        success = ends["success"].gather(1, last).squeeze(1) & ~crash
+        metrics = {"return": (ends["reward"] * first).sum(1), "crash": crash, "success": success}
+        return {name: value.squeeze(-1).to(self.dtype) for name, value in metrics.items()}
+
+    @staticmethod
+    def first_episode(rollout: TensorDictBase) -> Tensor:
+        """Marks the steps of a rollout up to and with the first end of each environment, bool (num_envs, time, 1)."""
+        done = rollout["next", "done"]
+        return (done.cumsum(1) - done.int()) == 0
+
     # -- TorchRL's side ------------------------------------------------------------------------------------------------
 
     def compile(self, **kwargs: Any) -> QuadrotorEnv:
@@ -192,6 +218,7 @@ class QuadrotorEnv(EnvBase):
         return self
 
     def to(self, device: torch.device | str) -> QuadrotorEnv:
+        """Move the environment to a device, and start its random generator again from its seed."""
         super().to(device)
         self.params = self.params.to(device=self.device)
         self.controller = FlightController(self.nominal.to(device=self.device))
@@ -214,7 +241,7 @@ class QuadrotorEnv(EnvBase):
             self.rng.manual_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False) -> TensorDictBase:
-        if set_state and tensordict is not None and "state" in tensordict.keys():
+        if set_state and tensordict is not None and "state" in tensordict:
             state = self._checked_state(tensordict.get("state"), "reset(..., set_state=True)")
         elif self.initial_state_source is not None:
             state = self._checked_state(self.initial_state_source(self.num_envs), "initial_state_source")
@@ -303,11 +330,11 @@ class QuadrotorEnv(EnvBase):
 
     def _checked_state(self, state: TensorDictBase, source: str) -> State:
         expected = self._fallback
-        missing = [key for key in expected if key not in state.keys()]
+        missing = [key for key in expected if key not in state]
         _require(
             not missing,
-            f"{source}: the state lacks {', '.join(missing)}. A state is restored whole: take it from a tensordict of this "
-            f"environment, which holds {', '.join(expected)}.",
+            f"{source}: the state lacks {', '.join(missing)}. A state is restored whole: take it from a tensordict of "
+            f"this environment, which holds {', '.join(expected)}.",
         )
         checked = {}
         for key, like in expected.items():

@@ -1,6 +1,7 @@
 """The hovering task."""
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.linalg import vector_norm
 
@@ -26,7 +27,8 @@ class HoveringEnv(QuadrotorEnv):
     Start: level and at rest, uniformly within (1, 1, 0.5) m of the target. State added: ``target`` (3) [m].
 
     End: crash when 5 m away from the target along x or y, or outside 0 < z < 6 m; truncated after
-    ``max_episode_steps``. Success: within 0.1 m of the target.
+    ``max_episode_steps``. Success of a state: within 0.1 m of the target. Success of an episode: a mean distance below
+    0.1 m over its last second, without a crash.
     """
 
     target = (1.0, 0.0, 1.5)  # [m]
@@ -55,7 +57,8 @@ class HoveringEnv(QuadrotorEnv):
             "position": -self.position_weight * distance,
             "attitude": -self.attitude_weight * quaternion.distance(state["quaternion"], level),
             "velocity": -self.velocity_weight * vector_norm(state["velocity"], dim=-1, keepdim=True),
-            "angular_velocity": -self.angular_velocity_weight * vector_norm(state["angular_velocity"], dim=-1, keepdim=True),
+            "angular_velocity": -self.angular_velocity_weight
+            * vector_norm(state["angular_velocity"], dim=-1, keepdim=True),
         }
 
     def is_terminated(self, state: State) -> Tensor:
@@ -67,5 +70,16 @@ class HoveringEnv(QuadrotorEnv):
         return self.distance(state) < self.success_radius
 
     def distance(self, state: State) -> Tensor:
-        """Distance to the target, (num_envs, 1) [m]."""
+        """Distance to the target, (*, 1) [m]."""
         return vector_norm(state["position"] - state["target"], dim=-1, keepdim=True)
+
+    def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
+        """Adds ``error``, the mean distance to the target over the last second of the episode [m]."""
+        metrics = super().episode_metrics(rollout)
+        first = self.first_episode(rollout)
+        steps_left = first.sum(1, keepdim=True) - first.cumsum(1)
+        last_second = first & (steps_left < round(1 / self.control_dt))
+        distance = self.distance(rollout["next", "state"])
+        error = ((distance * last_second).sum(1) / last_second.sum(1)).squeeze(-1)
+        success = (error < self.success_radius) * (1 - metrics["crash"])
+        return {**metrics, "success": success, "error": error}

@@ -66,9 +66,11 @@ def make_value(
 ) -> ValueOperator:
     """A state value V(s), written to ``state_value``, (*, 1). The arguments are those of :func:`make_actor`.
 
+    Its hidden layers are normalised (LayerNorm): the policy follows the critic's gradient, which is far off without.
+
     With in_keys such as ``("observation", ("state", "rotor_speed"))`` the critic sees more than the actor.
     """
-    return ValueOperator(_mlp(env, in_keys, 1, num_cells, activation), in_keys=list(in_keys))
+    return ValueOperator(_mlp(env, in_keys, 1, num_cells, activation, layer_norm=True), in_keys=list(in_keys))
 
 
 def make_qvalue(
@@ -80,17 +82,24 @@ def make_qvalue(
 ) -> ValueOperator:
     """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); as :func:`make_value` otherwise."""
     in_keys = [*in_keys, "action"]
-    return ValueOperator(_mlp(env, in_keys, 1, num_cells, activation), in_keys=in_keys)
+    return ValueOperator(_mlp(env, in_keys, 1, num_cells, activation, layer_norm=True), in_keys=in_keys)
 
 
 def _mlp(
-    env: EnvBase, in_keys: Sequence[NestedKey], out_features: int, num_cells: Sequence[int], activation: type[nn.Module]
+    env: EnvBase,
+    in_keys: Sequence[NestedKey],
+    out_features: int,
+    num_cells: Sequence[int],
+    activation: type[nn.Module],
+    layer_norm: bool = False,
 ) -> MLP:
     specs = [env.action_spec if key == "action" else env.observation_spec[key] for key in in_keys]
+    norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": cells} for cells in num_cells]}
     return MLP(
         in_features=sum(spec.shape[-1] for spec in specs),
         out_features=out_features,
         num_cells=list(num_cells),
         activation_class=activation,
         device=env.device,
+        **(norm if layer_norm else {}),
     ).to(specs[0].dtype)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,8 +29,8 @@ class ABPTLoss(PathwiseCriticLoss):
 
     Args:
         actor_network: the policy that has made the rollout.
-        qvalue_network: the critic Q(s, a), which writes ``state_action_value`` (see ``set_keys``); or a list of critics.
-        num_qvalue_nets: how many critics to make of a single one, each initialised anew.
+        qvalue_network: the critic Q(s, a), which writes ``state_action_value`` (see ``set_keys``).
+        num_qvalue_nets: how many critics to make of it, each initialised anew.
         n_step_return: include J_N.
         zero_step_return: include J_0.
         delay_qvalue: keep target networks, to be updated with :class:`torchrl.objectives.SoftUpdate`.
@@ -60,7 +59,7 @@ class ABPTLoss(PathwiseCriticLoss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        qvalue_network: TensorDictModule,
         *,
         num_qvalue_nets: int = 2,
         n_step_return: bool = True,
@@ -70,8 +69,6 @@ class ABPTLoss(PathwiseCriticLoss):
     ) -> None:
         if not (n_step_return or zero_step_return):
             raise ValueError("ABPTLoss needs n_step_return or zero_step_return: with both off there is no objective.")
-        several = isinstance(qvalue_network, Sequence)
-        num_qvalue_nets = len(qvalue_network) if several else num_qvalue_nets
         if num_qvalue_nets < 1:
             raise ValueError(f"ABPTLoss needs at least one critic, got num_qvalue_nets={num_qvalue_nets}.")
         super().__init__(actor_network, **kwargs)
@@ -79,7 +76,7 @@ class ABPTLoss(PathwiseCriticLoss):
         switched = {"n_step_return": n_step_return, "zero_step_return": zero_step_return}
         self.out_keys = [*self.out_keys, *(name for name, on in switched.items() if on)]
         self.convert_to_functional(
-            list(qvalue_network) if several else qvalue_network,
+            qvalue_network,
             "qvalue_network",
             expand_dim=num_qvalue_nets,
             create_target_params=delay_qvalue,

@@ -11,7 +11,6 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, composite_lp_aggregate, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import ValueEstimators, dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
@@ -204,8 +203,8 @@ class PathwiseLoss(LossModule):
         log_prob = tensordict.get(self.tensor_keys.sample_log_prob, None)
         if log_prob is None:
             raise RuntimeError(
-                f"The entropy bonus of {type(self).__name__} reads {self.tensor_keys.sample_log_prob!r}, which is not in "
-                "the rollout. Build the actor with return_log_prob=True, or set the loss's alpha to 0."
+                f"The entropy bonus of {type(self).__name__} reads {self.tensor_keys.sample_log_prob!r}, which is "
+                "not in the rollout. Build the actor with return_log_prob=True, or set the loss's alpha to 0."
             )
         horizon = tensordict.shape[-1]
         return -log_prob.reshape(*tensordict.shape[:-1], horizon).mean(-1)
@@ -218,8 +217,8 @@ class PathwiseLoss(LossModule):
     def _require_graph(self, value: Tensor, key: NestedKey) -> None:
         if torch.is_grad_enabled() and not value.requires_grad:
             raise RuntimeError(
-                f"{type(self).__name__} differentiates through the rollout, but {key!r} carries no gradient. Collectors, "
-                "ParallelEnv, replay buffers, .detach() and torch.no_grad() cut it. Use "
+                f"{type(self).__name__} differentiates through the rollout, but {key!r} carries no gradient. "
+                "Collectors, ParallelEnv, replay buffers, .detach() and torch.no_grad() cut it. Use "
                 "differentiable_rollout(env, actor, carry, horizon), or env.rollout(horizon, actor, "
                 "break_when_any_done=False) with gradients enabled, on an environment that is differentiable."
             )

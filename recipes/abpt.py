@@ -1,0 +1,54 @@
+"""Amended backpropagation through time (ABPT): N-step and 0-step return, from visited states.
+
+python recipes/abpt.py task=hovering seed=0
+"""
+
+import hydra
+from common import Run, descend, iterations, make_optimizer, minibatches, network, set_up
+from omegaconf import DictConfig
+from torchrl.objectives import SoftUpdate
+
+from torchrl_quad import ABPTLoss, VisitedStateBuffer, differentiable_rollout, make_qvalue
+
+
+@hydra.main(config_path="config", config_name="abpt", version_base=None)
+def main(cfg: DictConfig) -> None:
+    env, actor = set_up(cfg)
+    loss = ABPTLoss(actor, make_qvalue(env, **network(cfg.critic)), **cfg.loss)
+    loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
+    target = SoftUpdate(loss, tau=cfg.critic.tau)
+    buffer = VisitedStateBuffer(cfg.buffer.capacity, seed=cfg.seed)
+
+    critic_parameters = list(loss.qvalue_network_params.parameters())
+    actor_parameters = [p for p in loss.parameters() if not any(p is q for q in critic_parameters)]  # and alpha
+    actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters, iterations(cfg))
+    critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
+
+    run = Run(cfg, env, actor, loss=loss)
+    carry = env.reset()
+    for _ in run:
+        # The actor: up the N-step and the 0-step return of one horizon, through the dynamics.
+        rollout, _ = differentiable_rollout(env, actor, carry, cfg.horizon)
+        loss_actor, actor_metrics = loss.loss_actor(rollout)
+        loss_policy = loss_actor + actor_metrics.get("loss_alpha", 0.0)
+        grad_actor = descend(actor_optimizer, loss_policy, cfg.actor.max_grad_norm)
+
+        # The critics: towards the TD(lambda) targets of the target networks.
+        data = loss.write_value_target(rollout.detach())
+        for batch in minibatches(data, cfg.critic):
+            loss_qvalue, critic_metrics = loss.loss_qvalue(batch)
+            descend(critic_optimizer, loss_qvalue, cfg.critic.max_grad_norm)
+            target.step()
+
+        # The next horizon starts where the policy has been before, and in part afresh.
+        buffer.extend(data)
+        carry = buffer.initial_state(env, cfg.buffer.fraction)
+
+        actor_schedule.step()
+        critic_schedule.step()
+        losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue}
+        run.record(**losses, grad_actor=grad_actor, **actor_metrics, **critic_metrics)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,265 @@
+"""What is not the algorithm: building, descending, evaluating, logging, and what a run leaves behind."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType
+from torchrl.record.loggers import get_logger
+from tqdm import tqdm
+
+from torchrl_quad import QuadrotorEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad.render import plot_flight, plot_learning_curve
+
+
+def set_up(cfg: DictConfig) -> tuple[QuadrotorEnv, TensorDictModuleBase]:
+    """Seed everything, and build the environment and the policy of a configuration."""
+    torch.set_num_threads(cfg.threads)
+    torch.manual_seed(cfg.seed)
+    env = make_env(cfg.task, num_envs=cfg.num_envs, device=cfg.device, seed=cfg.seed, compile=cfg.compile, **cfg.env)
+    return env, make_policy(cfg, env)
+
+
+def make_policy(cfg: DictConfig, env: QuadrotorEnv) -> TensorDictModuleBase:
+    """The policy of a configuration; it writes log-probabilities where the loss has an entropy bonus."""
+    has_bonus = cfg.loss.alpha != 0
+    return make_actor(env, **network(cfg.actor), scale_init=cfg.actor.scale_init, return_log_prob=has_bonus)
+
+
+def network(cfg: DictConfig) -> dict[str, Any]:
+    """The sizes of a network as keywords of ``make_actor``, ``make_value`` and ``make_qvalue``."""
+    return {"num_cells": list(cfg.num_cells), "activation": getattr(nn, cfg.activation)}
+
+
+def make_optimizer(
+    cfg: DictConfig, parameters: Any, iterations: int
+) -> tuple[torch.optim.Adam, torch.optim.lr_scheduler.LinearLR]:
+    """Adam, and the schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run."""
+    optimizer = torch.optim.Adam(parameters, cfg.lr, betas=tuple(cfg.betas))
+    return optimizer, torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, cfg.final_lr / cfg.lr, max(iterations - 1, 1))
+
+
+def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> Tensor:
+    """One clipped step down the loss; returns the norm of the gradient before clipping.
+
+    Raises:
+        RuntimeError: the gradient is not finite; the parameters are left as they were.
+    """
+    optimizer.zero_grad()
+    loss.backward()
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    norm = nn.utils.clip_grad_norm_(parameters, max_grad_norm, error_if_nonfinite=True)
+    optimizer.step()
+    return norm
+
+
+def restart(env: QuadrotorEnv, carry: TensorDictBase, fraction: float) -> TensorDictBase:
+    """Give up a random fraction of the flights, and start them afresh; the others go on."""
+    chosen = torch.rand(*carry.shape, 1, device=carry.device) < fraction
+    return env.reset(carry.set("_reset", chosen), set_state=False)
+
+
+def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDictBase]:
+    """``cfg.updates`` random batches of ``cfg.batch_size`` steps from a rollout."""
+    steps = rollout.reshape(-1)
+    for _ in range(cfg.updates):
+        yield steps[torch.randint(len(steps), (cfg.batch_size,), device=steps.device)]
+
+
+def evaluate(env: QuadrotorEnv, actor: TensorDictModuleBase) -> tuple[dict[str, float], TensorDictBase]:
+    """One episode of the deterministic policy from a fresh start in every environment.
+
+    Returns:
+        metrics by name (the mean over episodes, the median for ``error``), and the flight.
+    """
+    with torch.no_grad():
+        flight, _ = differentiable_rollout(
+            env, actor, None, env.max_episode_steps, exploration_type=ExplorationType.DETERMINISTIC
+        )
+    metrics = {
+        f"eval/{name}": (value.median() if name == "error" else value.mean()).item()
+        for name, value in env.episode_metrics(flight).items()
+    }
+    first = env.first_episode(flight)
+    for name, term in flight["next", "reward_terms"].items():
+        metrics[f"reward/{name}"] = (term * first).sum(1).mean().item()
+    return metrics, flight
+
+
+class Run:
+    """The bookkeeping of a training run: ``for _ in run: ...; run.record(...)``.
+
+    Counts steps and seconds of training, evaluates every ``eval.interval`` iterations, and writes a row of metrics each
+    time. Leaves in the run's folder: ``metrics.csv``, ``checkpoint.pt``, ``summary.json``, ``learning_curve.png`` and
+    ``flight.png``. Set-up, compilation and the final evaluation are outside the seconds.
+    """
+
+    def __init__(self, cfg: DictConfig, env: QuadrotorEnv, actor: TensorDictModuleBase, **modules: nn.Module) -> None:
+        self.cfg, self.env, self.actor, self.modules = cfg, env, actor, {"actor": actor, **modules}
+        self.folder = Path(HydraConfig.get().runtime.output_dir)
+        self.iterations = iterations(cfg)
+        self.steps_per_iteration = cfg.num_envs * cfg.horizon
+        self.eval_env = make_env(
+            cfg.task, num_envs=cfg.num_envs, device=cfg.device, seed=cfg.eval.seed, compile=cfg.compile, **cfg.env
+        )
+        self.logger = None
+        if cfg.logger.backend:
+            wandb = {"mode": cfg.logger.mode, "project": cfg.logger.project, "config": OmegaConf.to_container(cfg)}
+            name = f"{cfg.task}_{cfg.algorithm}_seed{cfg.seed}"
+            self.logger = get_logger(cfg.logger.backend, str(self.folder), name, wandb_kwargs=wandb)
+        self.recorded: dict[str, list[float]] = defaultdict(list)
+        self.seconds = 0.0
+
+    def __iter__(self) -> Iterator[int]:
+        if self.cfg.compile:
+            self._warm_up()
+        bar = tqdm(
+            total=self.iterations * self.steps_per_iteration, unit="step", unit_scale=True, desc=self.cfg.algorithm
+        )
+        with bar:
+            start = time.perf_counter()
+            for iteration in range(self.iterations):
+                yield iteration
+                bar.update(self.steps_per_iteration)
+                if (iteration + 1) % self.cfg.eval.interval == 0 or iteration + 1 == self.iterations:
+                    metrics = self._evaluate(self.eval_env)
+                    self.seconds = time.perf_counter() - start
+                    self._write_row(iteration + 1, metrics)
+                    bar.set_postfix(
+                        {"return": f"{metrics['eval/return']:.2f}", "success": f"{metrics['eval/success']:.0%}"}
+                    )
+        self._finish()
+
+    def record(self, **metrics: Tensor | float) -> None:
+        """Keep what this iteration measured; a row holds the mean since the row before."""
+        for name, value in metrics.items():
+            group = "grad" if name.startswith("grad_") else "train"
+            self.recorded[f"{group}/{name.removeprefix('grad_')}"].append(float(value))
+
+    def save(self, path: Path) -> None:
+        """Write networks and configuration, all or nothing."""
+        state = {
+            "config": OmegaConf.to_yaml(self.cfg, resolve=True),
+            "steps": self.iterations * self.steps_per_iteration,
+            **{name: module.state_dict() for name, module in self.modules.items()},
+        }
+        temporary = path.with_suffix(".tmp")
+        torch.save(state, temporary)
+        os.replace(temporary, path)
+
+    def _evaluate(self, env: QuadrotorEnv) -> dict[str, float]:
+        env.set_seed(self.cfg.eval.seed)
+        metrics, _ = evaluate(env, self.actor)
+        return metrics
+
+    def _warm_up(self) -> None:
+        """Compile both variants of the step, with gradients and without, before the clock starts."""
+        rollout, _ = differentiable_rollout(self.env, self.actor, None, 2)
+        rollout["next", "reward"].sum().backward()
+        self.actor.zero_grad()
+        with torch.no_grad():
+            differentiable_rollout(self.eval_env, self.actor, None, 1)
+        self.env.set_seed(self.cfg.seed)
+
+    def _write_row(self, iteration: int, evaluation: dict[str, float]) -> None:
+        steps = iteration * self.steps_per_iteration
+        row = {
+            "iteration": iteration,
+            "steps": steps,
+            "time/seconds": self.seconds,
+            "time/steps_per_second": steps / self.seconds,
+            **{name: sum(values) / len(values) for name, values in self.recorded.items()},
+            **evaluation,
+        }
+        self.recorded.clear()
+        with open(self.folder / "metrics.csv", "a", newline="") as file:
+            writer = csv.DictWriter(file, fieldnames=list(row))
+            if file.tell() == 0:
+                writer.writeheader()
+            writer.writerow(row)
+        if self.logger is not None:
+            for name, value in row.items():
+                self.logger.log_scalar(name, value, step=steps)
+
+    def _finish(self) -> None:
+        """Checkpoint, final evaluation on fresh starts, pictures, summary."""
+        self.save(self.folder / "checkpoint.pt")
+        summary, flight = final_evaluation(self.cfg, self.actor)
+        summary |= {"steps": self.iterations * self.steps_per_iteration, "seconds": round(self.seconds, 2)}
+        write_json(self.folder / "summary.json", summary)
+        plot_learning_curve(self.folder / "metrics.csv", self.folder / "learning_curve.png")
+        plot_flight(flight, self.folder / "flight.png", control_dt=self.cfg.env.control_dt)
+        if self.cfg.logger.backend == "wandb":
+            self.logger.experiment.finish()
+        print_summary(summary, self.folder)
+
+
+def iterations(cfg: DictConfig) -> int:
+    """Rollouts in a run: as many as fit into ``total_steps``, and at least one."""
+    return max(cfg.total_steps // (cfg.num_envs * cfg.horizon), 1)
+
+
+def final_evaluation(
+    cfg: DictConfig, actor: TensorDictModuleBase, episodes: int = 256, seed: int = 2_000_000
+) -> tuple[dict[str, Any], TensorDictBase]:
+    """The deterministic policy over fresh episodes: a summary, and the flight."""
+    env = make_env(cfg.task, num_envs=episodes, device=cfg.device, seed=seed, **cfg.env)
+    metrics, flight = evaluate(env, actor)
+    summary = {"task": cfg.task, "algorithm": cfg.algorithm, "seed": cfg.seed, "episodes": episodes}
+    return summary | {name.removeprefix("eval/"): v for name, v in metrics.items() if name.startswith("eval/")}, flight
+
+
+def load_policy(checkpoint: Path, device: str = "cpu") -> tuple[DictConfig, TensorDictModuleBase]:
+    """The configuration and the policy of a checkpoint.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is not a checkpoint of these recipes.
+    """
+    if not checkpoint.is_file():
+        raise FileNotFoundError(f"No checkpoint at {checkpoint}. Train one first: python recipes/abpt.py")
+    try:
+        state = torch.load(checkpoint, map_location=device, weights_only=True)
+        cfg = OmegaConf.create(state["config"])
+        cfg.device = device
+        actor = make_policy(cfg, make_env(cfg.task, num_envs=1, device=device, **cfg.env))
+        actor.load_state_dict(state["actor"])
+    except Exception as error:
+        raise ValueError(f"{checkpoint} is not a checkpoint that these recipes can read: {error}") from error
+    return cfg, actor
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a JSON file, all or nothing."""
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(content, indent=2) + "\n")
+    os.replace(temporary, path)
+
+
+def print_summary(summary: dict[str, Any], folder: Path | None = None) -> None:
+    """Say how well the policy flies, and where the results are."""
+    print(
+        f"\n{summary['algorithm']} on {summary['task']}, seed {summary['seed']}, {summary['episodes']} fresh episodes:"
+    )
+    print(f"  success       {summary['success']:.1%}")
+    print(f"  crashes       {summary['crash']:.1%}")
+    if "error" in summary:
+        print(f"  median error  {100 * summary['error']:.2f} cm")
+    print(f"  return        {summary['return']:.2f}")
+    if "seconds" in summary:
+        print(f"  training      {summary['steps']:,} steps in {summary['seconds']:.1f} s")
+    if folder is not None:
+        print(f"  results in    {folder}")

@@ -1,0 +1,94 @@
+"""Figures as PNG files."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from tensordict import TensorDictBase
+
+_INK, _BLUE, _RED = "#222222", "#2f6db5", "#c8452f"
+
+
+def plot_flight(rollout: TensorDictBase, path: str | Path, *, num_envs: int = 12, control_dt: float = 0.02) -> None:
+    """Draw the first episodes of a flight: paths in space, and distance to the target over time.
+
+    Args:
+        rollout: (num_envs, time), of a task whose state has a ``target``.
+        path: where the PNG file goes.
+        num_envs: how many environments are drawn.
+        control_dt: control step of the environment [s].
+    """
+    plt = _pyplot()
+    flight = rollout[:num_envs].detach().cpu()
+    done = flight["next", "done"]
+    first = ((done.cumsum(1) - done.int()) == 0).squeeze(-1).numpy()
+    position = flight["next", "state", "position"].numpy()
+    start = flight["state", "position"][:, 0].numpy()
+    target = flight["next", "state", "target"].numpy()
+    distance = np.linalg.norm(position - target, axis=-1)
+    time = control_dt * np.arange(1, position.shape[1] + 1)
+
+    figure = plt.figure(figsize=(11, 4.6), layout="constrained")
+    space = figure.add_subplot(1, 2, 1, projection="3d")
+    decay = figure.add_subplot(1, 2, 2)
+    colors = plt.get_cmap("viridis")(np.linspace(0.05, 0.85, len(position)))
+    for i, color in enumerate(colors):
+        x, y, z = np.concatenate((start[i : i + 1], position[i, first[i]])).T
+        space.plot(x, y, z, color=color, linewidth=1.2)
+        space.scatter(*start[i], color=color, s=14)
+        decay.plot(time[first[i]], 100 * distance[i, first[i]], color=color, linewidth=1.2)
+    space.scatter(*target[0, 0], color=_RED, marker="*", s=140, label="target", zorder=10)
+    space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="Flights from fresh starts")
+    space.legend(loc="upper left", frameon=False)
+    decay.axhline(10, color=_RED, linestyle="--", linewidth=1, label="success: 10 cm over the last second")
+    decay.set(xlabel="time [s]", ylabel="distance to the target [cm]", yscale="log", title="Distance to the target")
+    decay.legend(frameon=False)
+    decay.grid(alpha=0.3)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def plot_learning_curve(metrics: str | Path, path: str | Path) -> None:
+    """Draw return, success and error of the evaluations in a ``metrics.csv`` over training time and steps.
+
+    Args:
+        metrics: the CSV file of a training run.
+        path: where the PNG file goes.
+    """
+    plt = _pyplot()
+    with open(metrics, newline="") as file:
+        rows = list(csv.DictReader(file))
+    columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    panels = [
+        ("eval/return", "return", 1.0),
+        ("eval/success", "success [%]", 100.0),
+        ("eval/error", "median error [cm]", 100.0),
+    ]
+    panels = [panel for panel in panels if panel[0] in columns]
+    figure, axes = plt.subplots(1, len(panels), figsize=(3.7 * len(panels), 3.2), layout="constrained", squeeze=False)
+    for axis, (name, label, scale) in zip(axes[0], panels, strict=True):
+        axis.plot(columns["time/seconds"], scale * columns[name], color=_BLUE, marker="o", markersize=3, linewidth=1.4)
+        axis.set(xlabel="training time [s]", ylabel=label)
+        axis.grid(alpha=0.3)
+        seconds_per_step = columns["time/seconds"][-1] / columns["steps"][-1]
+        upper = axis.secondary_xaxis(
+            "top", functions=(lambda s, k=seconds_per_step: s / k, lambda n, k=seconds_per_step: n * k)
+        )
+        upper.set_xlabel("control steps", color=_INK)
+        if name == "eval/error":
+            axis.set_yscale("log")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _pyplot():
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise ImportError("Pictures need matplotlib: pip install 'torchrl_quad[render]'.") from error
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt

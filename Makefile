@@ -1,24 +1,25 @@
 PYTHON ?= python3
-VENV := .venv
+VENV ?= .venv
 BIN := $(VENV)/bin
+READY := $(VENV)/.ready
 
 .PHONY: train test clean
 
-# Train a drone to hover, and leave checkpoint, metrics and pictures in outputs/.
-train: $(VENV)/recipes
-	$(BIN)/python recipes/abpt.py
+# Train a drone to hover; leaves a checkpoint, metrics and pictures in outputs/. Overrides: make train ARGS="seed=1"
+train: $(READY)
+	$(BIN)/python recipes/abpt.py $(ARGS)
 
 # Lint, and run all fast tests.
-test: $(VENV)/dev
+test: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m pytest -q -m "not slow"
 
-$(VENV)/%: pyproject.toml constraints.txt
+$(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$*]"
-	touch $@
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
+	touch $(READY)
 
 clean:
 	rm -rf $(VENV) outputs build dist *.egg-info

@@ -7,11 +7,23 @@ from collections.abc import Sequence
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 OBSERVATION = ("observation",)
+
+
+class Network(nn.Module):
+    """A multi-layer perceptron on the concatenation of its inputs, each multiplied by a constant of its own."""
+
+    def __init__(self, mlp: MLP, scales: Sequence[float]) -> None:
+        super().__init__()
+        self.mlp, self.scales = mlp, tuple(scales)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Map inputs (*, k_i) to outputs (*, out_features)."""
+        return self.mlp(torch.cat([x * scale for x, scale in zip(inputs, self.scales, strict=True)], -1))
 
 
 def make_actor(
@@ -20,6 +32,7 @@ def make_actor(
     *,
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
+    input_scale: float = 5.0,
     scale_init: float = 0.1,
     return_log_prob: bool = False,
 ) -> ProbabilisticActor:
@@ -33,13 +46,15 @@ def make_actor(
         num_cells: widths of the hidden layers.
         in_keys: the entries that are concatenated into the network's input, each (*, k).
         activation: of the hidden layers; smooth ones give smooth policy gradients.
+        input_scale: multiplies the input. The tasks observe a tenth of their SI units, as the paper does, which makes
+            for inputs that are too small to learn from quickly.
         scale_init: standard deviation at the start.
         return_log_prob: write the log-probability of the action as well, which an entropy bonus and PPO need.
     """
     spec = env.action_spec_unbatched
-    net = _mlp(env, in_keys, 2 * spec.shape[-1], num_cells, activation)
+    net = _network(env, in_keys, 2 * spec.shape[-1], num_cells, activation, input_scale)
     with torch.no_grad():
-        net[-1].weight.mul_(0.01)
+        net.mlp[-1].weight.mul_(0.01)
     params = TensorDictModule(
         nn.Sequential(net, NormalParamExtractor(scale_mapping=f"biased_softplus_{scale_init}")),
         in_keys=list(in_keys),
@@ -63,6 +78,7 @@ def make_value(
     *,
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
+    input_scale: float = 5.0,
 ) -> ValueOperator:
     """A state value V(s), written to ``state_value``, (*, 1). The arguments are those of :func:`make_actor`.
 
@@ -70,7 +86,8 @@ def make_value(
 
     With in_keys such as ``("observation", ("state", "rotor_speed"))`` the critic sees more than the actor.
     """
-    return ValueOperator(_mlp(env, in_keys, 1, num_cells, activation, layer_norm=True), in_keys=list(in_keys))
+    net = _network(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
+    return ValueOperator(net, in_keys=list(in_keys))
 
 
 def make_qvalue(
@@ -79,27 +96,37 @@ def make_qvalue(
     *,
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
+    input_scale: float = 5.0,
+    action_scale: float = 0.3,
 ) -> ValueOperator:
-    """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); as :func:`make_value` otherwise."""
+    """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); as :func:`make_value` otherwise.
+
+    A policy's action tells where the drone is, and a critic that reads it off the action gets the gradient in the
+    action wrong: ``action_scale`` multiplies the action, so that the critic looks at the state first.
+    """
     in_keys = [*in_keys, "action"]
-    return ValueOperator(_mlp(env, in_keys, 1, num_cells, activation, layer_norm=True), in_keys=in_keys)
+    net = _network(env, in_keys, 1, num_cells, activation, input_scale, action_scale, layer_norm=True)
+    return ValueOperator(net, in_keys=in_keys)
 
 
-def _mlp(
+def _network(
     env: EnvBase,
     in_keys: Sequence[NestedKey],
     out_features: int,
     num_cells: Sequence[int],
     activation: type[nn.Module],
+    input_scale: float,
+    action_scale: float = 1.0,
     layer_norm: bool = False,
-) -> MLP:
+) -> Network:
     specs = [env.action_spec if key == "action" else env.observation_spec[key] for key in in_keys]
     norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": cells} for cells in num_cells]}
-    return MLP(
+    mlp = MLP(
         in_features=sum(spec.shape[-1] for spec in specs),
         out_features=out_features,
         num_cells=list(num_cells),
         activation_class=activation,
         device=env.device,
         **(norm if layer_norm else {}),
-    ).to(specs[0].dtype)
+    )
+    return Network(mlp.to(specs[0].dtype), [action_scale if key == "action" else input_scale for key in in_keys])

@@ -1,0 +1,41 @@
+"""The wheel: what is in it, and that it works without the repository."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(ROOT)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return next(folder.glob("*.whl"))
+
+
+def test_it_holds_the_package_the_presets_and_its_types_and_nothing_else(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    for drone in ("visfly", "flightmare", "crazyflie", "small_racer"):
+        assert f"torchrl_quad/dynamics/drones/{drone}.yaml" in names
+    assert "torchrl_quad/py.typed" in names
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"torchrl_quad"}
+
+
+def test_it_works_away_from_the_repository(wheel, tmp_path):
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(tmp_path / "site"), str(wheel)]
+    subprocess.run(pip, check=True)
+    program = (
+        "import torchrl_quad, pathlib\n"
+        f"assert pathlib.Path(torchrl_quad.__file__).is_relative_to({str(tmp_path)!r}), torchrl_quad.__file__\n"
+        "for drone in torchrl_quad.available_drones():\n"
+        "    torchrl_quad.make_env('hovering', num_envs=2, drone=drone).rollout(2)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True)

@@ -1,0 +1,124 @@
+"""Recipes and README commands, on a reduced budget."""
+
+import csv
+import json
+import math
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+SMALL = "num_envs=4 horizon=6 total_steps=96 eval.interval=2 env.max_episode_steps=60".split()
+RECIPES = ["abpt", "bptt", "shac"]
+
+
+def run(*command, cwd=ROOT):
+    environment = {**os.environ, "WANDB_MODE": "offline", "RL_LOGGING_LEVEL": "WARNING"}
+    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def train(recipe, folder, *overrides):
+    return run(sys.executable, f"recipes/{recipe}.py", *SMALL, f"hydra.run.dir={folder}", *overrides)
+
+
+def read(folder):
+    with open(folder / "metrics.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_a_recipe_trains_and_leaves_what_it_promises(recipe, tmp_path):
+    printed = train(recipe, tmp_path)
+    rows = read(tmp_path)
+    assert [int(row["iteration"]) for row in rows] == [2, 4]
+    assert [int(row["steps"]) for row in rows] == [48, 96]
+    names = {"train/loss_actor", "grad/actor", "eval/return", "eval/success", "eval/error", "reward/position"}
+    assert names <= set(rows[0])
+    assert all(math.isfinite(float(value)) for row in rows for value in row.values())
+    for picture in ("learning_curve.png", "flight.png"):
+        assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["episodes"] == 256
+    assert summary["steps"] == 96
+    assert f"success       {summary['success']:.1%}" in printed
+    assert "median error" in printed
+
+
+def test_evaluation_of_a_checkpoint_repeats_the_summary_of_the_run(tmp_path):
+    train("bptt", tmp_path)
+    printed = run(sys.executable, "recipes/evaluate.py", f"checkpoint={tmp_path}/checkpoint.pt")
+    assert "256 fresh episodes" in printed
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    evaluation = json.loads((tmp_path / "evaluation.json").read_text())
+    assert all(summary[name] == value for name, value in evaluation.items())
+
+
+def test_a_missing_or_foreign_checkpoint_is_named(tmp_path):
+    def fails(path):
+        command = (sys.executable, "recipes/evaluate.py", f"checkpoint={path}")
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stderr
+
+    assert f"No checkpoint at {tmp_path}/none.pt. Train one first" in fails(tmp_path / "none.pt")
+    torch.save({"weights": torch.zeros(1)}, tmp_path / "foreign.pt")
+    assert "foreign.pt is not a checkpoint that these recipes can read" in fails(tmp_path / "foreign.pt")
+
+
+def test_two_runs_with_one_seed_are_equal_and_another_seed_differs(tmp_path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        train("abpt", tmp_path / name, f"seed={seed}")
+    a, b, c = ([row["train/loss_actor"] for row in read(tmp_path / name)] for name in "abc")
+    assert a == b != c
+
+
+@pytest.mark.parametrize("alpha", ["0.01", "auto"])
+def test_the_entropy_bonus_is_an_option(alpha, tmp_path):
+    train("abpt", tmp_path, f"loss.alpha={alpha}")
+    assert float(read(tmp_path)[-1]["train/alpha"]) > 0
+
+
+def test_wandb_and_tensorboard_log_by_option(tmp_path):
+    train("bptt", tmp_path / "wandb", "logger.backend=wandb")
+    assert list((tmp_path / "wandb").glob("**/*.wandb"))
+    train("bptt", tmp_path / "tensorboard", "logger.backend=tensorboard")
+    assert list((tmp_path / "tensorboard").glob("**/events.out.tfevents*"))
+    assert len(read(tmp_path / "wandb")) == 2
+
+
+def readme_blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+def test_every_readme_command_runs(tmp_path):
+    commands = [line.split("#")[0].strip() for block in readme_blocks("bash") for line in block.splitlines()]
+    commands = [command for command in commands if command]
+    assert {"make train", "make test"} <= set(commands)
+    for i, command in enumerate(commands):
+        small = [*SMALL, f"hydra.run.dir={tmp_path / str(i)}"]
+        if command == "make train":
+            if Path(sys.prefix) != ROOT / ".venv" or not (ROOT / ".venv/.ready").exists():
+                continue  # not under the Makefile's own environment, which this would build anew
+            run("make", "train", f"ARGS={' '.join(small)}")
+        elif command.startswith("python recipes/evaluate.py"):
+            checkpoint = next(tmp_path.glob("*/checkpoint.pt"))
+            run(sys.executable, "recipes/evaluate.py", f"checkpoint={checkpoint}")
+        elif command.startswith("python recipes/"):
+            words = shlex.split(command)
+            assert "multirun" not in command
+            run(sys.executable, *words[1:], *small)
+        else:
+            assert command == "make test" or command.startswith(("pip install", "git clone", "cd ")), command
+
+
+@pytest.mark.parametrize("block", readme_blocks("python"))
+def test_every_readme_program_runs(block):
+    budget = re.compile(r"ITERATIONS = \d+")
+    exec(compile(budget.sub("ITERATIONS = 2", block), "README.md", "exec"), {"__name__": "readme"})

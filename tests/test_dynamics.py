@@ -271,7 +271,7 @@ def test_the_motor_step_response_is_the_exact_exponential_for_any_dt():
     for dt in (1e-3, 5e-3, 0.05):
         speed, target = torch.full((1, 4), 1000.0, dtype=F64), torch.full((1, 4), 2000.0, dtype=F64)
         for _ in range(round(0.1 / dt)):
-            speed = target + (speed - target) * rotors.lag(dt)
+            speed = rotors.follow(speed, target, dt)
         expected = 2000.0 - 1000.0 * math.exp(-0.1 / 0.033)
         torch.testing.assert_close(speed, torch.full((1, 4), expected, dtype=F64))
 

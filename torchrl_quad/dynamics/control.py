@@ -54,8 +54,7 @@ class FlightController:
         inertia = self.nominal.inertia
         gyroscopic = gyroscopic_torque(angular_velocity, inertia)
         acceleration = (wrench[..., 1:] - gyroscopic) / inertia
-        torque = (
-            self.gain * (setpoint.body_rate - angular_velocity) - self.nominal.rate_damping * acceleration + gyroscopic
-        )
+        torque = torch.addcmul(gyroscopic, self.gain, setpoint.body_rate - angular_velocity)
+        torque = torch.addcmul(torque, self.nominal.rate_damping, acceleration, value=-1.0)
         thrust = apply(self.mixer, torch.cat((setpoint.thrust, torque), -1))
         return self.rotors.speed(torch.minimum(torch.maximum(thrust, self.thrust_min), self.thrust_max))

@@ -6,6 +6,7 @@ loop the wrench is held over each physics step, and all three are of first order
 
 from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
@@ -22,10 +23,11 @@ def euler(state: RigidBodyState, accelerations: Accelerations, dt: float) -> Rig
 def semi_implicit_euler(state: RigidBodyState, accelerations: Accelerations, dt: float) -> RigidBodyState:
     """Symplectic Euler: velocities first, then position and attitude with the new velocities."""
     linear, angular = accelerations(state)
-    velocity = state.velocity + dt * linear
-    angular_velocity = state.angular_velocity + dt * angular
-    position = state.position + dt * velocity
-    attitude = state.quaternion + dt * quaternion.derivative(state.quaternion, angular_velocity)
+    velocity = torch.add(state.velocity, linear, alpha=dt)
+    angular_velocity = torch.add(state.angular_velocity, angular, alpha=dt)
+    position = torch.add(state.position, velocity, alpha=dt)
+    turning = quaternion.derivative(state.quaternion, angular_velocity)
+    attitude = torch.add(state.quaternion, turning, alpha=dt)
     return _normalized(RigidBodyState(position, attitude, velocity, angular_velocity))
 
 
@@ -50,7 +52,7 @@ def _derivative(state: RigidBodyState, accelerations: Accelerations) -> RigidBod
 
 
 def _moved(state: RigidBodyState, derivative: RigidBodyState, dt: float) -> RigidBodyState:
-    return RigidBodyState(*(x + dt * dx for x, dx in zip(state, derivative, strict=True)))
+    return RigidBodyState(*(torch.add(x, dx, alpha=dt) for x, dx in zip(state, derivative, strict=True)))
 
 
 def _normalized(state: RigidBodyState) -> RigidBodyState:

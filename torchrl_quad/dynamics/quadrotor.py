@@ -39,7 +39,7 @@ def physics_step(
     believed = wrench if rotors is controller.rotors else controller.rotors.wrench(speed)
     commanded = controller.rotor_speed(setpoint, state.angular_velocity, believed)
     body = INTEGRATORS[integrator](RigidBodyState(*state[:4]), lambda s: accelerations(s, wrench, params), dt)
-    return QuadrotorState(*body, commanded + (speed - commanded) * rotors.lag(dt))
+    return QuadrotorState(*body, rotors.follow(speed, commanded, dt))
 
 
 def control_step(

@@ -24,7 +24,7 @@ def drag(velocity_body: Tensor, params: QuadrotorParams) -> Tensor:
 
     The paper prints the quadratic part as v * v without the sign, which would push a drone that flies forward.
     """
-    return -(params.linear_drag + params.quadratic_drag * velocity_body.abs()) * velocity_body
+    return torch.addcmul(params.linear_drag, params.quadratic_drag, velocity_body.abs()) * -velocity_body
 
 
 def angular_acceleration(angular_velocity: Tensor, torque: Tensor, inertia: Tensor) -> Tensor:
@@ -40,6 +40,7 @@ def gyroscopic_torque(angular_velocity: Tensor, inertia: Tensor) -> Tensor:
 def accelerations(state: RigidBodyState, wrench: Tensor, params: QuadrotorParams) -> tuple[Tensor, Tensor]:
     """Linear acceleration (world frame) and angular acceleration (body frame), each (*, 3), under a wrench (*, 4)."""
     velocity_body = quaternion.rotate_inverse(state.quaternion, state.velocity)
-    force_body = drag(velocity_body, params) + pad(wrench[..., :1], (2, 0))
+    thrust, torque = wrench.split((1, 3), -1)
+    force_body = drag(velocity_body, params) + pad(thrust, (2, 0))
     linear = quaternion.rotate(state.quaternion, force_body / params.mass) - pad(params.gravity, (2, 0))
-    return linear, angular_acceleration(state.angular_velocity, wrench[..., 1:], params.inertia)
+    return linear, angular_acceleration(state.angular_velocity, torque, params.inertia)

@@ -21,12 +21,12 @@ class Rotors:
         self.vertex_speed = -k1 / (2.0 * k2)
         self.vertex_thrust = k0 - k1 * k1 / (4.0 * k2)
         self.least_root = 1e-6 * (params.rotor_speed_max - self.vertex_speed).square()
-        self.time_constant = params.motor_time_constant
+        self.rate = -1.0 / params.motor_time_constant
         self.allocation = allocation_matrix(params)
 
     def thrust(self, speed: Tensor) -> Tensor:
         """Rotor thrust (*, 4) [N] at the rotor speed (*, 4) [rad/s]."""
-        return self.curvature * (speed - self.vertex_speed).square() + self.vertex_thrust
+        return torch.addcmul(self.vertex_thrust, self.curvature, (speed - self.vertex_speed).square())
 
     def speed(self, thrust: Tensor) -> Tensor:
         """Rotor speed (*, 4) [rad/s] that gives the thrust (*, 4) [N]: the inverse of :meth:`thrust`.
@@ -41,9 +41,9 @@ class Rotors:
         """The wrench (*, 4) on the body at the rotor speeds (*, 4) [rad/s]."""
         return apply(self.allocation, self.thrust(speed))
 
-    def lag(self, dt: float) -> Tensor:
-        """The share of a speed error that is left after dt [s] of first-order lag: exact for any dt."""
-        return torch.exp(-dt / self.time_constant)
+    def follow(self, speed: Tensor, commanded: Tensor, dt: float) -> Tensor:
+        """Rotor speed (*, 4) after dt [s] of first-order lag towards a constant command: exact for any dt."""
+        return torch.lerp(commanded, speed, torch.exp(self.rate * dt))
 
 
 def thrust_limits(params: QuadrotorParams) -> tuple[Tensor, Tensor]:

@@ -41,7 +41,8 @@ def make_policy(cfg: DictConfig, env: QuadrotorEnv) -> TensorDictModuleBase:
 
 def network(cfg: DictConfig) -> dict[str, Any]:
     """The sizes of a network as keywords of ``make_actor``, ``make_value`` and ``make_qvalue``."""
-    return {"num_cells": list(cfg.num_cells), "activation": getattr(nn, cfg.activation)}
+    activation = getattr(nn, cfg.activation)
+    return {"num_cells": list(cfg.num_cells), "activation": activation, "input_scale": cfg.input_scale}
 
 
 def make_optimizer(

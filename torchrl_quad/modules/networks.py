@@ -32,7 +32,7 @@ def make_actor(
     *,
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
-    input_scale: float = 5.0,
+    input_scale: float = 10.0,
     scale_init: float = 0.1,
     return_log_prob: bool = False,
 ) -> ProbabilisticActor:
@@ -78,7 +78,7 @@ def make_value(
     *,
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
-    input_scale: float = 5.0,
+    input_scale: float = 10.0,
 ) -> ValueOperator:
     """A state value V(s), written to ``state_value``, (*, 1). The arguments are those of :func:`make_actor`.
 
@@ -96,7 +96,7 @@ def make_qvalue(
     *,
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
-    input_scale: float = 5.0,
+    input_scale: float = 10.0,
     action_scale: float = 0.3,
 ) -> ValueOperator:
     """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); as :func:`make_value` otherwise.

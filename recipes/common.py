@@ -148,7 +148,9 @@ class Run:
         """Keep what this iteration measured; a row holds the mean since the row before."""
         for name, value in metrics.items():
             group = "grad" if name.startswith("grad_") else "train"
-            self.recorded[f"{group}/{name.removeprefix('grad_')}"].append(float(value.detach()) if isinstance(value, Tensor) else value)
+            self.recorded[f"{group}/{name.removeprefix('grad_')}"].append(
+                float(value.detach()) if isinstance(value, Tensor) else value
+            )
 
     def save(self, path: Path) -> None:
         """Write networks and configuration, all or nothing."""

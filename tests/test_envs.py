@@ -3,9 +3,10 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
 
-from torchrl_quad import HoveringEnv, load_drone, make_env
+from torchrl_quad import HoveringEnv, differentiable_rollout, load_drone, make_env
 from torchrl_quad.dynamics import quaternion
 
 
@@ -335,3 +336,19 @@ def test_everything_moves_to_the_gpu():
     check_env_specs(env)
     assert env.rollout(3)["next", "reward"].device.type == "cuda"
     assert HoveringEnv(num_envs=4, device="cuda").rollout(3).device.type == "cuda"
+
+
+def test_episode_metrics_judge_the_first_episode_by_its_last_second():
+    env = HoveringEnv(num_envs=3, max_episode_steps=60)
+    td = env.reset()
+    td["state", "position"] = td["state", "target"].clone()
+    td["state", "position"][1, 0] += 0.2  # hovers beside the target
+    td["state", "position"][2] = torch.tensor([1.0, 0.0, 5.99])
+    td["state", "velocity"][2, 2] = 5.0  # leaves the box, and starts again
+    hover = TensorDictModule(lambda _: env.hover_action.expand(3, 4), in_keys=["observation"], out_keys=["action"])
+    flight, _ = differentiable_rollout(env, hover, env.reset(td, set_state=True), 60)
+    metrics = env.episode_metrics(flight)
+    assert metrics["success"].tolist() == [1.0, 0.0, 0.0]
+    assert metrics["crash"].tolist() == [0.0, 0.0, 1.0]
+    assert metrics["error"].tolist() == pytest.approx([0.0, 0.2, 4.6], abs=0.1)
+    assert metrics["return"].tolist() == pytest.approx([6.0, 60 * (0.1 - 0.2 * 0.1 / 9), 0.04], abs=0.01)

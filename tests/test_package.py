@@ -29,7 +29,17 @@ def test_it_holds_the_package_the_presets_and_its_types_and_nothing_else(wheel):
 
 
 def test_it_works_away_from_the_repository(wheel, tmp_path):
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(tmp_path / "site"), str(wheel)]
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--target",
+        str(tmp_path / "site"),
+        str(wheel),
+    ]
     subprocess.run(pip, check=True)
     program = (
         "import torchrl_quad, pathlib\n"

@@ -15,7 +15,7 @@ import torch
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
-SMALL = "num_envs=4 horizon=6 total_steps=96 eval.interval=2 env.max_episode_steps=60".split()
+SMALL = ["num_envs=4", "horizon=6", "total_steps=96", "eval.interval=2", "env.max_episode_steps=60"]
 RECIPES = ["abpt", "bptt", "shac"]
 
 

@@ -4,7 +4,7 @@ python recipes/abpt.py task=hovering seed=0
 """
 
 import hydra
-from common import Run, descend, iterations, make_optimizer, minibatches, network, set_up
+from common import Run, actor_parameters, descend, iterations, make_optimizer, minibatches, network, set_up
 from omegaconf import DictConfig
 from torchrl.objectives import SoftUpdate
 
@@ -19,9 +19,8 @@ def main(cfg: DictConfig) -> None:
     target = SoftUpdate(loss, tau=cfg.critic.tau)
     buffer = VisitedStateBuffer(cfg.buffer.capacity, seed=cfg.seed)
 
-    critic_parameters = list(loss.qvalue_network_params.parameters())
-    actor_parameters = [p for p in loss.parameters() if not any(p is q for q in critic_parameters)]  # and alpha
-    actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters, iterations(cfg))
+    actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
+    critic_parameters = loss.qvalue_network_params.parameters()
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
     run = Run(cfg, env, actor, loss=loss)
@@ -30,8 +29,8 @@ def main(cfg: DictConfig) -> None:
         # The actor: up the N-step and the 0-step return of one horizon, through the dynamics.
         rollout, _ = differentiable_rollout(env, actor, carry, cfg.horizon)
         loss_actor, actor_metrics = loss.loss_actor(rollout)
-        loss_policy = loss_actor + actor_metrics.get("loss_alpha", 0.0)
-        grad_actor = descend(actor_optimizer, loss_policy, cfg.actor.max_grad_norm)
+        loss_alpha = actor_metrics.get("loss_alpha", 0.0)
+        grad_actor = descend(actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
 
         # The critics: towards the TD(lambda) targets of the target networks.
         data = loss.write_value_target(rollout.detach())

@@ -22,6 +22,7 @@ from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
 from torchrl_quad import QuadrotorEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.render import plot_flight, plot_learning_curve
 
 
@@ -43,6 +44,11 @@ def network(cfg: DictConfig) -> dict[str, Any]:
     """The sizes of a network as keywords of ``make_actor``, ``make_value`` and ``make_qvalue``."""
     activation = getattr(nn, cfg.activation)
     return {"num_cells": list(cfg.num_cells), "activation": activation, "input_scale": cfg.input_scale}
+
+
+def actor_parameters(loss: PathwiseLoss) -> list[nn.Parameter]:
+    """The policy's parameters, and the entropy coefficient where it is learned."""
+    return [*loss.actor_network_params.parameters(), *([loss.log_alpha] if loss.automatic_alpha else [])]
 
 
 def make_optimizer(
@@ -169,13 +175,13 @@ class Run:
         return metrics
 
     def _warm_up(self) -> None:
-        """Compile both variants of the step, with gradients and without, before the clock starts."""
-        rollout, _ = differentiable_rollout(self.env, self.actor, None, 2)
-        rollout["next", "reward"].sum().backward()
-        self.actor.zero_grad()
-        with torch.no_grad():
-            differentiable_rollout(self.eval_env, self.actor, None, 1)
-        self.env.set_seed(self.cfg.seed)
+        """Compile both variants of the step, with gradients and without, before the clock starts; change nothing."""
+        with torch.random.fork_rng():
+            rollout, _ = differentiable_rollout(self.eval_env, self.actor, None, 2)
+            rollout["next", "reward"].sum().backward()
+            self.actor.zero_grad()
+            with torch.no_grad():
+                differentiable_rollout(self.eval_env, self.actor, None, 1)
 
     def _write_row(self, iteration: int, evaluation: dict[str, float]) -> None:
         steps = iteration * self.steps_per_iteration

@@ -4,7 +4,7 @@ python recipes/shac.py task=hovering seed=0
 """
 
 import hydra
-from common import Run, descend, iterations, make_optimizer, minibatches, network, restart, set_up
+from common import Run, actor_parameters, descend, iterations, make_optimizer, minibatches, network, restart, set_up
 from omegaconf import DictConfig
 from torchrl.objectives import SoftUpdate
 
@@ -17,7 +17,7 @@ def main(cfg: DictConfig) -> None:
     loss = SHACLoss(actor, make_value(env, **network(cfg.critic)), **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     target = SoftUpdate(loss, tau=cfg.critic.tau)
-    actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor.parameters(), iterations(cfg))
+    actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
     critic_parameters = loss.value_network_params.parameters()
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
@@ -27,7 +27,8 @@ def main(cfg: DictConfig) -> None:
         # The actor: up the return of one horizon and the value of its end, through the dynamics.
         rollout, carry = differentiable_rollout(env, actor, carry, cfg.horizon)
         loss_actor, actor_metrics = loss.loss_actor(rollout)
-        grad_actor = descend(actor_optimizer, loss_actor, cfg.actor.max_grad_norm)
+        loss_alpha = actor_metrics.get("loss_alpha", 0.0)
+        grad_actor = descend(actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
 
         # The critic: towards the TD(lambda) targets of the target network.
         data = loss.write_value_target(rollout.detach())

@@ -182,6 +182,25 @@ def test_a_rollout_cut_in_two_by_way_of_the_buffer_equals_the_uncut_one_to_the_l
             assert torch.equal(value, joined[key]), key
 
 
+def test_fresh_starts_stay_fresh_while_resets_draw_from_the_buffer():
+    env = HoveringEnv(num_envs=50)
+    rollout, _ = differentiable_rollout(env, make_actor(env), None, 3)
+    buffer = VisitedStateBuffer()
+    buffer.extend(rollout[:, 1:])
+    env.set_initial_state_source(buffer.source(env, fraction=1.0))
+    assert (buffer.initial_state(env, 0.0)["state", "step"] == 0).all()
+    assert (env.reset()["state", "step"] > 0).all()
+
+
+def test_a_rollout_without_one_good_state_adds_nothing(flight):
+    *_, rollout, _ = flight
+    buffer = VisitedStateBuffer()
+    rollout = rollout.detach().clone()
+    rollout["state", "velocity"][:] = float("nan")
+    assert buffer.extend(rollout).numel() == 0
+    assert len(buffer) == 0
+
+
 @pytest.mark.parametrize("way", ["state_dict", "dumps"])
 def test_the_buffer_is_saved_and_loaded_with_its_generator(flight, tmp_path, way):
     env, _, rollout, _ = flight

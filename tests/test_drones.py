@@ -17,8 +17,8 @@ def test_the_four_presets_are_there():
 def test_every_preset_can_hover_and_reach_its_commanded_thrust(name):
     params = load_drone(name)
     env = HoveringEnv(num_envs=1, drone=name)
-    _, highest = env.controller.thrust_min, env.controller.thrust_max
-    assert (params.rotor_speed_min < env.controller.hover_speed).all()
+    hover, highest = env.controller.hover_speed, env.controller.thrust_max
+    assert ((params.rotor_speed_min < hover) & (hover < params.rotor_speed_max)).all()
     assert (4 * highest >= params.max_thrust_to_weight * params.mass * params.gravity).all()
 
 
@@ -42,7 +42,7 @@ def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
         ({"rotor_spin": [1, 1, 0, -1]}, r"mine.yaml: field 'rotor_spin' must be \+1 or -1"),
         ({"thrust_map": [0.0, 1.0, 0.0]}, r"mine.yaml: field 'thrust_map' must be finite, k2 positive"),
         ({"mass": "heavy"}, r"mine.yaml: field 'mass' is not a number or a list of numbers: 'heavy'"),
-        ({"rotor_speed_min": 4000.0}, r"rotor_speed_min must be below rotor_speed_max"),
+        ({"rotor_speed_min": 4000.0}, r"rotor_speed_min must be below rotor_speed_max, got \[4000.0\] and \[3500.0\]"),
     ],
 )
 def test_a_bad_file_is_told_which_field_and_what_is_allowed(tmp_path, change, message):
@@ -65,6 +65,19 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path):
     path.write_text("- 1\n- 2\n")
     with pytest.raises(ValueError, match="expected a mapping of field names to numbers, got list"):
         load_drone(path)
+
+
+def test_a_file_that_is_missing_or_no_yaml_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="No drone file at .*none.yaml. Presets go by name: crazyflie"):
+        load_drone(tmp_path / "none.yaml")
+    (tmp_path / "bad.yaml").write_text("mass: [1")
+    with pytest.raises(ValueError, match="bad.yaml: not a YAML file"):
+        load_drone(tmp_path / "bad.yaml")
+
+
+def test_rotors_that_cannot_turn_the_drone_are_refused():
+    with pytest.raises(ValueError, match="cannot make thrust and torque about each axis"):
+        HoveringEnv(num_envs=1, drone=load_drone().replace(rotor_spin=[1.0, 1.0, 1.0, 1.0]))
 
 
 def test_replacing_an_unknown_field_lists_the_known_ones():

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
 
-from torchrl_quad import HoveringEnv, differentiable_rollout, load_drone, make_env
+from torchrl_quad import HoveringEnv, QuadrotorParams, differentiable_rollout, load_drone, make_env
 from torchrl_quad.dynamics import quaternion
 
 
@@ -140,10 +140,10 @@ def test_flights_repeat_with_the_seed_whatever_the_global_generator_does():
 
 
 def test_setting_the_seed_starts_the_sequence_again(env):
-    env.set_seed(7)
-    first = env.reset()["state", "position"]
-    env.set_seed(7)
-    assert torch.equal(env.reset()["state", "position"], first)
+    first = HoveringEnv(num_envs=4, seed=7).reset()["state", "position"]
+    for _ in range(2):
+        env.set_seed(7)
+        assert torch.equal(env.reset()["state", "position"], first)
 
 
 def test_a_partial_reset_leaves_the_others_alone(env):
@@ -180,6 +180,8 @@ def test_a_state_has_to_be_complete_and_of_the_right_shape(env):
     del td["state", "rotor_speed"]
     with pytest.raises(ValueError, match=r"the state lacks rotor_speed. A state is restored whole"):
         env.reset(td, set_state=True)
+    with pytest.raises(ValueError, match='needs a tensordict with the state to set under "state"'):
+        env.reset(set_state=True)
     td = env.reset()
     td["state", "velocity"] = torch.zeros(4, 2)
     with pytest.raises(ValueError, match=r"state 'velocity' has shape \(4, 2\), expected \(4, 3\)"):
@@ -207,28 +209,45 @@ def test_resets_draw_from_the_initial_state_source(wrap):
     assert (env.reset()["state", "velocity"] == 0).all()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("velocity", float("nan")), ("position", float("inf")), ("velocity", 1e30), ("rotor_speed", float("nan"))],
+    [
+        ("velocity", float("nan")),
+        ("velocity", 1e30),
+        ("position", float("inf")),
+        ("position", 1e30),
+        ("target", 1e30),
+        ("angular_velocity", -1e12),
+        ("quaternion", 1e30),
+        ("quaternion", 0.0),
+        ("rotor_speed", float("nan")),
+        ("rotor_speed", 1e12),
+        ("rotor_speed", -1e9),
+    ],
 )
-def test_a_broken_state_terminates_and_leaks_nothing_into_the_others(env64, key, value):
-    action = (env64.hover_action.expand(4, 4) + 0.1).clone().requires_grad_()
-    mass = torch.tensor(0.46, dtype=torch.float64, requires_grad=True)
-    env64.params = env64.params.replace(mass=mass)
+def test_a_broken_state_terminates_and_leaks_nothing_into_the_others(dtype, key, value):
+    env = HoveringEnv(num_envs=4, seed=1, dtype=dtype)
+    action = (env.hover_action.expand(4, 4) + 0.1).clone().requires_grad_()
+    mass = torch.tensor(0.46, dtype=dtype, requires_grad=True)
+    env.params = env.params.replace(mass=mass)
 
     def gradients(td):
-        flight = fly(env64, td, [action] * 3)
+        flight = fly(env, td, [action] * 3)
         for entry, x in flight["next"].items(include_nested=True, leaves_only=True):
             assert x.isfinite().all(), entry
         loss = flight["next", "reward"][[0, 1, 3]].sum() + 0.0 * flight["next", "reward"][2].sum()
         return flight, torch.autograd.grad(loss, (action, mass))
 
-    td = env64.reset()
+    td = env.reset()
     clean, (clean_action, clean_mass) = gradients(td)
     broken = td.clone()
     broken["state", key][2] = value
     flight, (broken_action, broken_mass) = gradients(broken)
-    assert flight["next", "terminated"][2, 0] and not flight["next", "terminated"][[0, 1, 3]].any()
+    first = flight["next"][:, 0]
+    assert first["terminated"].flatten().tolist() == [False, False, True, False]
+    assert not first["success"][2]
+    assert first["reward"][2] == 0
     assert torch.equal(flight["next", "reward"][[0, 1, 3]], clean["next", "reward"][[0, 1, 3]])
     assert torch.equal(broken_action[[0, 1, 3]], clean_action[[0, 1, 3]])
     assert broken_action.isfinite().all()
@@ -257,10 +276,47 @@ def test_gradients_stay_finite_after_a_crash(env64):
     assert action.grad.isfinite().all()
 
 
+def test_a_state_that_was_set_is_a_copy(env):
+    td = env.reset()
+    start = env.reset(td.clone(), set_state=True)
+    source = td["state"].clone()
+    env.set_initial_state_source(lambda n: source)
+    env.reset()["state", "position"][0] = 99.0
+    assert (source["position"] == start["state", "position"]).all()
+
+
 def test_a_drone_may_be_given_by_name_mapping_or_parameters():
     params = load_drone("crazyflie")
-    for drone in ("crazyflie", params):
+    mapping = {name: value.squeeze().tolist() for name, value in params.fields().items()}
+    for drone in ("crazyflie", params, mapping):
         assert HoveringEnv(num_envs=1, drone=drone).params.mass == params.mass
+
+
+@pytest.mark.parametrize("num_envs", [2, 3])
+def test_every_field_of_the_drone_may_differ_between_environments(num_envs):
+    single = load_drone("crazyflie")
+    batched = QuadrotorParams(**{k: torch.stack([v] * num_envs) for k, v in single.fields().items()})
+    mass = single.mass * torch.linspace(1.0, 1.2, num_envs).unsqueeze(-1)
+    batched = batched.replace(mass=mass, max_thrust_to_weight=torch.linspace(1.8, 2.0, num_envs).unsqueeze(-1))
+    env = HoveringEnv(num_envs=num_envs, drone=batched, action_delay=2)
+    flight = fly(env, env.reset(), hold(env, 30))
+    torch.testing.assert_close(flight["next", "state", "velocity"], torch.zeros(num_envs, 30, 3), atol=1e-4, rtol=0)
+    with pytest.raises(ValueError, match=f"is for {num_envs} environments, and num_envs=5"):
+        HoveringEnv(num_envs=5, drone=batched)
+
+
+def test_the_controller_keeps_its_drone_when_the_true_one_is_fitted_in_place():
+    mass = torch.nn.Parameter(torch.tensor([0.46]))
+    env = HoveringEnv(num_envs=1, drone=load_drone().replace(mass=mass))
+    assert env.params.mass is mass
+    mass.data.mul_(2.0)
+    assert env.nominal.mass.item() == pytest.approx(0.46)
+    others = [HoveringEnv(num_envs=1, drone=load_drone()) for _ in range(2)]
+    assert others[0].params.mass is not others[1].params.mass
+
+
+def test_different_masses_all_hover_with_their_own_nominal_drone():
+    params = load_drone("crazyflie")
     per_env = params.replace(mass=torch.tensor([[0.027], [0.03]]))
     env = HoveringEnv(num_envs=2, drone=per_env)
     flight = fly(env, env.reset(), hold(env, 50))
@@ -278,7 +334,8 @@ def test_make_env_builds_by_name_and_lists_the_names():
     [
         ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
         ({"dtype": torch.int32}, "dtype must be torch.float32 or torch.float64"),
-        ({"dt": 0.0}, "dt must be positive"),
+        ({"dt": 0.0}, "dt must be positive and finite, got 0.0"),
+        ({"control_dt": float("nan")}, "control_dt must be positive and finite, got nan"),
         ({"control_dt": 0.012}, "control_dt must be a whole multiple of dt, got 0.012 and 0.005; try control_dt=0.01"),
         ({"action_delay": -1}, "action_delay must be zero or more"),
         ({"integrator": "heun"}, "Unknown integrator 'heun'. Choose from: euler, semi_implicit_euler, rk4"),

@@ -1,5 +1,6 @@
 """Gradients through the simulator against finite differences, in float64."""
 
+import pytest
 import torch
 from tensordict import TensorDict
 
@@ -44,8 +45,10 @@ def test_with_respect_to_actions_with_each_other_integrator_and_delay():
         assert gradients_agree(lambda a, env=env, state=state: flight(env, a, state), actions)
 
 
-def test_with_respect_to_every_entry_of_the_initial_state():
-    env, actions, state = setup()
+@pytest.mark.parametrize("max_episode_steps", [256, 12])
+def test_with_respect_to_every_entry_of_the_initial_state_also_through_resets(max_episode_steps):
+    env, actions, state = setup(max_episode_steps=max_episode_steps)
+    state["step"] = torch.tensor([[3], [0], [7]])
     actions = actions.detach()
     for key, value in state.items():
         if not value.is_floating_point():
@@ -54,8 +57,9 @@ def test_with_respect_to_every_entry_of_the_initial_state():
         assert gradients_agree(lambda x, key=key: flight(env, actions, state.copy().set(key, x)), value), key
 
 
-def test_with_respect_to_the_parameters_of_the_drone():
-    env, actions, state = setup(drone="visfly")
+@pytest.mark.parametrize("max_episode_steps", [256, 12])
+def test_with_respect_to_the_parameters_of_the_drone_also_through_resets(max_episode_steps):
+    env, actions, state = setup(drone="visfly", max_episode_steps=max_episode_steps)
     actions, params = actions.detach(), env.params
 
     def with_params(mass, linear_drag, motor_time_constant, inertia, thrust_map):
@@ -71,7 +75,7 @@ def test_with_respect_to_the_parameters_of_the_drone():
     scaled_map = params.thrust_map / torch.tensor([1e-6, 1e-5, 1e-2], dtype=torch.float64)
     values = (params.mass, params.linear_drag, params.motor_time_constant, params.inertia, scaled_map)
     values = [value.clone().requires_grad_() for value in values]
-    # Inertia is of the order of 1e-3: its own check needs a smaller step than the others.
+    # Inertia is of the order of 1e-3, and so needs a small step; all take the same.
     for i, value in enumerate(values):
         fixed = [v.detach() for v in values]
 
@@ -79,7 +83,6 @@ def test_with_respect_to_the_parameters_of_the_drone():
             return with_params(*fixed[:i], x, *fixed[i + 1 :])
 
         assert torch.autograd.gradcheck(one, (value,), fast_mode=True, eps=1e-7, atol=1e-4, rtol=1e-4), i
-        value.grad = None
 
 
 def test_through_a_partial_reset_the_gradient_is_cut_exactly_there():

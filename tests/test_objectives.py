@@ -206,6 +206,15 @@ def test_the_critic_s_loss_computes_its_targets_when_they_are_missing():
     assert without == loss.loss_value(loss.write_value_target(rollout.detach()))[0]
 
 
+def test_a_terminated_last_state_that_is_not_finite_leaves_the_targets_alone():
+    actor, value, _ = make_networks()
+    loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
+    rollout = make_rollout(actor).detach()
+    clean = loss.write_value_target(rollout.copy())["value_target"]
+    rollout["next", "observation"][1, 2] = float("nan")
+    assert torch.equal(loss.write_value_target(rollout)["value_target"], clean)
+
+
 def test_td0_is_offered_and_gae_is_not():
     actor, value, _ = make_networks()
     loss = SHACLoss(actor, value).make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
@@ -244,11 +253,8 @@ def test_without_delay_the_target_is_the_critic_itself():
     for loss in (SHACLoss(actor, value, delay_value=False), ABPTLoss(actor, qvalue, delay_qvalue=False)):
         loss.make_value_estimator(gamma=GAMMA)
         before = loss.write_value_target(make_rollout(actor).detach())["value_target"].clone()
-        for parameter in loss.parameters():
-            parameter.data.add_(1.0)
+        getattr(loss, f"{loss.critic_name}_params").data.apply_(lambda parameter: parameter.add_(1.0))
         assert not torch.equal(loss.write_value_target(make_rollout(actor).detach())["value_target"], before)
-        for parameter in loss.parameters():
-            parameter.data.sub_(1.0)
 
 
 def test_keys_can_be_renamed():
@@ -322,6 +328,7 @@ def test_the_entropy_bonus_needs_the_log_probability():
     [
         ({"alpha": -1.0}, "alpha must be 'auto' or a number that is not negative, got -1.0"),
         ({"alpha": "automatic"}, "alpha must be 'auto'"),
+        ({"alpha": "auto", "alpha_init": 0.0}, "alpha_init must be positive, got 0.0"),
         ({"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
     ],
 )

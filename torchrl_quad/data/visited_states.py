@@ -1,4 +1,4 @@
-"""The buffer of visited states, from which horizons and resets can start (paper, section III-B)."""
+"""The buffer of visited states, from which horizons and resets can start (paper, section IV)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         self.state_keys = tuple(state_keys)
         super().__init__(
             storage=LazyTensorStorage(capacity, device=device),
-            generator=torch.Generator().manual_seed(seed),
+            generator=torch.Generator(device=device).manual_seed(seed),
         )
 
     def extend(self, tensordicts: TensorDictBase) -> Tensor:
@@ -63,6 +63,8 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         terminated = tensordicts.get("terminated", None)
         if terminated is not None:
             keep &= ~terminated.reshape(-1)
+        if not keep.any():
+            return torch.zeros(0, dtype=torch.int64)
         return super().extend(states[keep].clone())
 
     def initial_state(self, env: EnvBase, fraction: float = 0.9) -> TensorDictBase:
@@ -79,9 +81,11 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             ValueError: the fraction is not in [0, 1].
             RuntimeError: the buffer is empty.
         """
-        fresh = env.reset()
-        states = self._mixed(fresh.select(*self.state_keys), fraction)
-        return env.reset(states, set_state=True)
+        if hasattr(env, "sample_initial_state"):  # the task's own starts, whatever its resets draw from
+            fresh = TensorDict({"state": env.sample_initial_state(env.num_envs)}, env.batch_size)
+        else:
+            fresh = env.reset().select(*self.state_keys)
+        return env.reset(self._mixed(fresh, fraction), set_state=True)
 
     def source(self, env: EnvBase, fraction: float = 0.9) -> Callable[[int], TensorDictBase]:
         """What ``env.set_initial_state_source`` takes, so that resets inside a horizon start in visited states, too.
@@ -102,5 +106,5 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
                 "The visited-state buffer is empty. Fly a first horizon from env.reset() and extend the buffer with it."
             )
         visited = self.sample(fresh.numel()).select(*self.state_keys).to(fresh.device).reshape(fresh.shape)
-        pick = torch.rand(fresh.shape, generator=self._rng) < fraction
+        pick = torch.rand(fresh.shape, generator=self._rng, device=self._rng.device) < fraction
         return visited.where(pick.to(fresh.device), fresh)

@@ -23,15 +23,18 @@ class Setpoint(NamedTuple):
 class FlightController:
     """Rate controller and mixer with the nominal parameters of the drone.
 
-    The plant may differ (randomised, fitted): the controller keeps what it was built with, and no gradient flows into
-    that.
+    The plant may differ (randomised, fitted): the controller keeps a copy of what it was built with, and no gradient
+    flows into that.
+
+    Raises:
+        ValueError: the rotor layout cannot make thrust and torque about each axis.
     """
 
     def __init__(self, nominal: QuadrotorParams) -> None:
         nominal = nominal.detach()
         self.nominal = nominal
         self.rotors = Rotors(nominal)
-        self.mixer = torch.linalg.inv(self.rotors.allocation)
+        self.mixer = _inverse(self.rotors.allocation)
         self.thrust_min, self.thrust_max = thrust_limits(nominal)
         self.gain = nominal.inertia * nominal.rate_gain
         weight = nominal.mass * nominal.gravity
@@ -58,3 +61,13 @@ class FlightController:
         torque = torch.addcmul(torque, self.nominal.rate_damping, acceleration, value=-1.0)
         thrust = apply(self.mixer, torch.cat((setpoint.thrust, torque), -1))
         return self.rotors.speed(torch.minimum(torch.maximum(thrust, self.thrust_min), self.thrust_max))
+
+
+def _inverse(allocation: Tensor) -> Tensor:
+    inverse, info = torch.linalg.inv_ex(allocation)
+    if info.any() or not inverse.isfinite().all():
+        raise ValueError(
+            "drone: with these rotor_positions and rotor_spin the four rotors cannot make thrust and torque about each "
+            "axis on their own. Put them off one line, and let two of them spin each way."
+        )
+    return inverse

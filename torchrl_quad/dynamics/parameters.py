@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from importlib import resources
+from importlib.abc import Traversable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -72,11 +74,16 @@ class QuadrotorParams:
 
     def __post_init__(self) -> None:
         for name, value in self.fields().items():
+            value = torch.as_tensor(value)
             value = value if value.dim() else value.reshape(1)
             object.__setattr__(self, name, value)
             _check(name, value, "QuadrotorParams")
-        if not (self.rotor_speed_min < self.rotor_speed_max).all():
-            raise ValueError("QuadrotorParams: rotor_speed_min must be below rotor_speed_max.")
+        low, high = self.rotor_speed_min.detach(), self.rotor_speed_max.detach()
+        if not (low < high).all():
+            raise ValueError(
+                "QuadrotorParams: rotor_speed_min must be below rotor_speed_max, "
+                f"got {low.tolist()} and {high.tolist()}."
+            )
 
     def fields(self) -> dict[str, Tensor]:
         """The fields by name, in the order of their declaration."""
@@ -100,10 +107,18 @@ class QuadrotorParams:
         return self._map(lambda value: value.to(device=device, dtype=dtype))
 
     def detach(self) -> QuadrotorParams:
-        """The same values without gradient; itself where there is none to lose."""
-        if not any(value.requires_grad for value in self.fields().values()):
-            return self
-        return self._map(Tensor.detach)
+        """A copy of the values, without gradient."""
+        return self._map(lambda value: value.detach().clone())
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether any field does."""
+        return any(value.requires_grad for value in self.fields().values())
+
+    @staticmethod
+    def dim(name: str) -> int:
+        """The number of dimensions of a field of a single drone."""
+        return len(_FIELDS[name][0])
 
     def _map(self, function) -> QuadrotorParams:
         return QuadrotorParams(**{name: function(value) for name, value in self.fields().items()})
@@ -123,9 +138,9 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
     if isinstance(drone, Mapping):
         source, values = "drone", drone
     elif isinstance(drone, Path) or str(drone).endswith((".yaml", ".yml")):
-        source, values = str(drone), yaml.safe_load(Path(drone).read_text())
+        source, values = str(drone), _read(Path(drone))
     elif drone in available_drones():
-        source, values = f"{drone}.yaml", yaml.safe_load((_DRONES / f"{drone}.yaml").read_text())
+        source, values = f"{drone}.yaml", _read(_DRONES / f"{drone}.yaml")
     else:
         names = ", ".join(available_drones())
         raise ValueError(f"Unknown drone {drone!r}. Choose from: {names}; or give the path of a .yaml file.")
@@ -152,6 +167,15 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
 def available_drones() -> list[str]:
     """The names of the presets that ship with the package."""
     return sorted(entry.name.removesuffix(".yaml") for entry in _DRONES.iterdir() if entry.name.endswith(".yaml"))
+
+
+def _read(path: Traversable) -> Any:
+    if not path.is_file():
+        raise FileNotFoundError(f"No drone file at {path}. Presets go by name: {', '.join(available_drones())}.")
+    try:
+        return yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: not a YAML file: {error}") from error
 
 
 def _check(name: str, value: Tensor, source: str) -> None:

@@ -5,6 +5,7 @@ All functions broadcast over leading dimensions and have finite derivatives for 
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 
 def multiply(p: Tensor, q: Tensor) -> Tensor:
@@ -19,6 +20,11 @@ def multiply(p: Tensor, q: Tensor) -> Tensor:
 def conjugate(q: Tensor) -> Tensor:
     """The inverse rotation of a unit quaternion, (*, 4)."""
     return torch.cat((q[..., :1], -q[..., 1:]), -1)
+
+
+def identity(like: Tensor) -> Tensor:
+    """No rotation, (*, 4), for each of the leading dimensions of a tensor (*, k)."""
+    return pad(torch.ones_like(like[..., :1]), (0, 3))
 
 
 def normalize(q: Tensor) -> Tensor:

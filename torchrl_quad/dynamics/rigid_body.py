@@ -1,4 +1,4 @@
-"""The rigid body: Newton and Euler with drag, in the frames of the paper's section II-B."""
+"""The rigid body: Newton and Euler with drag, in the frames of the paper's section III-B."""
 
 from typing import NamedTuple
 

@@ -12,7 +12,7 @@ from torchrl_quad.dynamics.parameters import QuadrotorParams
 class Rotors:
     """The four rotors of a drone, with what follows from its parameters worked out once.
 
-    The thrust map k2 w^2 + k1 w + k0 (paper, section II-B) is kept as k2 (w - w0)^2 + f0, which is quick both ways.
+    The thrust map k2 w^2 + k1 w + k0 (paper, section III-B) is kept as k2 (w - w0)^2 + f0, which is quick both ways.
     """
 
     def __init__(self, params: QuadrotorParams) -> None:

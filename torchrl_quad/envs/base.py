@@ -20,12 +20,16 @@ from torchrl_quad.dynamics import (
     QuadrotorState,
     control_step,
     load_drone,
+    quaternion,
 )
 
 State = dict[str, Tensor]  # the Markov state by name, each entry (num_envs, ...)
 
-# Beyond these the model means nothing and its numbers may overflow: such a state ends its episode.
+# Beyond these the model means nothing, and its numbers or their derivatives may overflow: the episode ends.
+_MAX_VALUE = 1e6  # of any entry of the state, in its unit
 _MAX_SPEED = 1e3  # [m/s] and [rad/s]
+_MAX_ROTOR_SPEED = 2.0  # of the nominal drone's rotor_speed_max
+_MAX_NORM_ERROR = 0.1  # of the quaternion's squared norm
 
 
 class QuadrotorEnv(EnvBase):
@@ -46,6 +50,9 @@ class QuadrotorEnv(EnvBase):
     ``action_queue``               (delay, 4)   commands on their way, oldest first; absent when the delay is 0
     ``step``                       (1)          control steps since the start of the episode
     =============================  ===========  =========================================================
+
+    ``env.params`` is the drone that flies and ``env.nominal`` what its controller believes. To change the drone, assign
+    ``env.params = env.params.replace(mass=0.5)``; a tensor that requires grad can so be fitted.
 
     The action is (4) in [-1, 1]: collective thrust (-1..1 maps to 0..max_thrust_to_weight times the nominal weight),
     then roll, pitch and yaw rate in units of the drone's max_body_rate.
@@ -89,7 +96,8 @@ class QuadrotorEnv(EnvBase):
     ) -> None:
         _require(num_envs >= 1, f"num_envs must be at least 1, got {num_envs}.")
         _require(dtype in (torch.float32, torch.float64), f"dtype must be torch.float32 or torch.float64, got {dtype}.")
-        _require(dt > 0, f"dt must be positive, got {dt}.")
+        _require(0 < dt < math.inf, f"dt must be positive and finite, got {dt}.")
+        _require(0 < control_dt < math.inf, f"control_dt must be positive and finite, got {control_dt}.")
         substeps = round(control_dt / dt)
         _require(
             substeps >= 1 and math.isclose(substeps * dt, control_dt, rel_tol=1e-6),
@@ -113,12 +121,19 @@ class QuadrotorEnv(EnvBase):
         self.initial_state_source: Callable[[int], TensorDictBase] | None = None
         self._transition_function = self._transition
         params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone)
-        self.params = params.to(device=self.device, dtype=dtype)
-        self.controller = FlightController(self.params)
-        self.set_seed(seed)
+        for name, value in params.fields().items():
+            batch = value.shape[0] if value.dim() > params.dim(name) else 1
+            _require(
+                batch in (1, num_envs), f"drone: field {name!r} is for {batch} environments, and num_envs={num_envs}."
+            )
+        params = params.to(device=self.device, dtype=dtype)
+        self.controller = FlightController(params)
+        self.params = params if params.requires_grad else self.nominal
+        self._set_seed(seed)
         # Stands in for a state that is not finite, so that its environment computes on with harmless numbers.
         self._fallback = self.sample_initial_state(num_envs)
         self._make_specs()
+        self.set_seed(seed)
 
     # -- what a task says ----------------------------------------------------------------------------------------------
 
@@ -159,7 +174,7 @@ class QuadrotorEnv(EnvBase):
         n = position.shape[0]
         return {
             "position": position,
-            "quaternion": self.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            "quaternion": quaternion.identity(torch.zeros_like(position[:, :1])),
             "velocity": torch.zeros_like(position),
             "angular_velocity": torch.zeros_like(position),
             "rotor_speed": self.controller.hover_speed.expand(n, 4).clone(),
@@ -169,7 +184,8 @@ class QuadrotorEnv(EnvBase):
         """Draw n complete Markov states from the task's own starts."""
         state = self.initial_state(n)
         if self.action_delay:
-            state["action_queue"] = self.hover_action.expand(n, self.action_delay, 4).clone()
+            hover = self.hover_action.expand(n, 4).unsqueeze(1)
+            state["action_queue"] = hover.expand(n, self.action_delay, 4).clone()
         state["step"] = torch.zeros(n, 1, dtype=torch.int64, device=self.device)
         return state
 
@@ -220,14 +236,15 @@ class QuadrotorEnv(EnvBase):
     def to(self, device: torch.device | str) -> QuadrotorEnv:
         """Move the environment to a device, and start its random generator again from its seed."""
         super().to(device)
-        self.params = self.params.to(device=self.device)
+        follows = self.params is self.nominal
         self.controller = FlightController(self.nominal.to(device=self.device))
+        self.params = self.nominal if follows else self.params.to(device=self.device)
         self._fallback = {key: value.to(self.device) for key, value in self._fallback.items()}
         self.set_seed(self._seed)
         return self
 
     def set_initial_state_source(self, source: Callable[[int], TensorDictBase] | None) -> None:
-        """Set :attr:`initial_state_source`; as a method it can be called through a TransformedEnv as well.
+        """Set :attr:`initial_state_source`, also through a TransformedEnv, where assigning the attribute would not.
 
         ``source(n)`` returns n complete states (the content of ``td["state"]``); resets then start from them. None
         goes back to the task's own starts.
@@ -237,12 +254,19 @@ class QuadrotorEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self._seed = seed
         self.rng = torch.Generator(device=self.device)
-        if seed is not None:
+        if seed is None:
+            self.rng.seed()
+        else:
             self.rng.manual_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False) -> TensorDictBase:
-        if set_state and tensordict is not None and "state" in tensordict:
-            state = self._checked_state(tensordict.get("state"), "reset(..., set_state=True)")
+        if set_state:
+            source = "reset(..., set_state=True)"
+            _require(
+                tensordict is not None and "state" in tensordict,
+                f'{source} needs a tensordict with the state to set under "state"; got none.',
+            )
+            state = self._checked_state(tensordict.get("state"), source)
         elif self.initial_state_source is not None:
             state = self._checked_state(self.initial_state_source(self.num_envs), "initial_state_source")
         else:
@@ -293,15 +317,16 @@ class QuadrotorEnv(EnvBase):
         )
         state = {**state, **flown._asdict(), **queue, "step": state["step"] + 1}
         state, still_valid = self._replace_invalid(state)
-        terms = self.reward_terms(state)
-        terminated = self.is_terminated(state) | ~valid | ~still_valid
+        valid = valid & still_valid
+        terms = {name: torch.where(valid, term, 0.0) for name, term in self.reward_terms(state).items()}
+        terminated = self.is_terminated(state) | ~valid
         truncated = state["step"] >= self.max_episode_steps
         return {
             "observation": self._observe(state),
             "state": state,
             "reward_terms": terms,
             "reward": sum(terms.values()),
-            "success": self.is_success(state),
+            "success": self.is_success(state) & valid,
             "done": terminated | truncated,
             "terminated": terminated,
             "truncated": truncated,
@@ -316,13 +341,21 @@ class QuadrotorEnv(EnvBase):
     def _replace_invalid(self, state: State, *inputs: Tensor) -> tuple[State, Tensor]:
         """Put the fallback in the place of states that are not finite, or beyond what the model can compute.
 
-        Selecting before the physics keeps both values and gradients of the others clean: 0 * inf never happens.
+        Selecting before the physics keeps the gradients of the others clean: a gradient of zero is never multiplied by
+        an infinite derivative.
         """
         with torch.no_grad():
             everything = [*(x for x in state.values() if x.is_floating_point()), *inputs]
-            total = torch.cat([x.flatten(1) for x in everything], -1).sum(-1, keepdim=True)
-            speed = torch.cat((state["velocity"], state["angular_velocity"]), -1).abs().amax(-1, keepdim=True)
-            valid = total.isfinite() & (speed < _MAX_SPEED)
+            bounded = (
+                (torch.cat([x.flatten(1) for x in everything], -1), _MAX_VALUE),
+                (torch.cat((state["velocity"], state["angular_velocity"]), -1), _MAX_SPEED),
+                (state["rotor_speed"] / self.nominal.rotor_speed_max, _MAX_ROTOR_SPEED),
+                (state["quaternion"].square().sum(-1, keepdim=True) - 1.0, _MAX_NORM_ERROR),
+            )
+            # NaN compares as false, and so counts as beyond every bound.
+            valid = torch.cat([x.abs().amax(-1, keepdim=True) < bound for x, bound in bounded], -1).all(
+                -1, keepdim=True
+            )
         replaced = {
             key: torch.where(valid.view(-1, *[1] * (x.dim() - 1)), x, self._fallback[key]) for key, x in state.items()
         }
@@ -341,7 +374,7 @@ class QuadrotorEnv(EnvBase):
             value = state.get(key)
             shape = (self.num_envs, *like.shape[1:])
             _require(value.shape == shape, f"{source}: state {key!r} has shape {tuple(value.shape)}, expected {shape}.")
-            checked[key] = value.to(device=like.device, dtype=like.dtype)
+            checked[key] = value.to(device=like.device, dtype=like.dtype, copy=True)
         return checked
 
     def _tensordict(self, entries: dict[str, Any]) -> TensorDict:

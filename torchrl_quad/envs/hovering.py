@@ -51,7 +51,7 @@ class HoveringEnv(QuadrotorEnv):
 
     def reward_terms(self, state: State) -> State:
         distance = self.distance(state)
-        level = self.tensor([1.0, 0.0, 0.0, 0.0])
+        level = quaternion.identity(state["quaternion"])
         return {
             "survival": torch.full_like(distance, self.survival_reward),
             "position": -self.position_weight * distance,

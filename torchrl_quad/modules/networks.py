@@ -55,6 +55,7 @@ def make_actor(
     net = _network(env, in_keys, 2 * spec.shape[-1], num_cells, activation, input_scale)
     with torch.no_grad():
         net.mlp[-1].weight.mul_(0.01)
+        net.mlp[-1].bias.zero_()
     params = TensorDictModule(
         nn.Sequential(net, NormalParamExtractor(scale_mapping=f"biased_softplus_{scale_init}")),
         in_keys=list(in_keys),

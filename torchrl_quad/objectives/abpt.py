@@ -16,7 +16,7 @@ from torchrl_quad.objectives.pathwise import PathwiseCriticLoss
 
 
 class ABPTLoss(PathwiseCriticLoss):
-    """Amended backpropagation through time: the N-step and the 0-step return together (paper, equations 6 to 8).
+    """Amended backpropagation through time: the N-step and the 0-step return together (paper, equations 13 to 15).
 
     For each segment of a rollout, J = (J_N + J_0) / 2 with
 
@@ -83,7 +83,7 @@ class ABPTLoss(PathwiseCriticLoss):
         )
 
     def loss_qvalue(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The critics' loss (paper, equation 9), summed over critics, on a rollout or on samples with their targets.
+        """The critics' loss (paper, equation 16), summed over critics, on a rollout or on samples with their targets.
 
         Returns:
             the loss, and a dictionary of what is worth logging.

@@ -78,6 +78,8 @@ class PathwiseLoss(LossModule):
             raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}.")
         if alpha != "auto" and not (isinstance(alpha, int | float) and alpha >= 0):
             raise ValueError(f"alpha must be 'auto' or a number that is not negative, got {alpha!r}.")
+        if alpha_init <= 0:
+            raise ValueError(f"alpha_init must be positive, got {alpha_init}; set alpha to 0 for no entropy bonus.")
         self._in_keys = None
         self.reduction = reduction
         self.convert_to_functional(actor_network, "actor_network")
@@ -96,7 +98,7 @@ class PathwiseLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """The keys that :meth:`forward` reads."""
+        """The keys of a rollout that :meth:`forward` may be given; more do no harm."""
         if self._in_keys is None:
             keys = self.tensor_keys
             names = {keys.action, *self._network_in_keys()}
@@ -253,7 +255,7 @@ class PathwiseCriticLoss(PathwiseLoss):
         return TensorDict({**losses, **metadata, **critic_metadata}, [])
 
     def write_value_target(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the TD(lambda) target of each step (paper, equations 10 and 11) into a rollout, and return it.
+        """Write the TD(lambda) target of each step (paper, equations 17 and 18) into a rollout, and return it.
 
         Each step's next value comes from the target network; a truncated step bootstraps, a terminated one does not,
         and the horizon's last step bootstraps unless it terminated. The critic's loss uses the entry when it finds it,
@@ -262,6 +264,8 @@ class PathwiseCriticLoss(PathwiseLoss):
         data = tensordict.detach()
         with torch.no_grad():
             next_value = self._value(data.get("next"), self._critic_params(target=True))
+            terminated = data.get(("next", self.tensor_keys.terminated))
+            next_value = torch.where(terminated, 0.0, next_value)  # also where the last state was not finite
             target = self.value_estimator.value_estimate(data, next_value=next_value)
         tensordict.set(self.tensor_keys.value_target, target)
         return tensordict
@@ -282,7 +286,7 @@ class PathwiseCriticLoss(PathwiseLoss):
         prediction = self._critics(data, getattr(self, f"{self.critic_name}_params"))
         error = (prediction - target).square().sum(0)
         with torch.no_grad():
-            residual = (target - prediction).var() / target.var().clamp_min(1e-12)
+            residual = (target - prediction).var(correction=0) / target.var(correction=0).clamp_min(1e-12)
         return self._reduce_loss(error, tensordict), {
             "pred_value": prediction.detach().mean(),
             "target_value": target.mean(),

@@ -54,7 +54,7 @@ class SHACLoss(PathwiseCriticLoss):
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The critic's loss (paper, equation 9) on a rollout, or on samples of one that holds its targets.
+        """The critic's loss (paper, equation 16) on a rollout, or on samples of one that holds its targets.
 
         Returns:
             the loss, and a dictionary of what is worth logging.

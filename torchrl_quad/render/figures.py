@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from tensordict import TensorDictBase
 
+from torchrl_quad.envs import QuadrotorEnv
+
 _INK, _BLUE, _RED = "#222222", "#2f6db5", "#c8452f"
 
 
@@ -22,8 +24,7 @@ def plot_flight(rollout: TensorDictBase, path: str | Path, *, num_envs: int = 12
     """
     plt = _pyplot()
     flight = rollout[:num_envs].detach().cpu()
-    done = flight["next", "done"]
-    first = ((done.cumsum(1) - done.int()) == 0).squeeze(-1).numpy()
+    first = QuadrotorEnv.first_episode(flight).squeeze(-1).numpy()
     position = flight["next", "state", "position"].numpy()
     start = flight["state", "position"][:, 0].numpy()
     target = flight["next", "state", "target"].numpy()
@@ -41,9 +42,12 @@ def plot_flight(rollout: TensorDictBase, path: str | Path, *, num_envs: int = 12
         decay.plot(time[first[i]], 100 * distance[i, first[i]], color=color, linewidth=1.2)
     space.scatter(*target[0, 0], color=_RED, marker="*", s=140, label="target", zorder=10)
     space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="Flights from fresh starts")
+    for axis in (space.xaxis, space.yaxis, space.zaxis):
+        axis.set_major_locator(plt.MaxNLocator(4))
     space.legend(loc="upper left", frameon=False)
     decay.axhline(10, color=_RED, linestyle="--", linewidth=1, label="success: 10 cm over the last second")
     decay.set(xlabel="time [s]", ylabel="distance to the target [cm]", yscale="log", title="Distance to the target")
+    decay.yaxis.set_major_formatter("{x:g}")
     decay.legend(frameon=False)
     decay.grid(alpha=0.3)
     figure.savefig(path, dpi=130)
@@ -79,6 +83,7 @@ def plot_learning_curve(metrics: str | Path, path: str | Path) -> None:
         upper.set_xlabel("control steps", color=_INK)
         if name == "eval/error":
             axis.set_yscale("log")
+            axis.yaxis.set_major_formatter("{x:g}")
     figure.savefig(path, dpi=130)
     plt.close(figure)
 

@@ -1,11 +1,16 @@
 """Training that is long enough to succeed."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
+from torchrl.envs.utils import ExplorationType
+
+from torchrl_quad import HoveringEnv, differentiable_rollout
 
 ROOT = Path(__file__).parent.parent
 
@@ -17,3 +22,16 @@ def test_every_recipe_learns_to_hover(recipe, tmp_path):
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["success"] >= 0.99
     assert summary["error"] < 0.05
+
+
+@pytest.mark.slow
+def test_the_program_of_the_readme_learns_to_hover():
+    program = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
+    names = {}
+    exec(program, names)
+    env = HoveringEnv(num_envs=256, seed=99)
+    with torch.no_grad():
+        flight, _ = differentiable_rollout(
+            env, names["actor"], None, 256, exploration_type=ExplorationType.DETERMINISTIC
+        )
+    assert env.episode_metrics(flight)["error"].median() < 0.1

@@ -42,7 +42,7 @@ def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
         ({"rotor_spin": [1, 1, 0, -1]}, r"mine.yaml: field 'rotor_spin' must be \+1 or -1"),
         ({"thrust_map": [0.0, 1.0, 0.0]}, r"mine.yaml: field 'thrust_map' must be finite, k2 positive"),
         ({"mass": "heavy"}, r"mine.yaml: field 'mass' is not a number or a list of numbers: 'heavy'"),
-        ({"thrust_map": [4e-7, -5e-3, 0.0]}, r"thrust_map must not fall with the rotor speed"),
+        ({"thrust_map": [4e-7, -5e-3, 0.0]}, r"thrust_map must not fall with rotor speed"),
         ({"rotor_speed_min": 4000.0}, r"rotor_speed_min must be below rotor_speed_max, got \[4000.0\] and \[3500.0\]"),
     ],
 )

@@ -88,7 +88,7 @@ class QuadrotorParams:
         k2, k1, _ = self.thrust_map.detach().split(1, -1)
         if not (k1 + 2.0 * k2 * low >= 0).all():
             raise ValueError(
-                "QuadrotorParams: thrust_map must not fall with the rotor speed: k1 + 2 k2 rotor_speed_min must be zero "
+                "QuadrotorParams: thrust_map must not fall with rotor speed: k1 + 2 k2 rotor_speed_min must be zero "
                 f"or positive, got {(k1 + 2.0 * k2 * low).tolist()}."
             )
 

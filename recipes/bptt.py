@@ -16,7 +16,7 @@ def main(cfg: DictConfig) -> None:
     loss = BPTTLoss(actor, **cfg.loss).make_value_estimator(gamma=cfg.gamma)
     optimizer, schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
 
-    run = Run(cfg, env, actor, loss=loss)
+    run = Run(cfg, actor, loss=loss)
     carry = env.reset()
     for _ in run:
         rollout, carry = differentiable_rollout(env, actor, carry, cfg.horizon)

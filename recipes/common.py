@@ -109,14 +109,19 @@ def evaluate(env: QuadrotorEnv, actor: TensorDictModuleBase) -> tuple[dict[str, 
 class Run:
     """The bookkeeping of a training run: ``for _ in run: ...; run.record(...)``.
 
-    Counts steps and seconds of training, evaluates every ``eval.interval`` iterations, and writes a row of metrics each
-    time. Leaves in the run's folder: ``metrics.csv``, ``checkpoint.pt``, ``summary.json``, ``learning_curve.png`` and
-    ``flight.png``. Set-up, compilation and the final evaluation are outside the seconds.
+    Counts steps and seconds of training, evaluates every ``eval.interval`` iterations, and each time writes a row of
+    metrics and a checkpoint. Leaves in the run's folder: ``metrics.csv``, ``checkpoint.pt``, ``summary.json``,
+    ``learning_curve.png`` and ``flight.png``. Set-up, compilation and the final evaluation are outside the seconds.
+
+    Raises:
+        FileExistsError: the folder holds the metrics of another run.
     """
 
-    def __init__(self, cfg: DictConfig, env: QuadrotorEnv, actor: TensorDictModuleBase, **modules: nn.Module) -> None:
-        self.cfg, self.env, self.actor, self.modules = cfg, env, actor, {"actor": actor, **modules}
+    def __init__(self, cfg: DictConfig, actor: TensorDictModuleBase, **modules: nn.Module) -> None:
+        self.cfg, self.actor, self.modules = cfg, actor, {"actor": actor, **modules}
         self.folder = Path(HydraConfig.get().runtime.output_dir)
+        if (self.folder / "metrics.csv").exists():
+            raise FileExistsError(f"{self.folder} holds the results of another run. Choose another hydra.run.dir.")
         self.iterations = iterations(cfg)
         self.steps_per_iteration = cfg.num_envs * cfg.horizon
         self.eval_env = make_env(
@@ -142,9 +147,11 @@ class Run:
                 yield iteration
                 bar.update(self.steps_per_iteration)
                 if (iteration + 1) % self.cfg.eval.interval == 0 or iteration + 1 == self.iterations:
-                    metrics = self._evaluate(self.eval_env)
+                    self.eval_env.set_seed(self.cfg.eval.seed)
+                    metrics, _ = evaluate(self.eval_env, self.actor)
                     self.seconds = time.perf_counter() - start
                     self._write_row(iteration + 1, metrics)
+                    self._save((iteration + 1) * self.steps_per_iteration)
                     bar.set_postfix(
                         {"return": f"{metrics['eval/return']:.2f}", "success": f"{metrics['eval/success']:.0%}"}
                     )
@@ -158,21 +165,12 @@ class Run:
                 float(value.detach()) if isinstance(value, Tensor) else value
             )
 
-    def save(self, path: Path) -> None:
+    def _save(self, steps: int) -> None:
         """Write networks and configuration, all or nothing."""
-        state = {
-            "config": OmegaConf.to_yaml(self.cfg, resolve=True),
-            "steps": self.iterations * self.steps_per_iteration,
-            **{name: module.state_dict() for name, module in self.modules.items()},
-        }
-        temporary = path.with_suffix(".tmp")
-        torch.save(state, temporary)
-        os.replace(temporary, path)
-
-    def _evaluate(self, env: QuadrotorEnv) -> dict[str, float]:
-        env.set_seed(self.cfg.eval.seed)
-        metrics, _ = evaluate(env, self.actor)
-        return metrics
+        weights = {name: module.state_dict() for name, module in self.modules.items()}
+        temporary = self.folder / "checkpoint.tmp"
+        torch.save({"config": OmegaConf.to_yaml(self.cfg, resolve=True), "steps": steps, **weights}, temporary)
+        os.replace(temporary, self.folder / "checkpoint.pt")
 
     def _warm_up(self) -> None:
         """Compile both variants of the step, with gradients and without, before the clock starts; change nothing."""
@@ -204,8 +202,7 @@ class Run:
                 self.logger.log_scalar(name, value, step=steps)
 
     def _finish(self) -> None:
-        """Checkpoint, final evaluation on fresh starts, pictures, summary."""
-        self.save(self.folder / "checkpoint.pt")
+        """Final evaluation on fresh starts, pictures, summary."""
         summary, flight = final_evaluation(self.cfg, self.actor)
         summary |= {"steps": self.iterations * self.steps_per_iteration, "seconds": round(self.seconds, 2)}
         write_json(self.folder / "summary.json", summary)

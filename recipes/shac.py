@@ -21,7 +21,7 @@ def main(cfg: DictConfig) -> None:
     critic_parameters = loss.value_network_params.parameters()
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
-    run = Run(cfg, env, actor, loss=loss)
+    run = Run(cfg, actor, loss=loss)
     carry = env.reset()
     for _ in run:
         # The actor: up the return of one horizon and the value of its end, through the dynamics.

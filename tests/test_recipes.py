@@ -72,6 +72,14 @@ def test_a_missing_or_foreign_checkpoint_is_named(tmp_path):
     assert "foreign.pt is not a checkpoint that these recipes can read" in fails(tmp_path / "foreign.pt")
 
 
+def test_a_second_run_does_not_write_into_the_results_of_the_first(tmp_path):
+    train("bptt", tmp_path)
+    command = (sys.executable, "recipes/bptt.py", *SMALL, f"hydra.run.dir={tmp_path}")
+    failed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert "holds the results of another run. Choose another hydra.run.dir." in failed.stderr
+    assert len(read(tmp_path)) == 2
+
+
 def test_two_runs_with_one_seed_are_equal_and_another_seed_differs(tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         train("abpt", tmp_path / name, f"seed={seed}")

@@ -33,12 +33,13 @@ def make_actor(
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
     input_scale: float = 10.0,
+    action_init: Tensor | None = None,
     scale_init: float = 0.1,
     return_log_prob: bool = False,
 ) -> ProbabilisticActor:
     """A tanh-Gaussian policy a = tanh(mu(s) + sigma(s) noise), stretched to the bounds of the action.
 
-    Its last layer starts near zero: the first actions are close to the middle of their range, with noise of about
+    The weights of its last layer start near zero: the first actions are close to ``action_init``, with noise of about
     ``scale_init`` (before the tanh, in units of half the range).
 
     Args:
@@ -48,20 +49,27 @@ def make_actor(
         activation: of the hidden layers; smooth ones give smooth policy gradients.
         input_scale: multiplies the input. The tasks observe a tenth of their SI units, as the paper does, which makes
             for inputs that are too small to learn from quickly.
+        action_init: the mean action at the start, (k), strictly between the bounds; by default ``env.hover_action``
+            where the environment has one, so that a drone does not begin by flying away, and the middle of the range
+            elsewhere.
         scale_init: standard deviation at the start.
         return_log_prob: write the log-probability of the action as well, which an entropy bonus and PPO need.
     """
     spec = env.action_spec_unbatched
+    low, high = spec.space.low, spec.space.high
+    middle = 0.5 * (low + high)
+    if action_init is None:
+        action_init = getattr(env, "hover_action", middle).reshape(-1, spec.shape[-1]).mean(0)
     net = _network(env, in_keys, 2 * spec.shape[-1], num_cells, activation, input_scale)
     with torch.no_grad():
         net.mlp[-1].weight.mul_(0.01)
         net.mlp[-1].bias.zero_()
+        net.mlp[-1].bias[: spec.shape[-1]] = torch.atanh((action_init - middle) / (0.5 * (high - low)))
     params = TensorDictModule(
         nn.Sequential(net, NormalParamExtractor(scale_mapping=f"biased_softplus_{scale_init}")),
         in_keys=list(in_keys),
         out_keys=["loc", "scale"],
     )
-    low, high = spec.space.low, spec.space.high
     bounds = {} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high}
     return ProbabilisticActor(
         params,

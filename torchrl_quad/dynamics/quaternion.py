@@ -17,11 +17,6 @@ def multiply(p: Tensor, q: Tensor) -> Tensor:
     return torch.cat((scalar, vector), -1)
 
 
-def conjugate(q: Tensor) -> Tensor:
-    """The inverse rotation of a unit quaternion, (*, 4)."""
-    return torch.cat((q[..., :1], -q[..., 1:]), -1)
-
-
 def identity(like: Tensor) -> Tensor:
     """No rotation, (*, 4), for each of the leading dimensions of a tensor (*, k)."""
     return pad(torch.ones_like(like[..., :1]), (0, 3))

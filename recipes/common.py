@@ -26,12 +26,28 @@ from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.render import plot_flight, plot_learning_curve
 
 
+UNITS = {  # how the metrics of an evaluation are printed: factor and unit
+    "position_error": (100, "cm (median)"),
+    "tracking_rmse": (100, "cm (median)"),
+    "landing_speed": (1, "m/s"),
+    "gates_passed": (1, "gates"),
+    "lap_time": (1, "s"),
+    "return": (1, ""),
+}
+
+
 def set_up(cfg: DictConfig) -> tuple[QuadrotorEnv, TensorDictModuleBase]:
     """Seed everything, and build the environment and the policy of a configuration."""
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
-    env = make_env(cfg.task, num_envs=cfg.num_envs, device=cfg.device, seed=cfg.seed, compile=cfg.compile, **cfg.env)
+    env = build_env(cfg, cfg.num_envs, cfg.seed, compile=cfg.compile)
     return env, make_policy(cfg, env)
+
+
+def build_env(cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = False) -> QuadrotorEnv:
+    """The environment of a configuration."""
+    options = OmegaConf.to_container(cfg.env, resolve=True)
+    return make_env(cfg.task, num_envs=num_envs, device=cfg.device, seed=seed, compile=compile, **options)
 
 
 def make_policy(cfg: DictConfig, env: QuadrotorEnv) -> TensorDictModuleBase:
@@ -90,14 +106,14 @@ def evaluate(env: QuadrotorEnv, actor: TensorDictModuleBase) -> tuple[dict[str, 
     """One episode of the deterministic policy from a fresh start in every environment.
 
     Returns:
-        metrics by name (the mean over episodes, the median for ``error``), and the flight.
+        metrics by name, each the mean over the episodes that have one (the median of errors), and the flight.
     """
     with torch.no_grad():
         flight, _ = differentiable_rollout(
             env, actor, None, env.max_episode_steps, exploration_type=ExplorationType.DETERMINISTIC
         )
     metrics = {
-        f"eval/{name}": (value.median() if name == "error" else value.mean()).item()
+        f"eval/{name}": (value.nanmedian() if name in ("position_error", "tracking_rmse") else value.nanmean()).item()
         for name, value in env.episode_metrics(flight).items()
     }
     first = env.first_episode(flight)
@@ -124,9 +140,7 @@ class Run:
             raise FileExistsError(f"{self.folder} holds the results of another run. Choose another hydra.run.dir.")
         self.iterations = iterations(cfg)
         self.steps_per_iteration = cfg.num_envs * cfg.horizon
-        self.eval_env = make_env(
-            cfg.task, num_envs=cfg.num_envs, device=cfg.device, seed=cfg.eval.seed, compile=cfg.compile, **cfg.env
-        )
+        self.eval_env = build_env(cfg, cfg.num_envs, cfg.eval.seed, compile=cfg.compile)
         self.logger = None
         if cfg.logger.backend:
             wandb = {"mode": cfg.logger.mode, "project": cfg.logger.project, "config": OmegaConf.to_container(cfg)}
@@ -222,7 +236,7 @@ def final_evaluation(
     cfg: DictConfig, actor: TensorDictModuleBase, episodes: int = 256, seed: int = 2_000_000
 ) -> tuple[dict[str, Any], TensorDictBase]:
     """The deterministic policy over fresh episodes: a summary, and the flight."""
-    env = make_env(cfg.task, num_envs=episodes, device=cfg.device, seed=seed, **cfg.env)
+    env = build_env(cfg, episodes, seed)
     metrics, flight = evaluate(env, actor)
     summary = {"task": cfg.task, "algorithm": cfg.algorithm, "seed": cfg.seed, "episodes": episodes}
     return summary | {name.removeprefix("eval/"): v for name, v in metrics.items() if name.startswith("eval/")}, flight
@@ -241,7 +255,7 @@ def load_policy(checkpoint: Path, device: str = "cpu") -> tuple[DictConfig, Tens
         state = torch.load(checkpoint, map_location=device, weights_only=True)
         cfg = OmegaConf.create(state["config"])
         cfg.device = device
-        actor = make_policy(cfg, make_env(cfg.task, num_envs=1, device=device, **cfg.env))
+        actor = make_policy(cfg, build_env(cfg, 1, 0))
         actor.load_state_dict(state["actor"])
     except Exception as error:
         raise ValueError(f"{checkpoint} is not a checkpoint that these recipes can read: {error}") from error
@@ -262,9 +276,9 @@ def print_summary(summary: dict[str, Any], folder: Path | None = None) -> None:
     )
     print(f"  success       {summary['success']:.1%}")
     print(f"  crashes       {summary['crash']:.1%}")
-    if "error" in summary:
-        print(f"  median error  {100 * summary['error']:.2f} cm")
-    print(f"  return        {summary['return']:.2f}")
+    for name, (scale, unit) in UNITS.items():
+        if name in summary:
+            print(f"  {name.replace('_', ' '):13s} {scale * summary[name]:.2f} {unit}")
     if "seconds" in summary:
         print(f"  training      {summary['steps']:,} steps in {summary['seconds']:.1f} s")
     if folder is not None:

@@ -64,12 +64,12 @@ def test_an_unknown_preset_lists_the_known_ones():
 def test_a_file_that_is_no_mapping_is_refused(tmp_path):
     path = tmp_path / "list.yaml"
     path.write_text("- 1\n- 2\n")
-    with pytest.raises(ValueError, match="expected a mapping of field names to numbers, got list"):
+    with pytest.raises(ValueError, match="expected a mapping of names to values, got list"):
         load_drone(path)
 
 
 def test_a_file_that_is_missing_or_no_yaml_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="No drone file at .*none.yaml. Presets go by name: crazyflie"):
+    with pytest.raises(FileNotFoundError, match="No drone file at .*none.yaml. Choose from: crazyflie"):
         load_drone(tmp_path / "none.yaml")
     (tmp_path / "bad.yaml").write_text("mass: [1")
     with pytest.raises(ValueError, match="bad.yaml: not a YAML file"):

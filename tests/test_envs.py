@@ -407,5 +407,5 @@ def test_episode_metrics_judge_the_first_episode_by_its_last_second():
     metrics = env.episode_metrics(flight)
     assert metrics["success"].tolist() == [1.0, 0.0, 0.0]
     assert metrics["crash"].tolist() == [0.0, 0.0, 1.0]
-    assert metrics["error"].tolist() == pytest.approx([0.0, 0.2, 4.6], abs=0.1)
+    assert metrics["position_error"].tolist() == pytest.approx([0.0, 0.2, 4.6], abs=0.1)
     assert metrics["return"].tolist() == pytest.approx([6.0, 60 * (0.1 - 0.2 * 0.1 / 9), 0.04], abs=0.01)

@@ -21,7 +21,7 @@ def test_every_recipe_learns_to_hover(recipe, tmp_path):
     subprocess.run([sys.executable, f"recipes/{recipe}.py", f"hydra.run.dir={tmp_path}"], cwd=ROOT, check=True)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["success"] >= 0.99
-    assert summary["error"] < 0.05
+    assert summary["position_error"] < 0.05
 
 
 @pytest.mark.slow
@@ -34,4 +34,4 @@ def test_the_program_of_the_readme_learns_to_hover():
         flight, _ = differentiable_rollout(
             env, names["actor"], None, 256, exploration_type=ExplorationType.DETERMINISTIC
         )
-    assert env.episode_metrics(flight)["error"].median() < 0.1
+    assert env.episode_metrics(flight)["position_error"].median() < 0.1

@@ -41,7 +41,7 @@ def test_a_recipe_trains_and_leaves_what_it_promises(recipe, tmp_path):
     rows = read(tmp_path)
     assert [int(row["iteration"]) for row in rows] == [2, 4]
     assert [int(row["steps"]) for row in rows] == [48, 96]
-    names = {"train/loss_actor", "grad/actor", "eval/return", "eval/success", "eval/error", "reward/position"}
+    names = {"train/loss_actor", "grad/actor", "eval/return", "eval/success", "eval/position_error", "reward/position"}
     assert names <= set(rows[0])
     assert all(math.isfinite(float(value)) for row in rows for value in row.values())
     for picture in ("learning_curve.png", "flight.png"):

@@ -20,7 +20,7 @@ def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(tm
 
 def test_a_learning_curve_is_drawn_from_its_csv(tmp_path):
     (tmp_path / "metrics.csv").write_text(
-        "steps,time/seconds,eval/return,eval/success,eval/error\n100,1.0,5.0,0.0,1.0\n200,2.0,20.0,1.0,0.02\n"
+        "steps,time/seconds,eval/return,eval/success,eval/position_error\n100,1.0,5.0,0.0,1.0\n200,2.0,20.0,1.0,0.02\n"
     )
     plot_learning_curve(tmp_path / "metrics.csv", tmp_path / "curve.png")
     assert (tmp_path / "curve.png").stat().st_size > 10_000

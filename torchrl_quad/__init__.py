@@ -2,7 +2,7 @@
 
 from torchrl_quad.data import VisitedStateBuffer, differentiable_rollout
 from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
-from torchrl_quad.envs import HoveringEnv, QuadrotorEnv, make_env
+from torchrl_quad.envs import HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
 from torchrl_quad.modules import make_actor, make_qvalue, make_value
 from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss
 
@@ -12,13 +12,17 @@ __all__ = [
     "ABPTLoss",
     "BPTTLoss",
     "HoveringEnv",
+    "LandingEnv",
     "QuadrotorEnv",
     "QuadrotorParams",
+    "RacingEnv",
     "SHACLoss",
+    "TrackingEnv",
     "VisitedStateBuffer",
     "available_drones",
     "differentiable_rollout",
     "load_drone",
+    "load_track",
     "make_actor",
     "make_env",
     "make_qvalue",

@@ -5,14 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from importlib import resources
-from importlib.abc import Traversable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from torch import Tensor
+
+from torchrl_quad.dynamics import presets
 
 _DRONES = resources.files(__package__) / "drones"
 
@@ -142,17 +141,7 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
         ValueError: the preset is unknown, or a field is missing, unknown, of the wrong shape, or out of its range.
         FileNotFoundError: the path does not exist.
     """
-    if isinstance(drone, Mapping):
-        source, values = "drone", drone
-    elif isinstance(drone, Path) or str(drone).endswith((".yaml", ".yml")):
-        source, values = str(drone), _read(Path(drone))
-    elif drone in available_drones():
-        source, values = f"{drone}.yaml", _read(_DRONES / f"{drone}.yaml")
-    else:
-        names = ", ".join(available_drones())
-        raise ValueError(f"Unknown drone {drone!r}. Choose from: {names}; or give the path of a .yaml file.")
-    if not isinstance(values, Mapping):
-        raise ValueError(f"{source}: expected a mapping of field names to numbers, got {type(values).__name__}.")
+    source, values = presets.read("drone", drone, _DRONES)
     missing = [name for name in _FIELDS if name not in values]
     unknown = sorted(str(name) for name in values if name not in _FIELDS)
     if missing:
@@ -173,16 +162,7 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
 
 def available_drones() -> list[str]:
     """The names of the presets that ship with the package."""
-    return sorted(entry.name.removesuffix(".yaml") for entry in _DRONES.iterdir() if entry.name.endswith(".yaml"))
-
-
-def _read(path: Traversable) -> Any:
-    if not path.is_file():
-        raise FileNotFoundError(f"No drone file at {path}. Presets go by name: {', '.join(available_drones())}.")
-    try:
-        return yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: not a YAML file: {error}") from error
+    return presets.names(_DRONES)
 
 
 def _check(name: str, value: Tensor, source: str) -> None:

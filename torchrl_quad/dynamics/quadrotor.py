@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics.control import FlightController, Setpoint
@@ -29,16 +30,20 @@ def physics_step(
     controller: FlightController,
     dt: float,
     integrator: str = "semi_implicit_euler",
+    wind: Tensor | None = None,
 ) -> QuadrotorState:
     """One physics step of dt [s]: the present rotor speeds make the wrench, and the controller sets their next target.
 
-    ``rotors`` are those of ``params``; the controller knows its own, and flies by them.
+    ``rotors`` are those of ``params``; the controller knows its own, and flies by them. ``wind`` is (*, 3) [m/s], world
+    frame.
     """
     speed = state.rotor_speed
     wrench = rotors.wrench(speed)
     believed = wrench if rotors is controller.rotors else controller.rotors.wrench(speed)
     commanded = controller.rotor_speed(setpoint, state.angular_velocity, believed)
-    body = INTEGRATORS[integrator](RigidBodyState(*state[:4]), lambda s: accelerations(s, wrench, params), dt)
+    if rotors is not controller.rotors:  # the nominal rotors can do what the controller asks of them; these may not
+        commanded = torch.minimum(torch.maximum(commanded, params.rotor_speed_min), params.rotor_speed_max)
+    body = INTEGRATORS[integrator](RigidBodyState(*state[:4]), lambda s: accelerations(s, wrench, params, wind), dt)
     return QuadrotorState(*body, rotors.follow(speed, commanded, dt))
 
 
@@ -50,10 +55,12 @@ def control_step(
     dt: float,
     substeps: int,
     integrator: str = "semi_implicit_euler",
+    wind: Tensor | None = None,
 ) -> QuadrotorState:
-    """Hold an action (*, 4) in [-1, 1] over ``substeps`` physics steps of dt [s], with the drone ``params``."""
+    """Hold an action (*, 4) in [-1, 1] over ``substeps`` physics steps of dt [s], with the drone ``params`` in the
+    wind (*, 3) [m/s], world frame."""
     setpoint = controller.setpoint(action)
     rotors = controller.rotors if params is controller.nominal else Rotors(params)
     for _ in range(substeps):
-        state = physics_step(state, setpoint, params, rotors, controller, dt, integrator)
+        state = physics_step(state, setpoint, params, rotors, controller, dt, integrator, wind)
     return state

@@ -37,9 +37,15 @@ def gyroscopic_torque(angular_velocity: Tensor, inertia: Tensor) -> Tensor:
     return torch.linalg.cross(angular_velocity, inertia * angular_velocity)
 
 
-def accelerations(state: RigidBodyState, wrench: Tensor, params: QuadrotorParams) -> tuple[Tensor, Tensor]:
-    """Linear acceleration (world frame) and angular acceleration (body frame), each (*, 3), under a wrench (*, 4)."""
-    velocity_body = quaternion.rotate_inverse(state.quaternion, state.velocity)
+def accelerations(
+    state: RigidBodyState, wrench: Tensor, params: QuadrotorParams, wind: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Linear acceleration (world frame) and angular acceleration (body frame), each (*, 3), under a wrench (*, 4).
+
+    Drag acts on the velocity relative to the wind (*, 3) [m/s], world frame; None is still air.
+    """
+    airspeed = state.velocity if wind is None else state.velocity - wind
+    velocity_body = quaternion.rotate_inverse(state.quaternion, airspeed)
     thrust, torque = wrench.split((1, 3), -1)
     force_body = drag(velocity_body, params) + pad(thrust, (2, 0))
     linear = quaternion.rotate(state.quaternion, force_body / params.mass) - pad(params.gravity, (2, 0))

@@ -4,10 +4,27 @@ from typing import Any
 
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.hovering import HoveringEnv
+from torchrl_quad.envs.landing import LandingEnv
+from torchrl_quad.envs.racing import RacingEnv, load_track
+from torchrl_quad.envs.tracking import TrackingEnv
 
-__all__ = ["TASKS", "HoveringEnv", "QuadrotorEnv", "make_env"]
+__all__ = [
+    "TASKS",
+    "HoveringEnv",
+    "LandingEnv",
+    "QuadrotorEnv",
+    "RacingEnv",
+    "TrackingEnv",
+    "load_track",
+    "make_env",
+]
 
-TASKS: dict[str, type[QuadrotorEnv]] = {"hovering": HoveringEnv}
+TASKS: dict[str, type[QuadrotorEnv]] = {
+    "hovering": HoveringEnv,
+    "landing": LandingEnv,
+    "racing": RacingEnv,
+    "tracking": TrackingEnv,
+}
 
 
 def make_env(task: str, **kwargs: Any) -> QuadrotorEnv:

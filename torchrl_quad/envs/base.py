@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import abc
+import collections
+import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,8 +25,13 @@ from torchrl_quad.dynamics import (
     load_drone,
     quaternion,
 )
+from torchrl_quad.envs import options
 
-State = dict[str, Tensor]  # the Markov state by name, each entry (num_envs, ...)
+# The Markov state by name, each entry (num_envs, ...); ("drone", field) is the name of a randomised parameter.
+State = dict[Any, Tensor]
+
+# The parameters of drones that are drawn at random: as QuadrotorParams, without its checks, which a step cannot make.
+DrawnParams = collections.namedtuple("DrawnParams", [field.name for field in dataclasses.fields(QuadrotorParams)])
 
 # Beyond these the model means nothing, and its numbers or their derivatives may overflow: the episode ends.
 _MAX_VALUE = 1e6  # of any entry of the state, in its unit
@@ -39,17 +47,20 @@ class QuadrotorEnv(EnvBase):
     from every entry of ``"next"`` to the actions, to the state, and to ``env.params``. A task subclasses this and says
     what it starts from, observes, rewards and ends; see :class:`~torchrl_quad.envs.HoveringEnv` for the pattern.
 
-    =============================  ===========  =========================================================
-    entry of ``"state"``           shape        meaning
-    =============================  ===========  =========================================================
-    ``position``                   (3)          [m], world frame, z up
-    ``quaternion``                 (4)          (w, x, y, z), body to world, unit norm
-    ``velocity``                   (3)          [m/s], world frame
-    ``angular_velocity``           (3)          [rad/s], body frame
-    ``rotor_speed``                (4)          [rad/s]
-    ``action_queue``               (delay, 4)   commands on their way, oldest first; absent when the delay is 0
-    ``step``                       (1)          control steps since the start of the episode
-    =============================  ===========  =========================================================
+    =============================  ============  =======================================================================
+    entry of ``"state"``           shape         meaning
+    =============================  ============  =======================================================================
+    ``position``                   (3)           [m], world frame, z up
+    ``quaternion``                 (4)           (w, x, y, z), body to world, unit norm
+    ``velocity``                   (3)           [m/s], world frame
+    ``angular_velocity``           (3)           [rad/s], body frame
+    ``rotor_speed``                (4)           [rad/s]
+    ``action_queue``               (delay, 4)    commands on their way, oldest first; absent when the delay is 0
+    ``step``                       (1)           control steps since the start of the episode
+    ``("drone", field)``           as the field  the randomised parameters, with ``randomize``
+    ``mean_wind``, ``wind``        (3)           [m/s], world frame, with ``wind``
+    ``measurements``               (d + 1, 13)   what the sensors told, oldest first, with noise or delay
+    =============================  ============  =======================================================================
 
     ``env.params`` is the drone that flies and ``env.nominal`` what its controller believes. To change the drone, assign
     ``env.params = env.params.replace(mass=0.5)``; a tensor that requires grad can so be fitted.
@@ -70,6 +81,16 @@ class QuadrotorEnv(EnvBase):
         max_episode_steps: control steps after which an episode is truncated.
         observe_last_action: append the commands that are still on their way to the observation, which makes the delay
             visible to the policy. Off in the paper.
+        observation_noise: standard deviations of white noise on what is observed, a mapping with any of ``position``
+            [m], ``attitude`` [rad], ``velocity`` [m/s], ``angular_velocity`` [rad/s]; see
+            :class:`~torchrl_quad.envs.options.Sensors`.
+        observation_delay: control steps by which the observation of the drone lags behind.
+        randomize: another drone in each episode: a mapping, or the path of a YAML file, from parameters to
+            distributions; see :class:`~torchrl_quad.envs.options.DroneRandomization`.
+        wind: a mapping with any of ``mean``, ``spread``, ``gust``, ``gust_time``; see
+            :class:`~torchrl_quad.envs.options.Wind`.
+        random_start: a mapping with any of ``tilt``, ``yaw``, ``velocity``, ``angular_velocity``; see
+            :class:`~torchrl_quad.envs.options.RandomStart`.
         compile: compile one control step with its observation, reward and termination into one graph.
 
     Raises:
@@ -93,6 +114,11 @@ class QuadrotorEnv(EnvBase):
         integrator: str = "semi_implicit_euler",
         max_episode_steps: int = 256,
         observe_last_action: bool = False,
+        observation_noise: Mapping[str, float] | None = None,
+        observation_delay: int = 0,
+        randomize: str | Path | Mapping | None = None,
+        wind: Mapping[str, Any] | None = None,
+        random_start: Mapping[str, float] | None = None,
     ) -> None:
         _require(num_envs >= 1, f"num_envs must be at least 1, got {num_envs}.")
         _require(dtype in (torch.float32, torch.float64), f"dtype must be torch.float32 or torch.float64, got {dtype}.")
@@ -129,7 +155,14 @@ class QuadrotorEnv(EnvBase):
         params = params.to(device=self.device, dtype=dtype)
         self.controller = FlightController(params)
         self.params = params if params.requires_grad else self.nominal
+        self.sensors = options.build(
+            options.Sensors, "observation_noise", observation_noise or {}, delay=observation_delay
+        )
+        self.wind = None if wind is None else options.build(options.Wind, "wind", wind)
+        self.random_start = options.build(options.RandomStart, "random_start", random_start or {})
+        self.randomization = options.DroneRandomization(randomize or {}, self.nominal)
         self._set_seed(seed)
+        self.set_up()
         # Stands in for a state that is not finite, so that its environment computes on with harmless numbers.
         self._fallback = self.sample_initial_state(num_envs)
         self._make_specs()
@@ -150,12 +183,25 @@ class QuadrotorEnv(EnvBase):
         """The weighted reward terms by name, each (num_envs, 1), of the state a step has led to."""
 
     @abc.abstractmethod
-    def is_terminated(self, state: State) -> Tensor:
-        """Where the episode has ended for good (a crash), bool (num_envs, 1)."""
+    def is_crash(self, state: State) -> Tensor:
+        """Where the drone is lost, bool (num_envs, 1): the episode terminates."""
 
     @abc.abstractmethod
     def is_success(self, state: State) -> Tensor:
         """Where the state, by itself, fulfils the task, bool (num_envs, 1)."""
+
+    ends_on_success = False  # whether success terminates the episode, too
+
+    def set_up(self) -> None:
+        """Make the constant tensors of the task; called when device and precision are known, and after a move."""
+
+    def advance(self, previous: State, state: State) -> State:
+        """The state with the entries of the task brought from the previous step to this one; the drone has flown."""
+        return state
+
+    def metrics(self, state: State) -> State:
+        """What to measure beside the reward, by name, each (num_envs, 1), without gradient."""
+        return {}
 
     # -- what a task may use -------------------------------------------------------------------------------------------
 
@@ -183,6 +229,13 @@ class QuadrotorEnv(EnvBase):
     def sample_initial_state(self, n: int) -> State:
         """Draw n complete Markov states from the task's own starts."""
         state = self.initial_state(n)
+        if any(dataclasses.astuple(self.random_start)):
+            state |= self.random_start.initial(self, state)
+        state |= self.randomization.initial(self, n)
+        if self.wind is not None:
+            state |= self.wind.initial(self, n)
+        if self._measures:
+            state |= self.sensors.initial(state, self.normal(n, 12) if self.sensors.has_noise else None)
         if self.action_delay:
             hover = self.hover_action.expand(n, 4).unsqueeze(1)
             state["action_queue"] = hover.expand(n, self.action_delay, 4).clone()
@@ -197,22 +250,39 @@ class QuadrotorEnv(EnvBase):
         """Uniform random numbers in [-1, 1] from the environment's own generator."""
         return torch.rand(shape, generator=self.rng, device=self.device, dtype=self.dtype) * 2.0 - 1.0
 
+    def normal(self, *shape: int) -> Tensor:
+        """Standard normal random numbers from the environment's own generator."""
+        return torch.randn(shape, generator=self.rng, device=self.device, dtype=self.dtype)
+
+    def integers(self, high: int, *shape: int) -> Tensor:
+        """Uniform random integers in [0, high) from the environment's own generator."""
+        return torch.randint(high, shape, generator=self.rng, device=self.device)
+
     # -- what an evaluation asks ---------------------------------------------------------------------------------------
 
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """What the first episode of each environment came to, in a rollout (num_envs, time) from fresh starts.
 
         Returns:
-            by name, each (num_envs): ``return``, the undiscounted sum of rewards; ``crash`` and ``success``, 0 or 1.
-            Here success means that the last state fulfils the task and that there was no crash; a task may ask more.
+            by name, each (num_envs): ``return``, the undiscounted sum of rewards; ``crash`` and ``success``, 0 or 1;
+            and the metrics of the task, as they are at the end of the episode. Here success means that the last state
+            fulfils the task and that there was no crash; a task may ask more.
         """
-        ends = rollout["next"]
-        first = self.first_episode(rollout)
-        crash = (ends["terminated"] & first).any(1)
-        last = first.sum(1, keepdim=True) - 1
-        success = ends["success"].gather(1, last).squeeze(1) & ~crash
-        metrics = {"return": (ends["reward"] * first).sum(1), "crash": crash, "success": success}
-        return {name: value.squeeze(-1).to(self.dtype) for name, value in metrics.items()}
+        ends, first = rollout["next"], self.first_episode(rollout)
+        crash = self.at_the_end(rollout, ends["crash"])
+        success = self.at_the_end(rollout, ends["success"])
+        return {
+            "return": (ends["reward"] * first).sum(1).squeeze(-1),
+            "crash": crash.to(self.dtype),
+            "success": (success & ~crash).to(self.dtype),
+            **{name: self.at_the_end(rollout, value) for name, value in ends.get("metrics", {}).items()},
+        }
+
+    @classmethod
+    def at_the_end(cls, rollout: TensorDictBase, value: Tensor) -> Tensor:
+        """The value (num_envs, time, 1) at the last step of the first episode of each environment, (num_envs)."""
+        last = cls.first_episode(rollout).sum(1, keepdim=True) - 1
+        return value.gather(1, last).flatten()
 
     @staticmethod
     def first_episode(rollout: TensorDictBase) -> Tensor:
@@ -240,6 +310,8 @@ class QuadrotorEnv(EnvBase):
         self.controller = FlightController(self.nominal.to(device=self.device))
         self.params = self.nominal if follows else self.params.to(device=self.device)
         self._fallback = {key: value.to(self.device) for key, value in self._fallback.items()}
+        self.randomization = options.DroneRandomization(self.randomization.spec, self.nominal)
+        self.set_up()
         self.set_seed(self._seed)
         return self
 
@@ -272,13 +344,14 @@ class QuadrotorEnv(EnvBase):
         else:
             state = self.sample_initial_state(self.num_envs)
         no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
-        terms = self.reward_terms(state)
         return self._tensordict(
             {
                 "observation": self._observe(state),
                 "state": state,
-                "reward_terms": {name: torch.zeros_like(term) for name, term in terms.items()},
+                "reward_terms": {name: torch.zeros_like(term) for name, term in self.reward_terms(state).items()},
+                "metrics": self.metrics(state),
                 "success": self.is_success(state),
+                "crash": no.clone(),
                 "done": no,
                 "terminated": no.clone(),
                 "truncated": no.clone(),
@@ -286,7 +359,7 @@ class QuadrotorEnv(EnvBase):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        state = dict(tensordict.get("state").items())
+        state = dict(tensordict.get("state").items(include_nested=True, leaves_only=True))
         action = tensordict.get("action")
         needs_grad = torch.is_grad_enabled() and any(
             x.requires_grad for x in (action, *state.values(), *self.params.fields().values())
@@ -297,9 +370,18 @@ class QuadrotorEnv(EnvBase):
                 if value.is_floating_point() and not value.requires_grad:
                     state[key] = value.detach().requires_grad_()
         with torch.set_grad_enabled(needs_grad):
-            return self._tensordict(self._transition_function(state, action))
+            return self._tensordict(self._transition_function(state, action, self._noise()))
 
-    def _transition(self, state: State, action: Tensor) -> dict[str, Any]:
+    def _noise(self) -> State:
+        """What chance adds to a step: drawn here, since a compiled step cannot draw from a generator."""
+        noise = {}
+        if self.wind is not None and self.wind.gust:
+            noise["wind"] = self.normal(self.num_envs, 3)
+        if self.sensors.has_noise:
+            noise["sensors"] = self.normal(self.num_envs, 12)
+        return noise
+
+    def _transition(self, state: State, action: Tensor, noise: State) -> dict[str, Any]:
         state, valid = self._replace_invalid(state, action)
         action = torch.where(valid, action, self.hover_action)
         applied, queue = action, {}
@@ -309,31 +391,53 @@ class QuadrotorEnv(EnvBase):
         flown = control_step(
             QuadrotorState(*(state[name] for name in QuadrotorState._fields)),
             applied,
-            self.params,
+            self._flying(state),
             self.controller,
             self.dt,
             self.substeps,
             self.integrator,
+            state.get("wind"),
         )
-        state = {**state, **flown._asdict(), **queue, "step": state["step"] + 1}
+        previous, state = state, {**state, **flown._asdict(), **queue, "step": state["step"] + 1}
+        if "wind" in noise:
+            state |= self.wind.advance(state, noise["wind"], self.control_dt)
+        if self._measures:
+            state |= self.sensors.advance(state, noise.get("sensors"))
         state, still_valid = self._replace_invalid(state)
+        state = self.advance(previous, state)
         valid = valid & still_valid
         terms = {name: torch.where(valid, term, 0.0) for name, term in self.reward_terms(state).items()}
-        terminated = self.is_terminated(state) | ~valid
+        crash = self.is_crash(state) | ~valid
+        success = self.is_success(state) & valid
+        terminated = crash | success if self.ends_on_success else crash
         truncated = state["step"] >= self.max_episode_steps
         return {
             "observation": self._observe(state),
             "state": state,
             "reward_terms": terms,
             "reward": sum(terms.values()),
-            "success": self.is_success(state) & valid,
+            "metrics": self.metrics({key: value.detach() for key, value in state.items()}),
+            "success": success,
+            "crash": crash,
             "done": terminated | truncated,
             "terminated": terminated,
             "truncated": truncated,
         }
 
+    def _flying(self, state: State) -> Any:
+        """The parameters of the drones that fly: those of the environment, with what each episode has drawn."""
+        if not self.randomization.spec:
+            return self.params
+        return DrawnParams(
+            **{**self.params.fields(), **{name: state["drone", name] for name in self.randomization.spec}}
+        )
+
+    @property
+    def _measures(self) -> bool:
+        return self.sensors.has_noise or self.sensors.delay > 0
+
     def _observe(self, state: State) -> Tensor:
-        observation = self.observe(state)
+        observation = self.observe(self.sensors.observed(state) if self._measures else state)
         if self.observe_last_action:
             observation = torch.cat((observation, state["action_queue"].flatten(1)), -1)
         return observation
@@ -366,8 +470,8 @@ class QuadrotorEnv(EnvBase):
         missing = [key for key in expected if key not in state]
         _require(
             not missing,
-            f"{source}: the state lacks {', '.join(missing)}. A state is restored whole: take it from a tensordict of "
-            f"this environment, which holds {', '.join(expected)}.",
+            f"{source}: the state lacks {_names(missing)}. A state is restored whole: take it from a tensordict of "
+            f"this environment, which holds {_names(expected)}.",
         )
         checked = {}
         for key, like in expected.items():
@@ -384,21 +488,35 @@ class QuadrotorEnv(EnvBase):
         def unbounded(x: Tensor) -> Unbounded:
             return Unbounded((self.num_envs, *x.shape[1:]), device=self.device, dtype=x.dtype)
 
-        def composite(**entries: Any) -> Composite:
-            return Composite(**entries, shape=self.batch_size, device=self.device)
+        def composite(entries: dict[Any, Any]) -> Composite:
+            return Composite(entries, shape=self.batch_size, device=self.device)
 
         def flag() -> Binary:
             return Binary(1, (self.num_envs, 1), device=self.device, dtype=torch.bool)
 
-        state = composite(**{key: unbounded(x) for key, x in self._fallback.items()})
-        terms = composite(**{name: unbounded(x) for name, x in self.reward_terms(self._fallback).items()})
-        observation = unbounded(self._observe(self._fallback))
+        def like(entries: State) -> Composite:
+            return composite({key: unbounded(x) for key, x in entries.items()})
+
+        state, terms, metrics = self._fallback, self.reward_terms(self._fallback), self.metrics(self._fallback)
+        self.observation_spec = composite(
+            {
+                "observation": unbounded(self._observe(state)),
+                "state": like(state),
+                "reward_terms": like(terms),
+                "success": flag(),
+                "crash": flag(),
+                **({"metrics": like(metrics)} if metrics else {}),
+            }
+        )
         # A key that stands in the state spec alone would never be carried on: it stands in both.
-        self.observation_spec = composite(observation=observation, state=state, reward_terms=terms, success=flag())
-        self.state_spec = composite(state=state.clone())
+        self.state_spec = composite({"state": like(state)})
         self.action_spec = Bounded(-1.0, 1.0, (self.num_envs, 4), device=self.device, dtype=self.dtype)
         self.reward_spec = unbounded(torch.zeros(1, 1, dtype=self.dtype))
-        self.done_spec = composite(done=flag(), terminated=flag(), truncated=flag())
+        self.done_spec = composite({"done": flag(), "terminated": flag(), "truncated": flag()})
+
+
+def _names(keys: Iterable[Any]) -> str:
+    return ", ".join(str(key) for key in keys)
 
 
 def _require(condition: bool, message: str) -> None:

@@ -1,0 +1,245 @@
+"""What may make any task harder, or more like the real one: other drones, wind, sensors, starts."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchrl_quad.dynamics import QuadrotorParams, presets, quaternion
+
+if TYPE_CHECKING:
+    from torchrl_quad.envs.base import QuadrotorEnv, State
+
+# What the flight controller alone reads, from its nominal drone.
+_CONTROLLER_FIELDS = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
+_DISTRIBUTIONS = {
+    "uniform": "low and high",
+    "scale": "low and high, as factors of the nominal value",
+    "normal": "mean and standard deviation, cut off at three of them",
+}
+
+
+class DroneRandomization:
+    """Another drone in each episode: any parameter of the drone that flies, drawn at reset.
+
+    A mapping, or a YAML file of one, from fields of :class:`QuadrotorParams` to a distribution and its two numbers:
+
+    .. code-block:: yaml
+
+        mass: {scale: [0.8, 1.2]}                    # uniform factors of the nominal value, one per entry
+        motor_time_constant: {uniform: [0.02, 0.05]}
+        linear_drag: {normal: [0.005, 0.001]}        # cut off at three standard deviations
+
+    The values drawn stand in the state under ``("drone", field)``. The controller keeps the nominal drone.
+
+    Raises:
+        ValueError: a field or distribution is unknown, belongs to the controller, or may give an impossible drone.
+    """
+
+    def __init__(self, spec: str | Path | Mapping, nominal: QuadrotorParams) -> None:
+        source, self.spec = presets.read("randomize", spec)
+        fields = nominal.fields()
+        for name, distribution in self.spec.items():
+            if name in _CONTROLLER_FIELDS:
+                raise ValueError(
+                    f"{source}: {name!r} belongs to the flight controller, which keeps the nominal drone; a random one "
+                    "would change nothing. Give another drone instead."
+                )
+            if name not in fields:
+                allowed = ", ".join(field for field in fields if field not in _CONTROLLER_FIELDS)
+                raise ValueError(f"{source}: unknown field {name!r}. Choose from: {allowed}.")
+            if not (
+                isinstance(distribution, Mapping)
+                and len(distribution) == 1
+                and set(distribution) <= set(_DISTRIBUTIONS)
+            ):
+                choices = "; ".join(f"{key}: {numbers}" for key, numbers in _DISTRIBUTIONS.items())
+                raise ValueError(f"{source}: {name} needs one distribution of: {choices}; got {distribution!r}.")
+            numbers = next(iter(distribution.values()))
+            if not (_is_numbers(numbers, 2) and (numbers[0] <= numbers[1] or "normal" in distribution)):
+                raise ValueError(f"{source}: {name} needs two numbers, such as [0.8, 1.2], got {numbers!r}.")
+        self.nominal = {name: fields[name] for name in self.spec}
+        for sign in (-1.0, 1.0):
+            extreme = {name: self._value(name, torch.full_like(value, sign)) for name, value in self.nominal.items()}
+            try:
+                nominal.replace(**extreme)
+            except ValueError as error:
+                raise ValueError(f"{source}: the drones that may be drawn are not all possible: {error}") from error
+
+    def initial(self, env: QuadrotorEnv, n: int) -> State:
+        """Draw n drones."""
+        drawn = {}
+        for name, nominal in self.nominal.items():
+            shape = (n, *nominal.shape[-QuadrotorParams.dim(name) :])
+            is_normal = "normal" in self.spec[name]
+            unit = env.normal(*shape).clamp(-3.0, 3.0) / 3.0 if is_normal else env.uniform(*shape)
+            drawn["drone", name] = self._value(name, unit)
+        return drawn
+
+    def _value(self, name: str, unit: Tensor) -> Tensor:
+        """From the range [-1, 1] to the one asked for."""
+        (kind, (first, second)) = next(iter(self.spec[name].items()))
+        if kind == "normal":
+            return first + 3.0 * second * unit
+        value = 0.5 * (first + second) + 0.5 * (second - first) * unit
+        return value * self.nominal[name].to(value) if kind == "scale" else value
+
+
+@dataclasses.dataclass(frozen=True)
+class Wind:
+    """A mean wind for each episode, and gusts about it: a first-order Gauss-Markov process, per axis and in time.
+
+    Stands in the state as ``mean_wind`` and ``wind``, each (3) [m/s], world frame, and is held over a control step.
+
+    Raises:
+        ValueError: a value is negative, not finite, or has the wrong number of entries.
+    """
+
+    mean: Sequence[float] = (0.0, 0.0, 0.0)  # [m/s], world frame
+    spread: Sequence[float] = (0.0, 0.0, 0.0)  # [m/s], to both sides of the mean; drawn at reset
+    gust: float = 0.0  # [m/s], standard deviation of the gusts
+    gust_time: float = 1.0  # [s], after which a gust has decayed to 1/e
+
+    def __post_init__(self) -> None:
+        for name in ("mean", "spread"):
+            if not _is_numbers(getattr(self, name), 3):
+                raise ValueError(f"wind: {name} must be three numbers [m/s], got {getattr(self, name)!r}.")
+        if not (_is_number(self.gust) and self.gust >= 0):
+            raise ValueError(f"wind: gust must be zero or positive [m/s], got {self.gust!r}.")
+        if not (_is_number(self.gust_time) and self.gust_time > 0):
+            raise ValueError(f"wind: gust_time must be positive [s], got {self.gust_time!r}.")
+
+    def initial(self, env: QuadrotorEnv, n: int) -> State:
+        """Draw n mean winds, and gusts in their steady state."""
+        mean = env.tensor(self.mean) + env.tensor(self.spread) * env.uniform(n, 3)
+        return {"mean_wind": mean, "wind": mean + self.gust * env.normal(n, 3) if self.gust else mean.clone()}
+
+    def advance(self, state: State, noise: Tensor, time: float) -> State:
+        """The wind a time [s] later, with standard normal noise (*, 3)."""
+        decay = math.exp(-time / self.gust_time)
+        gust = self.gust * math.sqrt(1.0 - decay * decay) * noise
+        return {"wind": torch.lerp(state["mean_wind"], state["wind"], decay) + gust}
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensors:
+    """What the policy is told of the drone: late, and with white noise. Rewards, crashes and success know the truth.
+
+    Stands in the state as ``measurements`` (delay + 1, 13), oldest first: position, quaternion, velocity and angular
+    velocity, as measured.
+
+    Raises:
+        ValueError: a standard deviation or the delay is negative.
+    """
+
+    position: float = 0.0  # [m], standard deviation per axis, world frame
+    attitude: float = 0.0  # [rad], per body axis
+    velocity: float = 0.0  # [m/s], per axis, world frame
+    angular_velocity: float = 0.0  # [rad/s], per axis, body frame
+    delay: int = 0  # control steps
+
+    def __post_init__(self) -> None:
+        for name in ("position", "attitude", "velocity", "angular_velocity"):
+            if not (_is_number(getattr(self, name)) and getattr(self, name) >= 0):
+                raise ValueError(f"observation_noise: {name} must be zero or positive, got {getattr(self, name)!r}.")
+        if not (isinstance(self.delay, int) and self.delay >= 0):
+            raise ValueError(f"observation_delay must be zero or more control steps, got {self.delay!r}.")
+
+    @property
+    def has_noise(self) -> bool:
+        """Whether measurements differ from the truth."""
+        return any((self.position, self.attitude, self.velocity, self.angular_velocity))
+
+    def initial(self, state: State, noise: Tensor | None) -> State:
+        """A queue full of the first measurement, with standard normal noise (*, 12)."""
+        return {"measurements": self._measure(state, noise).expand(-1, self.delay + 1, -1).clone()}
+
+    def advance(self, state: State, noise: Tensor | None) -> State:
+        """Measure once more, with standard normal noise (*, 12), and forget the oldest measurement."""
+        return {"measurements": torch.cat((state["measurements"][:, 1:], self._measure(state, noise)), 1)}
+
+    def observed(self, state: State) -> State:
+        """The state as the policy is told: the oldest measurement in the place of the truth."""
+        position, attitude, velocity, angular_velocity = state["measurements"][:, 0].split((3, 4, 3, 3), -1)
+        return {
+            **state,
+            "position": position,
+            "quaternion": attitude,
+            "velocity": velocity,
+            "angular_velocity": angular_velocity,
+        }
+
+    def _measure(self, state: State, noise: Tensor | None) -> Tensor:
+        position, attitude = state["position"], state["quaternion"]
+        velocity, angular_velocity = state["velocity"], state["angular_velocity"]
+        if noise is not None:
+            by_position, by_attitude, by_velocity, by_rate = noise.split(3, -1)
+            position = position + self.position * by_position
+            attitude = quaternion.multiply(attitude, quaternion.from_axis_angle(self.attitude * by_attitude))
+            velocity = velocity + self.velocity * by_velocity
+            angular_velocity = angular_velocity + self.angular_velocity * by_rate
+        return torch.cat((position, attitude, velocity, angular_velocity), -1).unsqueeze(1)
+
+
+@dataclasses.dataclass(frozen=True)
+class RandomStart:
+    """Episodes that do not start level and at rest: what is drawn here is added to the task's own start.
+
+    Raises:
+        ValueError: a value is negative or not finite.
+    """
+
+    tilt: float = 0.0  # [rad], at most; about a random horizontal axis
+    yaw: float = 0.0  # [rad], to both sides
+    velocity: float = 0.0  # [m/s], to both sides, per axis of the world frame
+    angular_velocity: float = 0.0  # [rad/s], to both sides, per axis of the body frame
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not (_is_number(value) and value >= 0):
+                raise ValueError(f"random_start: {field.name} must be zero or positive, got {value!r}.")
+
+    def initial(self, env: QuadrotorEnv, state: State) -> State:
+        """Turn and push the starts of a task."""
+        n = len(state["position"])
+        heading, tilt = math.pi * env.uniform(n, 1), 0.5 * self.tilt * (env.uniform(n, 1) + 1.0)
+        zero = torch.zeros_like(tilt)
+        tilting = quaternion.from_axis_angle(torch.cat((tilt * heading.cos(), tilt * heading.sin(), zero), -1))
+        turning = quaternion.from_axis_angle(torch.cat((zero, zero, self.yaw * env.uniform(n, 1)), -1))
+        return {
+            "quaternion": quaternion.multiply(turning, quaternion.multiply(tilting, state["quaternion"])),
+            "velocity": state["velocity"] + self.velocity * env.uniform(n, 3),
+            "angular_velocity": state["angular_velocity"] + self.angular_velocity * env.uniform(n, 3),
+        }
+
+
+def build(cls: type, name: str, spec: Any, **more: Any) -> Any:
+    """An option from its mapping, or the option itself.
+
+    Raises:
+        ValueError: it is neither, or has an unknown key.
+    """
+    if isinstance(spec, cls):
+        return spec
+    allowed = [field.name for field in dataclasses.fields(cls) if field.name not in more]
+    if not isinstance(spec, Mapping):
+        raise ValueError(f"{name} must be a mapping with any of {', '.join(allowed)}; got {spec!r}.")
+    unknown = sorted(str(key) for key in spec if key not in allowed)
+    if unknown:
+        raise ValueError(f"{name}: unknown key {unknown[0]!r}. Allowed: {', '.join(allowed)}.")
+    return cls(**spec, **more)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def _is_numbers(value: Any, count: int) -> bool:
+    return isinstance(value, Sequence) and len(value) == count and all(_is_number(x) for x in value)

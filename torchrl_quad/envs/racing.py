@@ -1,0 +1,215 @@
+"""The racing task."""
+
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_quad.dynamics import presets
+from torchrl_quad.envs.base import QuadrotorEnv, State
+from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, norm, outside, target_reward
+
+_TRACKS = resources.files(__package__) / "tracks"
+
+
+class RacingEnv(QuadrotorEnv):
+    """Fly through gates in their order, round after round (paper, table I and section V-E).
+
+    ==========================================  ====  =============================================
+    observation                                 size  unit
+    ==========================================  ====  =============================================
+    next gate - position                        3     10 m, world frame
+    gate after that - position                  3     10 m, world frame
+    quaternion                                  4     (w, x, y, z), body to world
+    velocity                                    3     10 m/s, world frame
+    angular velocity                            3     10 rad/s, body frame
+    ==========================================  ====  =============================================
+
+    Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. Reward "velocity":
+    0.02 min(v_t, 15) - 0.02 |v_a| / (d + 1) - 0.001 |w|, and a gate bonus of 5, where v_t is the velocity towards the
+    next gate, v_a the part of the velocity across that direction, and d the distance to the gate [m]. The binary bonus
+    is paid in the step that passes a gate and carries no gradient. In its place a relaxation may stand, paid in each
+    step: "log", -5 log(d + 0.01), or "reciprocal", 1 / (d + 0.05).
+
+    A gate is passed when the straight line that the drone flew in a control step comes within 0.3 m of its centre. The
+    reward of that step is already about the gate after it.
+
+    Start: level and at rest, uniformly within 0.2 m of one of four points along each axis, each before another gate.
+    State added: ``gate`` (1), the index of the next; ``target`` (3) [m], its centre; ``gate_passed`` (1), whether this
+    step passed one; ``gates_passed`` (1) in this episode; ``pass_step`` (gates), when each was passed last, -1 for
+    never; ``lap_time`` (1) [s], of the last full lap, 0 before.
+
+    End: crash when x or y leaves the gates behind by 4 m, or outside 0 < z < 6 m; truncated after
+    ``max_episode_steps``, 512. Success of a state: 8 gates passed. Success of an episode: 8 gates, without a crash.
+
+    Metrics: ``gates_passed``; ``lap_time`` [s], from a gate to the same gate again, NaN for an episode without a full
+    lap.
+
+    Args:
+        num_envs: number of drones that fly in parallel.
+        track: "visfly", the path of a YAML file, or a mapping, with ``gates``, a list of at least two centres [m]; and,
+            if wanted, ``starts``, as many points [m] (by default half way between gates), and ``gate_radius`` [m].
+        reward: "position" or "velocity".
+        gate_bonus: "binary", "log" or "reciprocal".
+        max_episode_steps: control steps after which an episode is truncated.
+        **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
+
+    Raises:
+        ValueError: an option is unknown, or the track is not one.
+        FileNotFoundError: there is no such file.
+    """
+
+    start_range = 0.2  # [m], to both sides of the start
+    box_margin = 4.0  # [m], beyond the outermost gates
+    box_height = 6.0  # [m]; a track that is higher has 4 m above it
+    weights = TARGET_WEIGHTS
+    velocity_weights = {"towards": 0.02, "across": 0.02, "angular_velocity": 0.001}
+    max_rewarded_speed = 15.0  # [m/s]
+    bonus = {"position": 20.0, "velocity": 5.0}  # per gate, by reward
+    success_gates = 8
+
+    def __init__(
+        self,
+        num_envs: int = 64,
+        *,
+        track: str | Path | Mapping = "visfly",
+        reward: str = "position",
+        gate_bonus: str = "binary",
+        max_episode_steps: int = 512,
+        **kwargs: Any,
+    ) -> None:
+        for name, value, choices in (
+            ("reward", reward, ("position", "velocity")),
+            ("gate_bonus", gate_bonus, ("binary", "log", "reciprocal")),
+        ):
+            if value not in choices:
+                raise ValueError(f"Unknown {name} {value!r}. Choose from: {', '.join(choices)}.")
+        self.track, self.reward, self.gate_bonus = load_track(track), reward, gate_bonus
+        super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
+
+    def set_up(self) -> None:
+        self.gates, self.starts = self.tensor(self.track["gates"]), self.tensor(self.track["starts"])
+        low, high = self.gates.amin(0), self.gates.amax(0)
+        self.centre = 0.5 * (low + high)
+        self.half_width = 0.5 * (high - low)[:2] + self.box_margin
+        self.ceiling = max(self.box_height, high[2].item() + self.box_margin)
+
+    def initial_state(self, n: int) -> State:
+        gate = self.integers(len(self.gates), n, 1)
+        start = self.hover_state(self.starts[gate[:, 0]] + self.start_range * self.uniform(n, 3))
+        return {
+            **start,
+            "gate": gate,
+            "target": self.gates[gate[:, 0]],
+            "gate_passed": torch.zeros_like(gate, dtype=torch.bool),
+            "gates_passed": torch.zeros_like(gate),
+            "pass_step": torch.full_like(gate, -1).repeat(1, len(self.gates)),
+            "lap_time": torch.zeros_like(start["position"][:, :1]),
+        }
+
+    def advance(self, previous: State, state: State) -> State:
+        gate, step = previous["gate"], state["step"]
+        passed = self.miss(previous["position"], state["position"], previous["target"]) < self.track["gate_radius"]
+        this_gate = passed & (gate == torch.arange(len(self.gates), device=gate.device))
+        last_pass = previous["pass_step"].gather(1, gate)
+        lap = (step - last_pass) * self.control_dt
+        next_gate = torch.where(passed, (gate + 1) % len(self.gates), gate)
+        return {
+            **state,
+            "gate": next_gate,
+            "target": self.gates[next_gate[:, 0]],
+            "gate_passed": passed,
+            "gates_passed": previous["gates_passed"] + passed,
+            "pass_step": torch.where(this_gate, step, previous["pass_step"]),
+            "lap_time": torch.where(passed & (last_pass >= 0), lap, previous["lap_time"]),
+        }
+
+    @staticmethod
+    def miss(start: Tensor, end: Tensor, point: Tensor) -> Tensor:
+        """How close to a point (*, 3) the straight line between two positions (*, 3) comes, (*, 1) [m]."""
+        with torch.no_grad():
+            line = end - start
+            along = ((point - start) * line).sum(-1, keepdim=True)
+            fraction = (along / line.square().sum(-1, keepdim=True).clamp_min(1e-12)).clamp(0.0, 1.0)
+            return norm(start + fraction * line - point)
+
+    def observe(self, state: State) -> Tensor:
+        after = self.gates[(state["gate"][:, 0] + 1) % len(self.gates)]
+        relative = [(gate - state["position"]) / 10 for gate in (state["target"], after)]
+        return torch.cat((*relative, *body_observation(state)), -1)
+
+    def reward_terms(self, state: State) -> State:
+        if self.reward == "position":
+            terms = target_reward(state, self.weights)
+        else:
+            direction = (state["target"] - state["position"]) / distance(state).clamp_min(1e-6)
+            towards = (state["velocity"] * direction).sum(-1, keepdim=True)
+            across = norm(state["velocity"] - towards * direction)
+            terms = {
+                "towards": self.velocity_weights["towards"] * towards.clamp_max(self.max_rewarded_speed),
+                "across": -self.velocity_weights["across"] * across / (distance(state) + 1.0),
+                "angular_velocity": -self.velocity_weights["angular_velocity"] * norm(state["angular_velocity"]),
+            }
+        if self.gate_bonus == "log":
+            bonus = -5.0 * torch.log(distance(state) + 0.01)
+        elif self.gate_bonus == "reciprocal":
+            bonus = 1.0 / (distance(state) + 0.05)
+        else:
+            bonus = self.bonus[self.reward] * state["gate_passed"].to(self.dtype)
+        return {**terms, "gate": bonus}
+
+    def is_crash(self, state: State) -> Tensor:
+        return outside(state["position"], self.centre, self.half_width, self.ceiling)
+
+    def is_success(self, state: State) -> Tensor:
+        return state["gates_passed"] >= self.success_gates
+
+    def metrics(self, state: State) -> State:
+        return {"gates_passed": state["gates_passed"].to(self.dtype), "lap_time": state["lap_time"]}
+
+    def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
+        """Gives a ``lap_time`` only to drones that flew a full lap."""
+        metrics = super().episode_metrics(rollout)
+        return {**metrics, "lap_time": torch.where(metrics["lap_time"] > 0, metrics["lap_time"], torch.nan)}
+
+
+def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:
+    """Read a track: the name of one that ships with the package, the path of a YAML file, or a mapping.
+
+    Returns:
+        ``gates`` and ``starts``, equally long lists of points [m], and ``gate_radius`` [m].
+
+    Raises:
+        ValueError: a key is unknown or missing, or a value is not what :class:`RacingEnv` takes.
+        FileNotFoundError: there is no such file.
+    """
+    source, values = presets.read("track", track, _TRACKS)
+    unknown = sorted(set(values) - {"gates", "starts", "gate_radius"})
+    if unknown:
+        raise ValueError(f"{source}: unknown key {unknown[0]!r}. Allowed: gates, starts, gate_radius.")
+    gates = _points(source, "gates", values.get("gates"))
+    if len(gates) < 2:
+        raise ValueError(f"{source}: a track needs at least two gates, got {len(gates)}.")
+    before = [gates[-1], *gates[:-1]]
+    halfway = [[0.5 * (p + q) for p, q in zip(a, b, strict=True)] for a, b in zip(before, gates, strict=True)]
+    starts = _points(source, "starts", values.get("starts", halfway))
+    if len(starts) != len(gates):
+        raise ValueError(f"{source}: there must be one start before each gate, got {len(starts)} for {len(gates)}.")
+    radius = values.get("gate_radius", 0.3)
+    if not (isinstance(radius, int | float) and radius > 0):
+        raise ValueError(f"{source}: gate_radius must be a positive number [m], got {radius!r}.")
+    return {"gates": gates, "starts": starts, "gate_radius": float(radius)}
+
+
+def _points(source: str, name: str, value: Any) -> list[list[float]]:
+    try:
+        points = [[float(x) for x in point] for point in value]
+    except (TypeError, ValueError):
+        points = []
+    if not points or any(len(point) != 3 or not all(abs(x) < 1e4 for x in point) or point[2] <= 0 for point in points):
+        raise ValueError(f"{source}: {name} must be a list of points [x, y, z] in metres above ground, got {value!r}.")
+    return points

@@ -1,0 +1,54 @@
+"""What several tasks observe, reward and avoid."""
+
+import torch
+from torch import Tensor
+from torch.linalg import vector_norm
+
+from torchrl_quad.dynamics import quaternion
+
+# Of the reward of hovering, tracking and racing (paper, table I); distances in m, speeds in m/s and rad/s.
+TARGET_WEIGHTS = {
+    "survival": 0.1,
+    "position": 0.1 / 9,
+    "attitude": 1e-5,
+    "velocity": 0.002,
+    "angular_velocity": 0.002,
+}
+
+
+def norm(x: Tensor) -> Tensor:
+    """Length of vectors (*, k), as (*, 1); its derivative at zero is zero."""
+    return vector_norm(x, dim=-1, keepdim=True)
+
+
+def distance(state: dict[str, Tensor]) -> Tensor:
+    """Distance to the target, (*, 1) [m]."""
+    return norm(state["position"] - state["target"])
+
+
+def body_observation(state: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Quaternion (w, x, y, z), velocity [10 m/s] in the world frame, angular velocity [10 rad/s] in the body frame."""
+    return state["quaternion"], state["velocity"] / 10, state["angular_velocity"] / 10
+
+
+def target_reward(state: dict[str, Tensor], weights: dict[str, float]) -> dict[str, Tensor]:
+    """The terms of "be at the target, level and still", each (*, 1): ``survival``, and four penalties."""
+    level = quaternion.identity(state["quaternion"])
+    return {
+        "survival": torch.full_like(state["position"][..., :1], weights["survival"]),
+        "position": -weights["position"] * distance(state),
+        "attitude": -weights["attitude"] * quaternion.distance(state["quaternion"], level),
+        "velocity": -weights["velocity"] * norm(state["velocity"]),
+        "angular_velocity": -weights["angular_velocity"] * norm(state["angular_velocity"]),
+    }
+
+
+def outside(position: Tensor, centre: Tensor, half_width: Tensor | float, height: float) -> Tensor:
+    """Whether a position (*, 3) [m] has left the box, (*, 1).
+
+    The box reaches half_width (a number, or one for x and one for y) [m] to all sides of the centre (*, 3), and from
+    the ground at 0 up to the height [m].
+    """
+    sideways = ((position - centre)[..., :2].abs() > half_width).any(-1, keepdim=True)
+    z = position[..., 2:]
+    return sideways | (z <= 0.0) | (z >= height)

@@ -1,0 +1,186 @@
+"""The tracking task."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_quad.envs.base import QuadrotorEnv, State
+from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, norm, outside, target_reward
+
+Curve = Callable[[Tensor], Tensor]
+
+
+def circle(centre: tuple[float, float, float], radius: float) -> Curve:
+    """A level circle, flown counter-clockwise from +x; centre and radius in m."""
+
+    def position(phase: Tensor) -> Tensor:
+        x, y, z = centre
+        return torch.stack((x + radius * phase.cos(), y + radius * phase.sin(), torch.full_like(phase, z)), -1)
+
+    return position
+
+
+def lemniscate(centre: tuple[float, float, float], half_length: float) -> Curve:
+    """A level figure of eight (Gerono's) along x, half as wide as long; centre and half_length in m."""
+
+    def position(phase: Tensor) -> Tensor:
+        x, y, z = centre
+        sine, cosine = phase.sin(), phase.cos()
+        return torch.stack((x + half_length * cosine, y + half_length * sine * cosine, torch.full_like(phase, z)), -1)
+
+    return position
+
+
+CURVES: dict[str, tuple[Curve, float]] = {  # by name: the curve, and its period [s]
+    "slow_circle": (circle((2.0, 0.0, 1.0), 2.0), 10.0),
+    "fast_circle": (circle((3.0, 0.0, 2.0), 1.5), 2.0),
+    "lemniscate": (lemniscate((2.0, 0.0, 1.5), 2.0), 8.0),  # size and period chosen here
+}
+
+
+class TrackingEnv(QuadrotorEnv):
+    """Follow a point that moves along a periodic curve (paper, table I).
+
+    ==========================================  ====  =============================================
+    observation                                 size  unit
+    ==========================================  ====  =============================================
+    next 10 points of the curve - position      30    10 m, world frame; 0.1 s apart, nearest first
+    quaternion                                  4     (w, x, y, z), body to world
+    velocity                                    3     10 m/s, world frame
+    angular velocity                            3     10 rad/s, body frame
+    ==========================================  ====  =============================================
+
+    Reward: that of hovering, with the point as its target: 0.1 - (0.1/9) |p - target| - 1e-5 |q - level| - 0.002 |v|
+    - 0.002 |w|.
+
+    Start: level and at rest, uniformly within 0.2 m of the point along each axis; the phase is uniform. State added:
+    ``phase`` (1) [rad] in [0, 2 pi), ``target`` (3) [m], the point that belongs to it, and ``squared_error`` (1) [m2],
+    summed for the metric below.
+
+    End: crash when 5 m away from the centre of the curve along x or y, or outside 0 < z < 6 m (a curve that needs more
+    room has 3 m beyond it); truncated after ``max_episode_steps``, 512. Success of a state: within 0.1 m of the
+    point. Success of an episode: ``tracking_rmse`` below 0.1 m, without a crash.
+
+    Metrics: ``position_error``, the distance to the point [m]; ``tracking_rmse``, the root of its mean square since 2 s
+    after the start [m] (before that: since the start).
+
+    Args:
+        num_envs: number of drones that fly in parallel.
+        curve: "slow_circle" (2 m, 1.26 m/s), "fast_circle" (1.5 m, 4.7 m/s, 14.8 m/s2: out of reach at 2 rad/s, fly it
+            with a drone that turns at 6 rad/s), "lemniscate" (2 m, 8 s), or a function of your own from phases (*)
+            [rad] to positions (*, 3) [m], of period 2 pi, made of torch operations.
+        period: time for one round [s]; by default that of the named curve.
+        max_episode_steps: control steps after which an episode is truncated.
+        **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
+
+    Raises:
+        ValueError: the curve is unknown, not periodic, underground, of the wrong shape, or has no period.
+    """
+
+    lookahead = 10  # points observed
+    lookahead_interval = 0.1  # [s], between them
+    start_range = 0.2  # [m], to both sides of the point
+    settling_time = 2.0  # [s], not counted in the tracking error
+    box_half_width = 5.0  # [m], around the centre of the curve
+    box_margin = 3.0  # [m], beyond the curve at least
+    box_height = 6.0  # [m]
+    weights = TARGET_WEIGHTS
+    success_radius = 0.1  # [m]
+
+    def __init__(
+        self,
+        num_envs: int = 64,
+        *,
+        curve: str | Curve = "slow_circle",
+        period: float | None = None,
+        max_episode_steps: int = 512,
+        **kwargs: Any,
+    ) -> None:
+        if isinstance(curve, str):
+            if curve not in CURVES:
+                raise ValueError(
+                    f"Unknown curve {curve!r}. Choose from: {', '.join(CURVES)}; or give a function from phases (*) "
+                    "[rad] to positions (*, 3) [m], and its period [s]."
+                )
+            curve, default_period = CURVES[curve]
+            period = default_period if period is None else period
+        if period is None or not 0 < period < math.inf:
+            raise ValueError(f"A curve of your own needs a period in seconds, such as period=10.0; got {period}.")
+        self.curve, self.period = curve, period
+        super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
+
+    def set_up(self) -> None:
+        phase = torch.linspace(0, 2 * math.pi, 257, device=self.device, dtype=self.dtype)
+        points = self.curve(phase)
+        _check_curve(points)
+        low, high = points.amin(0), points.amax(0)
+        self.centre = 0.5 * (low + high)
+        self.half_width = (0.5 * (high - low)[:2] + self.box_margin).clamp_min(self.box_half_width)
+        self.ceiling = max(self.box_height, high[2].item() + self.box_margin)
+        self.ahead = phase.new_tensor(range(1, self.lookahead + 1)) * self.lookahead_interval * self.phase_rate
+
+    @property
+    def phase_rate(self) -> float:
+        """How fast the point moves along the curve [rad/s]."""
+        return 2 * math.pi / self.period
+
+    def initial_state(self, n: int) -> State:
+        phase = (self.uniform(n, 1) + 1.0) * math.pi
+        target = self.curve(phase[:, 0])
+        start = self.hover_state(target + self.start_range * self.uniform(n, 3))
+        return {**start, "phase": phase, "target": target, "squared_error": torch.zeros_like(phase)}
+
+    def advance(self, previous: State, state: State) -> State:
+        phase = torch.remainder(previous["phase"] + self.phase_rate * self.control_dt, 2 * math.pi)
+        state = {**state, "phase": phase, "target": self.curve(phase[:, 0])}
+        error = distance(state).detach().square()
+        starts_anew = previous["step"] == self.settling_steps
+        return {**state, "squared_error": error + torch.where(starts_anew, 0.0, previous["squared_error"])}
+
+    def observe(self, state: State) -> Tensor:
+        points = self.curve(state["phase"] + self.ahead) - state["position"].unsqueeze(1)
+        return torch.cat((points.flatten(1) / 10, *body_observation(state)), -1)
+
+    def reward_terms(self, state: State) -> State:
+        return target_reward(state, self.weights)
+
+    def is_crash(self, state: State) -> Tensor:
+        return outside(state["position"], self.centre, self.half_width, self.ceiling)
+
+    def is_success(self, state: State) -> Tensor:
+        return distance(state) < self.success_radius
+
+    def metrics(self, state: State) -> State:
+        settled = state["step"] > self.settling_steps
+        counted = torch.where(settled, state["step"] - self.settling_steps, state["step"]).clamp_min(1)
+        return {"position_error": distance(state), "tracking_rmse": (state["squared_error"] / counted).sqrt()}
+
+    def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
+        """Judges the episode by its ``tracking_rmse``."""
+        metrics = super().episode_metrics(rollout)
+        success = (metrics["tracking_rmse"] < self.success_radius) * (1 - metrics["crash"])
+        return {**metrics, "success": success}
+
+    @property
+    def settling_steps(self) -> int:
+        """Control steps at the start of an episode that the tracking error leaves out."""
+        return round(self.settling_time / self.control_dt)
+
+
+def _check_curve(points: Tensor) -> None:
+    """Refuse a curve, sampled over one period with both ends, that cannot be flown."""
+    if points.shape != (257, 3):
+        raise ValueError(f"A curve maps phases of shape (*) to positions (*, 3); from (257) it made {points.shape}.")
+    if not points.isfinite().all():
+        raise ValueError("The curve is not finite everywhere in [0, 2 pi].")
+    gap = norm(points[0] - points[-1]).item()
+    if gap > 0.01:
+        raise ValueError(
+            f"The curve is not periodic: from phase 0 to 2 pi it moves by {gap:.3g} m. Make it close at 2 pi."
+        )
+    if points[:, 2].min() <= 0:
+        raise ValueError(f"The curve goes down to z = {points[:, 2].min():.3g} m, and the ground is at 0. Lift it.")

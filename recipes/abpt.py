@@ -4,7 +4,17 @@ python recipes/abpt.py task=hovering seed=0
 """
 
 import hydra
-from common import Run, actor_parameters, descend, iterations, make_optimizer, minibatches, network, set_up
+from common import (
+    Run,
+    actor_parameters,
+    descend,
+    iterations,
+    make_optimizer,
+    minibatches,
+    network,
+    set_up,
+    update_normalizer,
+)
 from omegaconf import DictConfig
 from torchrl.objectives import SoftUpdate
 
@@ -23,7 +33,7 @@ def main(cfg: DictConfig) -> None:
     critic_parameters = loss.qvalue_network_params.parameters()
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
-    run = Run(cfg, actor, loss=loss)
+    run = Run(cfg, env, actor, loss=loss)
     carry = env.reset()
     for _ in run:
         # The actor: up the N-step and the 0-step return of one horizon, through the dynamics.
@@ -40,6 +50,7 @@ def main(cfg: DictConfig) -> None:
             target.step()
 
         # The next horizon starts where the policy has been before, and in part afresh.
+        update_normalizer(env, data)
         buffer.extend(data)
         carry = buffer.initial_state(env, cfg.buffer.fraction)
 

@@ -4,7 +4,7 @@ python recipes/bptt.py task=hovering seed=0
 """
 
 import hydra
-from common import Run, actor_parameters, descend, iterations, make_optimizer, restart, set_up
+from common import Run, actor_parameters, descend, iterations, make_optimizer, restart, set_up, update_normalizer
 from omegaconf import DictConfig
 
 from torchrl_quad import BPTTLoss, differentiable_rollout
@@ -16,13 +16,14 @@ def main(cfg: DictConfig) -> None:
     loss = BPTTLoss(actor, **cfg.loss).make_value_estimator(gamma=cfg.gamma)
     optimizer, schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
 
-    run = Run(cfg, actor, loss=loss)
+    run = Run(cfg, env, actor, loss=loss)
     carry = env.reset()
     for _ in run:
         rollout, carry = differentiable_rollout(env, actor, carry, cfg.horizon)
         loss_actor, metrics = loss.loss_actor(rollout)
         loss_alpha = metrics.get("loss_alpha", 0.0)
         grad_actor = descend(optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
+        update_normalizer(env, rollout)
         carry = restart(env, carry, cfg.restart_fraction)
         schedule.step()
         run.record(loss_actor=loss_actor, grad_actor=grad_actor, **metrics)

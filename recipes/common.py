@@ -7,24 +7,25 @@ import json
 import os
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torch.optim import lr_scheduler
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
-from torchrl_quad import QuadrotorEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad import ObservationNormalizer, differentiable_rollout, make_actor, make_env
 from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.render import plot_flight, plot_learning_curve
-
 
 UNITS = {  # how the metrics of an evaluation are printed: factor and unit
     "position_error": (100, "cm (median)"),
@@ -36,24 +37,35 @@ UNITS = {  # how the metrics of an evaluation are printed: factor and unit
 }
 
 
-def set_up(cfg: DictConfig) -> tuple[QuadrotorEnv, TensorDictModuleBase]:
+def set_up(cfg: DictConfig) -> tuple[EnvBase, TensorDictModuleBase]:
     """Seed everything, and build the environment and the policy of a configuration."""
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
+    if cfg.normalize:
+        cfg.actor.input_scale = 1.0
+        if "critic" in cfg:
+            cfg.critic.input_scale = 1.0
     env = build_env(cfg, cfg.num_envs, cfg.seed, compile=cfg.compile)
     return env, make_policy(cfg, env)
 
 
-def build_env(cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = False) -> QuadrotorEnv:
-    """The environment of a configuration."""
+def build_env(cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = False) -> EnvBase:
+    """The environment of a configuration, under a normaliser where it asks for one."""
     options = OmegaConf.to_container(cfg.env, resolve=True)
-    return make_env(cfg.task, num_envs=num_envs, device=cfg.device, seed=seed, compile=compile, **options)
+    env = make_env(cfg.task, num_envs=num_envs, device=cfg.device, seed=seed, compile=compile, **options)
+    return TransformedEnv(env, ObservationNormalizer(env)) if cfg.normalize else env
 
 
-def make_policy(cfg: DictConfig, env: QuadrotorEnv) -> TensorDictModuleBase:
-    """The policy of a configuration; it writes log-probabilities where the loss has an entropy bonus."""
-    has_bonus = cfg.loss.alpha != 0
-    return make_actor(env, **network(cfg.actor), scale_init=cfg.actor.scale_init, return_log_prob=has_bonus)
+def update_normalizer(env: EnvBase, rollout: TensorDictBase) -> None:
+    """Show the observations of a horizon to the normaliser, where there is one."""
+    if isinstance(env, TransformedEnv):
+        env.transform.update(rollout)
+
+
+def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModuleBase:
+    """The policy of a configuration; it writes log-probabilities where the loss needs them."""
+    log_prob = cfg.algorithm == "ppo" or cfg.loss.alpha != 0
+    return make_actor(env, **network(cfg.actor), scale_init=cfg.actor.scale_init, return_log_prob=log_prob)
 
 
 def network(cfg: DictConfig) -> dict[str, Any]:
@@ -68,11 +80,24 @@ def actor_parameters(loss: PathwiseLoss) -> list[nn.Parameter]:
 
 
 def make_optimizer(
-    cfg: DictConfig, parameters: Any, iterations: int
-) -> tuple[torch.optim.Adam, torch.optim.lr_scheduler.LinearLR]:
-    """Adam, and the schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run."""
+    cfg: DictConfig, parameters: Iterable[nn.Parameter], iterations: int
+) -> tuple[torch.optim.Adam, lr_scheduler.LRScheduler]:
+    """Adam, and the schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run.
+
+    Raises:
+        ValueError: the schedule is unknown.
+    """
     optimizer = torch.optim.Adam(parameters, cfg.lr, betas=tuple(cfg.betas))
-    return optimizer, torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, cfg.final_lr / cfg.lr, max(iterations - 1, 1))
+    steps, decay = max(iterations - 1, 1), cfg.final_lr / cfg.lr
+    schedules = {
+        "constant": lambda: lr_scheduler.ConstantLR(optimizer, 1.0),
+        "linear": lambda: lr_scheduler.LinearLR(optimizer, 1.0, decay, steps),
+        "exponential": lambda: lr_scheduler.ExponentialLR(optimizer, decay ** (1 / steps)),
+        "cosine": lambda: lr_scheduler.CosineAnnealingLR(optimizer, steps, cfg.final_lr),
+    }
+    if cfg.schedule not in schedules:
+        raise ValueError(f"Unknown schedule {cfg.schedule!r}. Choose from: {', '.join(schedules)}.")
+    return optimizer, schedules[cfg.schedule]()
 
 
 def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> Tensor:
@@ -89,10 +114,11 @@ def descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float
     return norm
 
 
-def restart(env: QuadrotorEnv, carry: TensorDictBase, fraction: float) -> TensorDictBase:
+def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictBase:
     """Give up a random fraction of the flights, and start them afresh; the others go on."""
-    chosen = torch.rand(*carry.shape, 1, device=carry.device) < fraction
-    return env.reset(carry.set("_reset", chosen), set_state=False)
+    fresh = TensorDict({"state": env.sample_initial_state(env.num_envs)}, env.batch_size)
+    chosen = torch.rand(carry.shape, device=carry.device) < fraction
+    return env.reset(fresh.where(chosen, carry.select("state")), set_state=True)
 
 
 def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDictBase]:
@@ -102,7 +128,13 @@ def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDict
         yield steps[torch.randint(len(steps), (cfg.batch_size,), device=steps.device)]
 
 
-def evaluate(env: QuadrotorEnv, actor: TensorDictModuleBase) -> tuple[dict[str, float], TensorDictBase]:
+def shuffled(rollout: TensorDictBase, batch_size: int) -> Iterable[TensorDictBase]:
+    """All steps of a rollout once, in random batches."""
+    steps = rollout.reshape(-1)
+    return steps[torch.randperm(len(steps), device=steps.device)].split(batch_size)
+
+
+def evaluate(env: EnvBase, actor: TensorDictModuleBase) -> tuple[dict[str, float], TensorDictBase]:
     """One episode of the deterministic policy from a fresh start in every environment.
 
     Returns:
@@ -133,8 +165,10 @@ class Run:
         FileExistsError: the folder holds the metrics of another run.
     """
 
-    def __init__(self, cfg: DictConfig, actor: TensorDictModuleBase, **modules: nn.Module) -> None:
+    def __init__(self, cfg: DictConfig, env: EnvBase, actor: TensorDictModuleBase, **modules: nn.Module) -> None:
         self.cfg, self.actor, self.modules = cfg, actor, {"actor": actor, **modules}
+        if cfg.normalize:
+            self.modules["normalizer"] = env.transform
         self.folder = Path(HydraConfig.get().runtime.output_dir)
         if (self.folder / "metrics.csv").exists():
             raise FileExistsError(f"{self.folder} holds the results of another run. Choose another hydra.run.dir.")
@@ -162,6 +196,8 @@ class Run:
                 bar.update(self.steps_per_iteration)
                 if (iteration + 1) % self.cfg.eval.interval == 0 or iteration + 1 == self.iterations:
                     self.eval_env.set_seed(self.cfg.eval.seed)
+                    if self.cfg.normalize:
+                        self.eval_env.transform.load_state_dict(self.modules["normalizer"].state_dict())
                     metrics, _ = evaluate(self.eval_env, self.actor)
                     self.seconds = time.perf_counter() - start
                     self._write_row(iteration + 1, metrics)
@@ -217,7 +253,8 @@ class Run:
 
     def _finish(self) -> None:
         """Final evaluation on fresh starts, pictures, summary."""
-        summary, flight = final_evaluation(self.cfg, self.actor)
+        normalizer = self.modules["normalizer"].state_dict() if self.cfg.normalize else None
+        summary, flight = final_evaluation(self.cfg, self.actor, normalizer)
         summary |= {"steps": self.iterations * self.steps_per_iteration, "seconds": round(self.seconds, 2)}
         write_json(self.folder / "summary.json", summary)
         plot_learning_curve(self.folder / "metrics.csv", self.folder / "learning_curve.png")
@@ -233,17 +270,25 @@ def iterations(cfg: DictConfig) -> int:
 
 
 def final_evaluation(
-    cfg: DictConfig, actor: TensorDictModuleBase, episodes: int = 256, seed: int = 2_000_000
+    cfg: DictConfig,
+    actor: TensorDictModuleBase,
+    normalizer: dict[str, Tensor] | None,
+    episodes: int = 256,
+    seed: int = 2_000_000,
 ) -> tuple[dict[str, Any], TensorDictBase]:
     """The deterministic policy over fresh episodes: a summary, and the flight."""
     env = build_env(cfg, episodes, seed)
+    if normalizer is not None:
+        env.transform.load_state_dict(normalizer)
     metrics, flight = evaluate(env, actor)
     summary = {"task": cfg.task, "algorithm": cfg.algorithm, "seed": cfg.seed, "episodes": episodes}
     return summary | {name.removeprefix("eval/"): v for name, v in metrics.items() if name.startswith("eval/")}, flight
 
 
-def load_policy(checkpoint: Path, device: str = "cpu") -> tuple[DictConfig, TensorDictModuleBase]:
-    """The configuration and the policy of a checkpoint.
+def load_policy(
+    checkpoint: Path, device: str = "cpu"
+) -> tuple[DictConfig, TensorDictModuleBase, dict[str, Tensor] | None]:
+    """The configuration, the policy, and the state of the normaliser, where there is one, of a checkpoint.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -259,7 +304,7 @@ def load_policy(checkpoint: Path, device: str = "cpu") -> tuple[DictConfig, Tens
         actor.load_state_dict(state["actor"])
     except Exception as error:
         raise ValueError(f"{checkpoint} is not a checkpoint that these recipes can read: {error}") from error
-    return cfg, actor
+    return cfg, actor, state.get("normalizer")
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

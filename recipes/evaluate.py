@@ -16,8 +16,8 @@ from torchrl_quad.render import plot_flight
 @hydra.main(config_path="config", config_name="evaluate", version_base=None)
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
-    trained, actor = load_policy(Path(cfg.checkpoint), cfg.device)
-    summary, flight = final_evaluation(trained, actor, cfg.episodes, cfg.seed)
+    trained, actor, normalizer = load_policy(Path(cfg.checkpoint), cfg.device)
+    summary, flight = final_evaluation(trained, actor, normalizer, cfg.episodes, cfg.seed)
     folder = Path(cfg.checkpoint).parent
     write_json(folder / "evaluation.json", summary)
     plot_flight(flight, folder / "evaluation.png", control_dt=trained.env.control_dt)

@@ -4,7 +4,18 @@ python recipes/shac.py task=hovering seed=0
 """
 
 import hydra
-from common import Run, actor_parameters, descend, iterations, make_optimizer, minibatches, network, restart, set_up
+from common import (
+    Run,
+    actor_parameters,
+    descend,
+    iterations,
+    make_optimizer,
+    minibatches,
+    network,
+    restart,
+    set_up,
+    update_normalizer,
+)
 from omegaconf import DictConfig
 from torchrl.objectives import SoftUpdate
 
@@ -21,7 +32,7 @@ def main(cfg: DictConfig) -> None:
     critic_parameters = loss.value_network_params.parameters()
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
-    run = Run(cfg, actor, loss=loss)
+    run = Run(cfg, env, actor, loss=loss)
     carry = env.reset()
     for _ in run:
         # The actor: up the return of one horizon and the value of its end, through the dynamics.
@@ -37,6 +48,7 @@ def main(cfg: DictConfig) -> None:
             descend(critic_optimizer, loss_value, cfg.critic.max_grad_norm)
             target.step()
 
+        update_normalizer(env, rollout)
         carry = restart(env, carry, cfg.restart_fraction)
         actor_schedule.step()
         critic_schedule.step()

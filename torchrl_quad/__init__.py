@@ -1,6 +1,6 @@
 """Differentiable quadrotor tasks and first-order policy losses for TorchRL."""
 
-from torchrl_quad.data import VisitedStateBuffer, differentiable_rollout
+from torchrl_quad.data import ObservationNormalizer, VisitedStateBuffer, differentiable_rollout
 from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
 from torchrl_quad.envs import HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
 from torchrl_quad.modules import make_actor, make_qvalue, make_value
@@ -13,6 +13,7 @@ __all__ = [
     "BPTTLoss",
     "HoveringEnv",
     "LandingEnv",
+    "ObservationNormalizer",
     "QuadrotorEnv",
     "QuadrotorParams",
     "RacingEnv",

@@ -1,0 +1,56 @@
+"""Normalised observations that gradients can pass."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase, ObservationNorm
+
+
+class ObservationNormalizer(ObservationNorm):
+    """Subtracts the mean and divides by the standard deviation of all observations seen, fixed within a horizon.
+
+    TorchRL's VecNorm changes its statistics in place at every step, which breaks backward through a rollout. Here they
+    change only when :meth:`update` is called, between horizons, and a graph that is still to be differentiated keeps
+    the values that it was made with. They are buffers, and so stand in ``state_dict``.
+
+    .. code-block:: python
+
+        normalizer = ObservationNormalizer(env)
+        env = TransformedEnv(env, normalizer)
+        rollout, carry = differentiable_rollout(env, actor, carry, 64)
+        normalizer.update(rollout)
+
+    Args:
+        env: gives size, device and floating-point type of the observation.
+        key: the entry to normalise, (*, k), in its own place.
+        min_scale: the least standard deviation to divide by, in the observation's unit.
+    """
+
+    def __init__(self, env: EnvBase, key: NestedKey = "observation", *, min_scale: float = 0.01) -> None:
+        spec = env.observation_spec[key]
+        loc = torch.zeros(spec.shape[-1], device=spec.device, dtype=spec.dtype)
+        super().__init__(loc, torch.ones_like(loc), in_keys=[key], standard_normal=True)
+        self.min_scale = min_scale
+        self.register_buffer("variance", torch.zeros_like(loc))
+        self.register_buffer("count", torch.zeros_like(loc[0], dtype=torch.float64))
+
+    @torch.no_grad()
+    def update(self, rollout: TensorDictBase) -> None:
+        """Take the observations of a rollout (any batch size), as this transform wrote them, into the statistics.
+
+        The values that are not finite are left out. Observations that are kept from before, such as a carry, stay as
+        they were; reset to their state to see them anew.
+        """
+        written = rollout.get(self.out_keys[0]).reshape(-1, self.loc.shape[-1])
+        seen = written[written.isfinite().all(-1)] * self.scale + self.loc
+        if len(seen) == 0:
+            return
+        count = self.count + len(seen)
+        share = (len(seen) / count).to(seen.dtype)
+        gap = seen.mean(0) - self.loc
+        spread = torch.lerp(self.variance, seen.var(0, correction=0), share) + share * (1.0 - share) * gap.square()
+        # New tensors: those of before may belong to a graph.
+        self.count, self.loc, self.variance = count, self.loc + share * gap, spread
+        self.scale = spread.sqrt().clamp_min(self.min_scale)

@@ -1,0 +1,241 @@
+"""Random drones, wind, sensors and starts, on every task."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import check_env_specs
+
+from torchrl_quad import HoveringEnv, VisitedStateBuffer, differentiable_rollout, load_drone, make_actor, make_env
+from torchrl_quad.dynamics import quaternion
+
+EVERYTHING = {
+    "wind": {"mean": [1.0, 0.0, 0.0], "spread": [0.5, 0.5, 0.0], "gust": 0.5},
+    "observation_noise": {"position": 0.01, "attitude": 0.01, "velocity": 0.05, "angular_velocity": 0.02},
+    "observation_delay": 2,
+    "randomize": {
+        "mass": {"scale": [0.8, 1.2]},
+        "inertia": {"scale": [0.9, 1.1]},
+        "motor_time_constant": {"uniform": [0.02, 0.05]},
+        "linear_drag": {"normal": [0.005, 0.001]},
+    },
+    "random_start": {"tilt": 0.5, "yaw": 3.1, "velocity": 1.0, "angular_velocity": 0.5},
+}
+
+
+def fly(env, td, actions):
+    steps = []
+    for action in actions:
+        steps.append(env.step(td.copy().set("action", action)))
+        td = env.step_mdp(steps[-1])
+    return torch.stack(steps, 1)
+
+
+def hold(env, steps):
+    return [env.hover_action.expand(env.num_envs, 4)] * steps
+
+
+@pytest.mark.parametrize("task", ["hovering", "landing", "racing", "tracking"])
+def test_every_task_takes_every_option_and_a_restored_state_flies_the_same(task):
+    env = make_env(task, num_envs=3, dtype=torch.float64, **EVERYTHING)
+    check_env_specs(env, break_when_any_done="both")
+    env.set_seed(1)
+    whole = fly(env, env.reset(), hold(env, 4))
+    generator = env.rng.get_state()
+    rest = fly(env, env.step_mdp(whole[:, -1]), hold(env, 4))
+    env.reset()
+    env.rng.set_state(generator)
+    restored = env.reset(TensorDict({"state": whole["next", "state"][:, -1].clone()}, [3]), set_state=True)
+    torch.testing.assert_close(restored["observation"], whole["next", "observation"][:, -1], rtol=0, atol=0)
+    again = fly(env, restored, hold(env, 4))
+    for key, value in rest["next"].items(include_nested=True, leaves_only=True):
+        assert torch.equal(value, again["next", key]), key
+
+
+@pytest.mark.parametrize("task", ["hovering", "landing", "racing", "tracking"])
+def test_gradients_with_every_option_agree_with_finite_differences(task):
+    env = make_env(task, num_envs=2, dtype=torch.float64, **EVERYTHING)
+    start = env.rollout(3)["next", "state"][:, -1].clone()
+    actions = (env.hover_action + 0.1 * torch.randn(2, 8, 4, dtype=torch.float64)).requires_grad_()
+    position = start["position"].clone().requires_grad_()
+    mass = start["drone", "mass"].clone().requires_grad_()
+    wind = start["wind"].clone().requires_grad_()
+
+    def rewards_and_observations(actions, position, mass, wind):
+        env.set_seed(5)
+        state = start.clone(recurse=True)
+        state["position"], state["drone", "mass"], state["wind"] = position, mass, wind
+        td = env.reset(TensorDict({"state": state}, [2]), set_state=True)
+        ends = fly(env, td, actions.unbind(1))["next"]
+        return torch.cat((ends["reward"].flatten(), ends["observation"].flatten()))
+
+    inputs = (actions, position, mass, wind)
+    assert torch.autograd.gradcheck(rewards_and_observations, inputs, fast_mode=True, atol=1e-6, rtol=1e-5)
+
+
+def test_the_visited_state_buffer_keeps_the_drone_and_the_sensors():
+    env = make_env("racing", num_envs=4, **EVERYTHING)
+    actor, buffer = make_actor(env), VisitedStateBuffer(100)
+    rollout, _ = differentiable_rollout(env, actor, None, 5)
+    buffer.extend(rollout)
+    carry = buffer.initial_state(env, fraction=1.0)
+    masses = rollout["state", "drone", "mass"].flatten()
+    assert torch.isin(carry["state", "drone", "mass"].flatten(), masses).all()
+    assert carry["state", "measurements"].shape == (4, 3, 13)
+
+
+# -- drones ------------------------------------------------------------------------------------------------------------
+
+
+def test_drones_are_drawn_at_reset_within_their_bounds_and_stay_for_an_episode():
+    env = HoveringEnv(num_envs=2000, randomize=EVERYTHING["randomize"], max_episode_steps=3)
+    td = env.reset()
+    drone, nominal = td["state", "drone"], env.nominal
+    assert set(drone.keys()) == set(EVERYTHING["randomize"])
+    ratio = drone["mass"] / nominal.mass
+    assert 0.8 <= ratio.min() < 0.82
+    assert 1.18 < ratio.max() <= 1.2
+    assert 0.02 <= drone["motor_time_constant"].min() < 0.021
+    assert (drone["inertia"] / nominal.inertia).std(0).min() > 0.05
+    assert abs(drone["linear_drag"].std().item() - 0.001) < 1e-4
+    flight = env.rollout(5, break_when_any_done=False)["state", "drone", "mass"]
+    assert (flight[:, 0] == flight[:, 2]).all()
+    assert (flight[:, 2] != flight[:, 3]).all()
+
+
+def test_a_drone_that_is_heavier_than_its_controller_believes_sinks():
+    env = HoveringEnv(num_envs=1, randomize={"mass": {"uniform": [0.552, 0.552]}}, dtype=torch.float64)
+    fixed = HoveringEnv(num_envs=1, dtype=torch.float64)
+    fixed.params = fixed.params.replace(mass=0.552)
+    td = env.reset()
+    known = fixed.reset(TensorDict({"state": td["state"].exclude("drone")}, [1]), set_state=True)
+    flight, expected = fly(env, td, hold(env, 20)), fly(fixed, known, hold(fixed, 20))
+    torch.testing.assert_close(flight["next", "state", "position"], expected["next", "state", "position"])
+    # 20 % too heavy: it falls with (1 - 1 / 1.2) g.
+    assert flight["next", "state", "velocity"][0, -1, 2].item() == pytest.approx(-9.81 / 6 * 0.4, rel=0.02)
+    assert env.nominal.mass.item() == pytest.approx(0.46)
+
+
+def test_weaker_rotors_do_not_turn_faster_than_they_can():
+    env = HoveringEnv(num_envs=1, randomize={"rotor_speed_max": {"uniform": [1800.0, 1800.0]}})
+    flight = fly(env, env.reset(), [torch.tensor([[1.0, 0.0, 0.0, 0.0]])] * 30)
+    assert flight["next", "state", "rotor_speed"].max().item() == pytest.approx(1800.0, rel=1e-3)
+
+
+def test_a_yaml_file_of_distributions_is_read(tmp_path):
+    (tmp_path / "drones.yaml").write_text("mass: {scale: [0.9, 1.1]}\n")
+    env = HoveringEnv(num_envs=2, randomize=str(tmp_path / "drones.yaml"))
+    assert env.reset()["state", "drone", "mass"].shape == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("randomize", "message"),
+    [
+        ({"weight": {"scale": [0.9, 1.1]}}, "randomize: unknown field 'weight'. Choose from: mass, inertia"),
+        ({"rate_gain": {"scale": [0.9, 1.1]}}, "'rate_gain' belongs to the flight controller, which keeps the nominal"),
+        ({"mass": {"gamma": [1, 2]}}, "mass needs one distribution of: uniform: low and high; scale: .*; normal: "),
+        ({"mass": 0.5}, "mass needs one distribution of"),
+        ({"mass": {"uniform": [1.0]}}, "mass needs two numbers"),
+        ({"mass": {"uniform": [2.0, 1.0]}}, "mass needs two numbers"),
+        (
+            {"mass": {"uniform": [-0.1, 1.0]}},
+            "drones that may be drawn are not all possible: .* 'mass' must be positive",
+        ),
+        ({"mass": {"normal": [0.5, 0.2]}}, "not all possible"),
+        ("none", "Unknown randomize 'none'. Give the path of a .yaml file"),
+    ],
+)
+def test_impossible_drones_are_refused(randomize, message):
+    with pytest.raises(ValueError, match=message):
+        HoveringEnv(num_envs=1, randomize=randomize)
+
+
+# -- wind --------------------------------------------------------------------------------------------------------------
+
+
+def test_in_the_wind_a_drone_drifts_until_it_moves_with_the_air():
+    drone = load_drone("visfly").replace(linear_drag=[2.0, 2.0, 2.0])
+    env = HoveringEnv(num_envs=1, drone=drone, wind={"mean": [1.0, -0.5, 0.0]})
+    flight = fly(env, env.reset(), hold(env, 100))["next", "state", "velocity"][0]
+    torch.testing.assert_close(flight[-1], torch.tensor([1.0, -0.5, 0.0]), atol=2e-2, rtol=0)
+    calm = HoveringEnv(num_envs=1, drone=drone)
+    assert fly(calm, calm.reset(), hold(calm, 10))["next", "state", "velocity"].abs().max() < 1e-5
+
+
+def test_gusts_have_the_strength_and_the_memory_asked_for():
+    env = HoveringEnv(num_envs=4000, wind={"mean": [2.0, 0.0, 0.0], "gust": 1.5, "gust_time": 0.1})
+    wind = fly(env, env.reset(), hold(env, 6))["next", "state", "wind"] - torch.tensor([2.0, 0.0, 0.0])
+    for t in (0, 5):
+        assert wind[:, t].std(0).tolist() == pytest.approx([1.5] * 3, rel=0.05)
+    correlation = (wind[:, 0] * wind[:, 5]).mean(0) / 1.5**2
+    assert correlation.tolist() == pytest.approx([0.368] * 3, abs=0.06)
+
+
+def test_the_mean_wind_differs_between_episodes_within_its_spread():
+    env = HoveringEnv(num_envs=1000, wind={"spread": [3.0, 0.0, 1.0]})
+    wind = env.reset()["state", "wind"]
+    assert wind.abs().amax(0).tolist() == pytest.approx([3.0, 0.0, 1.0], abs=0.05)
+
+
+# -- sensors -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_observation_lags_behind_by_the_delay():
+    late, now = (HoveringEnv(num_envs=2, seed=4, observation_delay=delay, dtype=torch.float64) for delay in (3, 0))
+    actions = [now.hover_action + 0.3 * torch.rand(2, 4, dtype=torch.float64) for _ in range(8)]
+    seen, true = fly(late, late.reset(), actions), fly(now, now.reset(), actions)
+    torch.testing.assert_close(seen["observation"][:, 3:], true["observation"][:, :-3])
+    torch.testing.assert_close(seen["next", "reward"], true["next", "reward"])
+    assert (seen["observation"][:, :3] == true["observation"][:, :1]).all()
+
+
+def test_the_noise_has_the_size_asked_for_and_rewards_do_not_see_it():
+    noise = {"position": 0.2, "attitude": 0.05, "velocity": 0.3, "angular_velocity": 0.4}
+    env = HoveringEnv(num_envs=4000, observation_noise=noise)
+    flight = fly(env, env.reset(), hold(env, 3))
+    seen, state = flight["next", "observation"][:, -1], flight["next", "state"][:, -1]
+    error = seen[:, :3] * 10 - (state["target"] - state["position"])
+    assert error.std(0).tolist() == pytest.approx([0.2] * 3, rel=0.05)
+    assert (seen[:, 7:10] * 10).std(0).tolist() == pytest.approx([0.3] * 3, rel=0.05)
+    assert (seen[:, 10:] * 10).std(0).tolist() == pytest.approx([0.4] * 3, rel=0.05)
+    angle = 2 * quaternion.rotate(seen[:, 3:7], torch.eye(3)[2].expand(4000, 3))[:, :2] / 2
+    assert angle.std(0).tolist() == pytest.approx([0.05] * 2, rel=0.05)
+    assert seen[:, 3:7].norm(dim=-1).tolist() == pytest.approx([1.0] * 4000, abs=1e-5)
+    silent = HoveringEnv(num_envs=4000)
+    assert torch.equal(flight["next", "reward"], fly(silent, silent.reset(), hold(env, 3))["next", "reward"])
+
+
+# -- starts ------------------------------------------------------------------------------------------------------------
+
+
+def test_random_starts_tilt_turn_and_push_within_their_bounds():
+    env = HoveringEnv(num_envs=4000, random_start=EVERYTHING["random_start"])
+    state = env.reset()["state"]
+    up = quaternion.rotate(state["quaternion"], torch.tensor([0.0, 0.0, 1.0]).expand(4000, 3))
+    tilt = torch.acos(up[:, 2].clamp(max=1.0))
+    assert 0.48 < tilt.max() <= 0.5 + 1e-3
+    assert tilt.mean().item() == pytest.approx(0.25, abs=0.02)
+    ahead = quaternion.rotate(state["quaternion"], torch.tensor([1.0, 0.0, 0.0]).expand(4000, 3))
+    assert torch.atan2(ahead[:, 1], ahead[:, 0]).abs().max() > 3.0
+    assert 0.95 < state["velocity"].abs().max() <= 1.0
+    assert 0.47 < state["angular_velocity"].abs().max() <= 0.5
+    assert state["quaternion"].norm(dim=-1).tolist() == pytest.approx([1.0] * 4000, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"wind": {"speed": 3}}, "wind: unknown key 'speed'. Allowed: mean, spread, gust, gust_time"),
+        ({"wind": {"mean": [1.0]}}, "wind: mean must be three numbers"),
+        ({"wind": {"gust": -1.0}}, "wind: gust must be zero or positive"),
+        ({"wind": {"gust_time": 0.0}}, "wind: gust_time must be positive"),
+        ({"wind": 3.0}, "wind must be a mapping with any of mean"),
+        ({"observation_noise": {"yaw": 1.0}}, "observation_noise: unknown key 'yaw'"),
+        ({"observation_noise": {"delay": 1}}, "observation_noise: unknown key 'delay'"),
+        ({"observation_noise": {"position": -1.0}}, "observation_noise: position must be zero or positive"),
+        ({"observation_delay": -1}, "observation_delay must be zero or more control steps, got -1"),
+        ({"random_start": {"tilt": float("nan")}}, "random_start: tilt must be zero or positive"),
+    ],
+)
+def test_bad_options_say_what_is_allowed(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        HoveringEnv(num_envs=1, **kwargs)

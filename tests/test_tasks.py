@@ -1,0 +1,320 @@
+"""What tracking, landing and racing observe, reward and end, by numbers worked out here."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import check_env_specs
+
+from torchrl_quad import LandingEnv, RacingEnv, TrackingEnv, load_track, make_env
+
+TASKS = ["hovering", "landing", "racing", "tracking"]
+
+
+def hold(env, td, steps):
+    """Fly on with the hover action."""
+    return torch.stack([td := env.step_mdp(step) for step in flights(env, td, steps)], 1)
+
+
+def flights(env, td, steps):
+    for _ in range(steps):
+        step = env.step(td.copy().set("action", env.hover_action.expand(env.num_envs, 4)))
+        yield step
+        td = env.step_mdp(step)
+
+
+def fly(env, td, steps):
+    return torch.stack(list(flights(env, td, steps)), 1)
+
+
+def start(env, **entries):
+    """A reset with some entries of the state set."""
+    td = env.reset()
+    for key, value in entries.items():
+        td["state", key] = torch.as_tensor(value, dtype=td["state", key].dtype).expand_as(td["state", key]).clone()
+    return env.reset(td, set_state=True)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_specs_hold_and_the_reward_is_the_sum_of_its_terms(task):
+    env = make_env(task, num_envs=3, dtype=torch.float64)
+    check_env_specs(env, break_when_any_done="both")
+    flight = env.rollout(20, break_when_any_done=False)["next"]
+    torch.testing.assert_close(sum(flight["reward_terms"].values()), flight["reward"])
+    assert (flight["terminated"] == (flight["crash"] | (flight["success"] & env.ends_on_success))).all()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_goes_on_from_a_state_that_was_set_as_if_it_had_never_stopped(task):
+    env = make_env(task, num_envs=4, dtype=torch.float64)
+    whole = fly(env, env.reset(), 12)
+    middle = TensorDict({"state": whole["next", "state"][:, 5].clone()}, [4])
+    rest = fly(env, env.reset(middle, set_state=True), 6)
+    for key, value in rest["next"].items(include_nested=True, leaves_only=True):
+        assert torch.equal(value, whole["next", key][:, 6:]), key
+
+
+# -- tracking ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_point_moves_along_the_circle_and_the_next_ten_are_observed():
+    env = TrackingEnv(num_envs=4, dtype=torch.float64)
+    td = env.reset()
+    phase = td["state", "phase"]
+    flight = fly(env, td, 50)["next", "state"]
+    angle = phase.unsqueeze(1) + 0.2 * math.pi * 0.02 * torch.arange(1, 51, dtype=torch.float64).view(1, 50, 1)
+    expected = torch.cat((2 + 2 * angle.cos(), 2 * angle.sin(), torch.ones_like(angle)), -1)
+    torch.testing.assert_close(flight["target"], expected)
+    # In 0.1 s steps: what is the point after 5 control steps is the first point observed now.
+    first = 10 * td["observation"][:, :3] + td["state", "position"]
+    torch.testing.assert_close(first, flight["target"][:, 4])
+    tenth = 10 * td["observation"][:, 27:30] + td["state", "position"]
+    torch.testing.assert_close(tenth, flight["target"][:, 49])
+    assert td["observation"].shape == (4, 40)
+
+
+def test_the_tracking_error_is_the_root_mean_square_since_two_seconds():
+    env = TrackingEnv(num_envs=2, dtype=torch.float64)
+    flight = fly(env, env.reset(), 130)["next"]
+    error = flight["metrics", "position_error"]
+    rmse = flight["metrics", "tracking_rmse"]
+    torch.testing.assert_close(rmse[:, 129], error[:, 100:].square().mean(1).sqrt())
+    torch.testing.assert_close(rmse[:, 100], error[:, 100])
+    torch.testing.assert_close(rmse[:, 99], error[:, :100].square().mean(1).sqrt())
+    assert not rmse.requires_grad
+
+
+def test_an_episode_of_tracking_succeeds_below_ten_centimetres_without_a_crash():
+    def still(phase):
+        return torch.stack((torch.zeros_like(phase), torch.zeros_like(phase), 1 + 0.001 * phase.cos()), -1)
+
+    env = TrackingEnv(num_envs=3, curve=still, period=10.0, max_episode_steps=120)
+    td = start(env, position=torch.tensor([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.0, 0.0, 5.99]]))
+    td["state", "velocity"][2, 2] = 5.0
+    metrics = env.episode_metrics(fly(env, env.reset(td, set_state=True), 120))
+    assert metrics["success"].tolist() == [1.0, 0.0, 0.0]
+    assert metrics["crash"].tolist() == [0.0, 0.0, 1.0]
+    assert metrics["tracking_rmse"][:2].tolist() == pytest.approx([0.0, 0.2], abs=2e-3)
+
+
+@pytest.mark.parametrize("name", ["slow_circle", "fast_circle", "lemniscate"])
+def test_the_named_curves_start_near_their_point_and_inside_their_box(name):
+    env = TrackingEnv(num_envs=500, curve=name, seed=2)
+    state = env.reset()["state"]
+    assert ((state["position"] - state["target"]).abs().amax(0) <= 0.2).all()
+    assert state["phase"].min() < 0.1
+    assert state["phase"].max() > 2 * math.pi - 0.1
+    assert not env.is_crash(state).any()
+
+
+def test_a_large_curve_gets_a_box_that_holds_it():
+    def large(phase):
+        return torch.stack((20 * phase.cos(), 3 * phase.sin(), 8 + 0 * phase), -1)
+
+    env = TrackingEnv(num_envs=3, curve=large, period=60.0)
+    positions = torch.tensor([[22.9, 0.0, 8.0], [23.1, 0.0, 8.0], [0.0, 5.9, 8.0]])
+    assert env.is_crash({"position": positions}).flatten().tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"curve": "square"}, "Unknown curve 'square'. Choose from: slow_circle, fast_circle, lemniscate"),
+        ({"curve": lambda p: p}, "needs a period in seconds"),
+        ({"curve": "slow_circle", "period": -1.0}, "needs a period in seconds, such as period=10.0; got -1.0"),
+        ({"curve": lambda p: p, "period": 5.0}, r"to positions \(\*, 3\)"),
+        ({"curve": lambda p: torch.stack((p, p, p + 1), -1), "period": 5.0}, "not periodic: .* moves by 10.9 m"),
+        ({"curve": lambda p: torch.stack((p.cos(), p.sin(), p.sin()), -1), "period": 5.0}, "goes down to z = -1 m"),
+        ({"curve": lambda p: torch.stack((p / 0, p, p), -1), "period": 5.0}, "not finite"),
+    ],
+)
+def test_a_curve_that_cannot_be_flown_is_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        TrackingEnv(num_envs=1, **kwargs)
+
+
+# -- landing -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("height", "descent", "distance"),
+    [(2.0, 0.5, 0.0), (2.0, 1.0, 0.3), (2.0, 1.4, 1.0), (0.5, 0.4, 2.0), (0.5, -3.0, 0.5), (0.01, 2.0, 0.4)],
+)
+def test_the_landing_reward_is_the_published_formula(height, descent, distance):
+    env = LandingEnv(num_envs=1, dtype=torch.float64)
+    state = env.reset()["state"]
+    state["position"] = torch.tensor([[2.0 + distance, 0.0, height]], dtype=torch.float64)
+    state["velocity"] = torch.tensor([[0.0, 0.0, -descent]], dtype=torch.float64)
+    best, e = min(max(height, 0.05), 1.0), 1.2
+    x = descent / best
+    expected = 0.1 * (e ** (x if descent <= best else 5 - 4 * x) - 1) / (e - 1)
+    terms = env.reward_terms(state)
+    assert terms["descent"].item() == pytest.approx(expected)
+    assert terms["approach"].item() == pytest.approx(0.1 * (e ** (1 - distance / (2 * best)) - 1) / (e - 1))
+
+
+def test_a_landing_succeeds_crashes_or_does_neither():
+    env = LandingEnv(num_envs=6)
+    positions = [(2.0, 0.0, 0.15), (2.29, -0.29, 0.19), (2.4, 0.0, 0.1), (2.0, 0.0, 0.1), (2.4, 0.0, -0.01), (2, 0, 3)]
+    velocities = [(0.0, 0.0, -0.2), (0.1, 0.0, 0.0), (0, 0, 0), (0.0, 0.0, -0.5), (0, 0, 0), (0, 0, 0)]
+    td = start(env, position=torch.tensor(positions), velocity=torch.tensor(velocities))
+    ends = fly(env, td, 1)["next"]
+    assert ends["success"].flatten().tolist() == [True, True, False, False, False, False]
+    assert ends["crash"].flatten().tolist() == [False, False, False, False, True, False]
+    assert ends["terminated"].flatten().tolist() == [True, True, False, False, True, False]
+    assert ends["reward_terms", "success"].flatten().tolist() == [20.0, 20.0, 0.0, 0.0, 0.0, 0.0]
+    assert ends["reward_terms", "crash"].flatten().tolist() == pytest.approx([0.0, 0.0, 0.0, 0.0, -0.1, 0.0])
+    metrics = env.episode_metrics(fly(env, td, 1))
+    assert metrics["success"].tolist() == [1.0, 1.0, 0.0, 0.0, 0.0, 0.0]
+    assert metrics["crash"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    assert metrics["landing_speed"].isnan().tolist() == [False] * 5 + [True]
+    assert metrics["landing_speed"][3].item() == pytest.approx(0.5, abs=0.05)
+    assert metrics["position_error"][2].item() == pytest.approx(0.4, abs=0.01)
+
+
+def test_the_landing_gradient_is_finite_however_fast_the_fall():
+    env = LandingEnv(num_envs=4)
+    td = start(env, velocity=torch.tensor([[0.0, 0.0, v] for v in (-900.0, -50.0, 0.0, 900.0)]))
+    action = env.hover_action.expand(4, 4).clone().requires_grad_()
+    reward = env.step(td.set("action", action))["next", "reward"]
+    state = {key: value.clone() for key, value in td["state"].items()}
+    state["velocity"].requires_grad_()
+    state["position"].requires_grad_()
+    terms = sum(env.reward_terms(state).values()).sum()
+    assert reward.isfinite().all()
+    assert all(g.isfinite().all() for g in torch.autograd.grad(terms, (state["velocity"], state["position"])))
+
+
+# -- racing ------------------------------------------------------------------------------------------------------------
+
+
+def test_gates_are_passed_in_order_along_the_straight_line_of_a_step():
+    env = RacingEnv(num_envs=4, dtype=torch.float64)
+    gate = torch.tensor([4.0, 4.0, 1.0], dtype=torch.float64)
+    # Fast enough to jump over the gate within one step; beside it; not yet there; through another gate.
+    offset = [[-1.0, 0.0, 0.0], [-1.0, 0.35, 0.0], [-2.0, 0.0, 0.0], [4.0 - 1.0, -4.0, 1.0]]
+    velocity = torch.tensor([[100.0, 0.0, 0.0]] * 2 + [[1.0, 0.0, 0.0]] + [[100.0, 0.0, 0.0]], dtype=torch.float64)
+    td = start(env, position=gate + torch.tensor(offset, dtype=torch.float64), velocity=velocity, gate=[[0]])
+    td = start_with(env, td, target=gate)
+    state = fly(env, td, 1)["next"]
+    assert state["state", "gate_passed"].flatten().tolist() == [True, False, False, False]
+    assert state["state", "gates_passed"].flatten().tolist() == [1, 0, 0, 0]
+    assert state["state", "gate"].flatten().tolist() == [1, 0, 0, 0]
+    assert state["state", "target"][0, 0].tolist() == [8.0, 0.0, 2.0]
+    assert state["reward_terms", "gate"].flatten().tolist() == [20.0, 0.0, 0.0, 0.0]
+    assert state["state", "pass_step"][0, 0].tolist() == [1, -1, -1, -1]
+
+
+def start_with(env, td, **entries):
+    for key, value in entries.items():
+        td["state", key] = value.expand_as(td["state", key]).clone()
+    return env.reset(td, set_state=True)
+
+
+def test_a_lap_is_timed_from_a_gate_to_the_same_gate_and_eight_gates_succeed():
+    gates = [[0.1 * i, 0.0, 1.0] for i in range(2)]
+    env = RacingEnv(num_envs=1, track={"gates": gates, "gate_radius": 5.0}, max_episode_steps=9)
+    flight = fly(env, env.reset(), 9)
+    ends = flight["next"]
+    assert ends["state", "gates_passed"].flatten().tolist() == list(range(1, 10))
+    assert ends["metrics", "lap_time"].flatten().tolist() == pytest.approx([0.0, 0.0] + [0.04] * 7)
+    assert ends["success"].flatten().tolist() == [False] * 7 + [True] * 2
+    metrics = env.episode_metrics(flight)
+    assert metrics["success"].item() == 1.0
+    assert metrics["gates_passed"].item() == 9.0
+    assert metrics["lap_time"].item() == pytest.approx(0.04)
+    assert env.episode_metrics(flight[:, :2])["lap_time"].isnan().all()
+
+
+def test_a_racer_that_crashes_after_eight_gates_has_no_success():
+    env = RacingEnv(num_envs=1)
+    td = start(env, gates_passed=[[9]], position=[[5.0, 0.0, 0.01]], velocity=[[0.0, 0.0, -5.0]])
+    metrics = env.episode_metrics(fly(env, td, 1))
+    assert (metrics["success"].item(), metrics["crash"].item(), metrics["gates_passed"].item()) == (0.0, 1.0, 9.0)
+
+
+def test_starts_face_each_gate_in_turn():
+    env = RacingEnv(num_envs=400, seed=1)
+    state = env.reset()["state"]
+    track = load_track()
+    for i in range(4):
+        here = state["gate"].flatten() == i
+        assert here.sum() > 60
+        assert (state["target"][here] == torch.tensor(track["gates"][i])).all()
+        assert ((state["position"][here] - torch.tensor(track["starts"][i])).abs() <= 0.2 + 1e-6).all()
+    lap = sum(math.dist(track["gates"][i - 1], track["gates"][i]) for i in range(4))
+    assert lap == pytest.approx(21.67, abs=0.01)
+    assert not env.is_crash(state).any()
+
+
+def test_two_gates_are_observed():
+    env = RacingEnv(num_envs=5, dtype=torch.float64)
+    td = env.reset()
+    gates = env.gates[torch.cat((td["state", "gate"], (td["state", "gate"] + 1) % 4), -1)]
+    relative = (gates - td["state", "position"].unsqueeze(1)) / 10
+    torch.testing.assert_close(td["observation"][:, :6], relative.flatten(1))
+    assert td["observation"].shape == (5, 16)
+
+
+@pytest.mark.parametrize("gate_bonus", ["binary", "log", "reciprocal"])
+@pytest.mark.parametrize("reward", ["position", "velocity"])
+def test_the_racing_reward_is_the_published_formula(reward, gate_bonus):
+    env = RacingEnv(num_envs=1, reward=reward, gate_bonus=gate_bonus, dtype=torch.float64)
+    state = env.reset()["state"]
+    state["target"] = torch.tensor([[4.0, 4.0, 1.0]], dtype=torch.float64)
+    state["position"] = torch.tensor([[1.0, 0.0, 1.0]], dtype=torch.float64)  # 5 m away, along (0.6, 0.8, 0)
+    state["velocity"] = torch.tensor([[3.0, 0.0, 0.0]], dtype=torch.float64)  # 1.8 m/s towards, 2.4 m/s across
+    state["angular_velocity"] = torch.tensor([[0.0, 0.5, 0.0]], dtype=torch.float64)
+    state["gate_passed"] = torch.tensor([[True]])
+    terms = {name: value.item() for name, value in env.reward_terms(state).items()}
+    gate = terms.pop("gate")
+    if reward == "position":
+        assert sum(terms.values()) == pytest.approx(0.1 - 0.1 / 9 * 5 - 0.002 * 3 - 0.002 * 0.5)
+    else:
+        assert sum(terms.values()) == pytest.approx(0.02 * 1.8 - 0.02 * 2.4 / 6 - 0.001 * 0.5)
+    binary = {"position": 20.0, "velocity": 5.0}[reward]
+    assert gate == pytest.approx({"binary": binary, "log": -5 * math.log(5.01), "reciprocal": 1 / 5.05}[gate_bonus])
+
+
+def test_only_the_relaxed_bonus_has_a_gradient():
+    for gate_bonus, differentiable in (("binary", False), ("log", True), ("reciprocal", True)):
+        env = RacingEnv(num_envs=1, gate_bonus=gate_bonus)
+        td = env.reset()
+        action = env.hover_action.expand(1, 4).clone().requires_grad_()
+        for _ in range(3):
+            td = env.step_mdp(step := env.step(td.set("action", action)))
+        assert step["next", "reward_terms", "gate"].requires_grad == differentiable
+
+
+def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):
+    (tmp_path / "mine.yaml").write_text("gates: [[0, 0, 1], [4, 0, 2], [4, 4, 7]]\n")
+    env = RacingEnv(num_envs=3, track=str(tmp_path / "mine.yaml"))
+    assert env.starts.tolist() == [[2.0, 2.0, 4.0], [2.0, 0.0, 1.5], [4.0, 2.0, 4.5]]
+    assert env.ceiling == 11.0
+    check_env_specs(env)
+
+
+@pytest.mark.parametrize(
+    ("track", "message"),
+    [
+        ("monza", "Unknown track 'monza'. Choose from: visfly; or give the path"),
+        ({"gates": [[0, 0, 1]]}, "track: a track needs at least two gates, got 1"),
+        ({"gate": []}, "unknown key 'gate'. Allowed: gates, starts, gate_radius"),
+        ({}, "gates must be a list of points"),
+        ({"gates": [[0, 0], [1, 1]]}, "gates must be a list of points"),
+        ({"gates": [[0, 0, 1], [1, 1, -1]]}, "in metres above ground"),
+        ({"gates": [[0, 0, 1], [1, 1, float("nan")]]}, "gates must be a list of points"),
+        ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1]]}, "one start before each gate, got 1 for 2"),
+        ({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": 0}, "gate_radius must be a positive number"),
+    ],
+)
+def test_a_track_that_is_none_is_refused(track, message):
+    with pytest.raises(ValueError, match=message):
+        RacingEnv(num_envs=1, track=track)
+
+
+@pytest.mark.parametrize("option", ["reward", "gate_bonus"])
+def test_unknown_rewards_are_refused(option):
+    with pytest.raises(ValueError, match=f"Unknown {option} 'fast'. Choose from"):
+        RacingEnv(num_envs=1, **{option: "fast"})

@@ -171,12 +171,13 @@ def test_wandb_and_tensorboard_log_by_option(tmp_path):
     assert len(read(tmp_path / "wandb")) == 2
 
 
-def readme_blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+def readme_blocks(language, text=README):
+    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
 
 
 def test_every_readme_command_runs(tmp_path):
-    commands = [line.split("#")[0].strip() for block in readme_blocks("bash") for line in block.splitlines()]
+    blocks = readme_blocks("bash") + readme_blocks("bash", (ROOT / "recipes/README.md").read_text())
+    commands = [line.split("#")[0].strip() for block in blocks for line in block.splitlines()]
     commands = [command for command in commands if command]
     assert {"make train", "make test"} <= set(commands)
     for i, command in enumerate(commands):

@@ -33,7 +33,7 @@ def main(cfg: DictConfig) -> None:
         for _ in range(cfg.epochs):
             for batch in shuffled(data, cfg.batch_size):
                 losses = loss(batch)
-                loss_actor = losses["loss_objective"] + losses["loss_entropy"]
+                loss_actor = losses["loss_objective"] + losses.get("loss_entropy", 0.0)
                 grad_actor = descend(actor_optimizer, loss_actor, cfg.actor.max_grad_norm)
                 descend(critic_optimizer, losses["loss_critic"], cfg.critic.max_grad_norm)
 

@@ -239,3 +239,18 @@ def test_random_starts_tilt_turn_and_push_within_their_bounds():
 def test_bad_options_say_what_is_allowed(kwargs, message):
     with pytest.raises(ValueError, match=message):
         HoveringEnv(num_envs=1, **kwargs)
+
+
+# -- weights -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_weight_may_be_changed_and_an_unknown_one_is_named():
+    usual, other = HoveringEnv(num_envs=2), HoveringEnv(num_envs=2, weights={"velocity": 0.0, "position": 1.0})
+    state = usual.rollout(5)["next", "state"][:, -1]
+    before, after = usual.reward_terms(state), other.reward_terms(state)
+    torch.testing.assert_close(after["position"], 9 / 0.1 * before["position"])
+    assert (after["velocity"] == 0).all()
+    assert torch.equal(after["survival"], before["survival"])
+    assert make_env("racing", num_envs=1, gate_bonus="log", weights={"gate": 3.0}).weights["gate"] == 3.0
+    with pytest.raises(ValueError, match="weights: unknown term speed. Choose from: survival, position"):
+        HoveringEnv(num_envs=1, weights={"speed": 1.0})

@@ -89,6 +89,7 @@ class QuadrotorEnv(EnvBase):
             distributions; see :class:`~torchrl_quad.envs.options.DroneRandomization`.
         wind: a mapping with any of ``mean``, ``spread``, ``gust``, ``gust_time``; see
             :class:`~torchrl_quad.envs.options.Wind`.
+        weights: other weights of the reward's terms, by name, in the place of the task's own: ``{"velocity": 0.0}``.
         random_start: a mapping with any of ``tilt``, ``yaw``, ``velocity``, ``angular_velocity``; see
             :class:`~torchrl_quad.envs.options.RandomStart`.
         compile: compile one control step with its observation, reward and termination into one graph.
@@ -116,6 +117,7 @@ class QuadrotorEnv(EnvBase):
         observe_last_action: bool = False,
         observation_noise: Mapping[str, float] | None = None,
         observation_delay: int = 0,
+        weights: Mapping[str, float] | None = None,
         randomize: str | Path | Mapping | None = None,
         wind: Mapping[str, Any] | None = None,
         random_start: Mapping[str, float] | None = None,
@@ -155,6 +157,9 @@ class QuadrotorEnv(EnvBase):
         params = params.to(device=self.device, dtype=dtype)
         self.controller = FlightController(params)
         self.params = params if params.requires_grad else self.nominal
+        unknown = [str(name) for name in weights or {} if name not in self.weights]
+        _require(not unknown, f"weights: unknown term {_names(unknown)}. Choose from: {_names(self.weights)}.")
+        self.weights = {**self.weights, **(weights or {})}
         self.sensors = options.build(
             options.Sensors, "observation_noise", observation_noise or {}, delay=observation_delay
         )
@@ -190,6 +195,7 @@ class QuadrotorEnv(EnvBase):
     def is_success(self, state: State) -> Tensor:
         """Where the state, by itself, fulfils the task, bool (num_envs, 1)."""
 
+    weights: Mapping[str, float] = {}  # of the reward's terms, which an argument of the same name overrides
     ends_on_success = False  # whether success terminates the episode, too
 
     def set_up(self) -> None:

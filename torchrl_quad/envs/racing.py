@@ -13,6 +13,11 @@ from torchrl_quad.dynamics import presets
 from torchrl_quad.envs.base import QuadrotorEnv, State
 from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, norm, outside, target_reward
 
+WEIGHTS = {  # of the reward's terms, by reward
+    "position": {**TARGET_WEIGHTS, "gate": 20.0},
+    "velocity": {"towards": 0.02, "across": 0.02, "angular_velocity": 0.001, "gate": 5.0},
+}
+RELAXATION_WEIGHTS = {"log": {"gate": 5.0}, "reciprocal": {"gate": 1.0}}
 _TRACKS = resources.files(__package__) / "tracks"
 
 
@@ -66,10 +71,7 @@ class RacingEnv(QuadrotorEnv):
     start_range = 0.2  # [m], to both sides of the start
     box_margin = 4.0  # [m], beyond the outermost gates
     box_height = 6.0  # [m]; a track that is higher has 4 m above it
-    weights = TARGET_WEIGHTS
-    velocity_weights = {"towards": 0.02, "across": 0.02, "angular_velocity": 0.001}
     max_rewarded_speed = 15.0  # [m/s]
-    bonus = {"position": 20.0, "velocity": 5.0}  # per gate, by reward
     success_gates = 8
 
     def __init__(
@@ -89,6 +91,7 @@ class RacingEnv(QuadrotorEnv):
             if value not in choices:
                 raise ValueError(f"Unknown {name} {value!r}. Choose from: {', '.join(choices)}.")
         self.track, self.reward, self.gate_bonus = load_track(track), reward, gate_bonus
+        self.weights = {**WEIGHTS[reward], **RELAXATION_WEIGHTS.get(gate_bonus, {})}
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
 
     def set_up(self) -> None:
@@ -150,17 +153,17 @@ class RacingEnv(QuadrotorEnv):
             towards = (state["velocity"] * direction).sum(-1, keepdim=True)
             across = norm(state["velocity"] - towards * direction)
             terms = {
-                "towards": self.velocity_weights["towards"] * towards.clamp_max(self.max_rewarded_speed),
-                "across": -self.velocity_weights["across"] * across / (distance(state) + 1.0),
-                "angular_velocity": -self.velocity_weights["angular_velocity"] * norm(state["angular_velocity"]),
+                "towards": self.weights["towards"] * towards.clamp_max(self.max_rewarded_speed),
+                "across": -self.weights["across"] * across / (distance(state) + 1.0),
+                "angular_velocity": -self.weights["angular_velocity"] * norm(state["angular_velocity"]),
             }
         if self.gate_bonus == "log":
-            bonus = -5.0 * torch.log(distance(state) + 0.01)
+            bonus = -torch.log(distance(state) + 0.01)
         elif self.gate_bonus == "reciprocal":
             bonus = 1.0 / (distance(state) + 0.05)
         else:
-            bonus = self.bonus[self.reward] * state["gate_passed"].to(self.dtype)
-        return {**terms, "gate": bonus}
+            bonus = state["gate_passed"].to(self.dtype)
+        return {**terms, "gate": self.weights["gate"] * bonus}
 
     def is_crash(self, state: State) -> Tensor:
         return outside(state["position"], self.centre, self.half_width, self.ceiling)

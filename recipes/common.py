@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 import time
 from collections import defaultdict
@@ -308,9 +309,10 @@ def load_policy(
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a JSON file, all or nothing."""
+    """Write a JSON file, all or nothing; what is not a number becomes null."""
     temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(content, indent=2) + "\n")
+    content = {key: None if isinstance(x, float) and math.isnan(x) else x for key, x in content.items()}
+    temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     os.replace(temporary, path)
 
 
@@ -322,7 +324,7 @@ def print_summary(summary: dict[str, Any], folder: Path | None = None) -> None:
     print(f"  success       {summary['success']:.1%}")
     print(f"  crashes       {summary['crash']:.1%}")
     for name, (scale, unit) in UNITS.items():
-        if name in summary:
+        if not math.isnan(summary.get(name, math.nan)):
             print(f"  {name.replace('_', ' '):13s} {scale * summary[name]:.2f} {unit}")
     if "seconds" in summary:
         print(f"  training      {summary['steps']:,} steps in {summary['seconds']:.1f} s")

@@ -25,7 +25,7 @@ def main(cfg: DictConfig) -> None:
 
     run = Run(cfg, env, actor, loss=loss)
     frames = cfg.num_envs * cfg.horizon
-    collector = iter(Collector(env, actor, frames_per_batch=frames, auto_register_policy_transforms=True))
+    collector = iter(Collector(env, actor, frames_per_batch=frames, auto_register_policy_transforms=False))
     for _ in run:
         data = next(collector)
         with torch.no_grad():

@@ -141,6 +141,12 @@ def test_a_yaml_file_of_distributions_is_read(tmp_path):
             "drones that may be drawn are not all possible: .* 'mass' must be positive",
         ),
         ({"mass": {"normal": [0.5, 0.2]}}, "not all possible"),
+        ({"mass": {"normal": [0.5, -0.1]}}, "mass needs two numbers, mean and standard deviation"),
+        ({"rotor_spin": {"scale": [-1, 1]}}, "unknown field 'rotor_spin'"),
+        (
+            {"rotor_speed_min": {"uniform": [100.0, 3000.0]}, "rotor_speed_max": {"uniform": [2500.0, 4000.0]}},
+            "rotor_speed_min must be below rotor_speed_max",
+        ),
         ("none", "Unknown randomize 'none'. Give the path of a .yaml file"),
     ],
 )
@@ -197,7 +203,7 @@ def test_the_noise_has_the_size_asked_for_and_rewards_do_not_see_it():
     assert error.std(0).tolist() == pytest.approx([0.2] * 3, rel=0.05)
     assert (seen[:, 7:10] * 10).std(0).tolist() == pytest.approx([0.3] * 3, rel=0.05)
     assert (seen[:, 10:] * 10).std(0).tolist() == pytest.approx([0.4] * 3, rel=0.05)
-    angle = 2 * quaternion.rotate(seen[:, 3:7], torch.eye(3)[2].expand(4000, 3))[:, :2] / 2
+    angle = quaternion.rotate(seen[:, 3:7], torch.tensor([0.0, 0.0, 1.0]).expand(4000, 3))[:, :2]
     assert angle.std(0).tolist() == pytest.approx([0.05] * 2, rel=0.05)
     assert seen[:, 3:7].norm(dim=-1).tolist() == pytest.approx([1.0] * 4000, abs=1e-5)
     silent = HoveringEnv(num_envs=4000)
@@ -226,6 +232,7 @@ def test_random_starts_tilt_turn_and_push_within_their_bounds():
     [
         ({"wind": {"speed": 3}}, "wind: unknown key 'speed'. Allowed: mean, spread, gust, gust_time"),
         ({"wind": {"mean": [1.0]}}, "wind: mean must be three numbers"),
+        ({"wind": {"spread": [-1.0, 0.0, 0.0]}}, "wind: spread must not be negative"),
         ({"wind": {"gust": -1.0}}, "wind: gust must be zero or positive"),
         ({"wind": {"gust_time": 0.0}}, "wind: gust_time must be positive"),
         ({"wind": 3.0}, "wind must be a mapping with any of mean"),

@@ -28,7 +28,7 @@ def test_it_holds_the_package_the_presets_and_its_types_and_nothing_else(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     for drone in ("visfly", "flightmare", "crazyflie", "small_racer"):
         assert f"torchrl_quad/dynamics/drones/{drone}.yaml" in names
-    assert "torchrl_quad/py.typed" in names
+    assert {"torchrl_quad/envs/tracks/visfly.yaml", "torchrl_quad/py.typed"} <= set(names)
     assert {name.split("/")[0].split("-")[0] for name in names} == {"torchrl_quad"}
 
 
@@ -49,7 +49,7 @@ def test_it_works_away_from_the_repository(wheel, tmp_path):
         "import torchrl_quad, pathlib\n"
         f"assert pathlib.Path(torchrl_quad.__file__).is_relative_to({str(tmp_path)!r}), torchrl_quad.__file__\n"
         "for drone in torchrl_quad.available_drones():\n"
-        "    torchrl_quad.make_env('hovering', num_envs=2, drone=drone).rollout(2)\n"
+        "    torchrl_quad.make_env('racing', num_envs=2, drone=drone).rollout(2)\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
     subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True)

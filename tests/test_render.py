@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchrl_quad import HoveringEnv
+from torchrl_quad import HoveringEnv, make_env
 from torchrl_quad.render import plot_flight, plot_learning_curve
 
 
@@ -15,6 +15,13 @@ def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(tm
     flight = env.rollout(60, tensordict=env.reset(td, set_state=True), auto_reset=False, break_when_any_done=False)
     assert flight["next", "terminated"][1].any()
     plot_flight(flight, tmp_path / "flight.png")
+    assert (tmp_path / "flight.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("task", ["landing", "racing", "tracking"])
+def test_a_flight_of_every_task_is_drawn(task, tmp_path):
+    env = make_env(task, num_envs=2, max_episode_steps=30)
+    plot_flight(env.rollout(70, break_when_any_done=False), tmp_path / "flight.png")
     assert (tmp_path / "flight.png").stat().st_size > 10_000
 
 

@@ -12,20 +12,13 @@ from torchrl_quad import LandingEnv, RacingEnv, TrackingEnv, load_track, make_en
 TASKS = ["hovering", "landing", "racing", "tracking"]
 
 
-def hold(env, td, steps):
-    """Fly on with the hover action."""
-    return torch.stack([td := env.step_mdp(step) for step in flights(env, td, steps)], 1)
-
-
-def flights(env, td, steps):
-    for _ in range(steps):
-        step = env.step(td.copy().set("action", env.hover_action.expand(env.num_envs, 4)))
-        yield step
-        td = env.step_mdp(step)
-
-
 def fly(env, td, steps):
-    return torch.stack(list(flights(env, td, steps)), 1)
+    """Fly on with the hover action."""
+    flight = []
+    for _ in range(steps):
+        flight.append(env.step(td.copy().set("action", env.hover_action.expand(env.num_envs, 4))))
+        td = env.step_mdp(flight[-1])
+    return torch.stack(flight, 1)
 
 
 def start(env, **entries):
@@ -123,7 +116,14 @@ def test_a_large_curve_gets_a_box_that_holds_it():
         ({"curve": "square"}, "Unknown curve 'square'. Choose from: slow_circle, fast_circle, lemniscate"),
         ({"curve": lambda p: p}, "needs a period in seconds"),
         ({"curve": "slow_circle", "period": -1.0}, "needs a period in seconds, such as period=10.0; got -1.0"),
-        ({"curve": lambda p: p, "period": 5.0}, r"to positions \(\*, 3\)"),
+        ({"curve": lambda p: p, "period": 5.0}, r"from shape \(2, 257\) it made \(2, 257\), torch.float32"),
+        ({"curve": lambda p: torch.stack((p, p, p), 1), "period": 5.0}, r"it made \(2, 3, 257\)"),
+        (
+            {"curve": lambda p: torch.stack((p, p, p), -1).double(), "period": 5.0},
+            "both torch.float32; .* torch.float64",
+        ),
+        ({"curve": lambda p: [math.cos(p), 0, 1], "period": 5.0}, "it failed: "),
+        ({"curve": lambda p: [p, p, p], "period": 5.0}, "it made a list"),
         ({"curve": lambda p: torch.stack((p, p, p + 1), -1), "period": 5.0}, "not periodic: .* moves by 10.9 m"),
         ({"curve": lambda p: torch.stack((p.cos(), p.sin(), p.sin()), -1), "period": 5.0}, "goes down to z = -1 m"),
         ({"curve": lambda p: torch.stack((p / 0, p, p), -1), "period": 5.0}, "not finite"),
@@ -195,8 +195,7 @@ def test_gates_are_passed_in_order_along_the_straight_line_of_a_step():
     # Fast enough to jump over the gate within one step; beside it; not yet there; through another gate.
     offset = [[-1.0, 0.0, 0.0], [-1.0, 0.35, 0.0], [-2.0, 0.0, 0.0], [4.0 - 1.0, -4.0, 1.0]]
     velocity = torch.tensor([[100.0, 0.0, 0.0]] * 2 + [[1.0, 0.0, 0.0]] + [[100.0, 0.0, 0.0]], dtype=torch.float64)
-    td = start(env, position=gate + torch.tensor(offset, dtype=torch.float64), velocity=velocity, gate=[[0]])
-    td = start_with(env, td, target=gate)
+    td = start(env, position=gate + torch.tensor(offset, dtype=torch.float64), velocity=velocity, gate=0, target=gate)
     state = fly(env, td, 1)["next"]
     assert state["state", "gate_passed"].flatten().tolist() == [True, False, False, False]
     assert state["state", "gates_passed"].flatten().tolist() == [1, 0, 0, 0]
@@ -204,12 +203,6 @@ def test_gates_are_passed_in_order_along_the_straight_line_of_a_step():
     assert state["state", "target"][0, 0].tolist() == [8.0, 0.0, 2.0]
     assert state["reward_terms", "gate"].flatten().tolist() == [20.0, 0.0, 0.0, 0.0]
     assert state["state", "pass_step"][0, 0].tolist() == [1, -1, -1, -1]
-
-
-def start_with(env, td, **entries):
-    for key, value in entries.items():
-        td["state", key] = value.expand_as(td["state", key]).clone()
-    return env.reset(td, set_state=True)
 
 
 def test_a_lap_is_timed_from_a_gate_to_the_same_gate_and_eight_gates_succeed():
@@ -232,6 +225,19 @@ def test_a_racer_that_crashes_after_eight_gates_has_no_success():
     td = start(env, gates_passed=[[9]], position=[[5.0, 0.0, 0.01]], velocity=[[0.0, 0.0, -5.0]])
     metrics = env.episode_metrics(fly(env, td, 1))
     assert (metrics["success"].item(), metrics["crash"].item(), metrics["gates_passed"].item()) == (0.0, 1.0, 9.0)
+
+
+def test_a_racer_that_breaks_keeps_what_it_has_passed():
+    env = RacingEnv(num_envs=2)
+    td = start(env, gates_passed=3, step=100, pass_step=[[5, 6, 7, -1]], lap_time=4.0)
+    td["action"] = env.hover_action.expand(2, 4).clone()
+    td["action"][0] = float("nan")
+    ends = env.step(td)["next"]
+    assert ends["crash"].flatten().tolist() == [True, False]
+    assert ends["metrics", "gates_passed"].flatten().tolist() == [3.0, 3.0]
+    assert ends["metrics", "lap_time"].flatten().tolist() == [4.0, 4.0]
+    assert ends["state", "step"].flatten().tolist() == [101, 101]
+    assert ends["state", "pass_step"].tolist() == [[5, 6, 7, -1]] * 2
 
 
 def test_starts_face_each_gate_in_turn():
@@ -306,6 +312,8 @@ def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):
         ({"gates": [[0, 0, 1], [1, 1, -1]]}, "in metres above ground"),
         ({"gates": [[0, 0, 1], [1, 1, float("nan")]]}, "gates must be a list of points"),
         ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1]]}, "one start before each gate, got 1 for 2"),
+        ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1], [9, 9, 1]]}, r"within 0.2 m of \[9.0, 9.0, 1.0\]"),
+        ({"gates": [[0, 0, 0.1], [1, 1, 0.1]]}, "not all inside the box"),
         ({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": 0}, "gate_radius must be a positive number"),
     ],
 )

@@ -21,6 +21,7 @@ class ObservationNormalizer(ObservationNorm):
         env = TransformedEnv(env, normalizer)
         rollout, carry = differentiable_rollout(env, actor, carry, 64)
         normalizer.update(rollout)
+        carry = env.reset(carry.select("state"), set_state=True)  # what it observes was written before the update
 
     Args:
         env: gives size, device and floating-point type of the observation.
@@ -38,12 +39,12 @@ class ObservationNormalizer(ObservationNorm):
 
     @torch.no_grad()
     def update(self, rollout: TensorDictBase) -> None:
-        """Take the observations of a rollout (any batch size), as this transform wrote them, into the statistics.
+        """Take what the steps of a rollout (any batch size) led to, as this transform wrote it, into the statistics.
 
         The values that are not finite are left out. Observations that are kept from before, such as a carry, stay as
         they were; reset to their state to see them anew.
         """
-        written = rollout.get(self.out_keys[0]).reshape(-1, self.loc.shape[-1])
+        written = rollout.get(("next", self.out_keys[0])).reshape(-1, self.loc.shape[-1])
         seen = written[written.isfinite().all(-1)] * self.scale + self.loc
         if len(seen) == 0:
             return

@@ -62,6 +62,10 @@ class QuadrotorEnv(EnvBase):
     ``measurements``               (d + 1, 13)   what the sensors told, oldest first, with noise or delay
     =============================  ============  =======================================================================
 
+    Beside ``"observation"`` and ``"state"`` a step writes ``"success"``, ``"crash"``, ``("reward_terms", name)``, the
+    weighted terms whose sum is the reward, and ``("metrics", name)``, what the task measures, without gradient. At a
+    reset the terms are zero.
+
     ``env.params`` is the drone that flies and ``env.nominal`` what its controller believes. To change the drone, assign
     ``env.params = env.params.replace(mass=0.5)``; a tensor that requires grad can so be fitted.
 
@@ -170,6 +174,7 @@ class QuadrotorEnv(EnvBase):
         self.set_up()
         # Stands in for a state that is not finite, so that its environment computes on with harmless numbers.
         self._fallback = self.sample_initial_state(num_envs)
+        self._task_entries = set(self.initial_state(num_envs)) - set(self.hover_state(self.uniform(num_envs, 3)))
         self._make_specs()
         self.set_seed(seed)
 
@@ -355,7 +360,7 @@ class QuadrotorEnv(EnvBase):
                 "observation": self._observe(state),
                 "state": state,
                 "reward_terms": {name: torch.zeros_like(term) for name, term in self.reward_terms(state).items()},
-                "metrics": self.metrics(state),
+                "metrics": self._measured(state),
                 "success": self.is_success(state),
                 "crash": no.clone(),
                 "done": no,
@@ -410,8 +415,12 @@ class QuadrotorEnv(EnvBase):
         if self._measures:
             state |= self.sensors.advance(state, noise.get("sensors"))
         state, still_valid = self._replace_invalid(state)
-        state = self.advance(previous, state)
         valid = valid & still_valid
+        advanced = self.advance(previous, state)
+        state = {
+            key: torch.where(valid, value, state[key]) if key in self._task_entries else value
+            for key, value in advanced.items()
+        }
         terms = {name: torch.where(valid, term, 0.0) for name, term in self.reward_terms(state).items()}
         crash = self.is_crash(state) | ~valid
         success = self.is_success(state) & valid
@@ -422,7 +431,7 @@ class QuadrotorEnv(EnvBase):
             "state": state,
             "reward_terms": terms,
             "reward": sum(terms.values()),
-            "metrics": self.metrics({key: value.detach() for key, value in state.items()}),
+            "metrics": self._measured(state),
             "success": success,
             "crash": crash,
             "done": terminated | truncated,
@@ -442,6 +451,9 @@ class QuadrotorEnv(EnvBase):
     def _measures(self) -> bool:
         return self.sensors.has_noise or self.sensors.delay > 0
 
+    def _measured(self, state: State) -> State:
+        return self.metrics({key: value.detach() for key, value in state.items()})
+
     def _observe(self, state: State) -> Tensor:
         observation = self.observe(self.sensors.observed(state) if self._measures else state)
         if self.observe_last_action:
@@ -449,7 +461,9 @@ class QuadrotorEnv(EnvBase):
         return observation
 
     def _replace_invalid(self, state: State, *inputs: Tensor) -> tuple[State, Tensor]:
-        """Put the fallback in the place of states that are not finite, or beyond what the model can compute.
+        """Put the fallback in the place of drones that are not finite, or beyond what the model can compute.
+
+        What the task has added stays as it was, unless it is itself the trouble.
 
         Selecting before the physics keeps the gradients of the others clean: a gradient of zero is never multiplied by
         an infinite derivative.
@@ -466,9 +480,15 @@ class QuadrotorEnv(EnvBase):
             valid = torch.cat([x.abs().amax(-1, keepdim=True) < bound for x, bound in bounded], -1).all(
                 -1, keepdim=True
             )
-        replaced = {
-            key: torch.where(valid.view(-1, *[1] * (x.dim() - 1)), x, self._fallback[key]) for key, x in state.items()
-        }
+        replaced = {}
+        for key, x in state.items():
+            keep = valid
+            if key in self._task_entries or key == "step":
+                if not x.is_floating_point():
+                    replaced[key] = x
+                    continue
+                keep = (x.detach().abs() < _MAX_VALUE).flatten(1).all(-1, keepdim=True)
+            replaced[key] = torch.where(keep.view(-1, *[1] * (x.dim() - 1)), x, self._fallback[key])
         return replaced, valid
 
     def _checked_state(self, state: TensorDictBase, source: str) -> State:

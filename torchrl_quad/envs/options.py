@@ -36,7 +36,8 @@ class DroneRandomization:
         motor_time_constant: {uniform: [0.02, 0.05]}
         linear_drag: {normal: [0.005, 0.001]}        # cut off at three standard deviations
 
-    The values drawn stand in the state under ``("drone", field)``. The controller keeps the nominal drone.
+    "uniform" and "normal" give all entries of a field the same two numbers, "scale" each its own nominal value. The
+    values drawn stand in the state under ``("drone", field)``. The controller keeps the nominal drone.
 
     Raises:
         ValueError: a field or distribution is unknown, belongs to the controller, or may give an impossible drone.
@@ -51,8 +52,8 @@ class DroneRandomization:
                     f"{source}: {name!r} belongs to the flight controller, which keeps the nominal drone; a random one "
                     "would change nothing. Give another drone instead."
                 )
-            if name not in fields:
-                allowed = ", ".join(field for field in fields if field not in _CONTROLLER_FIELDS)
+            if name not in fields or name == "rotor_spin":
+                allowed = ", ".join(field for field in fields if field not in (*_CONTROLLER_FIELDS, "rotor_spin"))
                 raise ValueError(f"{source}: unknown field {name!r}. Choose from: {allowed}.")
             if not (
                 isinstance(distribution, Mapping)
@@ -62,11 +63,16 @@ class DroneRandomization:
                 choices = "; ".join(f"{key}: {numbers}" for key, numbers in _DISTRIBUTIONS.items())
                 raise ValueError(f"{source}: {name} needs one distribution of: {choices}; got {distribution!r}.")
             numbers = next(iter(distribution.values()))
-            if not (_is_numbers(numbers, 2) and (numbers[0] <= numbers[1] or "normal" in distribution)):
-                raise ValueError(f"{source}: {name} needs two numbers, such as [0.8, 1.2], got {numbers!r}.")
+            if not (_is_numbers(numbers, 2) and numbers[1] >= (0.0 if "normal" in distribution else numbers[0])):
+                kind = next(iter(distribution))
+                raise ValueError(f"{source}: {name} needs two numbers, {_DISTRIBUTIONS[kind]}; got {numbers!r}.")
         self.nominal = {name: fields[name] for name in self.spec}
+        # The least and the greatest of each; and for what has to lie below something else, the other way round.
         for sign in (-1.0, 1.0):
-            extreme = {name: self._value(name, torch.full_like(value, sign)) for name, value in self.nominal.items()}
+            extreme = {
+                name: self._value(name, torch.full_like(value, -sign if name == "rotor_speed_min" else sign))
+                for name, value in self.nominal.items()
+            }
             try:
                 nominal.replace(**extreme)
             except ValueError as error:
@@ -110,6 +116,8 @@ class Wind:
         for name in ("mean", "spread"):
             if not _is_numbers(getattr(self, name), 3):
                 raise ValueError(f"wind: {name} must be three numbers [m/s], got {getattr(self, name)!r}.")
+        if min(self.spread) < 0:
+            raise ValueError(f"wind: spread must not be negative, got {self.spread!r}.")
         if not (_is_number(self.gust) and self.gust >= 0):
             raise ValueError(f"wind: gust must be zero or positive [m/s], got {self.gust!r}.")
         if not (_is_number(self.gust_time) and self.gust_time > 0):
@@ -227,7 +235,7 @@ def build(cls: type, name: str, spec: Any, **more: Any) -> Any:
         ValueError: it is neither, or has an unknown key.
     """
     if isinstance(spec, cls):
-        return spec
+        return dataclasses.replace(spec, **more)
     allowed = [field.name for field in dataclasses.fields(cls) if field.name not in more]
     if not isinstance(spec, Mapping):
         raise ValueError(f"{name} must be a mapping with any of {', '.join(allowed)}; got {spec!r}.")

@@ -100,6 +100,13 @@ class RacingEnv(QuadrotorEnv):
         self.centre = 0.5 * (low + high)
         self.half_width = 0.5 * (high - low)[:2] + self.box_margin
         self.ceiling = max(self.box_height, high[2].item() + self.box_margin)
+        for start, point in zip(self.starts, self.track["starts"], strict=True):
+            corners = torch.stack((start - self.start_range, start + self.start_range))
+            if self.is_crash({"position": corners}).any():
+                raise ValueError(
+                    f"track: drones start within {self.start_range} m of {point}, which is not all inside the box: x "
+                    f"and y at most {self.box_margin} m beyond the gates, 0 < z < {self.ceiling} m. Move that start."
+                )
 
     def initial_state(self, n: int) -> State:
         gate = self.integers(len(self.gates), n, 1)
@@ -119,7 +126,7 @@ class RacingEnv(QuadrotorEnv):
         passed = self.miss(previous["position"], state["position"], previous["target"]) < self.track["gate_radius"]
         this_gate = passed & (gate == torch.arange(len(self.gates), device=gate.device))
         last_pass = previous["pass_step"].gather(1, gate)
-        lap = (step - last_pass) * self.control_dt
+        lap = (step - last_pass).to(self.dtype) * self.control_dt
         next_gate = torch.where(passed, (gate + 1) % len(self.gates), gate)
         return {
             **state,
@@ -191,7 +198,7 @@ def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:
         FileNotFoundError: there is no such file.
     """
     source, values = presets.read("track", track, _TRACKS)
-    unknown = sorted(set(values) - {"gates", "starts", "gate_radius"})
+    unknown = sorted(str(key) for key in set(values) - {"gates", "starts", "gate_radius"})
     if unknown:
         raise ValueError(f"{source}: unknown key {unknown[0]!r}. Allowed: gates, starts, gate_radius.")
     gates = _points(source, "gates", values.get("gates"))

@@ -110,13 +110,13 @@ class TrackingEnv(QuadrotorEnv):
             period = default_period if period is None else period
         if period is None or not 0 < period < math.inf:
             raise ValueError(f"A curve of your own needs a period in seconds, such as period=10.0; got {period}.")
-        self.curve, self.period = curve, period
+        self.curve = lambda phase: curve(phase)  # not itself: an environment registers modules as its own
+        self.period = period
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
 
     def set_up(self) -> None:
         phase = torch.linspace(0, 2 * math.pi, 257, device=self.device, dtype=self.dtype)
-        points = self.curve(phase)
-        _check_curve(points)
+        points = _checked_points(self.curve, phase, self.start_range)
         low, high = points.amin(0), points.amax(0)
         self.centre = 0.5 * (low + high)
         self.half_width = (0.5 * (high - low)[:2] + self.box_margin).clamp_min(self.box_half_width)
@@ -171,10 +171,18 @@ class TrackingEnv(QuadrotorEnv):
         return round(self.settling_time / self.control_dt)
 
 
-def _check_curve(points: Tensor) -> None:
-    """Refuse a curve, sampled over one period with both ends, that cannot be flown."""
-    if points.shape != (257, 3):
-        raise ValueError(f"A curve maps phases of shape (*) to positions (*, 3); from (257) it made {points.shape}.")
+def _checked_points(curve: Curve, phase: Tensor, margin: float) -> Tensor:
+    """The points (257, 3) of a curve at phases (257) over one period with both ends, if it can be flown."""
+    rule = f"A curve maps a tensor of phases (*) to one of positions (*, 3), both {phase.dtype}"
+    try:
+        points = curve(phase.repeat(2, 1))
+    except Exception as error:
+        raise ValueError(f"{rule}; given a tensor of shape (2, 257) it failed: {error}") from error
+    if not isinstance(points, Tensor):
+        raise ValueError(f"{rule}; it made a {type(points).__name__}.")
+    if points.shape != (2, 257, 3) or points.dtype != phase.dtype:
+        raise ValueError(f"{rule}; from shape (2, 257) it made {tuple(points.shape)}, {points.dtype}.")
+    points = points[0]
     if not points.isfinite().all():
         raise ValueError("The curve is not finite everywhere in [0, 2 pi].")
     gap = norm(points[0] - points[-1]).item()
@@ -182,5 +190,9 @@ def _check_curve(points: Tensor) -> None:
         raise ValueError(
             f"The curve is not periodic: from phase 0 to 2 pi it moves by {gap:.3g} m. Make it close at 2 pi."
         )
-    if points[:, 2].min() <= 0:
-        raise ValueError(f"The curve goes down to z = {points[:, 2].min():.3g} m, and the ground is at 0. Lift it.")
+    lowest = points[:, 2].min().item()
+    if lowest <= margin:
+        raise ValueError(
+            f"The curve goes down to z = {lowest:.3g} m, and drones start up to {margin} m below it. Lift it."
+        )
+    return points

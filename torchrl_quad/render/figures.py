@@ -50,7 +50,7 @@ def plot_flight(rollout: TensorDictBase, path: str | Path, *, num_envs: int = 12
     if len(places) <= 64:
         space.scatter(*places.T, color=_RED, marker="*", s=140, label="target", zorder=10)
     else:  # a target that moves
-        space.plot(*target[0].T, color=_RED, linestyle="--", linewidth=1.5, label="target", zorder=10)
+        space.plot(*target[0, first[0]].T, color=_RED, linestyle="--", linewidth=1.5, label="target", zorder=10)
     space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="Flights from fresh starts")
     for axis in (space.xaxis, space.yaxis, space.zaxis):
         axis.set_major_locator(plt.MaxNLocator(4))

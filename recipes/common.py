@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import json
 import math
@@ -159,8 +160,10 @@ class Run:
     """The bookkeeping of a training run: ``for _ in run: ...; run.record(...)``.
 
     Counts steps and seconds of training, evaluates every ``eval.interval`` iterations, and each time writes a row of
-    metrics and a checkpoint. Leaves in the run's folder: ``metrics.csv``, ``checkpoint.pt``, ``summary.json``,
-    ``learning_curve.png`` and ``flight.png``. Set-up, compilation and the final evaluation are outside the seconds.
+    metrics and a checkpoint. The checkpoint holds the networks as they are, and the best policy so far: the one with
+    the greatest return in these evaluations. That one is flown at the end, on other starts. Leaves in the run's folder:
+    ``metrics.csv``, ``checkpoint.pt``, ``summary.json``, ``learning_curve.png`` and ``flight.png``. Set-up, compilation
+    and the final evaluation are outside the seconds.
 
     Raises:
         FileExistsError: the folder holds the metrics of another run.
@@ -183,6 +186,7 @@ class Run:
             self.logger = get_logger(cfg.logger.backend, str(self.folder), name, wandb_kwargs=wandb)
         self.recorded: dict[str, list[float]] = defaultdict(list)
         self.seconds = 0.0
+        self.best: dict[str, Any] = {"return": -math.inf}
 
     def __iter__(self) -> Iterator[int]:
         if self.cfg.compile:
@@ -202,6 +206,7 @@ class Run:
                     metrics, _ = evaluate(self.eval_env, self.actor)
                     self.seconds = time.perf_counter() - start
                     self._write_row(iteration + 1, metrics)
+                    self._keep_best(metrics["eval/return"], (iteration + 1) * self.steps_per_iteration)
                     self._save((iteration + 1) * self.steps_per_iteration)
                     bar.set_postfix(
                         {"return": f"{metrics['eval/return']:.2f}", "success": f"{metrics['eval/success']:.0%}"}
@@ -216,11 +221,19 @@ class Run:
                 float(value.detach()) if isinstance(value, Tensor) else value
             )
 
+    def _keep_best(self, value: float, steps: int) -> None:
+        """Copy the policy if no evaluation has been better."""
+        if value >= self.best["return"]:
+            policy = {name: self.modules[name] for name in ("actor", "normalizer") if name in self.modules}
+            weights = {name: copy.deepcopy(module.state_dict()) for name, module in policy.items()}
+            self.best = {"return": value, "steps": steps, **weights}
+
     def _save(self, steps: int) -> None:
-        """Write networks and configuration, all or nothing."""
+        """Write networks, the best policy and the configuration, all or nothing."""
         weights = {name: module.state_dict() for name, module in self.modules.items()}
+        config = OmegaConf.to_yaml(self.cfg, resolve=True)
         temporary = self.folder / "checkpoint.tmp"
-        torch.save({"config": OmegaConf.to_yaml(self.cfg, resolve=True), "steps": steps, **weights}, temporary)
+        torch.save({"config": config, "steps": steps, "best": self.best, **weights}, temporary)
         os.replace(temporary, self.folder / "checkpoint.pt")
 
     def _warm_up(self) -> None:
@@ -254,9 +267,9 @@ class Run:
 
     def _finish(self) -> None:
         """Final evaluation on fresh starts, pictures, summary."""
-        normalizer = self.modules["normalizer"].state_dict() if self.cfg.normalize else None
-        summary, flight = final_evaluation(self.cfg, self.actor, normalizer)
-        summary |= {"steps": self.iterations * self.steps_per_iteration, "seconds": round(self.seconds, 2)}
+        summary, flight = final_evaluation(*load_policy(self.folder / "checkpoint.pt", self.cfg.device))
+        steps = {"steps": self.iterations * self.steps_per_iteration, "best_steps": self.best["steps"]}
+        summary |= {**steps, "seconds": round(self.seconds, 2)}
         write_json(self.folder / "summary.json", summary)
         plot_learning_curve(self.folder / "metrics.csv", self.folder / "learning_curve.png")
         plot_flight(flight, self.folder / "flight.png", control_dt=self.cfg.env.control_dt)
@@ -289,7 +302,7 @@ def final_evaluation(
 def load_policy(
     checkpoint: Path, device: str = "cpu"
 ) -> tuple[DictConfig, TensorDictModuleBase, dict[str, Tensor] | None]:
-    """The configuration, the policy, and the state of the normaliser, where there is one, of a checkpoint.
+    """The configuration, the best policy, and the state of its normaliser, where there is one, of a checkpoint.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -302,10 +315,10 @@ def load_policy(
         cfg = OmegaConf.create(state["config"])
         cfg.device = device
         actor = make_policy(cfg, build_env(cfg, 1, 0))
-        actor.load_state_dict(state["actor"])
+        actor.load_state_dict(state["best"]["actor"])
     except Exception as error:
         raise ValueError(f"{checkpoint} is not a checkpoint that these recipes can read: {error}") from error
-    return cfg, actor, state.get("normalizer")
+    return cfg, actor, state["best"].get("normalizer")
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Fly a trained policy: the deterministic policy over fresh episodes.
+"""Fly the best policy of a training run: deterministic, over fresh episodes.
 
 python recipes/evaluate.py checkpoint=outputs/.../checkpoint.pt
 """

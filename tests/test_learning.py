@@ -35,3 +35,21 @@ def test_the_program_of_the_readme_learns_to_hover():
             env, names["actor"], None, 256, exploration_type=ExplorationType.DETERMINISTIC
         )
     assert env.episode_metrics(flight)["position_error"].median() < 0.1
+
+
+@pytest.mark.slow
+def test_abpt_flies_two_laps(tmp_path):
+    command = [sys.executable, "recipes/abpt.py", "task=racing", "compile=true", f"hydra.run.dir={tmp_path}"]
+    subprocess.run(command, cwd=ROOT, check=True)
+    assert json.loads((tmp_path / "summary.json").read_text())["gates_passed"] >= 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["landing", "tracking"])
+def test_abpt_tracks_and_lands(task, tmp_path):
+    subprocess.run(
+        [sys.executable, "recipes/abpt.py", f"task={task}", f"hydra.run.dir={tmp_path}"], cwd=ROOT, check=True
+    )
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["success"] >= 0.95
+    assert task == "landing" or summary["tracking_rmse"] < 0.05

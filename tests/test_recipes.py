@@ -69,6 +69,9 @@ def test_every_recipe_trains_on_every_task_and_leaves_what_it_promises(recipe, t
     assert summary["steps"] == 96
     assert f"{summary['success']:.1%}" in printed
     assert METRICS[task] <= set(summary)
+    best = torch.load(tmp_path / "checkpoint.pt", weights_only=True)["best"]
+    assert best["return"] == max(float(row["eval/return"]) for row in rows)
+    assert summary["best_steps"] == best["steps"] in (48, 96)
 
 
 @pytest.mark.parametrize("task", TASKS)

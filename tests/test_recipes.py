@@ -50,28 +50,30 @@ def read(folder):
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_every_recipe_trains_on_every_task_and_leaves_what_it_promises(recipe, task, tmp_path):
-    printed = train(recipe, tmp_path, f"task={task}")
-    rows = read(tmp_path)
-    assert [int(row["iteration"]) for row in rows] == [2, 4]
-    assert [int(row["steps"]) for row in rows] == [48, 96]
-    metrics = {f"eval/{name}" for name in ("return", "success", "crash", *METRICS[task])}
-    assert {"grad/actor", *metrics} <= set(rows[0])
-    assert any(name.startswith("train/loss_") for name in rows[0])
-    may_be_missing = {"eval/lap_time", "eval/landing_speed"}
-    assert all(math.isfinite(float(row[name])) for row in rows for name in set(row) - may_be_missing)
-    for picture in ("learning_curve.png", "flight.png"):
-        assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["episodes"] == 256
-    assert summary["steps"] == 96
-    assert f"{summary['success']:.1%}" in printed
-    assert METRICS[task] <= set(summary)
-    best = torch.load(tmp_path / "checkpoint.pt", weights_only=True)["best"]
-    assert best["return"] == max(float(row["eval/return"]) for row in rows)
-    assert summary["best_steps"] == best["steps"] in (48, 96)
+def test_every_recipe_trains_on_every_task_and_leaves_what_it_promises(recipe, tmp_path):
+    sweep = [f"task={','.join(TASKS)}", f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=${task}"]
+    printed = run(sys.executable, f"recipes/{recipe}.py", "--multirun", *SMALL, *sweep)
+    for task in TASKS:
+        folder = tmp_path / task
+        rows = read(folder)
+        assert [int(row["iteration"]) for row in rows] == [2, 4]
+        assert [int(row["steps"]) for row in rows] == [48, 96]
+        metrics = {f"eval/{name}" for name in ("return", "success", "crash", *METRICS[task])}
+        assert {"grad/actor", *metrics} <= set(rows[0])
+        assert any(name.startswith("train/loss_") for name in rows[0])
+        may_be_missing = {"eval/lap_time", "eval/landing_speed"}
+        assert all(math.isfinite(float(row[name])) for row in rows for name in set(row) - may_be_missing)
+        for picture in ("learning_curve.png", "flight.png"):
+            assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+        summary = json.loads((folder / "summary.json").read_text())
+        assert summary["episodes"] == 256
+        assert summary["steps"] == 96
+        assert f"{recipe} on {task}, seed 0, 256 fresh episodes:\n  success       {summary['success']:.1%}" in printed
+        assert METRICS[task] <= set(summary)
+        best = torch.load(folder / "checkpoint.pt", weights_only=True)["best"]
+        assert best["return"] == max(float(row["eval/return"]) for row in rows)
+        assert summary["best_steps"] == best["steps"] in (48, 96)
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -245,7 +245,7 @@ class QuadrotorEnv(EnvBase):
         state |= self.randomization.initial(self, n)
         if self.wind is not None:
             state |= self.wind.initial(self, n)
-        if self._measures:
+        if not self.sensors.are_perfect:
             state |= self.sensors.initial(state, self.normal(n, 12) if self.sensors.has_noise else None)
         if self.action_delay:
             hover = self.hover_action.expand(n, 4).unsqueeze(1)
@@ -412,7 +412,7 @@ class QuadrotorEnv(EnvBase):
         previous, state = state, {**state, **flown._asdict(), **queue, "step": state["step"] + 1}
         if "wind" in noise:
             state |= self.wind.advance(state, noise["wind"], self.control_dt)
-        if self._measures:
+        if not self.sensors.are_perfect:
             state |= self.sensors.advance(state, noise.get("sensors"))
         state, still_valid = self._replace_invalid(state)
         valid = valid & still_valid
@@ -447,15 +447,11 @@ class QuadrotorEnv(EnvBase):
             **{**self.params.fields(), **{name: state["drone", name] for name in self.randomization.spec}}
         )
 
-    @property
-    def _measures(self) -> bool:
-        return self.sensors.has_noise or self.sensors.delay > 0
-
     def _measured(self, state: State) -> State:
         return self.metrics({key: value.detach() for key, value in state.items()})
 
     def _observe(self, state: State) -> Tensor:
-        observation = self.observe(self.sensors.observed(state) if self._measures else state)
+        observation = self.observe(state if self.sensors.are_perfect else self.sensors.observed(state))
         if self.observe_last_action:
             observation = torch.cat((observation, state["action_queue"].flatten(1)), -1)
         return observation
@@ -482,11 +478,11 @@ class QuadrotorEnv(EnvBase):
             )
         replaced = {}
         for key, x in state.items():
+            if not x.is_floating_point():  # counts and flags are always sound
+                replaced[key] = x
+                continue
             keep = valid
-            if key in self._task_entries or key == "step":
-                if not x.is_floating_point():
-                    replaced[key] = x
-                    continue
+            if key in self._task_entries:
                 keep = (x.detach().abs() < _MAX_VALUE).flatten(1).all(-1, keepdim=True)
             replaced[key] = torch.where(keep.view(-1, *[1] * (x.dim() - 1)), x, self._fallback[key])
         return replaced, valid

@@ -164,6 +164,11 @@ class Sensors:
         """Whether measurements differ from the truth."""
         return any((self.position, self.attitude, self.velocity, self.angular_velocity))
 
+    @property
+    def are_perfect(self) -> bool:
+        """Whether the policy is told the truth, and at once."""
+        return not self.has_noise and self.delay == 0
+
     def initial(self, state: State, noise: Tensor | None) -> State:
         """A queue full of the first measurement, with standard normal noise (*, 12)."""
         return {"measurements": self._measure(state, noise).expand(-1, self.delay + 1, -1).clone()}

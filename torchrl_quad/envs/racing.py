@@ -96,6 +96,7 @@ class RacingEnv(QuadrotorEnv):
 
     def set_up(self) -> None:
         self.gates, self.starts = self.tensor(self.track["gates"]), self.tensor(self.track["starts"])
+        self.gate_indices = torch.arange(len(self.gates), device=self.device)
         low, high = self.gates.amin(0), self.gates.amax(0)
         self.centre = 0.5 * (low + high)
         self.half_width = 0.5 * (high - low)[:2] + self.box_margin
@@ -124,7 +125,7 @@ class RacingEnv(QuadrotorEnv):
     def advance(self, previous: State, state: State) -> State:
         gate, step = previous["gate"], state["step"]
         passed = self.miss(previous["position"], state["position"], previous["target"]) < self.track["gate_radius"]
-        this_gate = passed & (gate == torch.arange(len(self.gates), device=gate.device))
+        this_gate = passed & (gate == self.gate_indices)
         last_pass = previous["pass_step"].gather(1, gate)
         lap = (step - last_pass).to(self.dtype) * self.control_dt
         next_gate = torch.where(passed, (gate + 1) % len(self.gates), gate)
@@ -153,21 +154,22 @@ class RacingEnv(QuadrotorEnv):
         return torch.cat((*relative, *body_observation(state)), -1)
 
     def reward_terms(self, state: State) -> State:
+        gap = distance(state)
         if self.reward == "position":
             terms = target_reward(state, self.weights)
         else:
-            direction = (state["target"] - state["position"]) / distance(state).clamp_min(1e-6)
+            direction = (state["target"] - state["position"]) / gap.clamp_min(1e-6)
             towards = (state["velocity"] * direction).sum(-1, keepdim=True)
             across = norm(state["velocity"] - towards * direction)
             terms = {
                 "towards": self.weights["towards"] * towards.clamp_max(self.max_rewarded_speed),
-                "across": -self.weights["across"] * across / (distance(state) + 1.0),
+                "across": -self.weights["across"] * across / (gap + 1.0),
                 "angular_velocity": -self.weights["angular_velocity"] * norm(state["angular_velocity"]),
             }
         if self.gate_bonus == "log":
-            bonus = -torch.log(distance(state) + 0.01)
+            bonus = -torch.log(gap + 0.01)
         elif self.gate_bonus == "reciprocal":
-            bonus = 1.0 / (distance(state) + 0.05)
+            bonus = 1.0 / (gap + 0.05)
         else:
             bonus = state["gate_passed"].to(self.dtype)
         return {**terms, "gate": self.weights["gate"] * bonus}

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchrl_quad.dynamics.parameters import QuadrotorParams
+from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import gyroscopic_torque
-from torchrl_quad.dynamics.rotors import Rotors, apply, thrust_limits
+from torchrl_quad.dynamics.rotors import Rotors, thrust_limits
+from torchrl_quad.dynamics.vector import Vector, clamp, join, multiply_add, take_apart, take_apart_rows, transform
 
 
 class Setpoint(NamedTuple):
     """What an action asks for: collective thrust and body rates (CTBR)."""
 
-    thrust: Tensor  # (*, 1) [N]
-    body_rate: Tensor  # (*, 3) [rad/s], body frame
+    thrust: Vector  # (*, 1) [N]
+    body_rate: Vector  # (*, 3) [rad/s], body frame
 
 
 class FlightController:
@@ -39,15 +41,30 @@ class FlightController:
         self.gain = nominal.inertia * nominal.rate_gain
         weight = nominal.mass * nominal.gravity
         self.half_range = 0.5 * nominal.max_thrust_to_weight * weight
-        self.hover_speed = self.rotors.speed(apply(self.mixer, pad(weight, (0, 3))))
+        self.hover_speed = self.rotors.speed(transform(self.mixer, pad(weight, (0, 3))))
         self.hover_action = pad(2.0 / nominal.max_thrust_to_weight - 1.0, (0, 3))
+
+    def take_apart(self) -> FlightController:
+        """The same on components: its numbers become constants of the code that is compiled with it."""
+        apart = copy.copy(self)
+        apart.nominal = RawParams(
+            **{
+                name: take_apart(value, constant=True)
+                for name, value in self.nominal.fields().items()
+                if name != "rotor_positions"
+            }
+        )
+        apart.rotors, apart.mixer = self.rotors.take_apart(), take_apart_rows(self.mixer)
+        for name in ("thrust_min", "thrust_max", "gain"):
+            setattr(apart, name, take_apart(getattr(self, name), constant=True))
+        return apart
 
     def setpoint(self, action: Tensor) -> Setpoint:
         """Decode an action (*, 4) in [-1, 1]; values outside are clamped."""
         action = action.clamp(-1.0, 1.0)
         return Setpoint((action[..., :1] + 1.0) * self.half_range, action[..., 1:] * self.nominal.max_body_rate)
 
-    def rotor_speed(self, setpoint: Setpoint, angular_velocity: Tensor, wrench: Tensor) -> Tensor:
+    def rotor_speed(self, setpoint: Setpoint, angular_velocity: Vector, wrench: Vector) -> Vector:
         """Commanded rotor speed (*, 4) [rad/s] for a setpoint, the body rates (*, 3), and the present wrench (*, 4).
 
         Torque = J K (desired rate - rate) - D (angular acceleration) + w x J w, where the angular acceleration follows
@@ -57,10 +74,10 @@ class FlightController:
         inertia = self.nominal.inertia
         gyroscopic = gyroscopic_torque(angular_velocity, inertia)
         acceleration = (wrench[..., 1:] - gyroscopic) / inertia
-        torque = torch.addcmul(gyroscopic, self.gain, setpoint.body_rate - angular_velocity)
-        torque = torch.addcmul(torque, self.nominal.rate_damping, acceleration, value=-1.0)
-        thrust = apply(self.mixer, torch.cat((setpoint.thrust, torque), -1))
-        return self.rotors.speed(torch.minimum(torch.maximum(thrust, self.thrust_min), self.thrust_max))
+        torque = multiply_add(gyroscopic, self.gain, setpoint.body_rate - angular_velocity)
+        torque = torque - self.nominal.rate_damping * acceleration
+        thrust = transform(self.mixer, join(setpoint.thrust, torque))
+        return self.rotors.speed(clamp(thrust, self.thrust_min, self.thrust_max))
 
 
 def _inverse(allocation: Tensor) -> Tensor:

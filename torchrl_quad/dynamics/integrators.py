@@ -6,13 +6,11 @@ loop the wrench is held over each physics step, and all three are of first order
 
 from collections.abc import Callable
 
-import torch
-from torch import Tensor
-
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.rigid_body import RigidBodyState
+from torchrl_quad.dynamics.vector import Vector
 
-Accelerations = Callable[[RigidBodyState], tuple[Tensor, Tensor]]
+Accelerations = Callable[[RigidBodyState], tuple[Vector, Vector]]
 
 
 def euler(state: RigidBodyState, accelerations: Accelerations, dt: float) -> RigidBodyState:
@@ -23,11 +21,10 @@ def euler(state: RigidBodyState, accelerations: Accelerations, dt: float) -> Rig
 def semi_implicit_euler(state: RigidBodyState, accelerations: Accelerations, dt: float) -> RigidBodyState:
     """Symplectic Euler: velocities first, then position and attitude with the new velocities."""
     linear, angular = accelerations(state)
-    velocity = torch.add(state.velocity, linear, alpha=dt)
-    angular_velocity = torch.add(state.angular_velocity, angular, alpha=dt)
-    position = torch.add(state.position, velocity, alpha=dt)
-    turning = quaternion.derivative(state.quaternion, angular_velocity)
-    attitude = torch.add(state.quaternion, turning, alpha=dt)
+    velocity = state.velocity + linear * dt
+    angular_velocity = state.angular_velocity + angular * dt
+    position = state.position + velocity * dt
+    attitude = state.quaternion + quaternion.derivative(state.quaternion, angular_velocity) * dt
     return _normalized(RigidBodyState(position, attitude, velocity, angular_velocity))
 
 
@@ -37,7 +34,7 @@ def rk4(state: RigidBodyState, accelerations: Accelerations, dt: float) -> Rigid
     k2 = _derivative(_moved(state, k1, 0.5 * dt), accelerations)
     k3 = _derivative(_moved(state, k2, 0.5 * dt), accelerations)
     k4 = _derivative(_moved(state, k3, dt), accelerations)
-    mean = RigidBodyState(*((a + 2.0 * b + 2.0 * c + d) / 6.0 for a, b, c, d in zip(k1, k2, k3, k4, strict=True)))
+    mean = RigidBodyState(*((a + (b + c) * 2.0 + d) / 6.0 for a, b, c, d in zip(k1, k2, k3, k4, strict=True)))
     return _normalized(_moved(state, mean, dt))
 
 
@@ -52,7 +49,7 @@ def _derivative(state: RigidBodyState, accelerations: Accelerations) -> RigidBod
 
 
 def _moved(state: RigidBodyState, derivative: RigidBodyState, dt: float) -> RigidBodyState:
-    return RigidBodyState(*(torch.add(x, dx, alpha=dt) for x, dx in zip(state, derivative, strict=True)))
+    return RigidBodyState(*(x + dx * dt for x, dx in zip(state, derivative, strict=True)))
 
 
 def _normalized(state: RigidBodyState) -> RigidBodyState:

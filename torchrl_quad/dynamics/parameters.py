@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 from collections.abc import Mapping
 from importlib import resources
@@ -34,6 +35,13 @@ _FIELDS = {
     "max_thrust_to_weight": ((1,), "positive"),
     "gravity": ((1,), "positive"),
 }
+# What the flight controller alone reads, from its nominal drone, and what the drone that flies is made of.
+CONTROLLER_FIELDS = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
+PLANT_FIELDS = tuple(name for name in _FIELDS if name not in CONTROLLER_FIELDS)
+
+# As QuadrotorParams, but unchecked and of any form: for drones that are drawn at random, and for compiled code.
+RawParams = collections.namedtuple("RawParams", _FIELDS, defaults=[None] * len(_FIELDS))
+
 _RULES = {
     "finite": lambda x: x.isfinite(),
     "positive": lambda x: x > 0,
@@ -94,6 +102,10 @@ class QuadrotorParams:
     def fields(self) -> dict[str, Tensor]:
         """The fields by name, in the order of their declaration."""
         return {name: getattr(self, name) for name in _FIELDS}
+
+    def plant(self) -> tuple[Tensor, ...]:
+        """What the drone that flies is made of, in the order of ``PLANT_FIELDS``."""
+        return tuple(getattr(self, name) for name in PLANT_FIELDS)
 
     def replace(self, **changes: Tensor | float | list) -> QuadrotorParams:
         """A copy with some fields changed: ``params.replace(mass=0.5)``.

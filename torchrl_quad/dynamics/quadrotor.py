@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics.control import FlightController, Setpoint
@@ -10,16 +9,17 @@ from torchrl_quad.dynamics.integrators import INTEGRATORS
 from torchrl_quad.dynamics.parameters import QuadrotorParams
 from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
 from torchrl_quad.dynamics.rotors import Rotors
+from torchrl_quad.dynamics.vector import Vector, clamp
 
 
 class QuadrotorState(NamedTuple):
     """A rigid body with four turning rotors."""
 
-    position: Tensor  # (*, 3) [m], world frame
-    quaternion: Tensor  # (*, 4), body to world, unit norm
-    velocity: Tensor  # (*, 3) [m/s], world frame
-    angular_velocity: Tensor  # (*, 3) [rad/s], body frame
-    rotor_speed: Tensor  # (*, 4) [rad/s]
+    position: Vector  # (*, 3) [m], world frame
+    quaternion: Vector  # (*, 4), body to world, unit norm
+    velocity: Vector  # (*, 3) [m/s], world frame
+    angular_velocity: Vector  # (*, 3) [rad/s], body frame
+    rotor_speed: Vector  # (*, 4) [rad/s]
 
 
 def physics_step(
@@ -30,7 +30,7 @@ def physics_step(
     controller: FlightController,
     dt: float,
     integrator: str = "semi_implicit_euler",
-    wind: Tensor | None = None,
+    wind: Vector | None = None,
 ) -> QuadrotorState:
     """One physics step of dt [s]: the present rotor speeds make the wrench, and the controller sets their next target.
 
@@ -42,7 +42,7 @@ def physics_step(
     believed = wrench if rotors is controller.rotors else controller.rotors.wrench(speed)
     commanded = controller.rotor_speed(setpoint, state.angular_velocity, believed)
     if rotors is not controller.rotors:  # the nominal rotors can do what the controller asks of them; these may not
-        commanded = torch.minimum(torch.maximum(commanded, params.rotor_speed_min), params.rotor_speed_max)
+        commanded = clamp(commanded, params.rotor_speed_min, params.rotor_speed_max)
     body = INTEGRATORS[integrator](RigidBodyState(*state[:4]), lambda s: accelerations(s, wrench, params, wind), dt)
     return QuadrotorState(*body, rotors.follow(speed, commanded, dt))
 

@@ -1,11 +1,14 @@
 """Unit quaternions (w, x, y, z) that turn body-frame vectors into world-frame vectors.
 
-All functions broadcast over leading dimensions and have finite derivatives for every finite input.
+All functions broadcast over leading dimensions and have finite derivatives for every finite input. What a physics step
+needs takes vectors in either form (:mod:`~torchrl_quad.dynamics.vector`).
 """
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
+
+from torchrl_quad.dynamics.vector import Vector, cross, dot, join, multiply_add
 
 
 def multiply(p: Tensor, q: Tensor) -> Tensor:
@@ -22,26 +25,26 @@ def identity(like: Tensor) -> Tensor:
     return pad(torch.ones_like(like[..., :1]), (0, 3))
 
 
-def normalize(q: Tensor) -> Tensor:
+def normalize(q: Vector) -> Vector:
     """Scale to unit norm, (*, 4). A norm below 1e-6 is treated as 1e-6, so that zero stays zero instead of NaN."""
-    return q * (q * q).sum(-1, keepdim=True).clamp_min(1e-12).rsqrt()
+    return q * dot(q, q).clamp_min(1e-12).rsqrt()
 
 
-def rotate(q: Tensor, v: Tensor) -> Tensor:
+def rotate(q: Vector, v: Vector) -> Vector:
     """Body to world: the vector v (*, 3) turned by the unit quaternion q (*, 4)."""
     return _rotate(q, v, 1.0)
 
 
-def rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
+def rotate_inverse(q: Vector, v: Vector) -> Vector:
     """World to body: the vector v (*, 3) turned by the inverse of the unit quaternion q (*, 4)."""
     return _rotate(q, v, -1.0)
 
 
-def derivative(q: Tensor, angular_velocity: Tensor) -> Tensor:
+def derivative(q: Vector, angular_velocity: Vector) -> Vector:
     """Time derivative (*, 4) [1/s] under the body-frame angular velocity (*, 3) [rad/s]: half of q (0, w)."""
-    w, u = (0.5 * q).split((1, 3), -1)
-    scalar = (-u * angular_velocity).sum(-1, keepdim=True)
-    return torch.cat((scalar, torch.addcmul(torch.linalg.cross(u, angular_velocity), w, angular_velocity)), -1)
+    half = q * 0.5
+    w, u = half[..., :1], half[..., 1:]
+    return join(-dot(u, angular_velocity), multiply_add(cross(u, angular_velocity), w, angular_velocity))
 
 
 def from_axis_angle(axis_angle: Tensor) -> Tensor:
@@ -70,8 +73,8 @@ def from_xyzw(q_xyzw: Tensor) -> Tensor:
     return q_xyzw.roll(1, -1)
 
 
-def _rotate(q: Tensor, v: Tensor, sign: float) -> Tensor:
-    """v + 2 (u x (u x v) + sign w (u x v)) for q = (w, u), in few calls: they are what an eager step costs."""
-    w, u = q.split((1, 3), -1)
-    turned = torch.linalg.cross(u, v)
-    return torch.add(v, torch.addcmul(torch.linalg.cross(u, turned), w, turned, value=sign), alpha=2.0)
+def _rotate(q: Vector, v: Vector, sign: float) -> Vector:
+    """v + u x t + sign w t with t = 2 u x v, for q = (w, u)."""
+    w, u = q[..., :1] * sign, q[..., 1:]
+    turned = cross(u * 2.0, v)
+    return v + multiply_add(cross(u, turned), w, turned)

@@ -3,10 +3,23 @@
 A wrench is (*, 4): collective thrust [N] along body z, then torque [N m] about body x, y, z.
 """
 
+from __future__ import annotations
+
+import copy
+
 import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics.parameters import QuadrotorParams
+from torchrl_quad.dynamics.vector import (
+    Components,
+    Vector,
+    maximum,
+    multiply_add,
+    take_apart,
+    take_apart_rows,
+    transform,
+)
 
 
 class Rotors:
@@ -16,34 +29,41 @@ class Rotors:
     """
 
     def __init__(self, params: QuadrotorParams) -> None:
-        k2, k1, k0 = params.thrust_map.split(1, -1)
+        k2, k1, k0 = (params.thrust_map[..., i : i + 1] for i in range(3))
         self.curvature = k2
-        self.vertex_speed = -k1 / (2.0 * k2)
-        self.vertex_thrust = k0 - k1 * k1 / (4.0 * k2)
-        self.least_root = 1e-6 * (params.rotor_speed_max - self.vertex_speed).square()
-        self.rate = -1.0 / params.motor_time_constant
+        self.vertex_speed = -k1 / (k2 * 2.0)
+        self.vertex_thrust = k0 - k1 * k1 / (k2 * 4.0)
+        self.least_root = (params.rotor_speed_max - self.vertex_speed).square() * 1e-6
+        self.time_constant = params.motor_time_constant
         self.allocation = allocation_matrix(params)
 
-    def thrust(self, speed: Tensor) -> Tensor:
-        """Rotor thrust (*, 4) [N] at the rotor speed (*, 4) [rad/s]."""
-        return torch.addcmul(self.vertex_thrust, self.curvature, (speed - self.vertex_speed).square())
+    def take_apart(self) -> Rotors:
+        """The same on components."""
+        apart = copy.copy(self)
+        for name, value in vars(self).items():
+            setattr(apart, name, take_apart_rows(value) if name == "allocation" else take_apart(value, constant=True))
+        return apart
 
-    def speed(self, thrust: Tensor) -> Tensor:
+    def thrust(self, speed: Vector) -> Vector:
+        """Rotor thrust (*, 4) [N] at the rotor speed (*, 4) [rad/s]."""
+        return multiply_add(self.vertex_thrust, self.curvature, (speed - self.vertex_speed).square())
+
+    def speed(self, thrust: Vector) -> Vector:
         """Rotor speed (*, 4) [rad/s] that gives the thrust (*, 4) [N]: the inverse of :meth:`thrust`.
 
         Next to the lowest point of the thrust map, where the slope of the inverse is infinite, the speed is held one
         thousandth of its range above that point, so that derivatives stay finite.
         """
         squared = (thrust - self.vertex_thrust) / self.curvature
-        return self.vertex_speed + torch.maximum(squared, self.least_root).sqrt()
+        return maximum(squared, self.least_root).sqrt() + self.vertex_speed
 
-    def wrench(self, speed: Tensor) -> Tensor:
+    def wrench(self, speed: Vector) -> Vector:
         """The wrench (*, 4) on the body at the rotor speeds (*, 4) [rad/s]."""
-        return apply(self.allocation, self.thrust(speed))
+        return transform(self.allocation, self.thrust(speed))
 
-    def follow(self, speed: Tensor, commanded: Tensor, dt: float) -> Tensor:
+    def follow(self, speed: Vector, commanded: Vector, dt: float) -> Vector:
         """Rotor speed (*, 4) after dt [s] of first-order lag towards a constant command: exact for any dt."""
-        return torch.lerp(commanded, speed, torch.exp(self.rate * dt))
+        return multiply_add(commanded, (-dt / self.time_constant).exp(), speed - commanded)
 
 
 def thrust_limits(params: QuadrotorParams) -> tuple[Tensor, Tensor]:
@@ -52,17 +72,15 @@ def thrust_limits(params: QuadrotorParams) -> tuple[Tensor, Tensor]:
     return rotors.thrust(params.rotor_speed_min).clamp_min(0.0), rotors.thrust(params.rotor_speed_max)
 
 
-def allocation_matrix(params: QuadrotorParams) -> Tensor:
+def allocation_matrix(params: QuadrotorParams) -> Tensor | tuple[Components, ...]:
     """The matrix (*, 4, 4) that turns four rotor thrusts into a wrench, for any rotor layout.
 
     Torque is r x F of each rotor, (y f, -x f), plus the drag torque kappa s f about z. The paper prints the matrix of a
     "+" frame; published drones are X frames.
     """
-    x, y = params.rotor_positions.unbind(-1)
     yaw = params.torque_to_thrust * params.rotor_spin
+    if isinstance(yaw, Components):  # then the positions are (x, y, x, y, ...)
+        x, y = params.rotor_positions[..., 0::2], params.rotor_positions[..., 1::2]
+        return Components([1.0]), y, -x, yaw
+    x, y = params.rotor_positions.unbind(-1)
     return torch.stack(torch.broadcast_tensors(torch.ones_like(x), y, -x, yaw), -2)
-
-
-def apply(matrix: Tensor, vector: Tensor) -> Tensor:
-    """The product (*, 4) of a matrix (*, 4, 4) and a vector (*, 4), written so that a compiler can fuse it."""
-    return (matrix * vector.unsqueeze(-2)).sum(-1)

@@ -12,12 +12,11 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import QuadrotorParams, presets, quaternion
+from torchrl_quad.dynamics.parameters import CONTROLLER_FIELDS
 
 if TYPE_CHECKING:
     from torchrl_quad.envs.base import QuadrotorEnv, State
 
-# What the flight controller alone reads, from its nominal drone.
-_CONTROLLER_FIELDS = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
 _DISTRIBUTIONS = {
     "uniform": "low and high",
     "scale": "low and high, as factors of the nominal value",
@@ -47,13 +46,13 @@ class DroneRandomization:
         source, self.spec = presets.read("randomize", spec)
         fields = nominal.fields()
         for name, distribution in self.spec.items():
-            if name in _CONTROLLER_FIELDS:
+            if name in CONTROLLER_FIELDS:
                 raise ValueError(
                     f"{source}: {name!r} belongs to the flight controller, which keeps the nominal drone; a random one "
                     "would change nothing. Give another drone instead."
                 )
             if name not in fields or name == "rotor_spin":
-                allowed = ", ".join(field for field in fields if field not in (*_CONTROLLER_FIELDS, "rotor_spin"))
+                allowed = ", ".join(field for field in fields if field not in (*CONTROLLER_FIELDS, "rotor_spin"))
                 raise ValueError(f"{source}: unknown field {name!r}. Choose from: {allowed}.")
             if not (
                 isinstance(distribution, Mapping)

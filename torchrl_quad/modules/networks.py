@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
@@ -19,11 +20,11 @@ class Network(nn.Module):
 
     def __init__(self, mlp: MLP, scales: Sequence[float]) -> None:
         super().__init__()
-        self.mlp, self.scales = mlp, tuple(scales)
+        self.mlp, self.scales, self.head = mlp, tuple(scales), nn.Identity()
 
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Map inputs (*, k_i) to outputs (*, out_features)."""
-        return self.mlp(torch.cat([x * scale for x, scale in zip(inputs, self.scales, strict=True)], -1))
+    def forward(self, *inputs: Tensor) -> Any:
+        """Map inputs (*, k_i) to outputs (*, out_features), and those to what the head makes of them."""
+        return self.head(self.mlp(torch.cat([x * scale for x, scale in zip(inputs, self.scales, strict=True)], -1)))
 
 
 def make_actor(
@@ -65,11 +66,8 @@ def make_actor(
         net.mlp[-1].weight.mul_(0.01)
         net.mlp[-1].bias.zero_()
         net.mlp[-1].bias[: spec.shape[-1]] = torch.atanh((action_init - middle) / (0.5 * (high - low)))
-    params = TensorDictModule(
-        nn.Sequential(net, NormalParamExtractor(scale_mapping=f"biased_softplus_{scale_init}")),
-        in_keys=list(in_keys),
-        out_keys=["loc", "scale"],
-    )
+    net.head = NormalParamExtractor(scale_mapping=f"biased_softplus_{scale_init}")
+    params = TensorDictModule(net, in_keys=list(in_keys), out_keys=["loc", "scale"])
     bounds = {} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high}
     return ProbabilisticActor(
         params,

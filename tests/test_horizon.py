@@ -1,0 +1,161 @@
+"""The quick rollout against TorchRL's own, and the compiled step against the eager one."""
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torch._dynamo.utils import counters
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_quad import HoveringEnv, RacingEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad.envs import TASKS
+
+EVERYTHING = {
+    "action_delay": 2,
+    "observe_last_action": True,
+    "observation_noise": {"position": 0.01, "attitude": 0.01},
+    "observation_delay": 1,
+    "wind": {"mean": [1.0, 0.0, 0.0], "gust": 0.5},
+    "randomize": {"mass": {"scale": [0.8, 1.2]}, "rotor_positions": {"scale": [0.9, 1.1]}},
+    "random_start": {"tilt": 0.3, "velocity": 0.5},
+}
+NO_CHANCE = {key: value for key, value in EVERYTHING.items() if key != "observation_noise"} | {
+    "wind": {"mean": [1.0, 0.0, 0.0]}
+}
+
+
+def fly(rollout, env, actor, start, steps):
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        flight = rollout(steps, actor, tensordict=start.clone(), auto_reset=False, break_when_any_done=False)
+    loss = flight["next", "reward"].sum() + flight["observation"].square().sum() + flight["state", "velocity"].sum()
+    return flight, torch.autograd.grad(loss, list(actor.parameters()))
+
+
+def entries(flight):
+    return dict(flight.items(include_nested=True, leaves_only=True))
+
+
+@pytest.mark.parametrize("options", [{}, NO_CHANCE], ids=["plain", "options"])
+@pytest.mark.parametrize("task", TASKS)
+def test_the_quick_rollout_is_that_of_torchrl_in_every_entry_and_gradient(task, options):
+    env = make_env(task, num_envs=3, max_episode_steps=15, dtype=torch.float64, **options)
+    actor = make_actor(env)
+    start = env.reset()
+    env.initial_state_source = lambda n, state=env.reset()["state"]: state  # the two draw in another order
+    quick, quick_grad = fly(env.rollout, env, actor, start, 40)
+    slow, slow_grad = fly(lambda *a, **k: EnvBase.rollout(env, *a, **k), env, actor, start, 40)
+    assert quick.names == slow.names and quick.shape == slow.shape
+    assert quick["next", "done"].sum() >= 6
+    torch.testing.assert_close(entries(quick), entries(slow))
+    torch.testing.assert_close(quick_grad, slow_grad)
+    assert not quick["next", "metrics"].requires_grad
+
+
+def test_episodes_that_end_on_the_way_start_anew_from_different_states():
+    env = HoveringEnv(num_envs=8, max_episode_steps=20)
+    flight = env.rollout(100, make_actor(env), break_when_any_done=False)
+    starts = flight["state", "position"][:, ::20]
+    assert (flight["state", "step"][:, ::20] == 0).all()
+    distances = torch.cdist(starts.flatten(0, 1), starts.flatten(0, 1)).fill_diagonal_(1.0)
+    assert (distances > 0).sum() > 0.9 * distances.numel()
+
+
+def test_a_policy_may_read_the_state():
+    env = HoveringEnv(num_envs=4)
+    actor = make_actor(env, in_keys=["observation", ("state", "rotor_speed")], input_scale=1e-3)
+    start = env.reset()
+    quick, _ = fly(env.rollout, env, actor, start, 5)
+    slow, _ = fly(lambda *a, **k: EnvBase.rollout(env, *a, **k), env, actor, start, 5)
+    torch.testing.assert_close(entries(quick), entries(slow))
+
+
+def test_any_other_policy_flies_in_torchrls_loop(env):
+    hover = env.hover_action.expand(4, 4)
+    reads_more = TensorDictModule(lambda x, y: hover, in_keys=["observation", "mine"], out_keys=["action"])
+    start = env.reset().set("mine", torch.ones(4, 1))
+    flight = env.rollout(5, reads_more, tensordict=start, auto_reset=False, break_when_any_done=False)
+    assert flight["mine"].sum() == 20
+    for policy in (lambda td: td.set("action", hover), None):
+        assert env.rollout(5, policy, break_when_any_done=False).shape == (4, 5)
+
+
+def test_a_compiled_step_has_exact_derivatives():
+    # Not from rest, where the norm of the velocity has a kink.
+    start_moving = {"velocity": 1.0, "angular_velocity": 1.0}
+    env = HoveringEnv(num_envs=3, dtype=torch.float64, max_episode_steps=6, random_start=start_moving).compile()
+    start = env.reset()
+    start["state", "step"] = torch.tensor([[3], [0], [1]])
+    env.initial_state_source = lambda n, state=env.reset()["state"]: state
+    hold = TensorDictModule(nn.Identity(), in_keys=["observation"], out_keys=["action"])
+
+    def flight(actions, mass, drag):
+        env.params = env.nominal.replace(mass=mass, linear_drag=drag)
+        sequence = iter(actions.unbind(1))
+        hold.module.forward = lambda _: next(sequence)
+        rollout = env.rollout(8, hold, tensordict=start, auto_reset=False, break_when_any_done=False)
+        return torch.cat([rollout["next", key].flatten() for key in ("reward", "observation")])
+
+    actions = (env.hover_action + 0.2 * torch.randn(3, 8, 4, dtype=torch.float64)).requires_grad_()
+    params = [x.clone().requires_grad_() for x in (env.params.mass, env.params.linear_drag)]
+    assert torch.autograd.gradcheck(flight, (actions, *params), fast_mode=True, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("options", [{}, {"gate_bonus": "log", **EVERYTHING}], ids=["plain", "everything"])
+def test_compiled_flights_equal_eager_ones_and_never_recompile(options):
+    env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, **options)
+    actor = make_actor(env)
+
+    def train():
+        env.set_seed(0)
+        mode = {"exploration_type": ExplorationType.DETERMINISTIC}
+        flight, carry = differentiable_rollout(env, actor, None, 50, **mode)
+        more, _ = differentiable_rollout(env, actor, carry, 7, **mode)
+        loss = flight["next", "reward"].sum() + more["next", "reward"].sum()
+        return flight, torch.autograd.grad(loss, list(actor.parameters()))
+
+    eager, eager_grad = train()
+    env.compile()
+    train()
+    compiled_so_far = counters["stats"]["unique_graphs"]
+    compiled, compiled_grad = train()
+    with torch.no_grad():
+        train_free = env.rollout(11, actor, break_when_any_done=False)
+        env.rollout(3, actor)
+    env.rollout(3)
+    env.set_initial_state_source(lambda n: train_free["next", "state"][:, 2])
+    env.rollout(40, actor, break_when_any_done=False)["next", "reward"].sum().backward()
+    assert counters["stats"]["unique_graphs"] == compiled_so_far
+    torch.testing.assert_close(entries(compiled), entries(eager))
+    torch.testing.assert_close(compiled_grad, eager_grad)
+    assert compiled["next", "done"].any()
+
+
+def test_a_compiled_environment_follows_changes_and_shares_nothing_with_others():
+    first, second = (HoveringEnv(num_envs=2, weights={"survival": w}).compile() for w in (0.1, 0.7))
+    for env, survival in ((first, 0.1), (second, 0.7), (first, 0.1)):
+        assert env.rollout(2)["next", "reward_terms", "survival"].flatten().tolist() == pytest.approx([survival] * 4)
+    first.weights = {**first.weights, "survival": 0.3}
+    assert first.rollout(2)["next", "reward_terms", "survival"].flatten().tolist() == pytest.approx([0.3] * 4)
+
+
+def test_a_drone_that_is_not_sound_crashes_alone_in_a_compiled_step():
+    env = HoveringEnv(num_envs=2).compile()
+    td = env.reset()
+    td["state", "velocity"][0] = torch.nan
+    action = env.hover_action.repeat(2, 1).requires_grad_()
+    end = env.step(td.set("action", action))["next"]
+    assert end["crash"].flatten().tolist() == [True, False]
+    assert end["state"].isfinite().all() and end["observation"].isfinite().all()
+    end["observation"].sum().backward()
+    assert action.grad.isfinite().all()
+    end = env.step(env.reset().set("action", torch.full((2, 4), torch.nan)))["next"]
+    assert end["crash"].all()
+
+
+def test_without_a_cpp_compiler_the_step_stays_eager_and_says_so(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    with pytest.warns(UserWarning, match="neither g.. nor clang.. is on the PATH"):
+        env = HoveringEnv(num_envs=2, compile=True)
+    assert not env.stepper.is_compiled
+    assert env.rollout(2)["next", "reward"].isfinite().all()

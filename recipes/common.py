@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import csv
 import json
@@ -156,6 +157,18 @@ def evaluate(env: EnvBase, actor: TensorDictModuleBase) -> tuple[dict[str, float
     return metrics, flight
 
 
+@contextlib.contextmanager
+def drawing_from(env: EnvBase, seed: int) -> Iterator[None]:
+    """Let the environment draw from a seed for a while, and go on afterwards as if nothing had been drawn."""
+    rng = getattr(env, "base_env", env).rng
+    state = rng.get_state()
+    rng.manual_seed(seed)
+    try:
+        yield
+    finally:
+        rng.set_state(state)
+
+
 class Run:
     """The bookkeeping of a training run: ``for _ in run: ...; run.record(...)``.
 
@@ -178,7 +191,7 @@ class Run:
             raise FileExistsError(f"{self.folder} holds the results of another run. Choose another hydra.run.dir.")
         self.iterations = iterations(cfg)
         self.steps_per_iteration = cfg.num_envs * cfg.horizon
-        self.eval_env = build_env(cfg, cfg.num_envs, cfg.eval.seed, compile=cfg.compile)
+        self.env = env
         self.logger = None
         if cfg.logger.backend:
             wandb = {"mode": cfg.logger.mode, "project": cfg.logger.project, "config": OmegaConf.to_container(cfg)}
@@ -200,10 +213,8 @@ class Run:
                 yield iteration
                 bar.update(self.steps_per_iteration)
                 if (iteration + 1) % self.cfg.eval.interval == 0 or iteration + 1 == self.iterations:
-                    self.eval_env.set_seed(self.cfg.eval.seed)
-                    if self.cfg.normalize:
-                        self.eval_env.transform.load_state_dict(self.modules["normalizer"].state_dict())
-                    metrics, _ = evaluate(self.eval_env, self.actor)
+                    with drawing_from(self.env, self.cfg.eval.seed):
+                        metrics, _ = evaluate(self.env, self.actor)
                     self.seconds = time.perf_counter() - start
                     self._write_row(iteration + 1, metrics)
                     self._keep_best(metrics["eval/return"], (iteration + 1) * self.steps_per_iteration)
@@ -237,13 +248,11 @@ class Run:
         os.replace(temporary, self.folder / "checkpoint.pt")
 
     def _warm_up(self) -> None:
-        """Compile both variants of the step, with gradients and without, before the clock starts; change nothing."""
-        with torch.random.fork_rng():
-            rollout, _ = differentiable_rollout(self.eval_env, self.actor, None, 2)
+        """Compile the step and its derivative before the clock starts; change nothing."""
+        with torch.random.fork_rng(), drawing_from(self.env, self.cfg.eval.seed):
+            rollout, _ = differentiable_rollout(self.env, self.actor, None, 2)
             rollout["next", "reward"].sum().backward()
             self.actor.zero_grad()
-            with torch.no_grad():
-                differentiable_rollout(self.eval_env, self.actor, None, 1)
 
     def _write_row(self, iteration: int, evaluation: dict[str, float]) -> None:
         steps = iteration * self.steps_per_iteration

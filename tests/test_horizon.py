@@ -42,7 +42,8 @@ def test_the_quick_rollout_is_that_of_torchrl_in_every_entry_and_gradient(task, 
     env = make_env(task, num_envs=3, max_episode_steps=15, dtype=torch.float64, **options)
     actor = make_actor(env)
     start = env.reset()
-    env.initial_state_source = lambda n, state=env.reset()["state"]: state  # the two draw in another order
+    again = env.reset()["state"]
+    env.initial_state_source = lambda n: again  # the two draw in another order
     quick, quick_grad = fly(env.rollout, env, actor, start, 40)
     slow, slow_grad = fly(lambda *a, **k: EnvBase.rollout(env, *a, **k), env, actor, start, 40)
     assert quick.names == slow.names and quick.shape == slow.shape
@@ -86,7 +87,8 @@ def test_a_compiled_step_has_exact_derivatives():
     env = HoveringEnv(num_envs=3, dtype=torch.float64, max_episode_steps=6, random_start=start_moving).compile()
     start = env.reset()
     start["state", "step"] = torch.tensor([[3], [0], [1]])
-    env.initial_state_source = lambda n, state=env.reset()["state"]: state
+    again = env.reset()["state"]
+    env.initial_state_source = lambda n: again
     hold = TensorDictModule(nn.Identity(), in_keys=["observation"], out_keys=["action"])
 
     def flight(actions, mass, drag):

@@ -364,7 +364,9 @@ class QuadrotorEnv(EnvBase):
         state = state._replace(floats=floats)
         # TorchRL resets by itself: what the episode after this one would start from is not used.
         end = stepper(state, valid, tensordict.get("action"), noise, state.detach(), self._no_observation)
-        return self._tensordict({"observation": end.observation, **horizon.nested(stepper.entries(end.state, end.told))})
+        return self._tensordict(
+            {"observation": end.observation, **horizon.nested(stepper.entries(end.state, end.told))}
+        )
 
     def rollout(self, max_steps: int, policy: Any = None, callback: Any = None, **options: Any) -> TensorDictBase:
         """As TorchRL's rollout; several times faster where it flies on through the ends of episodes.

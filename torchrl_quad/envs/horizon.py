@@ -131,6 +131,8 @@ class Stepper:
 
         self.is_compiled = options is not None
         if self.is_compiled:
+            like = self.fallback, self.told_layout.pack(flat(told)).floats, env.observation(start)
+            self.zeros = [torch.zeros_like(like[i]) for i in (0, 1, 2, 0, 2)]
             self.control_step = CompiledControlStep(env.controller, env.dt, env.substeps, env.integrator)
             mode = torch._inductor.list_mode_options(options["mode"]) if options.get("mode") else {}
             more = {**mode, **options.get("options", {}), "guard_filter_fn": _watched, "cpp.vec_isa_ok": True}
@@ -221,10 +223,13 @@ class Stepper:
         return Ends(rows, self.told_layout.pack(flat(told)), observation, fresh.where(done.t(), rows), first)
 
     def sound(self, floats: Tensor) -> tuple[Tensor, Tensor]:
-        """Put the fallback in the place of drones that are not finite, or beyond what the model can compute; tell which.
+        """Put the fallback in the place of drones that are not finite, or beyond what the model can compute.
 
         What the task has added stays as it was, unless it is itself the trouble. Selecting before the physics keeps the
         gradients of the others clean: a gradient of zero is never multiplied by an infinite derivative.
+
+        Returns:
+            the sound state, and which drones (n) were sound before.
         """
         with torch.no_grad():
             share = floats.abs() * self.inverse_limits
@@ -304,10 +309,10 @@ def _own(method: types.MethodType) -> types.MethodType:
 def _watched(guards: Sequence[Any]) -> list[bool]:
     """Which assumptions the compiled step checks at each call: on its input, on torch's state, on the environment's own
     attributes. The rest, several hundred that cost more than the physics, is about what never changes."""
+    fixed = ("G[", "__import__", "list(dict.keys(__import__", "self.control_step", "self.layout", "self.told_layout")
+    never = ("NOT_PRESENT_IN_GENERIC_DICT", "TYPE_MATCH", "BUILTIN_MATCH")
     return [
-        not guard.name or not guard.name.startswith(("G[", "__import__", "self.control_step", "self.layout", "self.told"))
-        and "__dict__" not in guard.name
-        for guard in guards
+        not (guard.name.startswith(fixed) or "__dict__" in guard.name or guard.guard_type in never) for guard in guards
     ]
 
 
@@ -319,6 +324,7 @@ class _Step(torch.autograd.Function):
         floats, action, *theta = (x.detach().contiguous() for x in (floats, action, *theta))
         states, ends = stepper.forward(floats, action, tuple(theta), integers, flags, valid, noise, fresh, first)
         ctx.stepper, ctx.noise = stepper, noise
+        ctx.set_materialize_grads(False)
         ctx.save_for_backward(floats, action, integers, flags, valid, *states, *theta)
         ends = (*ends.state, *ends.told, ends.observation, *ends.carried, ends.first)
         ctx.mark_non_differentiable(*(ends[i] for i in (1, 2, 4, 5, 8, 9)))
@@ -330,7 +336,10 @@ class _Step(torch.autograd.Function):
         floats, action, integers, flags, valid, *more = ctx.saved_tensors
         count = ctx.stepper.env.substeps + 1
         states, theta = more[:count], tuple(more[count:])
-        grad = tuple(grads[i].contiguous() for i in (0, 3, 6, 7, 10))
+        grad = tuple(
+            zero if grads[i] is None else grads[i].contiguous()
+            for i, zero in zip((0, 3, 6, 7, 10), ctx.stepper.zeros, strict=True)
+        )
         grad_floats, grad_action, grad_theta = ctx.stepper.adjoint(
             states, floats, action, theta, integers, flags, valid, ctx.noise, grad
         )

@@ -1,0 +1,144 @@
+"""What a training iteration spends its time on, per algorithm.
+
+python benchmarks/profile_recipes.py --algorithms bptt abpt --overrides num_envs=256 horizon=32
+
+Runs the recipes themselves, with clocks around their parts; a clock stops while one inside it runs. Writes
+``benchmarks/results/profile.csv``: per cent of the wall-clock time of the iterations, evaluations left out.
+"""
+
+import argparse
+import functools
+import multiprocessing
+import runpy
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import torch
+from report import save
+from tensordict.nn import ProbabilisticTensorDictSequential
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+sys.path.insert(0, str(RECIPES))
+
+PARTS = ("physics", "actor", "critic", "loss", "optimiser", "bookkeeping", "logging")
+
+
+class Clocks:
+    """Exclusive wall-clock time of nested parts [s]."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.running: list[str] = []
+        self.since = 0.0
+
+    def switch(self, part: str | None) -> None:
+        now = time.perf_counter()
+        if self.running:
+            self.seconds[self.running[-1]] += now - self.since
+        self.since = now
+        if part is None:
+            self.running.pop()
+        else:
+            self.running.append(part)
+
+    def around(self, owner, name: str, part: str) -> None:
+        """Put a clock around a function of a class or module."""
+        wrapped = owner.__dict__[name]
+        is_static = isinstance(wrapped, staticmethod)
+        function = wrapped.__func__ if is_static else wrapped
+
+        @functools.wraps(function)
+        def timed(*args, **kwargs):
+            self.switch(part)
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.switch(None)
+
+        setattr(owner, name, staticmethod(timed) if is_static else timed)
+
+
+def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) -> dict[str, float | str]:
+    """What each part of a recipe takes; changes the modules that it measures, and so wants a process of its own."""
+    import common
+
+    import torchrl_quad
+    from torchrl_quad import envs, objectives
+    from torchrl_quad.data import rollout as rollouts
+
+    clocks = Clocks()
+    horizon = envs.horizon
+    clocks.around(horizon.Stepper, "__call__", "physics")
+    clocks.around(horizon._Step, "backward", "physics")
+    clocks.around(ProbabilisticTensorDictSequential, "forward", "actor")
+    clocks.around(horizon, "fly", "bookkeeping")
+    clocks.around(rollouts, "differentiable_rollout", "bookkeeping")
+    clocks.around(objectives.PathwiseLoss, "loss_actor", "loss")
+    for loss, name in ((objectives.ABPTLoss, "loss_qvalue"), (objectives.SHACLoss, "loss_value")):
+        clocks.around(loss, name, "critic")
+    clocks.around(objectives.pathwise.PathwiseCriticLoss, "write_value_target", "critic")
+    clocks.around(torch.optim.Adam, "step", "optimiser")
+    clocks.around(torch.nn.utils, "clip_grad_norm_", "optimiser")
+    clocks.around(common, "update_normalizer", "bookkeeping")
+    clocks.around(common.Run, "record", "logging")
+
+    # What is not physics in the backward pass belongs to the network whose optimiser is about to step.
+    descend, first = common.descend, []
+
+    def timed_descend(optimizer, loss, norm):
+        first.append(optimizer) if not first else None
+        clocks.switch("actor" if optimizer is first[0] else "critic")
+        try:
+            return descend(optimizer, loss, norm)
+        finally:
+            clocks.switch(None)
+
+    common.descend = timed_descend
+    total, count = 0.0, 0
+    iterate = common.Run.__iter__
+
+    def timed_iterations(run):
+        nonlocal total, count
+        run.cfg.eval.interval = 10**9
+        for iteration in iterate(run):
+            if iteration == skip:
+                clocks.seconds.clear()
+            start = time.perf_counter()
+            clocks.switch("bookkeeping")
+            yield iteration
+            clocks.switch(None)
+            if iteration >= skip:
+                total, count = total + time.perf_counter() - start, count + 1
+            if count == iterations:
+                return
+
+    common.Run.__iter__ = timed_iterations
+    torchrl_quad.differentiable_rollout = rollouts.differentiable_rollout
+    with tempfile.TemporaryDirectory() as folder:
+        sys.argv = [algorithm, f"hydra.run.dir={folder}/run", "total_steps=1_000_000_000", *overrides]
+        runpy.run_path(str(RECIPES / f"{algorithm}.py"), run_name="__main__")
+    shares = {f"{part} %": round(100 * clocks.seconds[part] / total, 1) for part in PARTS}
+    return {"algorithm": algorithm, "ms per iteration": round(1e3 * total / count, 1), **shares}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--algorithms", nargs="+", default=["bptt", "shac", "abpt"], choices=["bptt", "shac", "abpt"])
+    parser.add_argument("--overrides", nargs="*", default=["num_envs=256", "horizon=32", "compile=true"])
+    parser.add_argument("--iterations", type=int, default=20)
+    parser.add_argument("--skip", type=int, default=5, help="iterations before the clocks start")
+    parser.add_argument("--output", default="profile")
+    args = parser.parse_args()
+    rows = []
+    for algorithm in args.algorithms:
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            rows.append(pool.submit(profile, algorithm, args.overrides, args.skip, args.iterations).result())
+    save(args.output, rows, overrides=" ".join(args.overrides))
+
+
+if __name__ == "__main__":
+    main()

@@ -18,7 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import torch
-from report import save
+from report import RESULTS, save
 from tensordict.nn import ProbabilisticTensorDictSequential
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -131,7 +131,7 @@ def main() -> None:
     parser.add_argument("--overrides", nargs="*", default=["num_envs=256", "horizon=32", "compile=true"])
     parser.add_argument("--iterations", type=int, default=20)
     parser.add_argument("--skip", type=int, default=5, help="iterations before the clocks start")
-    parser.add_argument("--output", default="profile")
+    parser.add_argument("--output", type=Path, default=RESULTS / "profile.csv")
     args = parser.parse_args()
     rows = []
     for algorithm in args.algorithms:

@@ -13,26 +13,25 @@ import torch
 RESULTS = Path(__file__).parent / "results"
 
 
-def save(name: str, rows: list[dict[str, Any]], **about: Any) -> None:
-    """Print rows of results, and write them to ``results/<name>.csv``, each with what they are about."""
+def save(path: Path, rows: list[dict[str, Any]], **about: Any) -> None:
+    """Print rows of results, and write them to a CSV file, each with what they are about."""
     about |= {"threads": torch.get_num_threads(), "machine": machine(), "torch": torch.__version__}
     columns = list(dict.fromkeys(key for row in rows for key in row if key not in about))
     widths = [max(len(str(row.get(key, ""))) for row in [*rows, {key: key}]) for key in columns]
     for row in [dict(zip(columns, columns, strict=True)), *rows]:
         print("  ".join(str(row.get(key, "")).rjust(width) for key, width in zip(columns, widths, strict=True)))
-    RESULTS.mkdir(exist_ok=True)
-    temporary = RESULTS / f"{name}.tmp"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
     with open(temporary, "w", newline="") as file:
         writer = csv.DictWriter(file, list(dict.fromkeys([*columns, *about])))
         writer.writeheader()
         writer.writerows({**about, **row} for row in rows)
-    os.replace(temporary, RESULTS / f"{name}.csv")
-    print(f"\n{RESULTS / name}.csv: {about}")
+    os.replace(temporary, path)
+    print(f"\n{path}: {about}")
 
 
-def finished(name: str) -> list[dict[str, Any]]:
-    """The rows that ``results/<name>.csv`` holds already."""
-    path = RESULTS / f"{name}.csv"
+def finished(path: Path) -> list[dict[str, Any]]:
+    """The rows that a CSV file of results holds already."""
     if not path.exists():
         return []
     with open(path, newline="") as file:

@@ -22,9 +22,10 @@ import importlib.util
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import torch
-from report import finished, save
+from report import RESULTS, finished, save
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -181,7 +182,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--output", default="throughput", help="name of the CSV; its rows are kept")
+    parser.add_argument("--output", type=Path, default=RESULTS / "throughput.csv")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     rows = finished(args.output)

@@ -384,7 +384,21 @@ def fly(env: QuadrotorEnv, policy: TensorDictModuleBase, tensordict: TensorDictB
         state, observation = end.carried, end.first
         if t == 0:
             valid = torch.ones_like(valid)  # what a step leads to is sound
+    rollout = _rollout(stepper, roots, draws, ends)
+    rollout |= {
+        flat_key(key): torch.stack(x, 1) for key, x in zip(policy.out_keys, zip(*written, strict=True), strict=True)
+    }
+    return TensorDict(nested(rollout), (n, steps), env.device, names=[None, "time"])
 
+
+def _rollout(
+    stepper: Stepper, roots: Sequence[tuple], draws: Sequence[tuple], ends: Sequence[tuple]
+) -> dict[Key, Tensor]:
+    """All entries of a rollout but those of the policy, each (n, time, ...).
+
+    Root, draws and ends each have three parts: the state's rows, the rows told, and the observation. A draw serves
+    ``STEPS_PER_DRAW`` steps.
+    """
     following = [[torch.stack(x) for x in zip(*rows, strict=True)] for rows in zip(*ends, strict=True)]
     kind, where, _ = stepper.told_layout.place["done"]
     done = following[1][kind][:, where]
@@ -406,9 +420,7 @@ def fly(env: QuadrotorEnv, policy: TensorDictModuleBase, tensordict: TensorDictB
         entries["observation"] = observation.transpose(0, 1)
         rollout |= {_path(*prefix, *_tuple(key)): x for key, x in entries.items()}
     del rollout["reward"]
-    for key, x in zip(policy.out_keys, zip(*written, strict=True), strict=True):
-        rollout[flat_key(key)] = torch.stack(x, 1)
-    return TensorDict(nested(rollout), (n, steps), env.device, names=[None, "time"])
+    return rollout
 
 
 def flat(entries: Mapping[Any, Any], *prefix: str) -> dict[Key, Tensor]:

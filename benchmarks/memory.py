@@ -1,0 +1,103 @@
+"""Memory that the graph of a horizon holds, per environment and control step, and what keeping less of it costs.
+
+python benchmarks/memory.py --num-envs 1024
+
+=========  =============================================================================================
+eager      autograd keeps every intermediate result
+recompute  the eager step under ``torch.utils.checkpoint``: only its input is kept, it is done again backward
+compiled   the compiled step keeps the states between its physics steps, and does those again backward
+=========  =============================================================================================
+
+The memory is what the process (on Linux) has gained between the start of a horizon and its end. Writes
+``benchmarks/results/memory.csv``.
+"""
+
+import argparse
+import gc
+import multiprocessing
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import torch
+from report import RESULTS, save
+from throughput import FixedActions
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+from torchrl.envs import EnvBase
+
+from torchrl_quad import differentiable_rollout, make_env
+from torchrl_quad.envs.horizon import Ends, Rows
+
+MODES = ["eager", "recompute", "compiled"]
+
+
+def resident() -> int:
+    """Memory of this process [byte]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def recompute(env: EnvBase) -> None:
+    """Let an environment keep only the input of each step."""
+    once = type(env.stepper)
+
+    class Checkpointed(once):
+        def __call__(self, state: Rows, valid: Tensor, action: Tensor, *others: Any) -> Ends:
+            def step(floats: Tensor, action: Tensor) -> tuple[Tensor, ...]:
+                ends = once.__call__(self, state._replace(floats=floats), valid, action, *others)
+                return (*ends.state, *ends.told, ends.observation, *ends.carried, ends.first)
+
+            ends = checkpoint(step, state.floats, action, use_reentrant=False)
+            return Ends(Rows(*ends[:3]), Rows(*ends[3:6]), ends[6], Rows(*ends[7:10]), ends[10])
+
+    env.stepper.__class__ = Checkpointed
+
+
+def measure(mode: str, n: int, horizon: int, rounds: int) -> dict[str, float | str]:
+    """Bytes and time per environment and step; wants a process of its own, since memory is not given back at once."""
+    torch.set_num_threads(1)
+    env = make_env("hovering", num_envs=n, compile=mode == "compiled")
+    if mode == "recompute":
+        recompute(env)
+    start = env.reset()
+
+    def fly(steps: int) -> dict[str, float]:
+        actions = (env.hover_action + 0.1 * torch.randn(steps, n, 4)).requires_grad_()
+        gc.collect()
+        before, begin = resident(), time.perf_counter()
+        rollout, _ = differentiable_rollout(env, FixedActions(actions), start, steps)
+        middle, held = time.perf_counter(), resident() - before
+        rollout["next", "reward"].sum().backward()
+        return {"held": held, "data": rollout.bytes(), "fwd": middle - begin, "bwd": time.perf_counter() - middle}
+
+    fly(2)  # compiles
+    flights = [fly(horizon) for _ in range(rounds)]
+    steps = n * horizon
+    return {
+        "step": mode,
+        "held [byte]": round(flights[0]["held"] / steps),
+        "of it data [byte]": round(flights[0]["data"] / steps),
+        "forward [us]": round(1e6 * min(flight["fwd"] for flight in flights) / steps, 2),
+        "backward [us]": round(1e6 * min(flight["bwd"] for flight in flights) / steps, 2),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--num-envs", type=int, default=1024)
+    parser.add_argument("--modes", nargs="+", default=MODES, choices=MODES)
+    parser.add_argument("--horizon", type=int, default=32)
+    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--output", type=Path, default=RESULTS / "memory.csv")
+    args = parser.parse_args()
+    rows = []
+    for mode in args.modes:
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            rows.append(pool.submit(measure, mode, args.num_envs, args.horizon, args.rounds).result())
+    save(args.output, rows, num_envs=args.num_envs, horizon=args.horizon)
+
+
+if __name__ == "__main__":
+    main()

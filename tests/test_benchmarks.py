@@ -1,0 +1,39 @@
+"""Every benchmark runs, on a reduced budget, and says what it has measured."""
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+SMALL = "num_envs=4 horizon=4 total_steps=16"
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "rows"),
+    [
+        ("throughput", "--num-envs 4 8 --modes eager --horizon 2 --rounds 1", 10),
+        ("memory", "--num-envs 4 --modes eager recompute --horizon 2 --rounds 1", 2),
+        ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL}", 1),
+        ("profile_recipes", "--algorithms bptt --iterations 2 --skip 1 --overrides num_envs=4 horizon=4", 1),
+    ],
+)
+def test_a_benchmark_writes_a_table(name, arguments, rows, tmp_path):
+    output = tmp_path / "results.csv"
+    command = [sys.executable, str(BENCHMARKS / f"{name}.py"), *arguments.split(), "--output", str(output)]
+    subprocess.run(command, check=True, timeout=120, cwd=tmp_path, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    with open(output, newline="") as file:
+        results = list(csv.DictReader(file))
+    assert len(results) == rows
+    assert all(row["machine"] and row["torch"] for row in results)
+
+
+def test_the_results_that_are_published_name_their_machine():
+    published = list((BENCHMARKS / "results").glob("*.csv"))
+    assert {path.stem for path in published} >= {"throughput", "memory", "time_to_solve", "profile"}
+    for path in published:
+        with open(path, newline="") as file:
+            assert all(row["machine"] for row in csv.DictReader(file))

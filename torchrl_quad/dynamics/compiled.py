@@ -35,8 +35,9 @@ class CompiledControlStep:
         def step(state: Tensor, setpoint: Tensor, plant: tuple, wind: tuple) -> Tensor:
             return self._physics_step(state, setpoint, plant, wind)
 
-        def adjoint(state: Tensor, setpoint: Tensor, plant: tuple, wind: tuple, grad: Tensor) -> tuple:
-            return torch.func.vjp(self._physics_step, state, setpoint, plant, wind)[1](grad)
+        def adjoint(state: Tensor, setpoint: Tensor, plant: tuple, wind: tuple, grad: Tensor) -> tuple[Tensor, ...]:
+            grads = torch.func.vjp(self._physics_step, state, setpoint, plant, wind)[1](grad)
+            return (*grads[:2], *grads[2], *grads[3])  # a flat tuple: only such a region is traced once for all
 
         self._step, self._adjoint = (torch.compiler.nested_compile_region(f) for f in (step, adjoint))
 
@@ -59,11 +60,11 @@ class CompiledControlStep:
         self, states: list[Tensor], setpoint: Tensor, plant: tuple[Tensor, ...], wind: tuple[Tensor, ...], grad: Tensor
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
         """From the gradient (17, n) of the last state those of the first, the setpoint, the plant and the wind."""
-        others = None
+        grad, total = grad.contiguous(), None
         for state in reversed(states[:-1]):
             grad, *more = self._adjoint(state, setpoint, plant, wind, grad)
-            others = more if others is None else torch.utils._pytree.tree_map(torch.add, others, more)
-        return grad, *others
+            total = more if total is None else [a + b for a, b in zip(total, more, strict=True)]
+        return grad, total[0], tuple(total[1 : len(plant) + 1]), tuple(total[len(plant) + 1 :])
 
     def _physics_step(self, state: Tensor, setpoint: Tensor, plant: tuple, wind: tuple) -> Tensor:
         rows, parts = Components(state.unbind()), []

@@ -251,8 +251,9 @@ class Run:
         """Compile the step and its derivative before the clock starts; change nothing."""
         with torch.random.fork_rng(), drawing_from(self.env, self.cfg.eval.seed):
             rollout, _ = differentiable_rollout(self.env, self.actor, None, 2)
-            rollout["next", "reward"].sum().backward()
-            self.actor.zero_grad()
+            if self.cfg.algorithm != "ppo":  # which takes no derivative of the step
+                rollout["next", "reward"].sum().backward()
+                self.actor.zero_grad()
 
     def _write_row(self, iteration: int, evaluation: dict[str, float]) -> None:
         steps = iteration * self.steps_per_iteration

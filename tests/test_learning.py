@@ -39,7 +39,7 @@ def test_the_program_of_the_readme_learns_to_hover():
 
 @pytest.mark.slow
 def test_abpt_flies_two_laps(tmp_path):
-    command = [sys.executable, "recipes/abpt.py", "task=racing", "compile=true", f"hydra.run.dir={tmp_path}"]
+    command = [sys.executable, "recipes/abpt.py", "task=racing", f"hydra.run.dir={tmp_path}"]
     subprocess.run(command, cwd=ROOT, check=True)
     assert json.loads((tmp_path / "summary.json").read_text())["gates_passed"] >= 8
 

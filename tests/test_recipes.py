@@ -22,7 +22,7 @@ sys.path.insert(0, str(ROOT / "recipes"))
 from common import make_optimizer  # noqa: E402, it lies beside the recipes
 
 README = (ROOT / "README.md").read_text()
-SMALL = ["num_envs=4", "horizon=6", "total_steps=96", "eval.interval=2", "env.max_episode_steps=60"]
+SMALL = ["num_envs=4", "horizon=6", "total_steps=96", "eval.interval=2", "env.max_episode_steps=60", "compile=false"]
 RECIPES = ["abpt", "bptt", "shac", "ppo"]
 FIRST_ORDER = ["abpt", "bptt", "shac"]
 TASKS = ["hovering", "landing", "racing", "tracking"]
@@ -48,6 +48,15 @@ def train(recipe, folder, *overrides):
 def read(folder):
     with open(folder / "metrics.csv", newline="") as file:
         return list(csv.DictReader(file))
+
+
+def test_a_compiled_run_learns_what_an_eager_one_does(tmp_path):
+    small = ["env.integrator=euler", "hydra.job_logging.root.level=WARNING"]
+    for mode in ("false", "true"):
+        train("bptt", tmp_path / mode, *small, f"compile={mode}")
+    eager, compiled = (read(tmp_path / mode)[-1] for mode in ("false", "true"))
+    for name in ("train/loss_actor", "grad/actor", "eval/return", "eval/position_error"):
+        assert float(compiled[name]) == pytest.approx(float(eager[name]), rel=1e-3), name
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
@@ -186,7 +195,7 @@ def test_every_readme_command_runs(tmp_path):
     commands = [command for command in commands if command]
     assert {"make train", "make test"} <= set(commands)
     for i, command in enumerate(commands):
-        small = [*SMALL, "compile=false", f"hydra.run.dir={tmp_path / str(i)}"]
+        small = [*SMALL, f"hydra.run.dir={tmp_path / str(i)}"]
         if command in ("make train", "make test"):
             continue  # make train has its own test below, and make test runs this one
         if command.startswith("python recipes/evaluate.py"):

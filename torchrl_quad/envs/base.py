@@ -89,7 +89,9 @@ class QuadrotorEnv(EnvBase):
         weights: other weights of the reward's terms, by name, in the place of the task's own: ``{"velocity": 0.0}``.
         random_start: a mapping with any of ``tilt``, ``yaw``, ``velocity``, ``angular_velocity``; see
             :class:`~torchrl_quad.envs.options.RandomStart`.
-        compile: compile one control step with its observation, reward and termination into one graph.
+        compile: compile one control step with its observation, reward and termination, and its derivative; see
+            ``docs/performance.md``. Takes half a minute for each number of environments, a few seconds once torch has
+            it in its cache. First derivatives only.
 
     Raises:
         ValueError: an argument is out of its range, with the allowed values.
@@ -328,7 +330,8 @@ class QuadrotorEnv(EnvBase):
         self.randomization = options.DroneRandomization(self.randomization.spec, self.nominal)
         self.set_up()
         self.set_seed(self._seed)
-        return self.compile() if self.stepper.is_compiled else self.eager()
+        self.stepper = horizon.Stepper(self, self.stepper.options)
+        return self
 
     def set_initial_state_source(self, source: Callable[[int], TensorDictBase] | None) -> None:
         """Set :attr:`initial_state_source`, also through a TransformedEnv, where assigning the attribute would not.

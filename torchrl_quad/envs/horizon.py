@@ -129,7 +129,7 @@ class Stepper:
                 limits[where] = (_MAX_ROTOR_SPEED * env.nominal.rotor_speed_max).expand(n, 4).t()
         self.inverse_limits = 1.0 / limits
 
-        self.is_compiled = options is not None
+        self.options, self.is_compiled = options, options is not None
         if self.is_compiled:
             like = self.fallback, self.told_layout.pack(flat(told)).floats, env.observation(start)
             self.zeros = [torch.zeros_like(like[i]) for i in (0, 1, 2, 0, 2)]

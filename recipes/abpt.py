@@ -44,7 +44,8 @@ def main(cfg: DictConfig) -> None:
 
         # The critics: towards the TD(lambda) targets of the target networks.
         data = loss.write_value_target(rollout.detach())
-        for batch in minibatches(data, cfg.critic):
+        read = data.select(*loss.in_keys, loss.tensor_keys.value_target)
+        for batch in minibatches(read, cfg.critic):
             loss_qvalue, critic_metrics = loss.loss_qvalue(batch)
             descend(critic_optimizer, loss_qvalue, cfg.critic.max_grad_norm)
             target.step()

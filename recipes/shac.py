@@ -43,7 +43,8 @@ def main(cfg: DictConfig) -> None:
 
         # The critic: towards the TD(lambda) targets of the target network.
         data = loss.write_value_target(rollout.detach())
-        for batch in minibatches(data, cfg.critic):
+        read = data.select(*loss.in_keys, loss.tensor_keys.value_target)
+        for batch in minibatches(read, cfg.critic):
             loss_value, critic_metrics = loss.loss_value(batch)
             descend(critic_optimizer, loss_value, cfg.critic.max_grad_norm)
             target.step()

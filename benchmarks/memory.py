@@ -46,11 +46,9 @@ def recompute(env: EnvBase) -> None:
     class Checkpointed(once):
         def __call__(self, state: Rows, valid: Tensor, action: Tensor, *others: Any) -> Ends:
             def step(floats: Tensor, action: Tensor) -> tuple[Tensor, ...]:
-                ends = once.__call__(self, state._replace(floats=floats), valid, action, *others)
-                return (*ends.state, *ends.told, ends.observation, *ends.carried, ends.first)
+                return once.__call__(self, state._replace(floats=floats), valid, action, *others).leaves()
 
-            ends = checkpoint(step, state.floats, action, use_reentrant=False)
-            return Ends(Rows(*ends[:3]), Rows(*ends[3:6]), ends[6], Rows(*ends[7:10]), ends[10])
+            return Ends.of(checkpoint(step, state.floats, action, use_reentrant=False))
 
     env.stepper.__class__ = Checkpointed
 

@@ -116,11 +116,18 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(options):
         loss = flight["next", "reward"].sum() + more["next", "reward"].sum()
         return flight, torch.autograd.grad(loss, list(actor.parameters()))
 
+    def train_in_torchrls_loop():
+        env.set_seed(0)
+        return fly(lambda *a, **k: EnvBase.rollout(env, *a, **k), env, actor, env.reset(), 45)
+
     eager, eager_grad = train()
+    slow, slow_grad = train_in_torchrls_loop()
     env.compile()
     train()
+    train_in_torchrls_loop()
     compiled_so_far = counters["stats"]["unique_graphs"]
     compiled, compiled_grad = train()
+    compiled_slow, compiled_slow_grad = train_in_torchrls_loop()
     with torch.no_grad():
         train_free = env.rollout(11, actor, break_when_any_done=False)
         env.rollout(3, actor)
@@ -130,6 +137,8 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(options):
     assert counters["stats"]["unique_graphs"] == compiled_so_far
     torch.testing.assert_close(entries(compiled), entries(eager))
     torch.testing.assert_close(compiled_grad, eager_grad)
+    torch.testing.assert_close(entries(compiled_slow), entries(slow))
+    torch.testing.assert_close(compiled_slow_grad, slow_grad)
     assert compiled["next", "done"].any()
 
 

@@ -96,6 +96,15 @@ class Ends(NamedTuple):
     carried: Rows  # the state to go on from: that at its end, or another where the episode is over
     first: Tensor  # (n, k), the observation to go on from
 
+    def leaves(self) -> tuple[Tensor, ...]:
+        """All tensors in a row, which is what autograd can pass on."""
+        return (*self.state, *self.told, self.observation, *self.carried, self.first)
+
+    @classmethod
+    def of(cls, leaves: Sequence[Tensor]) -> Ends:
+        """The reverse of :meth:`leaves`."""
+        return cls(Rows(*leaves[:3]), Rows(*leaves[3:6]), leaves[6], Rows(*leaves[7:10]), leaves[10])
+
 
 class Stepper:
     """A control step of an environment on rows: eager, or compiled with its derivative.
@@ -113,9 +122,9 @@ class Stepper:
         order = [*QuadrotorState._fields, "step", *(k for k in start if k not in of_task), *of_task]
         self.layout = Layout({key: start[key] for key in order})
         told = env.told(start)
-        told |= {"reward": told["observation"][:, :1], "reward_terms": env.reward_terms(start)}
-        del told["observation"]
-        self.told_layout = Layout(flat(told))
+        observation = told.pop("observation")
+        told = flat({**told, "reward": observation[:, :1], "reward_terms": env.reward_terms(start)})
+        self.told_layout = Layout(told)
 
         self.fallback = self.layout.pack(start).floats
         self.is_of_task = torch.zeros_like(self.fallback[:, :1], dtype=torch.bool)
@@ -131,8 +140,9 @@ class Stepper:
 
         self.options, self.is_compiled = options, options is not None
         if self.is_compiled:
-            like = self.fallback, self.told_layout.pack(flat(told)).floats, env.observation(start)
-            self.zeros = [torch.zeros_like(like[i]) for i in (0, 1, 2, 0, 2)]
+            state, told = torch.zeros_like(self.fallback), torch.zeros_like(self.told_layout.pack(told).floats)
+            observation = torch.zeros_like(observation)
+            self.zeros = state, told, observation, state, observation  # gradients of ends that nothing depends on
             self.control_step = CompiledControlStep(env.controller, env.dt, env.substeps, env.integrator)
             mode = torch._inductor.list_mode_options(options["mode"]) if options.get("mode") else {}
             more = {**mode, **options.get("options", {}), "guard_filter_fn": _watched, "cpp.vec_isa_ok": True}
@@ -155,8 +165,7 @@ class Stepper:
         """
         if self.is_compiled:
             theta = () if self.env.params is self.env.nominal else self.env.params.plant()
-            ends = _Step.apply(self, *state[1:], valid, noise, fresh, first, state.floats, action, *theta)
-            return Ends(Rows(*ends[:3]), Rows(*ends[3:6]), ends[6], Rows(*ends[7:10]), ends[10])
+            return Ends.of(_Step.apply(self, *state[1:], valid, noise, fresh, first, state.floats, action, *theta))
         floats, applied, valid = self._begin(state.floats, action, valid)
         before = self.layout.unpack(state._replace(floats=floats))
         flown = control_step(
@@ -326,9 +335,8 @@ class _Step(torch.autograd.Function):
         ctx.stepper, ctx.noise = stepper, noise
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(floats, action, integers, flags, valid, *states, *theta)
-        ends = (*ends.state, *ends.told, ends.observation, *ends.carried, ends.first)
-        ctx.mark_non_differentiable(*(ends[i] for i in (1, 2, 4, 5, 8, 9)))
-        return ends
+        ctx.mark_non_differentiable(*ends.state[1:], *ends.told[1:], *ends.carried[1:])
+        return ends.leaves()
 
     @staticmethod
     @once_differentiable
@@ -336,10 +344,9 @@ class _Step(torch.autograd.Function):
         floats, action, integers, flags, valid, *more = ctx.saved_tensors
         count = ctx.stepper.env.substeps + 1
         states, theta = more[:count], tuple(more[count:])
-        grad = tuple(
-            zero if grads[i] is None else grads[i].contiguous()
-            for i, zero in zip((0, 3, 6, 7, 10), ctx.stepper.zeros, strict=True)
-        )
+        ends = Ends.of(grads)
+        grads = ends.state.floats, ends.told.floats, ends.observation, ends.carried.floats, ends.first
+        grad = tuple(zero if x is None else x.contiguous() for x, zero in zip(grads, ctx.stepper.zeros, strict=True))
         grad_floats, grad_action, grad_theta = ctx.stepper.adjoint(
             states, floats, action, theta, integers, flags, valid, ctx.noise, grad
         )

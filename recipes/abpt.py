@@ -5,17 +5,17 @@ python recipes/abpt.py task=hovering seed=0
 
 import hydra
 from common import (
-    Run,
     actor_parameters,
-    descend,
     iterations,
     make_optimizer,
     minibatches,
     network,
+    own_seed,
     set_up,
     update_normalizer,
 )
 from omegaconf import DictConfig
+from run import Run
 from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import ABPTLoss, VisitedStateBuffer, differentiable_rollout, make_qvalue
@@ -24,41 +24,40 @@ from torchrl_quad import ABPTLoss, VisitedStateBuffer, differentiable_rollout, m
 @hydra.main(config_path="config", config_name="abpt", version_base=None)
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    loss = ABPTLoss(actor, make_qvalue(env, **network(cfg.critic)), **cfg.loss)
+    loss = ABPTLoss(actor, make_qvalue(env, **network(cfg, "critic")), **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     target = SoftUpdate(loss, tau=cfg.critic.tau)
-    buffer = VisitedStateBuffer(cfg.buffer.capacity, seed=cfg.seed)
+    buffer = VisitedStateBuffer(cfg.buffer.capacity, seed=own_seed(cfg))
 
     actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
     critic_parameters = loss.qvalue_network_params.parameters()
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
-    run = Run(cfg, env, actor, loss=loss)
-    carry = env.reset()
+    parts = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
+    run = Run(cfg, env, actor, loss, parts, buffer)
     for _ in run:
         # The actor: up the N-step and the 0-step return of one horizon, through the dynamics.
-        rollout, _ = differentiable_rollout(env, actor, carry, cfg.horizon)
+        rollout, _ = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         loss_actor, actor_metrics = loss.loss_actor(rollout)
         loss_alpha = actor_metrics.get("loss_alpha", 0.0)
-        grad_actor = descend(actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
+        run.descend("actor", actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
 
         # The critics: towards the TD(lambda) targets of the target networks.
         data = loss.write_value_target(rollout.detach())
         read = data.select(*loss.in_keys, loss.tensor_keys.value_target)
         for batch in minibatches(read, cfg.critic):
             loss_qvalue, critic_metrics = loss.loss_qvalue(batch)
-            descend(critic_optimizer, loss_qvalue, cfg.critic.max_grad_norm)
+            run.descend("critic", critic_optimizer, loss_qvalue, cfg.critic.max_grad_norm)
             target.step()
 
         # The next horizon starts where the policy has been before, and in part afresh.
         update_normalizer(env, data)
         buffer.extend(data)
-        carry = buffer.initial_state(env, cfg.buffer.fraction)
+        run.carry = buffer.initial_state(env, cfg.buffer.fraction)
 
         actor_schedule.step()
         critic_schedule.step()
-        losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue}
-        run.record(**losses, grad_actor=grad_actor, **actor_metrics, **critic_metrics)
+        run.record(loss_actor=loss_actor, loss_qvalue=loss_qvalue, **actor_metrics, **critic_metrics)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,9 @@ python recipes/bptt.py task=hovering seed=0
 """
 
 import hydra
-from common import Run, actor_parameters, descend, iterations, make_optimizer, restart, set_up, update_normalizer
+from common import actor_parameters, iterations, make_optimizer, restart, set_up, update_normalizer
 from omegaconf import DictConfig
+from run import Run
 
 from torchrl_quad import BPTTLoss, differentiable_rollout
 
@@ -16,17 +17,16 @@ def main(cfg: DictConfig) -> None:
     loss = BPTTLoss(actor, **cfg.loss).make_value_estimator(gamma=cfg.gamma)
     optimizer, schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
 
-    run = Run(cfg, env, actor, loss=loss)
-    carry = env.reset()
+    run = Run(cfg, env, actor, loss, [optimizer, schedule])
     for _ in run:
-        rollout, carry = differentiable_rollout(env, actor, carry, cfg.horizon)
+        rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         loss_actor, metrics = loss.loss_actor(rollout)
         loss_alpha = metrics.get("loss_alpha", 0.0)
-        grad_actor = descend(optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
+        run.descend("actor", optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
         update_normalizer(env, rollout)
-        carry = restart(env, carry, cfg.restart_fraction)
+        run.carry = restart(env, end, cfg.restart_fraction)
         schedule.step()
-        run.record(loss_actor=loss_actor, grad_actor=grad_actor, **metrics)
+        run.record(loss_actor=loss_actor, **metrics)
 
 
 if __name__ == "__main__":

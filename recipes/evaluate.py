@@ -7,8 +7,10 @@ from pathlib import Path
 
 import hydra
 import torch
-from common import final_evaluation, load_policy, print_summary, write_json
+from checkpoints import write_json
+from common import final_evaluation, load_policy
 from omegaconf import DictConfig
+from run import print_summary
 
 from torchrl_quad.render import plot_flight
 

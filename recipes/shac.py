@@ -5,9 +5,7 @@ python recipes/shac.py task=hovering seed=0
 
 import hydra
 from common import (
-    Run,
     actor_parameters,
-    descend,
     iterations,
     make_optimizer,
     minibatches,
@@ -17,6 +15,7 @@ from common import (
     update_normalizer,
 )
 from omegaconf import DictConfig
+from run import Run
 from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import SHACLoss, differentiable_rollout, make_value
@@ -25,36 +24,35 @@ from torchrl_quad import SHACLoss, differentiable_rollout, make_value
 @hydra.main(config_path="config", config_name="shac", version_base=None)
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    loss = SHACLoss(actor, make_value(env, **network(cfg.critic)), **cfg.loss)
+    loss = SHACLoss(actor, make_value(env, **network(cfg, "critic")), **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     target = SoftUpdate(loss, tau=cfg.critic.tau)
     actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
     critic_parameters = loss.value_network_params.parameters()
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
-    run = Run(cfg, env, actor, loss=loss)
-    carry = env.reset()
+    parts = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
+    run = Run(cfg, env, actor, loss, parts)
     for _ in run:
         # The actor: up the return of one horizon and the value of its end, through the dynamics.
-        rollout, carry = differentiable_rollout(env, actor, carry, cfg.horizon)
+        rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         loss_actor, actor_metrics = loss.loss_actor(rollout)
         loss_alpha = actor_metrics.get("loss_alpha", 0.0)
-        grad_actor = descend(actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
+        run.descend("actor", actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
 
         # The critic: towards the TD(lambda) targets of the target network.
         data = loss.write_value_target(rollout.detach())
         read = data.select(*loss.in_keys, loss.tensor_keys.value_target)
         for batch in minibatches(read, cfg.critic):
             loss_value, critic_metrics = loss.loss_value(batch)
-            descend(critic_optimizer, loss_value, cfg.critic.max_grad_norm)
+            run.descend("critic", critic_optimizer, loss_value, cfg.critic.max_grad_norm)
             target.step()
 
         update_normalizer(env, rollout)
-        carry = restart(env, carry, cfg.restart_fraction)
+        run.carry = restart(env, end, cfg.restart_fraction)
         actor_schedule.step()
         critic_schedule.step()
-        losses = {"loss_actor": loss_actor, "loss_value": loss_value}
-        run.record(**losses, grad_actor=grad_actor, **actor_metrics, **critic_metrics)
+        run.record(loss_actor=loss_actor, loss_value=loss_value, **actor_metrics, **critic_metrics)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,14 @@
+import runpy
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 
 from torchrl_quad import HoveringEnv
+
+RECIPES = Path(__file__).parent.parent / "recipes"
+sys.path.insert(0, str(RECIPES))
 
 
 @pytest.fixture(autouse=True)
@@ -18,3 +25,17 @@ def env():
 @pytest.fixture
 def env64():
     return HoveringEnv(num_envs=4, seed=1, dtype=torch.float64)
+
+
+@pytest.fixture
+def launch(monkeypatch, capsys):
+    """``python recipes/NAME.py ARGUMENTS``, but in this process, where it starts quicker and parts can be replaced."""
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+
+    def launch(name, *arguments):
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, arguments)])
+        runpy.run_path(str(RECIPES / f"{name}.py"), run_name="__main__")
+        return capsys.readouterr().out
+
+    return launch

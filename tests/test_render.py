@@ -1,10 +1,11 @@
 """Pictures."""
 
+import numpy as np
 import pytest
 import torch
 
 from torchrl_quad import HoveringEnv, make_env
-from torchrl_quad.render import plot_flight, plot_learning_curve
+from torchrl_quad.render import animate_flight, plot_flight, plot_learning_curve
 
 
 def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(tmp_path):
@@ -23,6 +24,18 @@ def test_a_flight_of_every_task_is_drawn(task, tmp_path):
     env = make_env(task, num_envs=2, max_episode_steps=30)
     plot_flight(env.rollout(70, break_when_any_done=False), tmp_path / "flight.png")
     assert (tmp_path / "flight.png").stat().st_size > 10_000
+
+
+def test_a_flight_is_filmed_in_real_time_until_its_episodes_end(tmp_path):
+    from PIL import Image
+
+    env = make_env("racing", num_envs=3, max_episode_steps=60)
+    animate_flight(env.rollout(100, break_when_any_done=False), tmp_path / "flight.gif", fps=10)
+    with Image.open(tmp_path / "flight.gif") as film:
+        assert film.n_frames == 20
+        assert film.info["duration"] == 100  # [ms], five control steps
+        first, last = (np.asarray(film.convert("RGB")) for _ in map(film.seek, (0, 19)))
+    assert (first != last).any()
 
 
 def test_a_learning_curve_is_drawn_from_its_csv(tmp_path):

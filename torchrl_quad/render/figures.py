@@ -6,8 +6,10 @@ import csv
 from pathlib import Path
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 
+from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs import QuadrotorEnv
 
 _INK, _BLUE, _RED = "#222222", "#2f6db5", "#c8452f"
@@ -59,6 +61,70 @@ def plot_flight(rollout: TensorDictBase, path: str | Path, *, num_envs: int = 12
     over_time.yaxis.set_major_formatter("{x:g}")
     over_time.grid(alpha=0.3)
     figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def animate_flight(
+    rollout: TensorDictBase,
+    path: str | Path,
+    *,
+    num_envs: int = 6,
+    control_dt: float = 0.02,
+    fps: int = 15,
+    max_seconds: float = 12.0,
+) -> None:
+    """Film the first episodes of a flight in real time: drones with their body axes, trails, and targets.
+
+    Args:
+        rollout: (num_envs, time), of any task whose state has a ``target``.
+        path: where the GIF file goes.
+        num_envs: how many environments are shown.
+        control_dt: control step of the environment [s].
+        fps: frames per second, at least; as many as go into whole control steps.
+        max_seconds: what is filmed of a longer flight.
+    """
+    plt = _pyplot()
+    from PIL import Image
+
+    flight = rollout[:num_envs, : max(round(max_seconds / control_dt), 1)].detach().cpu()
+    # A drone stays where its episode has ended.
+    last = QuadrotorEnv.first_episode(flight).sum(1, keepdim=True) - 1
+    index = torch.arange(flight.shape[1])[None, :, None].minimum(last).squeeze(-1)
+    position, attitude, target = (
+        flight["next", "state", name].gather(1, index.unsqueeze(-1).expand(-1, -1, k))
+        for name, k in (("position", 3), ("quaternion", 4), ("target", 3))
+    )
+    low, high = position.flatten(0, 1).amin(0), position.flatten(0, 1).amax(0)
+    center, half = 0.5 * (low + high), max(0.55 * (high - low).max().item(), 0.5)
+    arm = 0.08 * half * torch.tensor([[1, 1, 0], [-1, -1, 0], [0, 0, 0], [1, -1, 0], [-1, 1, 0]], dtype=position.dtype)
+    body = position.unsqueeze(-2) + quaternion.rotate(attitude.unsqueeze(-2), arm.expand(*position.shape[:2], 5, 3))
+
+    figure = plt.figure(figsize=(4.2, 4.2), dpi=80)
+    space = figure.add_axes((0.0, 0.03, 0.92, 0.95), projection="3d")
+    space.set(**{f"{axis}lim": (c - half, c + half) for axis, c in zip("xyz", center.tolist(), strict=True)})
+    space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    colors = plt.get_cmap("viridis")(np.linspace(0.05, 0.85, len(position)))
+    moving = {"animated": True}  # drawn onto the axes in each frame; the axes are drawn once
+    drones = [space.plot([], [], [], color=color, linewidth=2.5, **moving)[0] for color in colors]
+    trails = [space.plot([], [], [], color=color, linewidth=1, alpha=0.5, **moving)[0] for color in colors]
+    (targets,) = space.plot([], [], [], color=_RED, marker="*", markersize=9, linestyle="none", **moving)
+    clock = space.text2D(0.04, 0.94, "", transform=space.transAxes, color=_INK, **moving)
+    figure.canvas.draw()
+    background = figure.canvas.copy_from_bbox(figure.bbox)
+    trail = max(round(1.0 / control_dt), 1)
+    stride = max(int(1.0 / (fps * control_dt)), 1)
+    frames = []
+    for t in range(0, position.shape[1], stride):
+        for i, (drone, line) in enumerate(zip(drones, trails, strict=True)):
+            drone.set_data_3d(*body[i, t].T)
+            line.set_data_3d(*position[i, max(t - trail, 0) : t + 1].T)
+        targets.set_data_3d(*target[:, t].T)
+        clock.set_text(f"{control_dt * (t + 1):.1f} s")
+        figure.canvas.restore_region(background)
+        for artist in (*trails, targets, *drones, clock):
+            figure.draw_artist(artist)
+        frames.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3]))
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=1000 * stride * control_dt, loop=0)
     plt.close(figure)
 
 

@@ -1,8 +1,10 @@
 """Differentiable quadrotor tasks and first-order policy losses for TorchRL."""
 
+import gymnasium
+
 from torchrl_quad.data import ObservationNormalizer, VisitedStateBuffer, differentiable_rollout
 from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
-from torchrl_quad.envs import HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
+from torchrl_quad.envs import TASKS, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
 from torchrl_quad.modules import make_actor, make_qvalue, make_value
 from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss
 
@@ -28,4 +30,17 @@ __all__ = [
     "make_env",
     "make_qvalue",
     "make_value",
+    "register_envs",
 ]
+
+
+def register_envs() -> None:
+    """Register the tasks with gymnasium, as ``torchrl_quad/Hovering-v0`` and so on; importing the package does it."""
+    for task in TASKS:
+        name = f"torchrl_quad/{task.capitalize()}-v0"
+        if name not in gymnasium.registry:
+            classes = {"entry_point": "torchrl_quad.gym:GymEnv", "vector_entry_point": "torchrl_quad.gym:GymVectorEnv"}
+            gymnasium.register(name, **classes, kwargs={"task": task})
+
+
+register_envs()

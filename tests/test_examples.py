@@ -1,0 +1,36 @@
+"""Every example, on a budget of two."""
+
+import os
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
+BUDGET = re.compile(r"^(STEPS|ITERATIONS) = [\d_]+$", flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_every_example_runs(example, tmp_path):
+    small = tmp_path / example.name
+    small.write_text(BUDGET.sub(r"\1 = 2", example.read_text()))
+    one_core = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, small], cwd=tmp_path, env=one_core, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_ppo_of_stable_baselines3_beats_random_actions(seed):
+    (path,) = (path for path in EXAMPLES if path.stem.startswith("10_"))
+    example, random = runpy.run_path(str(path)), np.random.default_rng(seed)
+    by_chance = example["mean_return"](lambda seen: random.uniform(-1, 1, (len(seen), 4)), seed=100 + seed)
+    learnt = example["mean_return"](example["train"](seed), seed=100 + seed)
+    print(f"seed {seed}: random {by_chance:.2f}, PPO {learnt:.2f}")
+    assert learnt > by_chance + 12  # of 25.6 at most

@@ -1,0 +1,357 @@
+"""The tasks as gymnasium environments: its checkers, its vector environments, its wrappers."""
+
+import copy
+import importlib
+import importlib.metadata
+import subprocess
+import sys
+from functools import partial
+from itertools import combinations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env, data_equivalence, data_shares_objects
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import PassiveEnvChecker, TimeLimit
+from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
+from torchrl import envs as torchrl_envs
+
+import torchrl_quad
+from torchrl_quad import load_drone, make_env
+from torchrl_quad.gym import GymEnv, GymVectorEnv
+
+TASKS = ["hovering", "landing", "racing", "tracking"]
+MODES = list(AutoresetMode)
+HOVERING = "torchrl_quad/Hovering-v0"
+
+
+def name(task):
+    return f"torchrl_quad/{task.capitalize()}-v0"
+
+
+def sinking(env, heights):
+    """Start every episode at the same heights [m], on the way down: the lower a drone begins, the sooner it crashes."""
+    state = env.torchrl_env.reset()["state"].clone()
+    state["position"][:, 2] = torch.as_tensor(heights)
+    state["velocity"][:, 2] = -1.0
+    state["position"][:, :2] = state["target"][:, :2]
+    env.torchrl_env.set_initial_state_source(lambda n: state.clone())
+    return env
+
+
+def some_actions(steps, num_envs, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, num_envs, 4)).astype(np.float32)
+
+
+# -- registration ------------------------------------------------------------------------------------------------------
+
+
+def test_gymnasium_imports_the_package_by_its_prefix_and_the_environments_only_when_they_are_made():
+    program = (
+        "import contextlib, sys, gymnasium\n"
+        "with contextlib.suppress(gymnasium.error.Error):\n"
+        "    gymnasium.make('torchrl_quad:torchrl_quad/Walking-v0')\n"
+        f"assert gymnasium.spec('{HOVERING}').vector_entry_point == 'torchrl_quad.gym:GymVectorEnv'\n"
+        "assert 'torchrl_quad.gym' not in sys.modules\n"
+        f"gymnasium.make('torchrl_quad:{HOVERING}').reset()\n"
+        f"gymnasium.make_vec('torchrl_quad:{HOVERING}', num_envs=2).reset()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_registering_again_changes_nothing_and_warns_of_nothing():
+    (plugin,) = importlib.metadata.entry_points(group="gymnasium.envs", name="torchrl_quad")
+    specs = {task: gymnasium.spec(name(task)) for task in TASKS}
+    plugin.load()()
+    importlib.reload(torchrl_quad)
+    assert all(gymnasium.spec(name(task)) is specs[task] for task in TASKS)
+
+
+# -- one drone ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasium_s_checker_finds_nothing(task):
+    check_env(gymnasium.make(name(task), max_episode_steps=-1).unwrapped)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_an_episode_under_the_passive_checker_warns_of_nothing(task):
+    env = PassiveEnvChecker(GymEnv(task, max_episode_steps=30))
+    observation, info = env.reset(seed=1)
+    total, ended, steps = 0.0, False, 0
+    while not ended:
+        observation, reward, terminated, truncated, info = env.step(env.unwrapped.torchrl_env.hover_action.numpy())
+        assert observation in env.observation_space
+        assert sum(info["reward_terms"].values()) == pytest.approx(reward, abs=1e-6)
+        total, ended, steps = total + reward, terminated or truncated, steps + 1
+    assert terminated == info["crash"] | (task == "landing" and info["success"])
+    assert truncated == (steps == 30)
+    assert info["metrics"]
+    env.close()
+    env.close()
+
+
+def test_the_time_limit_is_the_task_s_own():
+    assert not any(isinstance(env, TimeLimit) for env in wrappers(gymnasium.make(HOVERING)))
+    envs = gymnasium.make_vec(HOVERING, num_envs=2, max_episode_steps=3)
+    for env, actions in ((GymEnv("hovering", max_episode_steps=3), np.zeros(4)), (envs, np.zeros((2, 4)))):
+        env.reset()
+        assert [np.all(env.step(actions)[3]) for _ in range(3)] == [False, False, True]
+    shorter = gymnasium.make(HOVERING, max_episode_steps=2)
+    shorter.reset()
+    assert [shorter.step(np.zeros(4))[3] for _ in range(2)] == [False, True]
+
+
+def wrappers(env):
+    while isinstance(env, gymnasium.Wrapper):
+        yield env
+        env = env.env
+
+
+def test_torchrl_can_wrap_the_gymnasium_environment():
+    for env in (
+        torchrl_envs.GymWrapper(gymnasium.make(HOVERING)),
+        torchrl_envs.GymEnv("torchrl_quad/Racing-v0", track="visfly"),
+    ):
+        torchrl_envs.check_env_specs(env)
+        env.set_seed(0)
+        assert env.rollout(5)["next", "reward"].shape == (5, 1)
+
+
+# -- many drones -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_spaces_and_types_are_those_that_gymnasium_expects(task):
+    env = gymnasium.make_vec(name(task), num_envs=3)
+    assert isinstance(env, GymVectorEnv)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert env.single_action_space == gymnasium.spaces.Box(-1, 1, (4,))
+    assert env.action_space.shape == (3, 4)
+    observation, _ = env.reset(seed=0)
+    assert observation in env.observation_space
+    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    assert observation in env.observation_space
+    assert observation[0] in env.single_observation_space
+    assert (observation.dtype, reward.dtype) == (np.float32, np.float64)
+    assert (
+        reward.shape == terminated.shape == truncated.shape == info["success"].shape == info["_success"].shape == (3,)
+    )
+    assert terminated.dtype == truncated.dtype == info["success"].dtype == info["crash"].dtype == bool
+    np.testing.assert_allclose(sum(x for key, x in info["reward_terms"].items() if key[0] != "_"), reward, atol=1e-6)
+    assert {key for key in info if key[0] != "_"} == {"success", "crash", "reward_terms", "metrics"}
+
+
+@pytest.mark.parametrize("options", [{}, {"wind": {"gust": 0.5}, "observation_noise": {"position": 0.1}}])
+def test_the_flight_is_that_of_the_torchrl_environment(options):
+    options = {"num_envs": 16, "seed": 3, "max_episode_steps": 12, **options}
+    env, reference = GymVectorEnv("racing", autoreset_mode="SameStep", **options), make_env("racing", **options)
+    observation, info = env.reset()
+    td = reference.reset()
+    for actions in some_actions(30, 16):
+        np.testing.assert_array_equal(observation, td["observation"])
+        for key in ("success", "crash"):
+            np.testing.assert_array_equal(info[key], td[key].squeeze(-1))
+        observation, reward, terminated, truncated, info = env.step(actions)
+        stepped, td = reference.step_and_maybe_reset(td.set("action", torch.tensor(actions)))
+        ends = stepped["next"]
+        for mine, key in ((reward, "reward"), (terminated, "terminated"), (truncated, "truncated")):
+            np.testing.assert_array_equal(mine, ends[key].squeeze(-1))
+        over = terminated | truncated
+        for i in np.flatnonzero(over):
+            np.testing.assert_array_equal(info["final_obs"][i], ends["observation"][i])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_episodes_end_and_begin_as_in_gymnasium_s_own_vector_environment(mode):
+    options = {"dtype": torch.float64, "max_episode_steps": 7}
+    heights = [0.05, 0.08, 0.11, 1.5, 1.5]
+    mine = sinking(GymVectorEnv("hovering", 5, autoreset_mode=mode, **options), heights)
+    singles = [partial(lambda z: sinking(GymEnv("hovering", **options), z), z) for z in heights]
+    its = SyncVectorEnv(singles, autoreset_mode=mode)
+    assert mine.metadata["autoreset_mode"] == its.metadata["autoreset_mode"]
+    assert mine.observation_space == its.observation_space
+    assert mine.action_space == its.action_space
+    assert data_equivalence(mine.reset(), its.reset())
+    ends = np.zeros((2, 5))
+    for actions in some_actions(30, 5):
+        flown = mine.step(actions)
+        assert data_equivalence(flown, its.step(actions))
+        over, ends = flown[2] | flown[3], ends + flown[2:4]
+        if mode is AutoresetMode.DISABLED and over.any():
+            again = [env.reset(options={"reset_mask": over}) for env in (mine, its)]
+            assert data_equivalence(*again)
+    crashes, timeouts = ends
+    assert crashes[0] > crashes[1] > crashes[2] > crashes[3] == crashes[4] == 0
+    assert (timeouts[3:] > 2).all()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_gymnasium_s_wrapper_records_the_statistics_of_the_episodes(mode):
+    env = RecordEpisodeStatistics(gymnasium.make_vec(HOVERING, num_envs=3, max_episode_steps=4, autoreset_mode=mode))
+    env.reset(seed=0)
+    total = 0.0
+    for actions in some_actions(4, 3):
+        _, reward, _, _, info = env.step(actions)
+        total = total + reward
+    assert info["_episode"].all()
+    assert info["episode"]["l"].tolist() == [4, 4, 4]
+    np.testing.assert_allclose(info["episode"]["r"], total)
+    if mode is AutoresetMode.DISABLED:
+        env.reset(options={"reset_mask": np.array([True, True, True])})
+    for actions in some_actions(4 + (mode is AutoresetMode.NEXT_STEP), 3):
+        info = env.step(actions)[-1]
+    assert info["episode"]["l"].tolist() == [4, 4, 4]
+
+
+def test_gymnasium_s_wrapper_normalizes_the_observations():
+    env = NormalizeObservation(gymnasium.make_vec(HOVERING, num_envs=64))
+    env.reset(seed=0)
+    for actions in some_actions(20, 64):
+        observation = env.step(actions)[0]
+    assert observation.dtype == np.float32
+    assert 0.1 < observation[:, 10:].std() < 10
+
+
+def test_a_reset_mask_leaves_the_other_drones_where_they_are():
+    env = GymVectorEnv("tracking", 3, autoreset_mode="Disabled")
+    env.reset(seed=0)
+    for actions in some_actions(3, 3):
+        before = env.step(actions)[0]
+    mask = np.array([False, True, False])
+    after, info = env.reset(options={"reset_mask": mask})
+    assert (before != after).any(1).tolist() == info["_success"].tolist() == mask.tolist()
+    assert env._now["state", "step"].flatten().tolist() == [3, 0, 3]
+
+
+# -- random numbers, memory, gradients ---------------------------------------------------------------------------------
+
+
+def test_a_seed_repeats_the_flight_and_no_seed_goes_on_drawing():
+    env = GymVectorEnv("hovering", 4, wind={"gust": 1.0})
+
+    def fly(seed):
+        first = env.reset(seed=seed)[0]
+        return np.stack([first, *(env.step(actions)[0] for actions in some_actions(5, 4)), env.reset()[0]])
+
+    np.testing.assert_array_equal(fly(5), fly(5))
+    assert (fly(5) != fly(6))[:, :, :3].any((1, 2)).all()
+    assert (fly(5)[0] != fly(None)[0]).any()
+
+
+def test_environments_that_nobody_seeds_start_differently_as_in_gymnasium():
+    starts = [GymEnv("hovering").reset()[0] for _ in range(2)]
+    assert (starts[0] != starts[1]).any()
+    starts = [GymEnv("hovering", seed=3).reset()[0] for _ in range(2)]
+    assert (starts[0] == starts[1]).all()
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_what_is_handed_out_belongs_to_the_caller(mode):
+    def fly(disturb):
+        env = GymVectorEnv("racing", 3, seed=0, max_episode_steps=3, autoreset_mode=mode)
+        calls = [(*env.reset()[:1], {})]
+        for actions in some_actions(8, 3):
+            observation, *told, info = env.step(actions)
+            calls.append((np.array(observation), copy.deepcopy(told), copy.deepcopy(info)))
+            if disturb:
+                actions[:] = np.nan
+                for x in (observation, *told, *info["metrics"].values(), *info["reward_terms"].values()):
+                    x[:] = 1
+        return calls
+
+    assert data_equivalence(fly(disturb=True), fly(disturb=False), exact=True)
+    env = GymVectorEnv("racing", 3, max_episode_steps=2, autoreset_mode=mode)
+    env.reset()
+    flown = [env.step(actions) for actions in some_actions(4, 3)]
+    assert not any(data_shares_objects(a, b) for a, b in combinations(flown, 2))
+    assert all(not data_shares_objects(a, b) for step in flown for a, b in combinations(arrays(step), 2))
+
+
+def arrays(told):
+    """All arrays of what a step tells, but those of objects."""
+    if isinstance(told, np.ndarray) and told.dtype != object:
+        return [told]
+    entries = told.values() if isinstance(told, dict) else () if told is None else told
+    return [x for entry in entries for x in arrays(entry)]
+
+
+def test_no_gradient_is_kept():
+    drone = load_drone("visfly")
+    env = GymVectorEnv("hovering", 2, drone=drone.replace(mass=drone.mass.clone().requires_grad_()))
+    assert env.torchrl_env.params.mass.requires_grad
+    env.reset()
+    for actions in some_actions(3, 2):
+        env.step(actions)
+    assert not any(x.requires_grad for x in env._now.values(True, True))
+
+
+def test_options_reach_the_torchrl_environment():
+    env = gymnasium.make(HOVERING, drone="crazyflie", compile=True, control_dt=0.01).unwrapped.torchrl_env
+    assert env.stepper.is_compiled
+    assert env.control_dt == 0.01
+    assert env.nominal.mass == load_drone("crazyflie").mass
+
+
+# -- errors ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros((3, 3)), r"The action has shape \(3, 3\), expected \(3, 4\): thrust, .* a row for each drone."),
+        (np.zeros(4), r"shape \(4,\), expected \(3, 4\)"),
+        (None, r"shape \(\), expected \(3, 4\)"),
+        ([[0, 0, 0, 0], [0, np.nan, 0, 0], [0, 0, 0, np.inf]], r"NaN or infinite at \[\[1, 1\], \[2, 3\]\]"),
+    ],
+)
+def test_an_action_that_cannot_be_flown_is_refused(action, message):
+    env = GymVectorEnv("hovering", 3)
+    env.reset()
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+
+
+def test_one_drone_s_action_is_refused_in_its_own_words():
+    env = GymEnv("hovering")
+    env.reset()
+    with pytest.raises(ValueError, match=r"shape \(3,\), expected \(4,\): thrust, roll, .* each in \[-1, 1\]\.$"):
+        env.step(np.zeros(3))
+    with pytest.raises(ValueError, match=r"NaN or infinite at \[\[2\]\], .* np.nan_to_num"):
+        env.step([0, 0, np.nan, 0])
+
+
+def test_unknown_options_are_refused_with_those_that_exist():
+    with pytest.raises(ValueError, match="Unknown autoreset_mode 'same'. Choose from: NextStep, SameStep, Disabled."):
+        GymVectorEnv("hovering", autoreset_mode="same")
+    with pytest.raises(ValueError, match="Unknown task 'hover'. Choose from: hovering, landing, racing, tracking."):
+        GymEnv("hover")
+    with pytest.raises(ValueError, match="num_envs is for many drones, .* Write gymnasium.make_vec instead."):
+        gymnasium.make(HOVERING, num_envs=2)
+    for build in (GymEnv, GymVectorEnv):
+        with pytest.raises(ValueError, match="Unknown render_mode 'human': these environments draw no pictures."):
+            build("hovering", render_mode="human")
+    with pytest.raises(TypeError, match="control_dt"):
+        GymEnv("hovering", frameskip=2)
+
+
+@pytest.mark.parametrize("mask", [[True, False], np.ones(3), np.zeros(3, dtype=bool), np.ones((3, 1), dtype=bool)])
+def test_a_reset_mask_has_to_mark_some_of_the_drones(mask):
+    with pytest.raises(ValueError, match=r"reset_mask must be a bool array of shape \(3,\) .* leave it out"):
+        GymVectorEnv("hovering", 3).reset(options={"reset_mask": mask})
+
+
+def test_a_step_outside_an_episode_is_refused():
+    env = GymVectorEnv("hovering", 2, autoreset_mode="Disabled", max_episode_steps=1)
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) first"):
+        env.step(np.zeros((2, 4)))
+    env.reset()
+    env.step(np.zeros((2, 4)))
+    env.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(ResetNeeded, match=r"episodes of drones \[1\] have ended. Call reset\(\) before"):
+        env.step(np.zeros((2, 4)))

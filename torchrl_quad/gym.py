@@ -1,0 +1,236 @@
+"""The tasks as gymnasium environments: numpy arrays in and out, no gradient.
+
+Importing ``torchrl_quad`` registers them, and so does ``gymnasium.make("torchrl_quad:torchrl_quad/Hovering-v0")``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from torchrl_quad.envs import make_env
+
+# An episode ends before an entry of the state is beyond this, and so nothing that is observed ever is.
+_LIMIT = 1e6
+_INFO = "success", "crash", "reward_terms", "metrics"
+
+
+class GymVectorEnv(VectorEnv):
+    """All drones of a task in one batched environment: ``gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=64)``.
+
+    Observations are float32 (num_envs, k), actions (num_envs, 4) in [-1, 1] as :class:`~torchrl_quad.envs.QuadrotorEnv`
+    has them, rewards float64 (num_envs). ``info`` holds ``success``, ``crash``, ``reward_terms`` and ``metrics`` by
+    name, each (num_envs), with a mask ``_name`` beside every name as in gymnasium's own vector environments.
+
+    The time limit is the task's ``max_episode_steps``. An episode that has ended begins anew at the next step, which
+    ignores the action and is paid nothing; or in the same step, with ``final_obs`` and ``final_info`` in ``info``; or,
+    with "Disabled", when ``reset(options={"reset_mask": mask})`` is called with a bool mask (num_envs).
+
+    ``reset(seed=...)`` seeds the one generator of all drones, which without a seed goes on drawing. ``torchrl_env`` is
+    the TorchRL environment, to be read: its ``params``, ``hover_action`` and so on.
+
+    Args:
+        task: "hovering", "landing", "racing" or "tracking".
+        num_envs: number of drones.
+        autoreset_mode: "NextStep", "SameStep" or "Disabled", or the ``AutoresetMode``.
+        render_mode: None; there are no pictures.
+        **kwargs: for the task's environment. Without ``seed`` the first starts differ from run to run, as is usual in
+            gymnasium.
+
+    Raises:
+        ValueError: an argument is out of its range, or an action has another shape or is not finite.
+        ResetNeeded: a step before the first reset, or, with "Disabled", after an episode's end.
+    """
+
+    metadata = {"render_modes": []}
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        modes = [mode.value for mode in AutoresetMode]
+        if autoreset_mode not in (*modes, *AutoresetMode):
+            raise ValueError(f"Unknown autoreset_mode {autoreset_mode!r}. Choose from: {', '.join(modes)}.")
+        if render_mode is not None:
+            raise ValueError(
+                f"Unknown render_mode {render_mode!r}: these environments draw no pictures. Leave it out, and see "
+                "torchrl_quad.render for figures of a flight."
+            )
+        self.torchrl_env = make_env(task, num_envs=num_envs, **kwargs)
+        if "seed" not in kwargs:
+            self.torchrl_env.set_seed(None)
+        self.num_envs, self.autoreset_mode = num_envs, AutoresetMode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        size = self.torchrl_env.observation_spec["observation"].shape[-1]
+        self.single_observation_space = Box(-_LIMIT, _LIMIT, (size,), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (4,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._now: Any = None  # the tensordict to step from
+        self._over = np.zeros(num_envs, dtype=bool)  # whose episode has ended, and has not begun anew
+
+    @torch.no_grad()
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode with all drones, or with those of the bool ``options["reset_mask"]`` (num_envs)."""
+        super().reset(seed=seed)
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise ValueError(
+                f"reset_mask must be a bool array of shape ({self.num_envs},) that marks at least one drone, got shape "
+                f"{mask.shape}, dtype {mask.dtype}. To reset all drones, leave it out."
+            )
+        if seed is not None:
+            self.torchrl_env.set_seed(seed)
+        self._restart(mask)
+        return _observation(self._now), _info(self._now, mask)
+
+    @torch.no_grad()
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Fly one control step with actions (num_envs, 4)."""
+        env, over, info = self.torchrl_env, self._over, {}
+        actions = _checked(actions, self.action_space.shape)
+        if self._now is None:
+            raise ResetNeeded("A step needs an episode to stand in: call reset() first.")
+        if self.autoreset_mode is AutoresetMode.DISABLED and over.any():
+            raise ResetNeeded(
+                f"The episodes of drones {np.flatnonzero(over).tolist()} have ended. Call reset() before the next "
+                'step or, to leave the others alone, reset(options={"reset_mask": terminated | truncated}).'
+            )
+        after = env.step(self._now.set("action", torch.tensor(actions, dtype=env.dtype, device=env.device)))["next"]
+        self._now = after.exclude("reward")
+        reward, terminated, truncated = (_array(after[name]) for name in ("reward", "terminated", "truncated"))
+        if over.any():
+            self._restart(over)
+            reward[over], terminated[over], truncated[over] = 0.0, False, False
+        self._over = terminated | truncated
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._over.any():
+            info = self._final(after)
+            self._restart(self._over)
+        everyone = np.ones(self.num_envs, dtype=bool)
+        return _observation(self._now), reward, terminated, truncated, {**info, **_info(self._now, everyone)}
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the TorchRL environment."""
+        self.torchrl_env.close()
+
+    def _restart(self, mask: np.ndarray) -> None:
+        fresh = self.torchrl_env.reset()
+        keep = self._now is not None and not mask.all()
+        self._now = fresh.where(torch.as_tensor(mask, device=self.torchrl_env.device), self._now) if keep else fresh
+        self._over = self._over & ~mask
+
+    def _final(self, after: Any) -> dict[str, Any]:
+        over, last = self._over, _observation(after)
+        observations = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(over):
+            observations[i] = last[i]
+        return {
+            "final_obs": observations,
+            "_final_obs": over.copy(),
+            "final_info": _info(after, over),
+            "_final_info": over.copy(),
+        }
+
+
+class GymEnv(gymnasium.Env):
+    """One drone of a task: ``gymnasium.make("torchrl_quad/Hovering-v0")``; see :class:`GymVectorEnv`.
+
+    ``gymnasium.make`` keeps ``max_episode_steps`` for a wrapper of its own, which can end episodes earlier than the
+    task does, and not later: for that write ``GymEnv("hovering", max_episode_steps=1000)``.
+
+    Args:
+        task: "hovering", "landing", "racing" or "tracking".
+        **kwargs: as for :class:`GymVectorEnv`, but ``num_envs`` and ``autoreset_mode``.
+
+    Raises:
+        ValueError: an argument is out of its range, or an action has another shape or is not finite.
+        ResetNeeded: a step before the first reset, or after the end of an episode.
+    """
+
+    metadata = {"render_modes": []}
+
+    def __init__(self, task: str, **kwargs: Any) -> None:
+        for name in ("num_envs", "autoreset_mode"):
+            if name in kwargs:
+                raise ValueError(f"{name} is for many drones, and GymEnv flies one. Write gymnasium.make_vec instead.")
+        self._drones = GymVectorEnv(task, autoreset_mode=AutoresetMode.DISABLED, **kwargs)
+        self.torchrl_env = self._drones.torchrl_env
+        self.observation_space = self._drones.single_observation_space
+        self.action_space = self._drones.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode."""
+        super().reset(seed=seed)
+        observation, info = self._drones.reset(seed=seed)
+        return observation[0], _first(info)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Fly one control step with an action (4)."""
+        observation, *told, info = self._drones.step(_checked(action, self.action_space.shape)[None])
+        return observation[0], *(x.item() for x in told), _first(info)
+
+    def close(self) -> None:
+        """Close the TorchRL environment."""
+        self._drones.close()
+
+
+def _checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
+    action = np.asarray(action, dtype=np.float64)
+    if action.shape != shape:
+        raise ValueError(
+            f"The action has shape {action.shape}, expected {shape}: thrust, roll, pitch and yaw rate, each in [-1, 1]"
+            + (", a row for each drone." if len(shape) > 1 else ".")
+        )
+    if not np.isfinite(action).all():
+        raise ValueError(
+            f"The action is NaN or infinite at {np.argwhere(~np.isfinite(action)).tolist()}, which no drone can fly. "
+            "Check the policy's parameters, or write np.nan_to_num(action)."
+        )
+    return action
+
+
+# What is handed out is copied: the next step starts from the same memory.
+
+
+def _observation(told: Any) -> np.ndarray:
+    return np.array(told["observation"].numpy(force=True), dtype=np.float32)
+
+
+def _array(x: torch.Tensor) -> np.ndarray:
+    """An entry (n, 1) as (n), float64 as gymnasium has it, or bool."""
+    return np.array(x.squeeze(-1).numpy(force=True), dtype=bool if x.dtype is torch.bool else np.float64)
+
+
+def _info(told: Any, mask: np.ndarray) -> dict[str, Any]:
+    """Gymnasium's info of the drones under the mask (n), of others zeros."""
+
+    def masked(entries: Any) -> dict[str, Any]:
+        info = {}
+        for name, x in entries.items():
+            info[name] = np.where(mask, _array(x), False) if isinstance(x, torch.Tensor) else masked(x)
+            info[f"_{name}"] = mask.copy()
+        return info
+
+    return masked({name: told[name] for name in _INFO if name in told.keys()})  # noqa: SIM118, a tensordict
+
+
+def _first(info: dict[str, Any]) -> dict[str, Any]:
+    """The info of the first drone, as a single environment tells it."""
+    told = {name: x for name, x in info.items() if not name.startswith("_")}
+    return {name: _first(x) if isinstance(x, dict) else x[0].item() for name, x in told.items()}

@@ -254,9 +254,9 @@ def test_a_broken_state_terminates_and_leaks_nothing_into_the_others(dtype, key,
     torch.testing.assert_close(broken_mass, clean_mass)
 
 
-def test_an_action_that_is_not_finite_terminates_its_own_environment_only(env):
+def test_an_action_beyond_all_bounds_terminates_its_own_environment_only(env):
     action = env.hover_action.expand(4, 4).clone()
-    action[1, 2] = float("nan")
+    action[1, 2] = 1e30
     action.requires_grad_()
     flight = fly(env, env.reset(), [action] * 2)
     assert flight["next", "terminated"][:, 0].flatten().tolist() == [False, True, False, False]
@@ -265,6 +265,14 @@ def test_an_action_that_is_not_finite_terminates_its_own_environment_only(env):
     assert grad.isfinite().all()
     assert (grad[1] == 0).all()
     assert (grad[[0, 2, 3]] != 0).any(-1).all()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_an_action_that_is_not_finite_is_refused_with_the_name_of_its_environment(env, value):
+    action = env.hover_action.repeat(4, 1)
+    action[[1, 3], 2] = value
+    with pytest.raises(ValueError, match="The action is not finite in environments 1, 3: the weights of the policy"):
+        env.step(env.reset().set("action", action))
 
 
 def test_gradients_stay_finite_after_a_crash(env64):

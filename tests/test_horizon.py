@@ -160,8 +160,19 @@ def test_a_drone_that_is_not_sound_crashes_alone_in_a_compiled_step():
     assert end["state"].isfinite().all() and end["observation"].isfinite().all()
     end["observation"].sum().backward()
     assert action.grad.isfinite().all()
-    end = env.step(env.reset().set("action", torch.full((2, 4), torch.nan)))["next"]
+    end = env.step(env.reset().set("action", torch.full((2, 4), 1e30)))["next"]
     assert end["crash"].all()
+    with pytest.raises(ValueError, match="The action is not finite in environments 0, 1: "):
+        env.step(env.reset().set("action", torch.full((2, 4), torch.nan)))
+
+
+def test_an_action_of_a_horizon_that_is_not_finite_is_refused_with_its_first_step(env):
+    actions = env.hover_action.repeat(8, 4, 1)
+    actions[5:, 2, 0] = torch.nan
+    sequence = iter(actions)
+    policy = TensorDictModule(lambda _: next(sequence), in_keys=["observation"], out_keys=["action"])
+    with pytest.raises(ValueError, match="not finite in environments 2, first at step 5 of the rollout: the weights"):
+        env.rollout(8, policy, break_when_any_done=False)
 
 
 def test_without_a_cpp_compiler_the_step_stays_eager_and_says_so(monkeypatch):

@@ -1,12 +1,249 @@
-"""The environment in TorchRL's own hands."""
+"""The environment in TorchRL's own hands: under its transforms, losses and collectors, and in several processes."""
 
+import signal
+from functools import partial
+
+import pytest
 import torch
-from torchrl.collectors import Collector
-from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
-from torchrl.objectives import ClipPPOLoss
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+from torchrl.collectors import Collector, MultiCollector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import (
+    CatFrames,
+    CatTensors,
+    Compose,
+    DoubleToFloat,
+    DTypeCastTransform,
+    ObservationNorm,
+    ParallelEnv,
+    RewardScaling,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+    check_env_specs,
+)
+from torchrl.envs.utils import ExplorationType
+from torchrl.objectives import ClipPPOLoss, SACLoss, SoftUpdate
 from torchrl.objectives.value import GAE
 
-from torchrl_quad import HoveringEnv, make_actor, make_value
+from torchrl_quad import (
+    ABPTLoss,
+    BPTTLoss,
+    HoveringEnv,
+    ObservationNormalizer,
+    SHACLoss,
+    VisitedStateBuffer,
+    differentiable_rollout,
+    make_actor,
+    make_env,
+    make_qvalue,
+    make_value,
+)
+from torchrl_quad.envs import TASKS
+
+FEATURES = ["observation", ("state", "velocity")]
+
+
+def norm(scale=2.0):
+    return ObservationNorm(loc=0.1, scale=scale, in_keys=["observation"], standard_normal=True)
+
+
+def frames(**kwargs):
+    return CatFrames(N=3, dim=-1, in_keys=["observation"], **kwargs)
+
+
+def tensors():
+    return CatTensors(FEATURES, "observation", del_keys=False)
+
+
+# By name: what leaves the policy's input alone, with the factor on the reward, and what does not.
+BESIDE_THE_POLICY = {
+    "step counter": (lambda: [StepCounter()], 1.0),
+    "reward sum": (lambda: [RewardSum()], 1.0),
+    "reward scaling": (lambda: [RewardScaling(0.5, 2.0)], 2.0),
+    "all": (lambda: [StepCounter(max_steps=50), RewardScaling(0.5, 2.0), RewardSum()], 2.0),
+}
+BEFORE_THE_POLICY = {
+    "normalised": lambda: [norm()],
+    "frames": lambda: [frames()],
+    "frames after zeros": lambda: [frames(padding="constant")],
+    "tensors": lambda: [tensors()],
+    "all": lambda: [StepCounter(), norm(), tensors(), frames(), RewardScaling(0.5, 2.0), RewardSum()],
+}
+STACKS = {**{name: make for name, (make, _) in BESIDE_THE_POLICY.items()}, **BEFORE_THE_POLICY}
+PRECISION = {"double to float": lambda: [DoubleToFloat()]}
+
+
+def make(transforms, **kwargs):
+    """Three drones in float64, one of which begins anew after 4 steps, and each time at the same place."""
+    env = HoveringEnv(**{"num_envs": 3, "dtype": torch.float64, "random_start": {"velocity": 1.0}} | kwargs)
+    start = env.reset()["state"]
+    start["step"] = torch.tensor([[0], [10], [env.max_episode_steps - 4]])
+    env.set_initial_state_source(lambda n: start)
+    return TransformedEnv(env, Compose(*transforms)) if transforms else env
+
+
+def make_loss(name, env, actor):
+    if name == "bptt":
+        return BPTTLoss(actor).make_value_estimator(gamma=0.99)
+    loss = SHACLoss(actor, make_value(env)) if name == "shac" else ABPTLoss(actor, make_qvalue(env))
+    SoftUpdate(loss.make_value_estimator(gamma=0.99), tau=0.01)
+    return loss
+
+
+def lively(actor):
+    """The actor with weights large enough for its input to matter."""
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter += 0.05 * torch.randn_like(parameter)
+    return actor
+
+
+def total(out):
+    return sum(value for key, value in out.items() if key.startswith("loss_"))
+
+
+def total_reward(env, actor):
+    flight, _ = differentiable_rollout(env, actor, None, 9, exploration_type=ExplorationType.DETERMINISTIC)
+    assert flight["next", "done"].sum() == 2
+    return flight["next", "reward"].sum()
+
+
+def gradient(env, actor):
+    return torch.cat([g.flatten() for g in torch.autograd.grad(total_reward(env, actor), list(actor.parameters()))])
+
+
+@pytest.fixture
+def deadline():
+    """Processes that do not answer fail the test."""
+
+    def give_up(*_):
+        raise TimeoutError("no answer from the other processes in 100 s")
+
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.alarm(100)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+# -- transforms --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [*STACKS, *PRECISION])
+def test_specs_hold_under_transforms(name):
+    check_env_specs(make({**STACKS, **PRECISION}[name]()), break_when_any_done="both")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_specs_of_every_task_hold_under_a_stack_of_transforms(task):
+    check_env_specs(TransformedEnv(make_env(task, num_envs=2), Compose(*BEFORE_THE_POLICY["all"]())))
+
+
+@pytest.mark.parametrize("name", BESIDE_THE_POLICY)
+def test_transforms_that_the_policy_does_not_see_leave_its_gradient_as_it_is(name):
+    transforms, factor = BESIDE_THE_POLICY[name]
+    plain = make([], seed=1)
+    actor = lively(make_actor(plain))
+    expected = factor * gradient(plain, actor)
+    assert expected.norm() > 1e-3
+    torch.testing.assert_close(gradient(make(transforms(), seed=1), actor), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", BEFORE_THE_POLICY)
+def test_gradients_through_transforms_that_the_policy_sees_are_finite_differences(name):
+    env = make(BEFORE_THE_POLICY[name]())
+    actor = lively(make_actor(env))
+    start = parameters_to_vector(actor.parameters()).detach()
+    direction = torch.randn_like(start)
+    along = gradient(env, actor) @ direction
+
+    def at(step):
+        vector_to_parameters(start + step * direction, actor.parameters())
+        with torch.no_grad():
+            return total_reward(env, actor)
+
+    assert along.abs() > 1e-3
+    torch.testing.assert_close((at(1e-6) - at(-1e-6)) / 2e-6, along, rtol=1e-5, atol=1e-8)
+
+
+def test_gradients_through_a_change_of_precision_are_those_of_either():
+    exact = make([], seed=1)
+    actor = lively(make_actor(exact))
+    expected = gradient(exact, actor)
+    start = exact.reset()["state"]
+    up = DTypeCastTransform(torch.float32, torch.float64)
+    for env in (make([DoubleToFloat()]), make([up], dtype=torch.float32)):
+        env.set_initial_state_source(lambda n: start)
+        same = make_actor(env)
+        same.load_state_dict(actor.state_dict())
+        result = gradient(env, same)
+        assert result.dtype is env.observation_spec["observation"].dtype
+        assert (result - expected).norm() < 1e-3 * expected.norm()
+
+
+def test_frames_of_one_horizon_are_remembered_in_the_next_without_their_graph():
+    env = make([frames()])
+    actor = lively(make_actor(env))
+    _, carry = differentiable_rollout(env, actor, None, 3)
+    for _ in range(3):
+        flight, following = differentiable_rollout(env, actor, carry, 2)
+        assert torch.equal(flight["next", "observation"][:2, 0, :26], carry["observation"][:2, 13:])
+        flight["next", "reward"].sum().backward()  # of this horizon alone: the graph of the one before is gone
+        carry = following
+
+
+def test_a_transform_that_deletes_the_state_is_refused():
+    env = TransformedEnv(HoveringEnv(num_envs=2), CatTensors(FEATURES, "features"))
+    with pytest.raises(ValueError, match="step: the state lacks velocity. A state is restored whole"):
+        env.rollout(2)
+
+
+@pytest.mark.parametrize("name", ["all", "double to float"])
+@pytest.mark.parametrize("loss_name", ["bptt", "shac", "abpt"])
+def test_first_order_losses_train_under_transforms_and_from_visited_states(loss_name, name):
+    env = make({**BEFORE_THE_POLICY, **PRECISION}[name](), seed=2)
+    actor, buffer, carry = make_actor(env), VisitedStateBuffer(), None
+    loss = make_loss(loss_name, env, actor)
+    optimizer = torch.optim.SGD(loss.parameters(), 1e-3)
+    before = parameters_to_vector(actor.parameters()).detach().clone()
+    for _ in range(3):
+        rollout, _ = differentiable_rollout(env, actor, carry, 6)
+        buffer.extend(rollout)
+        carry = buffer.initial_state(env, 0.5)
+        loss_now = total(loss(rollout))
+        optimizer.zero_grad()
+        loss_now.backward()
+        assert loss_now.isfinite()
+        assert all(p.grad.isfinite().all() for p in loss.parameters() if p.requires_grad)
+        assert parameters_to_vector([p.grad for p in actor.parameters()]).norm() > 0
+        optimizer.step()
+    assert not torch.equal(parameters_to_vector(actor.parameters()), before)
+
+
+def test_visited_states_restart_what_transforms_remember():
+    env = make([StepCounter(), RewardSum(), frames()])
+    rollout, _ = differentiable_rollout(env, make_actor(env), None, 3)
+    buffer = VisitedStateBuffer()
+    buffer.extend(rollout[:, 1:])
+    carry = buffer.initial_state(env, 1.0)
+    one, two, three = carry["observation"].split(13, -1)
+    assert torch.equal(one, two) and torch.equal(two, three)
+    torch.testing.assert_close(three[:, :3], (carry["state", "target"] - carry["state", "position"]) / 10)
+    assert (carry["step_count"] == 0).all() and (carry["episode_reward"] == 0).all()
+
+
+def test_a_compiled_step_keeps_its_gradients_under_transforms():
+    def build(**kwargs):
+        return make(BEFORE_THE_POLICY["all"](), dt=0.02, seed=1, **kwargs)
+
+    env = build()
+    actor = lively(make_actor(env))
+    torch.testing.assert_close(gradient(build(compile=True), actor), gradient(env, actor))
+
+
+# -- losses and collectors ---------------------------------------------------------------------------------------------
 
 
 def test_a_collector_and_the_ppo_loss_of_torchrl_train_on_it():
@@ -23,10 +260,96 @@ def test_a_collector_and_the_ppo_loss_of_torchrl_train_on_it():
         out = loss(data)
         optimizer.zero_grad()
         (out["loss_objective"] + out["loss_critic"]).backward()
+        assert out["loss_objective"].isfinite() and out["loss_critic"].isfinite()
         optimizer.step()
     collector.shutdown()
     assert any(not torch.equal(p, q) for p, q in zip(actor.parameters(), before, strict=True))
 
 
-def test_specs_hold_under_transforms():
-    check_env_specs(TransformedEnv(HoveringEnv(num_envs=3), Compose(StepCounter(), RewardSum())))
+def test_a_collector_and_the_sac_loss_of_torchrl_train_on_it():
+    env = TransformedEnv(HoveringEnv(num_envs=4, max_episode_steps=8), Compose(StepCounter(), RewardSum()))
+    actor = make_actor(env)
+    loss = SACLoss(actor, make_qvalue(env), action_spec=env.action_spec_unbatched)
+    loss.make_value_estimator(gamma=0.99)
+    updater = SoftUpdate(loss, tau=0.05)
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=32)
+    optimizer = torch.optim.Adam(loss.parameters(), 1e-3)
+    before = [p.detach().clone() for p in loss.parameters()]
+    sizes = {"frames_per_batch": 40, "total_frames": 80, "init_random_frames": 40}
+    collector = Collector(env, actor, **sizes, auto_register_policy_transforms=True)
+    for data in collector:
+        replay.extend(data.reshape(-1))
+        for _ in range(3):
+            loss_now = total(loss(replay.sample()))
+            optimizer.zero_grad()
+            loss_now.backward()
+            assert loss_now.isfinite()
+            optimizer.step()
+            updater.step()
+    collector.shutdown()
+    assert all(not torch.equal(p, q) for p, q in zip(loss.parameters(), before, strict=True))
+
+
+def test_a_collector_of_several_processes_flies_it(deadline):
+    makers = [partial(HoveringEnv, num_envs=3, max_episode_steps=6, seed=seed) for seed in (0, 1)]
+    sizes = {"frames_per_batch": 24, "total_frames": 48}
+    collector = MultiCollector(makers, make_actor(makers[0]()), sync=True, **sizes)
+    try:
+        batches = [data.clone() for data in collector]
+    finally:
+        collector.shutdown()
+    assert [data.numel() for data in batches] == [24, 24]
+    steps = torch.cat([data.reshape(2, 3, 4)["state", "step"] for data in batches], 2)
+    assert steps[..., 0].tolist() == [[[0, 1, 2, 3, 4, 5, 0, 1]] * 3] * 2
+    position = batches[0].reshape(2, 3, 4)["state", "position"]
+    assert not torch.equal(position[0, :, 0], position[1, :, 0])
+
+
+# -- several environments, each with several drones --------------------------------------------------------------------
+
+
+def check_a_batch_of_environments(env):
+    env.set_seed(0)
+    check_env_specs(env)
+    assert env.batch_size == (2, 3)
+    actor = make_actor(env)
+    rollout, carry = differentiable_rollout(env, actor, None, 8)
+    assert rollout.batch_size == (2, 3, 8)
+    assert rollout["state", "step"][..., 0].tolist() == [[[0, 1, 2, 3, 4, 5, 0, 1]] * 3] * 2
+    assert not torch.equal(*rollout["state", "position"][:, :, 0])
+    hover = HoveringEnv(num_envs=1).hover_action
+    torch.testing.assert_close(rollout["loc"][..., 0].tanh(), hover[0].expand(2, 3, 8), atol=0.02, rtol=0)
+    buffer = VisitedStateBuffer()
+    buffer.extend(rollout[..., 1:3])
+    assert len(buffer) == 12
+    visited = buffer.initial_state(env, 1.0)
+    assert set(visited["state", "step"].flatten().tolist()) <= {1, 2}
+    assert carry.batch_size == visited.batch_size == (2, 3)
+    return actor, rollout
+
+
+def test_environments_in_one_process_keep_their_gradients():
+    env = TransformedEnv(SerialEnv(2, partial(HoveringEnv, num_envs=3, max_episode_steps=6)), StepCounter())
+    actor, rollout = check_a_batch_of_environments(env)
+    for name in ("bptt", "shac", "abpt"):
+        loss = make_loss(name, env, actor)
+        (grad, *_) = torch.autograd.grad(loss(rollout)["loss_actor"], list(actor.parameters()), retain_graph=True)
+        assert grad.isfinite().all() and grad.norm() > 0
+
+
+def test_environments_in_several_processes_fly_and_tell_that_they_cut_the_gradient(deadline):
+    env = ParallelEnv(2, partial(HoveringEnv, num_envs=3, max_episode_steps=6))
+    try:
+        actor, rollout = check_a_batch_of_environments(env)
+    finally:
+        env.close(raise_if_closed=False)
+    with pytest.raises(RuntimeError, match="carries no gradient. Collectors, ParallelEnv, .* cut it"):
+        BPTTLoss(actor)(rollout)
+
+
+def test_networks_are_made_for_environments_that_have_not_started_and_for_others():
+    env = ParallelEnv(2, partial(HoveringEnv, num_envs=3))
+    assert make_actor(env)(env.fake_tensordict())["action"].shape == (2, 3, 4)
+    assert env.is_closed
+    normalizer = ObservationNormalizer(env)
+    assert normalizer.loc.shape == (13,)

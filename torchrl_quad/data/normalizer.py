@@ -27,9 +27,19 @@ class ObservationNormalizer(ObservationNorm):
         env: gives size, device and floating-point type of the observation.
         key: the entry to normalise, (*, k), in its own place.
         min_scale: the least standard deviation to divide by, in the observation's unit.
+
+    Raises:
+        ValueError: the environment does not observe the key, or min_scale is not positive.
     """
 
     def __init__(self, env: EnvBase, key: NestedKey = "observation", *, min_scale: float = 0.01) -> None:
+        if key not in env.observation_spec.keys(True, True):
+            raise ValueError(
+                f"The environment does not observe {key!r}. Choose from: "
+                f"{', '.join(map(str, env.observation_spec.keys(True, True)))}."
+            )
+        if not min_scale > 0:
+            raise ValueError(f"min_scale must be positive, since the normalizer divides by it; got {min_scale}.")
         spec = env.observation_spec[key]
         loc = torch.zeros(spec.shape[-1], device=spec.device, dtype=spec.dtype)
         super().__init__(loc, torch.ones_like(loc), in_keys=[key], standard_normal=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numbers
+
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
@@ -34,17 +36,34 @@ def differentiable_rollout(
         rollout ended done.
 
     Raises:
-        ValueError: the horizon is less than 1.
-        TypeError: the actor is not a TensorDictModule.
+        ValueError: the horizon is less than 1, or the actor reads an entry that is not there.
+        TypeError: the actor is not a TensorDictModule, or the carry no tensordict.
     """
-    if horizon < 1:
+    if not (isinstance(horizon, numbers.Integral) and horizon >= 1):
         raise ValueError(f"horizon must be at least 1 control step, got {horizon}.")
     if not isinstance(actor, TensorDictModuleBase):
         raise TypeError(
             f"actor must be a TensorDictModule that writes the action, got {type(actor).__name__}. "
             'Wrap a plain module: TensorDictModule(module, in_keys=["observation"], out_keys=["action"]).'
         )
+    if not (carry is None or isinstance(carry, TensorDictBase)):
+        raise TypeError(
+            f"carry must be the tensordict to start from, or None to reset the environment; got {type(carry).__name__}."
+        )
     carry = env.reset() if carry is None else carry.copy()
-    with set_exploration_type(exploration_type):
-        rollout = env.rollout(horizon, actor, tensordict=carry, auto_reset=False, break_when_any_done=False)
+    try:
+        with set_exploration_type(exploration_type):
+            rollout = env.rollout(horizon, actor, tensordict=carry, auto_reset=False, break_when_any_done=False)
+    except KeyError as error:
+        missing = [key for key in actor.in_keys if key not in carry]
+        if not missing:
+            raise
+        raise ValueError(
+            f"The actor reads {missing[0]!r}, which is not in the tensordict it starts from. Choose its in_keys from "
+            f"what env.reset() writes: {', '.join(map(str, env.observation_spec.keys(True, True)))}."
+        ) from error
+    # Transforms such as CatFrames remember what they have seen in buffers, with its graph.
+    for buffer in env.buffers():
+        if not buffer.is_leaf:
+            buffer.detach_()
     return rollout, env.maybe_reset(env.step_mdp(rollout[..., -1]).detach().clone())

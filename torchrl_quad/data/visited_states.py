@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Callable, Sequence
 
 import torch
@@ -9,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 
 class VisitedStateBuffer(TensorDictReplayBuffer):
@@ -40,7 +41,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         device: torch.device | str = "cpu",
         seed: int = 0,
     ) -> None:
-        if capacity < 1:
+        if not (isinstance(capacity, numbers.Integral) and capacity >= 1):
             raise ValueError(f"capacity must be at least 1 state, got {capacity}.")
         self.state_keys = tuple(state_keys)
         super().__init__(
@@ -55,7 +56,16 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
 
         Returns:
             the indices written.
+
+        Raises:
+            ValueError: the rollout lacks an entry of the state, or its states are not those of the buffer.
         """
+        missing = [key for key in self.state_keys if key not in tensordicts]
+        if missing:
+            raise ValueError(
+                f"The visited-state buffer keeps {self.state_keys}, and the rollout lacks {missing[0]!r}. Name the "
+                "entries of the environment's Markov state: VisitedStateBuffer(state_keys=[...])."
+            )
         states = tensordicts.select(*self.state_keys).detach().reshape(-1)
         keep = torch.ones(states.shape[0], dtype=torch.bool, device=states.device)
         for value in states.values(include_nested=True, leaves_only=True):
@@ -65,6 +75,8 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             keep &= ~terminated.reshape(-1)
         if not keep.any():
             return torch.zeros(0, dtype=torch.int64)
+        if len(self):
+            _require_same(states, self[:1].select(*self.state_keys))
         return super().extend(states[keep].clone())
 
     def initial_state(self, env: EnvBase, fraction: float = 0.9) -> TensorDictBase:
@@ -78,10 +90,14 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             the tensordict of the reset, to be the carry of a rollout.
 
         Raises:
-            ValueError: the fraction is not in [0, 1].
+            ValueError: the fraction is not in [0, 1], or the states of the buffer are not those of the environment.
             RuntimeError: the buffer is empty.
         """
-        if hasattr(env, "sample_initial_state"):  # the task's own starts, whatever its resets draw from
+        base = env
+        while isinstance(base, TransformedEnv):
+            base = base.base_env
+        # Of the class: environments in other processes cannot be asked what they know, one that does not know dies.
+        if hasattr(type(base), "sample_initial_state"):  # the task's own starts, whatever its resets draw from
             fresh = TensorDict({"state": env.sample_initial_state(env.num_envs)}, env.batch_size)
         else:
             fresh = env.reset().select(*self.state_keys)
@@ -93,18 +109,37 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         ``env`` is a quadrotor environment; arguments and errors are those of :meth:`initial_state`.
         """
 
+        _require_fraction(fraction)
+
         def draw(n: int) -> TensorDictBase:
             return self._mixed(TensorDict({"state": env.sample_initial_state(n)}, [n]), fraction).get("state")
 
         return draw
 
     def _mixed(self, fresh: TensorDictBase, fraction: float) -> TensorDictBase:
-        if not 0.0 <= fraction <= 1.0:
-            raise ValueError(f"fraction must lie between 0 (all fresh) and 1 (all visited), got {fraction}.")
+        _require_fraction(fraction)
         if len(self) == 0:
             raise RuntimeError(
                 "The visited-state buffer is empty. Fly a first horizon from env.reset() and extend the buffer with it."
             )
-        visited = self.sample(fresh.numel()).select(*self.state_keys).to(fresh.device).reshape(fresh.shape)
+        visited = self.sample(fresh.numel()).select(*self.state_keys).to(fresh.device)
+        _require_same(fresh.reshape(-1), visited)
+        visited = visited.reshape(fresh.shape)
         pick = torch.rand(fresh.shape, generator=self._rng, device=self._rng.device) < fraction
         return visited.where(pick.to(fresh.device), fresh)
+
+
+def _require_fraction(fraction: float) -> None:
+    if not 0.0 <= fraction <= 1.0:
+        raise ValueError(f"fraction must lie between 0 (all fresh) and 1 (all visited), got {fraction}.")
+
+
+def _require_same(states: TensorDictBase, kept: TensorDictBase) -> None:
+    """Refuse states (n) of another kind than those that are kept: they would be mixed, or broadcast, in silence."""
+    ours, theirs = ({key: x.shape[1:] for key, x in td.items(True, True)} for td in (kept, states))
+    different = sorted({str(key) for key, _ in ours.items() ^ theirs.items()})
+    if different:
+        raise ValueError(
+            f"These are other states than those in the visited-state buffer: {', '.join(different)} differ in name or "
+            "shape. Keep a buffer for each task and its options, such as action_delay."
+        )

@@ -31,8 +31,9 @@ def make_env(task: str, **kwargs: Any) -> QuadrotorEnv:
     """Build a task by its name: ``make_env("hovering", num_envs=64)``; the keywords go to the environment.
 
     Raises:
-        ValueError: the task is unknown.
+        ValueError: the task is unknown, or an argument is out of its range.
+        TypeError: a keyword is unknown.
     """
-    if task not in TASKS:
+    if task not in list(TASKS):  # a list compares what cannot be hashed, too
         raise ValueError(f"Unknown task {task!r}. Choose from: {', '.join(sorted(TASKS))}.")
     return TASKS[task](**kwargs)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import difflib
+import inspect
 import math
+import numbers
 import os
 import shutil
 import warnings
@@ -94,7 +97,9 @@ class QuadrotorEnv(EnvBase):
             it in its cache. First derivatives only.
 
     Raises:
-        ValueError: an argument is out of its range, with the allowed values.
+        TypeError: an argument is unknown, with the closest one that is known, and all of them.
+        ValueError: an argument is out of its range, with the allowed values. Of a step: the action or the state has
+            the wrong shape, precision or device, or the action is not finite.
     """
 
     batch_locked = True
@@ -120,26 +125,31 @@ class QuadrotorEnv(EnvBase):
         randomize: str | Path | Mapping | None = None,
         wind: Mapping[str, Any] | None = None,
         random_start: Mapping[str, float] | None = None,
+        **unknown: Any,
     ) -> None:
-        _require(num_envs >= 1, f"num_envs must be at least 1, got {num_envs}.")
+        self._refuse(unknown)
+        _require_count("num_envs", num_envs, 1)
         _require(dtype in (torch.float32, torch.float64), f"dtype must be torch.float32 or torch.float64, got {dtype}.")
-        _require(0 < dt < math.inf, f"dt must be positive and finite, got {dt}.")
-        _require(0 < control_dt < math.inf, f"control_dt must be positive and finite, got {control_dt}.")
+        for name, value in (("dt", dt), ("control_dt", control_dt)):
+            is_time = isinstance(value, numbers.Real) and 0 < value < math.inf
+            _require(is_time, f"{name} must be positive and finite, got {value!r}.")
         substeps = round(control_dt / dt)
         _require(
             substeps >= 1 and math.isclose(substeps * dt, control_dt, rel_tol=1e-6),
             f"control_dt must be a whole multiple of dt, got {control_dt} and {dt}; "
             f"try control_dt={max(substeps, 1) * dt:g}.",
         )
-        _require(action_delay >= 0, f"action_delay must be zero or more control steps, got {action_delay}.")
+        _require_count("action_delay", action_delay, 0, "zero or more control steps")
         _require(
             integrator in INTEGRATORS, f"Unknown integrator {integrator!r}. Choose from: {', '.join(INTEGRATORS)}."
         )
-        _require(max_episode_steps >= 1, f"max_episode_steps must be at least 1, got {max_episode_steps}.")
+        _require_count("max_episode_steps", max_episode_steps, 1)
         _require(
             action_delay > 0 or not observe_last_action,
             "observe_last_action shows the commands that are on their way; with action_delay=0 there are none.",
         )
+        is_seed = seed is None or isinstance(seed, numbers.Integral)
+        _require(is_seed, f"seed must be a whole number, or None for another one each time; got {seed!r}.")
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.num_envs, self.dtype = num_envs, dtype
         self.dt, self.control_dt, self.substeps = dt, control_dt, substeps
@@ -155,9 +165,7 @@ class QuadrotorEnv(EnvBase):
         params = params.to(device=self.device, dtype=dtype)
         self.controller = FlightController(params)
         self.params = params if params.requires_grad else self.nominal
-        unknown = [str(name) for name in weights or {} if name not in self.weights]
-        _require(not unknown, f"weights: unknown term {_names(unknown)}. Choose from: {_names(self.weights)}.")
-        self.weights = {**self.weights, **(weights or {})}
+        self.weights = {**self.weights, **self._checked_weights({} if weights is None else weights)}
         self.sensors = options.build(
             options.Sensors, "observation_noise", observation_noise or {}, delay=observation_delay
         )
@@ -301,7 +309,11 @@ class QuadrotorEnv(EnvBase):
     # -- TorchRL's side ------------------------------------------------------------------------------------------------
 
     def compile(self, **kwargs: Any) -> QuadrotorEnv:
-        """Compile the control step with its observation, reward and termination; the keywords go to torch.compile."""
+        """Compile the control step with its observation, reward and termination; the keywords go to torch.compile.
+
+        Under transforms it is this environment that has to be compiled, ``TransformedEnv(HoveringEnv(compile=True),
+        ...)``: TransformedEnv's own ``compile`` takes minutes and makes nothing faster.
+        """
         kwargs.pop("warmup", None)  # TorchRL's option for steps whose input changes its layout: ours never does
         if shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++"):
             self.stepper = horizon.Stepper(self, kwargs)
@@ -339,6 +351,11 @@ class QuadrotorEnv(EnvBase):
         ``source(n)`` returns n complete states (the content of ``td["state"]``); resets then start from them. None
         goes back to the task's own starts.
         """
+        _require(
+            source is None or callable(source),
+            "initial_state_source must be a function from a number n to n states, or None for the task's own starts; "
+            f"got {type(source).__name__}.",
+        )
         self.initial_state_source = source
 
     def _set_seed(self, seed: int | None) -> None:
@@ -360,13 +377,14 @@ class QuadrotorEnv(EnvBase):
         return self._tensordict(self.first_entries(self._checked_state(tensordict.get("state"), source)))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        stepper = self.stepper
-        state = stepper.layout.pack(dict(tensordict.get("state").items(include_nested=True, leaves_only=True)))
+        stepper, action = self.stepper, tensordict.get("action", None)
+        state = stepper.layout.pack(self.required_state(tensordict.get("state", None), "step"))
         noise = {key: x[0] for key, x in self.draw_noise(1).items()}
         floats, valid = stepper.sound(state.floats)
         state = state._replace(floats=floats)
         # TorchRL resets by itself: what the episode after this one would start from is not used.
-        end = stepper(state, valid, tensordict.get("action"), noise, state.detach(), self._no_observation)
+        end = stepper(state, valid, action, noise, state.detach(), self._no_observation)
+        horizon.require_finite(action)
         return self._tensordict(
             {"observation": end.observation, **horizon.nested(stepper.entries(end.state, end.told))}
         )
@@ -377,9 +395,10 @@ class QuadrotorEnv(EnvBase):
         That is with ``break_when_any_done=False``, a policy that is a TensorDictModule and reads the observation or
         the state, and no other option than ``tensordict`` (with ``auto_reset=False``).
         """
+        _require_count("max_steps", max_steps, 1)
         start, auto_reset = options.get("tensordict"), options.get("auto_reset", True)
         quick = callback is None and options.get("break_when_any_done") is False and auto_reset == (start is None)
-        if quick and set(options) <= {"break_when_any_done", "auto_reset", "tensordict"} and max_steps > 0:
+        if quick and set(options) <= {"break_when_any_done", "auto_reset", "tensordict"}:
             start = self.reset() if start is None else start
             if horizon.can_fly(self, policy, start):
                 return horizon.fly(self, policy, start, max_steps)
@@ -443,21 +462,66 @@ class QuadrotorEnv(EnvBase):
         drawn = {name: state["drone", name] for name in self.randomization.spec}
         return RawParams(**{**self.params.fields(), **drawn})
 
-    def _checked_state(self, state: TensorDictBase, source: str) -> State:
-        expected = self.fallback
-        missing = [key for key in expected if key not in state]
+    def required_state(self, state: Any, source: str) -> State:
+        """The entries of a state, if all are there and of the right shape, precision and device."""
+        checked = self._complete_state(state, source)
+        for key, like in self.fallback.items():
+            x = checked[key]
+            _require(
+                x.dtype == like.dtype and x.device == like.device,
+                f"{source}: state {key!r} is {x.dtype} on {x.device}, and this environment {like.dtype} on "
+                f"{like.device}. Convert it: env.reset(tensordict, set_state=True) does.",
+            )
+        return checked
+
+    def _checked_state(self, state: Any, source: str) -> State:
+        state = self._complete_state(state, source)
+        return {key: state[key].to(x.device, x.dtype, copy=True) for key, x in self.fallback.items()}
+
+    def _complete_state(self, state: Any, source: str) -> State:
+        _require(
+            isinstance(state, TensorDictBase),
+            f'{source}: a state is a tensordict, such as env.reset()["state"]; got {type(state).__name__}.',
+        )
+        given = dict(state.items(include_nested=True, leaves_only=True))
+        missing = [key for key in self.fallback if key not in given]
         _require(
             not missing,
             f"{source}: the state lacks {_names(missing)}. A state is restored whole: take it from a tensordict of "
-            f"this environment, which holds {_names(expected)}.",
+            f"this environment, which holds {_names(self.fallback)}.",
         )
-        checked = {}
-        for key, like in expected.items():
-            value = state.get(key)
-            shape = (self.num_envs, *like.shape[1:])
-            _require(value.shape == shape, f"{source}: state {key!r} has shape {tuple(value.shape)}, expected {shape}.")
-            checked[key] = value.to(device=like.device, dtype=like.dtype, copy=True)
-        return checked
+        for key, like in self.fallback.items():
+            shape, expected = tuple(given[key].shape), (self.num_envs, *like.shape[1:])
+            _require(shape == expected, f"{source}: state {key!r} has shape {shape}, expected {expected}.")
+        return given
+
+    def _checked_weights(self, weights: Any) -> Mapping[str, float]:
+        _require(
+            isinstance(weights, Mapping),
+            f"weights must be a mapping from terms of the reward to numbers, got {weights!r}.",
+        )
+        unknown = [str(name) for name in weights if name not in self.weights]
+        _require(not unknown, f"weights: unknown term {_names(unknown)}. Choose from: {_names(self.weights)}.")
+        for name, value in weights.items():
+            is_finite = isinstance(value, Tensor) or (isinstance(value, numbers.Real) and math.isfinite(value))
+            _require(is_finite, f"weights: {name} must be a finite number, got {value!r}.")
+        return weights
+
+    def _refuse(self, unknown: Mapping[str, Any]) -> None:
+        """Say of options that no task knows what they may have meant."""
+        if not unknown:
+            return
+        known = ["compile"]
+        for cls in reversed(type(self).__mro__[: type(self).__mro__.index(QuadrotorEnv) + 1]):
+            parameters = inspect.signature(cls.__init__).parameters.values()
+            known += [p.name for p in parameters if p.name not in ("self", *known) and p.kind is not p.VAR_KEYWORD]
+        name = next(iter(unknown))
+        close = difflib.get_close_matches(name, known, 1)
+        hint = f" Did you mean {close[0]!r}?" if close else ""
+        raise TypeError(
+            f"{type(self).__name__} got an unexpected keyword argument {name!r}.{hint} Choose from: "
+            f"{_names(sorted(known))}."
+        )
 
     def _tensordict(self, entries: dict[str, Any]) -> TensorDict:
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
@@ -500,3 +564,8 @@ def _names(keys: Iterable[Any]) -> str:
 def _require(condition: bool, message: str) -> None:
     if not condition:
         raise ValueError(message)
+
+
+def _require_count(name: str, value: Any, least: int, rule: str | None = None) -> None:
+    _require(isinstance(value, numbers.Integral), f"{name} must be a whole number, got {value!r}.")
+    _require(value >= least, f"{name} must be {rule or f'at least {least}'}, got {value}.")

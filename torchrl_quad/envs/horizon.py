@@ -163,6 +163,15 @@ class Stepper:
             fresh: states to begin the next episode with where this one ends.
             first: their observations (n, k).
         """
+        if action is None or action.shape != (self.env.num_envs, 4):
+            got = "there is none" if action is None else f"got {tuple(action.shape)}"
+            raise ValueError(
+                f"The action must have shape ({self.env.num_envs}, 4), thrust and three body rates for each "
+                f'environment; {got}. A policy writes it under "action", as make_actor(env) does.'
+            )
+        if action.device != state.floats.device:
+            raise ValueError(f"The action is on {action.device}, and the environment on {state.floats.device}.")
+        action = action.to(state.floats.dtype)
         if self.is_compiled:
             theta = () if self.env.params is self.env.nominal else self.env.params.plant()
             return Ends.of(_Step.apply(self, *state[1:], valid, noise, fresh, first, state.floats, action, *theta))
@@ -358,15 +367,16 @@ def can_fly(env: QuadrotorEnv, policy: Any, tensordict: TensorDictBase) -> bool:
     if not isinstance(policy, TensorDictModuleBase):
         return False
     state = {_path("state", *_tuple(key)) for key in env.stepper.layout.place}
-    mine = state | {"observation", *env.stepper.told_layout.place, *(flat_key(key) for key in policy.out_keys)}
-    reads = {flat_key(key) for key in policy.in_keys}
-    return reads <= state | {"observation"} and set(tensordict.keys(True, True)) <= mine
+    needed = {"observation", *env.stepper.told_layout.place} - {"reward"}
+    writes, reads = ({flat_key(key) for key in keys} for keys in (policy.out_keys, policy.in_keys))
+    given = set(tensordict.keys(True, True))
+    return reads <= state | {"observation"} and "action" in writes and needed <= given <= state | needed | writes
 
 
 def fly(env: QuadrotorEnv, policy: TensorDictModuleBase, tensordict: TensorDictBase, steps: int) -> TensorDict:
     """A rollout (n, steps) from a reset tensordict, through the ends of episodes."""
     stepper, n = env.stepper, env.num_envs
-    start = stepper.layout.pack(dict(tensordict.get("state").items(True, True)))
+    start = stepper.layout.pack(env.required_state(tensordict.get("state"), "rollout"))
     told = {key: tensordict.get(key) for key in stepper.told_layout.place if key != "reward"}
     no_reward = {"reward": torch.zeros(n, 1, device=env.device, dtype=env.dtype)}
     roots = start, stepper.told_layout.pack({**told, **no_reward}), (tensordict.get("observation"),)
@@ -391,10 +401,12 @@ def fly(env: QuadrotorEnv, policy: TensorDictModuleBase, tensordict: TensorDictB
         state, observation = end.carried, end.first
         if t == 0:
             valid = torch.ones_like(valid)  # what a step leads to is sound
-    rollout = _rollout(stepper, roots, draws, ends)
-    rollout |= {
+    by_policy = {
         flat_key(key): torch.stack(x, 1) for key, x in zip(policy.out_keys, zip(*written, strict=True), strict=True)
     }
+    # Once for all steps: to look at a value makes the processor wait for the accelerator.
+    require_finite(by_policy["action"])
+    rollout = _rollout(stepper, roots, draws, ends) | by_policy
     return TensorDict(nested(rollout), (n, steps), env.device, names=[None, "time"])
 
 
@@ -428,6 +440,28 @@ def _rollout(
         rollout |= {_path(*prefix, *_tuple(key)): x for key, x in entries.items()}
     del rollout["reward"]
     return rollout
+
+
+def require_finite(action: Tensor) -> None:
+    """Refuse actions (n, 4), or (n, time, 4) of a horizon, that are not finite.
+
+    Raises:
+        ValueError: some are not, with their environments and the first step.
+    """
+    if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():
+        return  # nobody can look at a value there
+    finite = action.isfinite().all(-1)
+    if finite.all():
+        return
+    broken = ~finite if action.dim() == 3 else ~finite.unsqueeze(1)
+    who, when = (broken.any(dim).nonzero().flatten().tolist() for dim in (1, 0))
+    names = ", ".join(str(i) for i in who[:10]) + (", ..." if len(who) > 10 else "")
+    at = f", first at step {when[0]} of the rollout" if action.dim() == 3 else ""
+    raise ValueError(
+        f"The action is not finite in environments {names}{at}: the weights of the policy are broken, or what it reads "
+        "is. Look for NaN in both; if training made them, clip the norm of the gradient, and skip updates whose "
+        "gradient is not finite."
+    )
 
 
 def flat(entries: Mapping[Any, Any], *prefix: str) -> dict[Key, Tensor]:

@@ -212,7 +212,7 @@ def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:
     if len(starts) != len(gates):
         raise ValueError(f"{source}: there must be one start before each gate, got {len(starts)} for {len(gates)}.")
     radius = values.get("gate_radius", 0.3)
-    if not (isinstance(radius, int | float) and radius > 0):
+    if not (isinstance(radius, int | float) and 0 < radius < float("inf")):
         raise ValueError(f"{source}: gate_radius must be a positive number [m], got {radius!r}.")
     return {"gates": gates, "starts": starts, "gate_radius": float(radius)}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,7 +10,9 @@ import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
+from torchrl.data import Bounded, TensorSpec
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 OBSERVATION = ("observation",)
@@ -55,12 +58,26 @@ def make_actor(
             elsewhere.
         scale_init: standard deviation at the start.
         return_log_prob: write the log-probability of the action as well, which an entropy bonus and PPO need.
+
+    Raises:
+        ValueError: an entry is unknown or of more than one dimension, a width is none, or the first action is not
+            inside the bounds.
     """
     spec = env.action_spec_unbatched
+    if not isinstance(spec, Bounded):
+        raise ValueError(f"make_actor needs an action with bounds, a Bounded spec; got {type(spec).__name__}.")
     low, high = spec.space.low, spec.space.high
     middle = 0.5 * (low + high)
     if action_init is None:
-        action_init = getattr(env, "hover_action", middle).reshape(-1, spec.shape[-1]).mean(0)
+        action_init = getattr(_single(env), "hover_action", middle)
+    action_init = torch.as_tensor(action_init).to(middle)
+    if action_init.shape != spec.shape or not ((low < action_init) & (action_init < high)).all():
+        raise ValueError(
+            f"action_init must be {spec.shape[-1]} numbers strictly between {low.tolist()} and {high.tolist()}, got "
+            f"{action_init.tolist()}."
+        )
+    if not scale_init > 0:
+        raise ValueError(f"scale_init must be positive, got {scale_init}.")
     net = _network(env, in_keys, 2 * spec.shape[-1], num_cells, activation, input_scale)
     with torch.no_grad():
         net.mlp[-1].weight.mul_(0.01)
@@ -126,7 +143,11 @@ def _network(
     action_scale: float = 1.0,
     layer_norm: bool = False,
 ) -> Network:
-    specs = [env.action_spec if key == "action" else env.observation_spec[key] for key in in_keys]
+    if isinstance(in_keys, str) or not in_keys:
+        raise ValueError(f'in_keys must be a list of entries, such as ["observation"]; got {in_keys!r}.')
+    specs = [_spec(env, key) for key in in_keys]
+    if isinstance(num_cells, int) or not all(isinstance(n, numbers.Integral) and n >= 1 for n in num_cells):
+        raise ValueError(f"num_cells must be the widths of the hidden layers, such as (64, 64); got {num_cells!r}.")
     norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": cells} for cells in num_cells]}
     mlp = MLP(
         in_features=sum(spec.shape[-1] for spec in specs),
@@ -136,4 +157,27 @@ def _network(
         device=env.device,
         **(norm if layer_norm else {}),
     )
-    return Network(mlp.to(specs[0].dtype), [action_scale if key == "action" else input_scale for key in in_keys])
+    dtype = next((spec.dtype for spec in specs if spec.dtype.is_floating_point), None)
+    return Network(mlp.to(dtype), [action_scale if key == "action" else input_scale for key in in_keys])
+
+
+def _single(env: EnvBase) -> EnvBase:
+    """The environment under transforms; and of several in processes of their own, which one cannot ask, another."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    if isinstance(env, BatchedEnvBase):
+        return _single(env.create_env_fn[0](**env.create_env_kwargs[0]))
+    return env
+
+
+def _spec(env: EnvBase, key: NestedKey) -> TensorSpec:
+    """What is known of an entry (*, k) that a network can read."""
+    known = {**dict(env.observation_spec.items(True, True)), "action": env.action_spec}
+    if key not in known:
+        raise ValueError(f"Unknown entry {key!r} in in_keys. Choose from: {', '.join(map(str, known))}.")
+    if known[key].ndim != len(env.batch_size) + 1:
+        raise ValueError(
+            f"Entry {key!r} has shape {tuple(known[key].shape)} and a network reads vectors: flatten it, such as with "
+            "torchrl's FlattenObservation."
+        )
+    return known[key]

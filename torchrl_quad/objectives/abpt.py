@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +51,7 @@ class ABPTLoss(PathwiseCriticLoss):
     default_keys = _AcceptedKeys
     critic_name = "qvalue_network"
     critic_loss_key = "loss_qvalue"
+    prediction_key = "state_action_value"
     out_keys = ["loss_actor", "loss_qvalue", "pred_value", "target_value", "explained_variance"]
 
     qvalue_network: TensorDictModule
@@ -69,7 +71,7 @@ class ABPTLoss(PathwiseCriticLoss):
     ) -> None:
         if not (n_step_return or zero_step_return):
             raise ValueError("ABPTLoss needs n_step_return or zero_step_return: with both off there is no objective.")
-        if num_qvalue_nets < 1:
+        if not (isinstance(num_qvalue_nets, numbers.Integral) and num_qvalue_nets >= 1):
             raise ValueError(f"ABPTLoss needs at least one critic, got num_qvalue_nets={num_qvalue_nets}.")
         super().__init__(actor_network, **kwargs)
         self.n_step_return, self.zero_step_return = n_step_return, zero_step_return

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule, composite_lp_aggregate, dispatch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, composite_lp_aggregate, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -33,7 +33,9 @@ class PathwiseLoss(LossModule):
         reduction: "mean" or "sum" over environments (over samples for a critic), or "none".
 
     Raises:
-        ValueError: alpha or reduction is none of the allowed values.
+        TypeError: a network is not a TensorDictModule.
+        ValueError: alpha or reduction is none of the allowed values; (in use) the rollout has no time dimension, lacks
+            an entry, or is on another device.
         RuntimeError: (in use) the rollout has lost its graph, or lacks the log-probability that the bonus needs.
     """
 
@@ -93,6 +95,15 @@ class PathwiseLoss(LossModule):
         self.has_entropy_bonus = alpha == "auto" or alpha > 0
         entropy_keys = ["entropy", "alpha"] if self.has_entropy_bonus else []
         self.out_keys = [*self.out_keys, *entropy_keys, *(["loss_alpha"] if self.automatic_alpha else [])]
+
+    def convert_to_functional(self, module: TensorDictModule, module_name: str, *args: Any, **kwargs: Any) -> None:
+        """As TorchRL's, of a TensorDictModule alone."""
+        if not isinstance(module, TensorDictModuleBase):
+            raise TypeError(
+                f"{module_name} must be a TensorDictModule, got {type(module).__name__}. Wrap a plain module: "
+                'TensorDictModule(module, in_keys=["observation"], out_keys=[...]).'
+            )
+        super().convert_to_functional(module, module_name, *args, **kwargs)
 
     # -- keys and parameters -------------------------------------------------------------------------------------------
 
@@ -160,6 +171,7 @@ class PathwiseLoss(LossModule):
         Returns:
             the loss, and a dictionary of what is worth logging.
         """
+        self._require_rollout(tensordict)
         objective, metadata = self._objective(tensordict)
         if self.has_entropy_bonus:
             entropy = self._entropy(tensordict)
@@ -216,6 +228,26 @@ class PathwiseLoss(LossModule):
             return -float(tensordict.get(self.tensor_keys.action).shape[-1])
         return float(self.target_entropy)
 
+    def _require_rollout(self, tensordict: TensorDictBase) -> None:
+        name, shape = type(self).__name__, tuple(tensordict.batch_size)
+        names = tensordict.names
+        # Without names nothing tells a single flight from a single step.
+        has_time = names[-1] == "time" if "time" in names else len(shape) > 1
+        if not has_time or shape[-1] == 0:
+            raise ValueError(
+                f"{name} needs a rollout of batch size (*, horizon), whose last dimension is time; got {shape}. Give "
+                'it what differentiable_rollout returns, unflattened; name a single flight: rollout.names = ["time"].'
+            )
+        missing = [key for key in self.in_keys if key not in tensordict and key != self.tensor_keys.sample_log_prob]
+        if missing:
+            raise ValueError(
+                f"{name} reads {missing[0]!r}, which is not in the rollout. If it has another name there, tell the "
+                f"loss by set_keys, which takes {', '.join(vars(self.tensor_keys))}."
+            )
+        device, own = tensordict.get(("next", self.tensor_keys.reward)).device, self._default_device
+        if own not in (None, device):
+            raise ValueError(f"{name} is on {own}, and the rollout on {device}: loss.to({str(device)!r}) moves it.")
+
     def _require_graph(self, value: Tensor, key: NestedKey) -> None:
         if torch.is_grad_enabled() and not value.requires_grad:
             raise RuntimeError(
@@ -245,6 +277,7 @@ class PathwiseCriticLoss(PathwiseLoss):
 
     critic_name: str  # the attribute under which the critic network stands
     critic_loss_key: str
+    prediction_key: str  # the name, among the tensor keys, of what the critic writes
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -261,6 +294,7 @@ class PathwiseCriticLoss(PathwiseLoss):
         and the horizon's last step bootstraps unless it terminated. The critic's loss uses the entry when it finds it,
         so that several critic steps share one set of targets; it computes it otherwise.
         """
+        self._require_rollout(tensordict)
         data = tensordict.detach()
         with torch.no_grad():
             next_value = self._value(data.get("next"), self._critic_params(target=True))
@@ -308,6 +342,15 @@ class PathwiseCriticLoss(PathwiseLoss):
         """What the critic, and the actor before it, read of a state."""
         names = set(self.actor_network.in_keys) | set(getattr(self, self.critic_name).in_keys)
         return names - {self.tensor_keys.action}
+
+    def _require_rollout(self, tensordict: TensorDictBase) -> None:
+        critic, key = getattr(self, self.critic_name), getattr(self.tensor_keys, self.prediction_key)
+        if key not in critic.out_keys:
+            raise ValueError(
+                f"{type(self).__name__} reads {key!r} of its {self.critic_name}, which writes "
+                f"{', '.join(map(str, critic.out_keys))}. Give another network, or set_keys({self.prediction_key}=...)."
+            )
+        super()._require_rollout(tensordict)
 
     def _network_in_keys(self) -> set[NestedKey]:
         inputs = self._critic_inputs()

@@ -36,6 +36,7 @@ class SHACLoss(PathwiseCriticLoss):
     default_keys = _AcceptedKeys
     critic_name = "value_network"
     critic_loss_key = "loss_value"
+    prediction_key = "value"
     out_keys = ["loss_actor", "loss_value", "n_step_return", "pred_value", "target_value", "explained_variance"]
 
     value_network: TensorDictModule

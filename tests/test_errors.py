@@ -1,0 +1,425 @@
+"""Wrong input is refused where it comes in: what is wrong, why, and what to write instead."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import Unbounded
+from torchrl.envs import PendulumEnv, StepCounter, TransformedEnv
+
+from torchrl_quad import (
+    ABPTLoss,
+    BPTTLoss,
+    HoveringEnv,
+    ObservationNormalizer,
+    SHACLoss,
+    TrackingEnv,
+    VisitedStateBuffer,
+    differentiable_rollout,
+    load_track,
+    make_actor,
+    make_env,
+    make_qvalue,
+    make_value,
+)
+
+nan = float("nan")
+
+
+@pytest.fixture
+def flight(env):
+    return differentiable_rollout(env, make_actor(env), None, 3)
+
+
+def linear(inputs, outputs, in_key="observation", out_key="action", **kwargs):
+    return TensorDictModule(nn.Linear(inputs, outputs, **kwargs), in_keys=[in_key], out_keys=[out_key])
+
+
+# -- options -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("task", "kwargs", "message"),
+    [
+        (
+            "hovering",
+            {"num_env": 3},
+            r"HoveringEnv got an unexpected keyword argument 'num_env'. Did you mean 'num_envs'\? Choose from: ",
+        ),
+        ("landing", {"max_episode_step": 3}, r"LandingEnv .* Did you mean 'max_episode_steps'\?"),
+        (
+            "racing",
+            {"gate_bonsu": "log"},
+            r"RacingEnv got an unexpected keyword argument 'gate_bonsu'. Did you mean 'gate_bonus'\?",
+        ),
+        (
+            "tracking",
+            {"curves": "circle"},
+            r"Did you mean 'curve'\? Choose from: action_delay, compile, control_dt, cur",
+        ),
+        (
+            "hovering",
+            {"xyz": 1},
+            r"unexpected keyword argument 'xyz'. Choose from: action_delay, compile, .* seed, weights, wind.$",
+        ),
+    ],
+)
+def test_an_unknown_option_is_told_the_closest_one_and_all_of_them(task, kwargs, message):
+    with pytest.raises(TypeError, match=message):
+        make_env(task, **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"num_envs": 2.5}, "num_envs must be a whole number, got 2.5"),
+        ({"num_envs": "4"}, "num_envs must be a whole number, got '4'"),
+        ({"num_envs": -1}, "num_envs must be at least 1, got -1"),
+        ({"max_episode_steps": 2.5}, "max_episode_steps must be a whole number, got 2.5"),
+        ({"max_episode_steps": -3}, "max_episode_steps must be at least 1, got -3"),
+        ({"action_delay": 0.5}, "action_delay must be a whole number, got 0.5"),
+        ({"dt": "fast"}, "dt must be positive and finite, got 'fast'"),
+        ({"dt": -0.01}, "dt must be positive and finite, got -0.01"),
+        ({"control_dt": 0.002}, "control_dt must be a whole multiple of dt, got 0.002 and 0.005; try control_dt=0.005"),
+        ({"seed": "lucky"}, "seed must be a whole number, or None for another one each time; got 'lucky'"),
+        (
+            {"weights": ["velocity"]},
+            r"weights must be a mapping from terms of the reward to numbers, got \['velocity'\]",
+        ),
+        ({"weights": {"velocity": nan}}, "weights: velocity must be a finite number, got nan"),
+        ({"weights": {"velocity": "much"}}, "weights: velocity must be a finite number, got 'much'"),
+        ({"drone": None}, "Unknown drone None. Choose from: crazyflie"),
+    ],
+)
+def test_a_bad_value_is_refused_by_name(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        HoveringEnv(**kwargs)
+
+
+@pytest.mark.parametrize("task", ["hover", None, ["hovering"]])
+def test_an_unknown_task_is_told_the_known_ones(task):
+    with pytest.raises(ValueError, match="Unknown task .*. Choose from: hovering, landing, racing, tracking."):
+        make_env(task)
+
+
+def test_a_gate_without_end_is_none():
+    with pytest.raises(ValueError, match="gate_radius must be a positive number .m., got inf"):
+        load_track({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": float("inf")})
+
+
+# -- actions -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(4,), (4, 1), (4, 3), (4, 5), (4, 4, 1)])
+def test_an_action_of_another_shape_is_refused_and_not_broadcast(env, shape):
+    message = r"The action must have shape \(4, 4\), thrust and three body rates for each environment; got \("
+    with pytest.raises(ValueError, match=message):
+        env.step(env.reset().set("action", torch.zeros(shape)))
+    policy = TensorDictModule(lambda _: torch.zeros(shape), in_keys=["observation"], out_keys=["action"])
+    with pytest.raises(ValueError, match=message):
+        env.rollout(2, policy, break_when_any_done=False)
+
+
+def test_a_policy_that_writes_no_action_is_told_where_to(env):
+    message = 'The action must have shape .* there is none. A policy writes it under "action", as make_actor'
+    with pytest.raises(ValueError, match=message):
+        differentiable_rollout(env, linear(13, 4, out_key="acton"), None, 2)
+    with pytest.raises(ValueError, match=message):
+        env.step(env.reset())
+
+
+def test_an_action_on_another_device_is_refused_and_one_of_another_precision_converted(env):
+    with pytest.raises(ValueError, match="The action is on meta, and the environment on cpu"):
+        env.step(TensorDict({**env.reset().to_dict(), "action": torch.zeros(4, 4, device="meta")}, [4]))
+    for dtype in (torch.float64, torch.float16, torch.int64):
+        following = env.step(env.reset().set("action", torch.zeros(4, 4, dtype=dtype)))["next"]
+        assert following["state", "position"].dtype is torch.float32
+
+
+@pytest.mark.parametrize("wrap", [False, True])
+def test_a_broken_policy_is_told_so_and_does_not_crash_its_drones_in_silence(wrap):
+    env = HoveringEnv(num_envs=20)
+    env = TransformedEnv(env, StepCounter()) if wrap else env
+    actor = make_actor(env)
+    with torch.no_grad():
+        next(actor.parameters())[0, 0] = nan
+    message = r"not finite in environments 0, 1, .* 9, \.\.\..*: the weights of the policy are broken, or what it reads"
+    with pytest.raises(ValueError, match=message):
+        differentiable_rollout(env, actor, None, 3)
+
+
+@pytest.mark.parametrize("transform", ["grad", "jacrev", "vmap", "compile"])
+def test_an_action_is_not_looked_at_where_nobody_can(env64, transform):
+    td = env64.rollout(2)["next"][:, -1].select("state")
+
+    def reward(action):
+        return env64.step(td.copy().set("action", action))["next", "reward"].sum()
+
+    action = env64.hover_action.repeat(4, 1)
+    if transform == "compile":
+        compiled = torch.compile(reward, backend="eager")
+        torch.testing.assert_close(compiled(action), reward(action))
+    elif transform == "vmap":
+        torch.testing.assert_close(torch.vmap(reward)(action.expand(2, 4, 4)), reward(action).expand(2))
+    else:
+        assert getattr(torch.func, transform)(reward)(action).isfinite().all()
+
+
+# -- states ------------------------------------------------------------------------------------------------------------
+
+
+def broken_states(env):
+    td = env.reset()
+    yield td.exclude("state"), r"a state is a tensordict, such as env.reset\(\)\[.state.\]; got NoneType"
+    yield td.exclude(("state", "velocity")), "the state lacks velocity. A state is restored whole"
+    yield TensorDict({**td, "state": torch.zeros(4, 3)}, [4]), "a state is a tensordict, such as .* got Tensor"
+    short = td.clone()
+    short["state", "velocity"] = torch.zeros(4, 2)
+    yield short, r"state 'velocity' has shape \(4, 2\), expected \(4, 3\)"
+
+
+def test_a_state_that_is_not_whole_is_refused_by_a_step_a_rollout_and_a_reset(env):
+    actor = make_actor(env)
+    for td, message in broken_states(env):
+        with pytest.raises(ValueError, match=message):
+            env.step(td.copy().set("action", torch.zeros(4, 4)))
+        with pytest.raises(ValueError, match=message):
+            differentiable_rollout(env, actor, td, 2)
+        if "state" in td:
+            with pytest.raises(ValueError, match=message):
+                env.reset(td.copy(), set_state=True)
+
+
+def test_a_state_of_another_device_or_precision_is_refused_by_a_step_and_converted_by_a_reset(env):
+    td = env.reset()
+    double = TensorDict({"state": td["state"].double(), "action": torch.zeros(4, 4)}, [4])
+    elsewhere = TensorDict({"state": td["state"].to("meta"), "action": torch.zeros(4, 4)}, [4])
+    for wrong, message in ((double, "torch.float64 on cpu"), (elsewhere, "torch.float32 on meta")):
+        with pytest.raises(ValueError, match=f"state 'position' is {message}, and this environment torch.float32 on"):
+            env.step(wrong)
+    with pytest.raises(ValueError, match="on meta, and this environment torch.float32 on cpu. Convert it: env.reset"):
+        differentiable_rollout(env, make_actor(env), td.to("meta"), 2)
+    assert env.reset(double, set_state=True)["state", "position"].dtype is torch.float32
+
+
+def test_starts_come_from_a_function_that_gives_whole_states(env):
+    with pytest.raises(ValueError, match="initial_state_source must be a function from a number n to n states.*got Te"):
+        env.set_initial_state_source(env.reset())
+    state = env.reset()["state"]
+    for wrong, message in ((state[:2], r"has shape \(2, 3\), expected \(4, 3\)"), (torch.zeros(4), "got Tensor")):
+        env.set_initial_state_source(lambda n, wrong=wrong: wrong)
+        with pytest.raises(ValueError, match=f"initial_state_source: .*{message}"):
+            env.reset()
+
+
+# -- rollouts ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("horizon", [0, -1, 2.5, "long"])
+def test_a_horizon_is_a_number_of_steps(env, horizon):
+    with pytest.raises(ValueError, match="horizon must be at least 1 control step, got"):
+        differentiable_rollout(env, make_actor(env), None, horizon)
+    with pytest.raises(ValueError, match="max_steps must be"):
+        env.rollout(horizon)
+
+
+@pytest.mark.parametrize("key", ["obs", ("state", "speed")])
+def test_an_actor_that_reads_what_nobody_writes_is_told_what_there_is(env, key):
+    message = "The actor reads .*, which is not in the tensordict .* env.reset.. writes: observation, .'state', 'pos"
+    for some in (env, TransformedEnv(env, StepCounter())):
+        with pytest.raises(ValueError, match=message):
+            differentiable_rollout(some, linear(13, 4, in_key=key), None, 2)
+    with pytest.raises(ValueError, match="The actor reads 'observation', which is not in the tensordict"):
+        differentiable_rollout(env, make_actor(env), env.reset().select("state"), 2)
+
+
+def test_an_error_inside_the_actor_stays_what_it_is(env):
+    def fail(_):
+        raise KeyError("mine")
+
+    with pytest.raises(KeyError, match="mine"):
+        differentiable_rollout(env, TensorDictModule(fail, in_keys=["observation"], out_keys=["action"]), None, 2)
+
+
+def test_a_carry_is_a_tensordict_of_the_environment(env, flight):
+    actor, (rollout, carry) = make_actor(env), flight
+    with pytest.raises(TypeError, match="carry must be the tensordict to start from, or None .* got Tensor"):
+        differentiable_rollout(env, actor, torch.zeros(4), 2)
+    with pytest.raises(ValueError, match=r"state 'position' has shape \(2, 3\), expected \(4, 3\)"):
+        differentiable_rollout(env, actor, carry[:2], 2)
+    with pytest.raises((RuntimeError, ValueError), match="shape"):
+        differentiable_rollout(env, actor, rollout, 2)
+
+
+# -- visited states ----------------------------------------------------------------------------------------------------
+
+
+def test_a_capacity_is_a_whole_number():
+    for capacity in (2.5, -1, "many"):
+        with pytest.raises(ValueError, match="capacity must be at least 1 state, got"):
+            VisitedStateBuffer(capacity)
+
+
+def test_an_empty_buffer_is_refused_as_a_source_too_and_a_bad_fraction_at_once(env):
+    with pytest.raises(ValueError, match="fraction must lie between 0 .* got 1.5"):
+        VisitedStateBuffer().source(env, 1.5)
+    env.set_initial_state_source(VisitedStateBuffer().source(env))
+    with pytest.raises(RuntimeError, match="The visited-state buffer is empty. Fly a first horizon"):
+        env.reset()
+
+
+def test_states_of_other_tasks_and_options_are_neither_mixed_nor_broadcast(env, flight):
+    buffer, message = VisitedStateBuffer(), "These are other states than those in the visited-state buffer: .*{}.* diff"
+    buffer.extend(flight[0])
+    for other, key in ((TrackingEnv(num_envs=4), "phase"), (HoveringEnv(num_envs=4, action_delay=2), "action_queue")):
+        with pytest.raises(ValueError, match=message.format(key)):
+            buffer.initial_state(other)
+        with pytest.raises(ValueError, match=message.format(key)):
+            buffer.extend(other.rollout(2))
+    assert len(buffer) == 12
+
+
+def test_a_buffer_is_told_which_entries_make_up_a_state(flight):
+    with pytest.raises(ValueError, match="keeps .'th',., and the rollout lacks 'th'. Name the entries of the env"):
+        VisitedStateBuffer(state_keys=["th"]).extend(flight[0])
+
+
+def test_the_normalizer_is_told_what_it_can_normalise(env):
+    with pytest.raises(ValueError, match="The environment does not observe 'obs'. Choose from: observation, "):
+        ObservationNormalizer(env, "obs")
+    with pytest.raises(ValueError, match="min_scale must be positive, since the normalizer divides by it; got 0.0"):
+        ObservationNormalizer(env, min_scale=0.0)
+
+
+# -- networks ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [make_actor, make_value, make_qvalue])
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"num_cells": (0,)}, r"num_cells must be the widths of the hidden layers, such as \(64, 64\); got \(0,\)"),
+        ({"num_cells": (64, -1)}, "num_cells must be the widths"),
+        ({"num_cells": (2.5,)}, "num_cells must be the widths"),
+        ({"num_cells": 64}, "num_cells must be the widths .* got 64"),
+        ({"in_keys": ["obs"]}, "Unknown entry 'obs' in in_keys. Choose from: observation, "),
+        (
+            {"in_keys": [("state", "speed")]},
+            r"Unknown entry \('state', 'speed'\) in in_keys. Choose from: observation, ",
+        ),
+        ({"in_keys": ["state"]}, "Unknown entry 'state' in in_keys"),
+        ({"in_keys": [("state", "action_queue")]}, r"has shape \(4, 1, 4\) and a network reads vectors: flatten it"),
+    ],
+)
+def test_a_network_that_cannot_be_is_refused(env, make, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make(env, **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        (
+            {"in_keys": "observation"},
+            r'in_keys must be a list of entries, such as \["observation"\]; got \'observation',
+        ),
+        ({"in_keys": []}, "in_keys must be a list of entries"),
+        ({"action_init": [0.0, 0.0, 0.0]}, "action_init must be 4 numbers strictly between"),
+        ({"action_init": [1.0, 0.0, 0.0, 0.0]}, r"strictly between .* got \[1.0, 0.0, 0.0, 0.0\]"),
+        ({"action_init": [nan, 0.0, 0.0, 0.0]}, "strictly between"),
+        ({"scale_init": 0.0}, "scale_init must be positive, got 0.0"),
+    ],
+)
+def test_an_actor_that_cannot_be_is_refused(env, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make_actor(env, **kwargs)
+
+
+def test_an_actor_needs_an_action_with_bounds():
+    env = PendulumEnv()
+    env.action_spec = Unbounded(env.action_spec.shape)
+    with pytest.raises(ValueError, match="make_actor needs an action with bounds, a Bounded spec; got Unbounded"):
+        make_actor(env)
+
+
+def test_networks_may_read_whole_numbers(env64):
+    network = make_value(env64, in_keys=[("state", "step"), "success", "observation"])
+    assert network(env64.reset())["state_value"].dtype is torch.float64
+
+
+# -- losses ------------------------------------------------------------------------------------------------------------
+
+
+def losses(env):
+    actor = make_actor(env)
+    return [BPTTLoss(actor), SHACLoss(actor, make_value(env)), ABPTLoss(actor, make_qvalue(env))]
+
+
+def test_a_rollout_without_a_time_dimension_is_refused(env, flight):
+    rollout, carry = flight
+    message = (
+        r"needs a rollout of batch size \(\*, horizon\), whose last dimension is time; got \({}.*Give it what diff"
+    )
+    for loss in losses(env):
+        for wrong, shape in (
+            (rollout[:, 0], "4,"),
+            (rollout.reshape(-1), "12,"),
+            (rollout[:, :0], "4, 0"),
+            (carry, "4,"),
+        ):
+            with pytest.raises(ValueError, match=f"{type(loss).__name__} {message.format(shape)}"):
+                loss(wrong)
+        with pytest.raises(ValueError, match=message.format("3, 4")):
+            loss(rollout.transpose(0, 1))
+        loss(rollout[0])  # a single flight, whose dimension has the name of time
+
+
+@pytest.mark.parametrize(
+    "key", ["action", "next", *(("next", key) for key in ("reward", "done", "terminated", "observation"))]
+)
+def test_a_rollout_that_lacks_an_entry_is_refused(env, flight, key):
+    for loss in losses(env):
+        if key in loss.in_keys or key == "next":
+            named = "reads .*'next'" if key == "next" else f"reads {key!r}".replace("(", r"\(").replace(")", r"\)")
+            with pytest.raises(ValueError, match=f"{type(loss).__name__} {named}.*not in the rollout.*set_keys"):
+                loss(flight[0].exclude(key))
+
+
+def test_a_wrong_tensor_key_is_refused(env, flight):
+    for loss in losses(env):
+        loss.set_keys(reward="gain")
+        with pytest.raises(
+            ValueError, match=r"reads \('next', 'gain'\), which is not in the rollout. If it has another"
+        ):
+            loss(flight[0])
+        with pytest.raises(ValueError, match="rewards is not an accepted tensordict key"):
+            loss.set_keys(rewards="gain")
+
+
+def test_a_rollout_on_another_device_is_refused(env, flight):
+    for loss in losses(env)[1:]:
+        with pytest.raises(ValueError, match="is on cpu, and the rollout on meta: loss.to.'meta'. moves it"):
+            loss(flight[0].to("meta"))
+
+
+def test_networks_in_each_others_place_are_refused(env, flight):
+    actor, value, qvalue = make_actor(env), make_value(env), make_qvalue(env)
+    for loss, reads, writes in (
+        (SHACLoss(actor, qvalue), "'state_value' of its value_network", "state_action_value"),
+        (ABPTLoss(actor, value), "'state_action_value' of its qvalue_network", "state_value"),
+        (SHACLoss(value, actor), "'state_value' of its value_network", "loc, scale, action"),
+    ):
+        with pytest.raises(
+            ValueError, match=f"reads {reads}, which writes {writes}. Give another network, or set_keys"
+        ):
+            loss(flight[0])
+
+
+def test_a_loss_takes_modules_for_tensordicts(env):
+    with pytest.raises(TypeError, match="actor_network must be a TensorDictModule, got Linear. Wrap a plain module"):
+        BPTTLoss(nn.Linear(13, 4))
+    with pytest.raises(TypeError, match="value_network must be a TensorDictModule, got Linear"):
+        SHACLoss(make_actor(env), nn.Linear(13, 1))
+    with pytest.raises(ValueError, match="at least one critic, got num_qvalue_nets=2.5"):
+        ABPTLoss(make_actor(env), make_qvalue(env), num_qvalue_nets=2.5)

@@ -1,0 +1,284 @@
+"""What holds of every state and every action, searched for counterexamples."""
+
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import hypothesis.strategies as st
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis.configuration import set_hypothesis_home_dir
+from hypothesis.extra.numpy import arrays
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+
+from torchrl_quad import VisitedStateBuffer, make_env
+from torchrl_quad.dynamics import quaternion
+from torchrl_quad.envs import TASKS
+
+N = 3
+DRONE = "position", "quaternion", "velocity", "angular_velocity", "rotor_speed"
+set_hypothesis_home_dir(Path(tempfile.gettempdir(), "hypothesis"))  # what it keeps does not belong among the sources
+search = settings(max_examples=25, deadline=None, derandomize=True, database=None)
+each_task = pytest.mark.parametrize("task", TASKS)
+
+
+@cache
+def env_of(task, dtype=torch.float64):
+    return make_env(task, num_envs=N, dtype=dtype, max_episode_steps=50)
+
+
+def numbers(bound, *shape):
+    """Arrays of numbers up to a bound, the round and the tiny among them."""
+    return arrays("float64", (N, *shape), elements=st.floats(-bound, bound), fill=st.nothing())
+
+
+def wild(bound):
+    """As numbers up to the bound, and now and then of any size that is finite."""
+    return st.one_of(numbers(bound, 3), arrays("float64", (N, 3), elements=st.floats(-1e300, 1e300)))
+
+
+@st.composite
+def flights(draw, calm=True):
+    """Drones anywhere, turned, moving and in any step of their episode, and actions; calm ones within the model."""
+    motion = numbers if calm else lambda bound, _: wild(bound)
+    turned = torch.from_numpy(draw(numbers(1.0, 4))) + 1e-3
+    return {
+        "seed": draw(st.integers(0, 9)),
+        "position": draw(motion(8.0, 3)),
+        "quaternion": turned / turned.norm(dim=-1, keepdim=True),
+        "velocity": draw(motion(20.0, 3)),
+        "angular_velocity": draw(motion(10.0, 3)),
+        "rotors": draw(numbers(1.0, 4)),
+        "queued": draw(numbers(1.0, 4)),
+        "step": draw(arrays("int64", (N, 1), elements=st.integers(0, 10**6 if not calm else 60))),
+        "action": draw(numbers(1.0 if calm else 3.0, 4)),
+    }
+
+
+def start(env, flight):
+    """The flight's state, in a task's own starts, with its action."""
+    env.set_seed(flight["seed"])
+    state = TensorDict({"state": env.sample_initial_state(N)}, [N])["state"]
+    low, high = env.nominal.rotor_speed_min, env.nominal.rotor_speed_max
+    values = {name: torch.as_tensor(value).to(env.dtype).clamp(-3e38, 3e38) for name, value in flight.items()}
+    for name in DRONE[:-1]:
+        state[name] = values[name]
+    state["rotor_speed"] = low + (high - low) * (0.5 + 0.5 * values["rotors"])
+    state["action_queue"] = values["queued"].unsqueeze(1)
+    state["step"] = torch.as_tensor(flight["step"])
+    return TensorDict({"state": state, "action": values["action"]}, [N])
+
+
+def step(env, td):
+    return env.step(td.copy())["next"]
+
+
+def leaves(td):
+    return dict(td.items(include_nested=True, leaves_only=True))
+
+
+def equal(one, other):
+    return one.keys() == other.keys() and all(torch.equal(x, other[key]) for key, x in one.items())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@each_task
+@search
+@given(flight=flights(calm=False))
+def test_a_step_from_anywhere_is_finite_and_so_are_its_derivatives(task, dtype, flight):
+    env = env_of(task, dtype)
+    td = start(env, flight)
+    inputs = [td["action"], *(x for x in leaves(td["state"]).values() if x.is_floating_point())]
+    for x in inputs:
+        x.requires_grad_()
+    ends = step(env, td)
+    assert all(x.isfinite().all() for x in leaves(ends).values())
+    grads = torch.autograd.grad(ends["reward"].sum() + ends["observation"].sum(), inputs, allow_unused=True)
+    assert all(x is None or x.isfinite().all() for x in grads)
+    unit = ends["state", "quaternion"].norm(dim=-1)
+    torch.testing.assert_close(unit, torch.ones_like(unit), atol=1e-5, rtol=0)
+
+
+@each_task
+@search
+@given(flight=flights(calm=False))
+def test_rewards_are_the_sum_of_their_terms_and_flags_agree(task, flight):
+    env = env_of(task)
+    ends = step(env, start(env, flight))
+    torch.testing.assert_close(sum(ends["reward_terms"].values()), ends["reward"])
+    assert torch.equal(ends["done"], ends["terminated"] | ends["truncated"])
+    assert torch.equal(ends["terminated"], ends["crash"] | (ends["success"] & env.ends_on_success))
+    assert torch.equal(ends["truncated"], ends["state", "step"] >= env.max_episode_steps)
+    assert not (ends["crash"] & ends["success"] & env.ends_on_success).any()
+
+
+@each_task
+@search
+@given(flight=flights(calm=False))
+def test_the_specs_contain_whatever_a_step_or_a_reset_makes(task, flight):
+    env = env_of(task)
+    td = start(env, flight)
+    for made in (step(env, td), env.reset(td.select("state"), set_state=True)):
+        assert env.observation_spec.is_in(made.select(*env.observation_spec.keys()))
+        assert env.state_spec.is_in(made.select("state"))
+        assert env.done_spec.is_in(made.select(*env.done_spec.keys()))
+
+
+@each_task
+@search
+@given(flight=flights(calm=False))
+def test_a_step_is_a_pure_function_of_its_input(task, flight):
+    env = env_of(task)
+    td = start(env, flight)
+    before = td.clone()
+    first, env.rng = step(env, td), torch.Generator().manual_seed(99)
+    assert equal(leaves(first), leaves(step(env, td)))
+    assert equal(leaves(td), leaves(before))
+
+
+@each_task
+@search
+@given(flight=flights(calm=False))
+def test_a_reset_to_a_state_restores_it_to_the_last_bit(task, flight):
+    env = env_of(task)
+    td = start(env, flight)
+    restored = env.reset(td.select("state").clone(), set_state=True)["state"]
+    assert equal(leaves(restored), leaves(td["state"]))
+
+
+@each_task
+@search
+@given(flight=flights())
+def test_two_quaternions_of_one_attitude_fly_alike(task, flight):
+    env = env_of(task)
+    td = start(env, flight)
+    other = td.clone()
+    other["state", "quaternion"] = -td["state", "quaternion"]
+    one, two = step(env, td), step(env, other)
+    for key in ("reward", "crash", "success", ("state", "position"), ("state", "velocity"), ("state", "rotor_speed")):
+        torch.testing.assert_close(one[key], two[key], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(one["state", "quaternion"], -two["state", "quaternion"], rtol=1e-12, atol=1e-12)
+
+
+@each_task
+@search
+@given(flight=flights(), order=st.permutations(range(N)))
+def test_the_order_of_the_environments_is_that_of_the_results(task, flight, order):
+    env = env_of(task)
+    td = start(env, flight)
+    one, two = step(env, td)[list(order)], step(env, td[list(order)])
+    torch.testing.assert_close(leaves(one), leaves(two), rtol=1e-12, atol=1e-12)
+
+
+@search
+@given(flight=flights(), angle=st.floats(-7.0, 7.0))
+def test_a_world_turned_about_its_vertical_turns_the_flight(flight, angle):
+    env = env_of("hovering")
+    turn = quaternion.from_axis_angle(torch.tensor([[0.0, 0.0, angle]], dtype=torch.float64))
+
+    def turned(state):
+        rotated = {key: quaternion.rotate(turn, state[key]) for key in ("position", "velocity")}
+        return {**rotated, "quaternion": quaternion.multiply(turn.expand(N, 4), state["quaternion"])}
+
+    td = start(env, flight)
+    other = td.clone()
+    other["state"].update(turned(td["state"]))
+    for _ in range(3):
+        td, other = (x.copy().update({"state": step(env, x)["state"]}) for x in (td, other))
+    expected = td["state"].copy().update(turned(td["state"]))
+    for key in DRONE:
+        torch.testing.assert_close(other["state", key], expected[key], rtol=1e-9, atol=1e-9)
+
+
+@search
+@given(flight=flights())
+def test_rotors_keep_their_limits(flight):
+    env = env_of("hovering")
+    td = start(env, flight)
+    for _ in range(10):
+        td = td.copy().update({"state": step(env, td)["state"]})
+        speed = td["state", "rotor_speed"]
+        assert (speed >= env.nominal.rotor_speed_min * (1 - 1e-12)).all()
+        assert (speed <= env.nominal.rotor_speed_max * (1 + 1e-12)).all()
+
+
+@search
+@given(flight=flights())
+def test_body_rates_follow_their_command_and_hardly_exceed_the_limit(flight):
+    env = env_of("hovering")
+    td = env.reset().set("action", torch.as_tensor(flight["action"]))
+    td["action"][:, 0] = env.hover_action[0]
+    command = td["action"][:, 1:] * env.nominal.max_body_rate
+    for _ in range(50):
+        td = td.copy().update({"state": step(env, td)["state"]})
+        assert (td["state", "angular_velocity"].abs() < 1.25 * env.nominal.max_body_rate).all()
+    torch.testing.assert_close(td["state", "angular_velocity"], command, atol=1e-6, rtol=0)
+
+
+@search
+@given(flight=flights(calm=False))
+def test_actions_beyond_their_bounds_are_clamped(flight):
+    env = env_of("hovering")
+    td = start(env, {**flight, "action": flight["action"] * 10.0})
+    clamped = td.clone()
+    clamped["action"] = td["action"].clamp(-1.0, 1.0)
+    for _ in range(3):
+        td, clamped = (x.copy().update({"state": step(env, x)["state"]}) for x in (td, clamped))
+    assert all(torch.equal(td["state", key], clamped["state", key]) for key in DRONE)
+
+
+@each_task
+@search
+@given(flight=flights(), steps=st.integers(1, 6))
+def test_a_rollout_is_so_many_steps(task, flight, steps):
+    env = env_of(task)
+    td = start(env, flight)
+    again = env.reset()["state"]
+    env.set_initial_state_source(lambda n: again)
+    action = td["action"]
+    policy = TensorDictModule(lambda _: action, in_keys=["observation"], out_keys=["action"])
+    carry = env.reset(td.select("state"), set_state=True)
+    options = {"auto_reset": False, "break_when_any_done": False}
+    whole = env.rollout(steps, policy, tensordict=carry.clone(), **options)
+    for t in range(steps):
+        one, carry = env.step_and_maybe_reset(carry.set("action", action))
+        torch.testing.assert_close(leaves(whole[:, t]), leaves(one), rtol=1e-12, atol=1e-12)
+    env.set_initial_state_source(None)
+
+
+@each_task
+@search
+@given(flight=flights(calm=False), terminated=arrays("bool", (N, 1)), nan=st.booleans())
+def test_the_visited_state_buffer_gives_back_what_it_was_given(task, flight, terminated, nan):
+    env = env_of(task)
+    td = start(env, flight).set("terminated", torch.as_tensor(terminated))
+    if nan:
+        td["state", "velocity"][0] = torch.nan
+    buffer = VisitedStateBuffer(10)
+    buffer.extend(td)
+    good = ~td["terminated"][:, 0] & torch.tensor([not nan, True, True])
+    assert len(buffer) == good.sum()
+    if len(buffer):
+        kept = [{key: x[i] for key, x in leaves(td["state"]).items()} for i in good.nonzero().flatten()]
+        given_back = buffer.initial_state(env, 1.0)["state"]
+        for i in range(N):
+            assert any(equal({key: x[i] for key, x in leaves(given_back).items()}, state) for state in kept)
+
+
+@each_task
+@search
+@given(flight=flights())
+def test_the_hover_action_holds_any_place_and_heading(task, flight):
+    env = env_of(task)
+    td = start(env, flight)
+    yaw = torch.as_tensor(flight["queued"])[:, :1] * 4.0
+    state = env.hover_state(td["state", "position"])
+    state["quaternion"] = quaternion.from_axis_angle(torch.cat((0 * yaw, 0 * yaw, yaw), -1))
+    td["state"].update({**state, "action_queue": env.hover_action.expand(N, 1, 4)})
+    td["action"] = env.hover_action.expand(N, 4)
+    for _ in range(10):
+        td = td.copy().update({"state": step(env, td)["state"]})
+    for key in DRONE:
+        torch.testing.assert_close(td["state", key], state[key], rtol=1e-9, atol=1e-9)

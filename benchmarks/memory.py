@@ -27,6 +27,7 @@ from throughput import FixedActions
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 from torchrl.envs import EnvBase
+from tqdm import tqdm
 
 from torchrl_quad import differentiable_rollout, make_env
 from torchrl_quad.envs.horizon import Ends, Rows
@@ -91,7 +92,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=RESULTS / "memory.csv")
     args = parser.parse_args()
     rows = []
-    for mode in args.modes:
+    for mode in tqdm(args.modes):
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
             rows.append(pool.submit(measure, mode, args.num_envs, args.horizon, args.rounds).result())
     save(args.output, rows, num_envs=args.num_envs, horizon=args.horizon)

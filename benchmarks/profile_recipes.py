@@ -20,6 +20,7 @@ from pathlib import Path
 import torch
 from report import RESULTS, save
 from tensordict.nn import ProbabilisticTensorDictSequential
+from tqdm import tqdm
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 sys.path.insert(0, str(RECIPES))
@@ -65,6 +66,7 @@ class Clocks:
 def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) -> dict[str, float | str]:
     """What each part of a recipe takes; changes the modules that it measures, and so wants a process of its own."""
     import common
+    import run
 
     import torchrl_quad
     from torchrl_quad import envs, objectives
@@ -84,27 +86,23 @@ def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) ->
     clocks.around(torch.optim.Adam, "step", "optimiser")
     clocks.around(torch.nn.utils, "clip_grad_norm_", "optimiser")
     clocks.around(common, "update_normalizer", "bookkeeping")
-    clocks.around(common.Run, "record", "logging")
+    clocks.around(run.Run, "record", "logging")
 
     # What is not physics in the backward pass belongs to the network whose optimiser is about to step.
-    descend, first = common.descend, []
+    descend, iterate = run.Run.descend, run.Run.__iter__
+    total, count = 0.0, 0
 
-    def timed_descend(optimizer, loss, norm):
-        first.append(optimizer) if not first else None
-        clocks.switch("actor" if optimizer is first[0] else "critic")
+    def timed_descend(self, name, *arguments):
+        clocks.switch(name)
         try:
-            return descend(optimizer, loss, norm)
+            descend(self, name, *arguments)
         finally:
             clocks.switch(None)
 
-    common.descend = timed_descend
-    total, count = 0.0, 0
-    iterate = common.Run.__iter__
-
-    def timed_iterations(run):
+    def timed_iterations(self):
         nonlocal total, count
-        run.cfg.eval.interval = 10**9
-        for iteration in iterate(run):
+        self.cfg.eval.interval = 10**9
+        for iteration in iterate(self):
             if iteration == skip:
                 clocks.seconds.clear()
             start = time.perf_counter()
@@ -116,7 +114,7 @@ def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) ->
             if count == iterations:
                 return
 
-    common.Run.__iter__ = timed_iterations
+    run.Run.descend, run.Run.__iter__ = timed_descend, timed_iterations
     torchrl_quad.differentiable_rollout = rollouts.differentiable_rollout
     with tempfile.TemporaryDirectory() as folder:
         sys.argv = [algorithm, f"hydra.run.dir={folder}/run", "total_steps=1_000_000_000", *overrides]
@@ -134,7 +132,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=RESULTS / "profile.csv")
     args = parser.parse_args()
     rows = []
-    for algorithm in args.algorithms:
+    for algorithm in tqdm(args.algorithms):
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
             rows.append(pool.submit(profile, algorithm, args.overrides, args.skip, args.iterations).result())
     save(args.output, rows, overrides=" ".join(args.overrides))

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import itertools
 import time
 from collections.abc import Callable
 from functools import partial
@@ -30,6 +31,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
+from tqdm import tqdm
 
 from torchrl_quad import differentiable_rollout, make_actor, make_env
 from torchrl_quad.dynamics import QuadrotorState, control_step
@@ -186,11 +188,10 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     rows = finished(args.output)
-    for mode in args.modes:
-        for n in args.num_envs:
-            if not any(row["num_envs"] == str(n) and row["mode"] == mode for row in rows):
-                rows += measure(n, mode, args.task, args.horizon, args.rounds, args.device)
-                save(args.output, rows, task=args.task, horizon=args.horizon, unit="1000 control steps per second")
+    for mode, n in tqdm(list(itertools.product(args.modes, args.num_envs))):
+        if not any(row["num_envs"] == str(n) and row["mode"] == mode for row in rows):
+            rows += measure(n, mode, args.task, args.horizon, args.rounds, args.device)
+            save(args.output, rows, task=args.task, horizon=args.horizon, unit="1000 control steps per second")
 
 
 if __name__ == "__main__":

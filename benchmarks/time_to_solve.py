@@ -9,6 +9,7 @@ Nothing is left out of the clock: imports, compilation and evaluations count. "C
 
 import argparse
 import csv
+import itertools
 import os
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import time
 from pathlib import Path
 
 from report import RESULTS, finished, save
+from tqdm import tqdm
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -57,19 +59,18 @@ def main() -> None:
     args = parser.parse_args()
     rows = finished(args.output)
     with tempfile.TemporaryDirectory() as cache:
-        for algorithm in args.algorithms:
-            for seed in args.seeds:
-                for mode in args.modes:  # "warm" follows "cold", and finds its cache
-                    key = {"algorithm": algorithm, "seed": str(seed), "mode": mode}
-                    if any(all(row[name] == value for name, value in key.items()) for row in rows):
-                        continue
-                    folder = Path(cache) / f"{algorithm}{seed}"
-                    compile = f"compile={'false' if mode == 'eager' else 'true'}"
-                    if mode == "warm" and not folder.exists():
-                        solve(algorithm, seed, [*args.overrides, compile], folder)
-                    seconds = solve(algorithm, seed, [*args.overrides, compile], folder)
-                    rows.append({**key, "seconds": "never" if seconds is None else round(seconds, 1)})
-                    save(args.output, rows, overrides=" ".join(args.overrides))
+        # "warm" follows "cold", and finds its cache.
+        for algorithm, seed, mode in tqdm(list(itertools.product(args.algorithms, args.seeds, args.modes))):
+            key = {"algorithm": algorithm, "seed": str(seed), "mode": mode}
+            if any(all(row[name] == value for name, value in key.items()) for row in rows):
+                continue
+            folder = Path(cache) / f"{algorithm}{seed}"
+            compile = f"compile={'false' if mode == 'eager' else 'true'}"
+            if mode == "warm" and not folder.exists():
+                solve(algorithm, seed, [*args.overrides, compile], folder)
+            seconds = solve(algorithm, seed, [*args.overrides, compile], folder)
+            rows.append({**key, "seconds": "never" if seconds is None else round(seconds, 1)})
+            save(args.output, rows, overrides=" ".join(args.overrides))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from common import (
     minibatches,
     network,
     own_seed,
+    restart,
     set_up,
     update_normalizer,
 )
@@ -37,7 +38,7 @@ def main(cfg: DictConfig) -> None:
     run = Run(cfg, env, actor, loss, parts, buffer)
     for _ in run:
         # The actor: up the N-step and the 0-step return of one horizon, through the dynamics.
-        rollout, _ = differentiable_rollout(env, actor, run.carry, cfg.horizon)
+        rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         loss_actor, actor_metrics = loss.loss_actor(rollout)
         loss_alpha = actor_metrics.get("loss_alpha", 0.0)
         run.descend("actor", actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
@@ -53,7 +54,10 @@ def main(cfg: DictConfig) -> None:
         # The next horizon starts where the policy has been before, and in part afresh.
         update_normalizer(env, data)
         buffer.extend(data)
-        run.carry = buffer.initial_state(env, cfg.buffer.fraction)
+        if cfg.buffer.fraction is None:  # or where the last one has ended
+            run.carry = restart(env, end, cfg.restart_fraction)
+        else:
+            run.carry = buffer.initial_state(env, cfg.buffer.fraction)
 
         actor_schedule.step()
         critic_schedule.step()

@@ -217,6 +217,7 @@ def test_a_lap_is_timed_from_a_gate_to_the_same_gate_and_eight_gates_succeed():
     assert metrics["success"].item() == 1.0
     assert metrics["gates_passed"].item() == 9.0
     assert metrics["lap_time"].item() == pytest.approx(0.04)
+    assert metrics["time_near_gate"].item() == pytest.approx(9 * 0.02)  # [s]; both gates are within 1 m all the time
     assert env.episode_metrics(flight[:, :2])["lap_time"].isnan().all()
 
 

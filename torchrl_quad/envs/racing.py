@@ -184,9 +184,11 @@ class RacingEnv(QuadrotorEnv):
         return {"gates_passed": state["gates_passed"].to(self.dtype), "lap_time": state["lap_time"]}
 
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
-        """Gives a ``lap_time`` only to drones that flew a full lap."""
+        """Gives a ``lap_time`` only to drones that flew a full lap; adds ``time_near_gate``, within 1 m of the next."""
         metrics = super().episode_metrics(rollout)
-        return {**metrics, "lap_time": torch.where(metrics["lap_time"] > 0, metrics["lap_time"], torch.nan)}
+        lap_time = torch.where(metrics["lap_time"] > 0, metrics["lap_time"], torch.nan)
+        near = (distance(rollout["next", "state"]) < 1.0) & self.first_episode(rollout)
+        return {**metrics, "lap_time": lap_time, "time_near_gate": self.control_dt * near.sum((1, 2)).to(self.dtype)}
 
 
 def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:

@@ -148,7 +148,7 @@ def main() -> None:
     if args.quick and args.data == DATA:
         parser.error("--quick gives no results to keep: name another folder with --data.")
 
-    rates = LEARNING_RATES[2:3] if args.quick else LEARNING_RATES
+    rates = LEARNING_RATES[1:2] if args.quick else LEARNING_RATES
     searches = search_jobs(tuple(args.tasks), rates)
     todo = [*searches, *jobs(tuple(args.experiments), tuple(args.tasks), tuple(args.seeds))]
     waiting = [job for job in todo if not is_kept(job, args.data)]

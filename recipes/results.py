@@ -1,0 +1,204 @@
+"""Figures, tables and verdicts of the results of reproduce.py; no run is needed for it.
+
+python recipes/results.py
+
+Reads docs/results/data, draws into docs/results, and puts the tables between the markers of docs/results.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from checkpoints import replacing
+from claims import CLAIMS, METHODS, NotRunError, Results, Verdict, try_claim
+from matrix import EXPERIMENTS, LEARNING_RATES, SEEDS, TASKS, VARIANTS
+from reproduce import DATA, best_learning_rate, read
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+COLORS = {"abpt": "#c8452f", "shac": "#2f6db5", "bptt": "#3b9c5a", "ppo": "#7d7d7d"}
+FIGURES = {  # file: experiment, and what is drawn
+    "main": (METHODS, TASKS, "return"),
+    "ablation": (("abpt", *EXPERIMENTS["ablation"][0]), TASKS, "return"),
+    "relaxation": (("abpt", "bptt", "shac", *EXPERIMENTS["relaxation"][0]), ("racing",), "gates_passed"),
+    "reward": ((*METHODS, *EXPERIMENTS["reward"][0]), ("racing",), "gates_passed"),
+    "differences": (("abpt", "shac", *EXPERIMENTS["differences"][0]), ("landing", "racing"), "return"),
+}
+COLUMNS = {  # of the table of ends: heading, column of the curves, factor, digits
+    "return": ("return", 1, 2),
+    "success [%]": ("success", 100, 0),
+    "gates": ("gates_passed", 1, 1),
+    "error [cm]": ("position_error", 100, 1),
+}
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table in Markdown."""
+    lines = [list(head), ["---" for _ in head], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def spread(values: np.ndarray, factor: float = 1.0, digits: int = 2) -> str:
+    """The mean over seeds, and from the least to the greatest."""
+    values = factor * values[np.isfinite(values)]
+    if len(values) == 0:
+        return ""
+    return f"{values.mean():.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
+
+
+def draw(results: Results, path: Path, variants: Iterable[str], tasks: Iterable[str], column: str) -> bool:
+    """Curves over steps and over seconds: the mean over seeds, and the band from the least to the greatest."""
+    tasks = [task for task in tasks if any((task, variant) in results.curves for variant in variants)]
+    if not tasks:
+        return False
+    figure, axes = plt.subplots(2, len(tasks), figsize=(4.2 * len(tasks), 6.4), layout="constrained", squeeze=False)
+    shades = plt.get_cmap("tab20")
+    for (row, axis), k in ((x, k) for x in enumerate(("steps", "seconds")) for k in range(len(tasks))):
+        for i, variant in enumerate(variants):
+            try:
+                times, values = (results.column(tasks[k], variant, name) for name in (axis, column))
+            except NotRunError:
+                continue
+            # Seeds share their steps, and not their seconds: all are drawn on the grid of the mean.
+            n = min(map(len, times))
+            grid = np.mean([x[:n] for x in times], 0)
+            band = np.array([np.interp(grid, t, y) for t, y in zip(times, values, strict=True)])
+            color = COLORS.get(variant, shades(i))
+            axes[row, k].plot(grid, band.mean(0), color=color, linewidth=1.5, label=VARIANTS[variant].label)
+            axes[row, k].fill_between(grid, band.min(0), band.max(0), color=color, alpha=0.15, linewidth=0)
+        axes[row, k].set(xlabel={"steps": "control steps", "seconds": "seconds"}[axis], xscale="log")
+        axes[row, k].grid(alpha=0.3)
+        if row == 0:
+            axes[row, k].set_title(tasks[k])
+        if k == 0:
+            axes[row, k].set_ylabel(column.replace("_", " "))
+    axes[0, 0].legend(fontsize=8, frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return True
+
+
+def search_table(data: Path) -> str:
+    """What the search for learning rates found, and what it took."""
+    finals = [row for row in read(data / "final.csv") if row["lr"]]
+    rows = []
+    for method in METHODS:
+        own = [row for row in finals if row["variant"] == method]
+        found = [best_learning_rate(task, method, data, LEARNING_RATES) for task in TASKS]
+        steps, seconds = (sum(float(row[name] or 0) for row in own) for name in ("steps", "seconds"))
+        rates = ["not complete" if lr is None else f"{lr:g}" for lr in found]
+        rows.append([VARIANTS[method].label, *rates, f"{len(own)}", f"{steps / 1e6:.1f} M", f"{seconds:.0f}"])
+    return table(["", *TASKS, "runs", "control steps", "seconds"], rows)
+
+
+def ends_table(results: Results, experiment: str) -> str:
+    """Where the curves of an experiment end, and when they have converged."""
+    variants, tasks = EXPERIMENTS[experiment]
+    if experiment != "main":
+        variants = (*dict.fromkeys(VARIANTS[variant].algorithm for variant in variants), *variants)
+    rows = []
+    for task, variant in ((task, variant) for task in tasks for variant in variants):
+        try:
+            columns = [results.end(task, variant, name) for name, _, _ in COLUMNS.values()]
+            until = [results.until(task, variant, axis) for axis in ("steps", "seconds")]
+        except NotRunError:
+            continue
+        cells = [spread(x, factor, digits) for x, (_, factor, digits) in zip(columns, COLUMNS.values(), strict=True)]
+        median = [f"{np.median(x) / scale:.{d}f}" for x, scale, d in zip(until, (1e6, 1), (2, 0), strict=True)]
+        median = ["never" if cell == "inf" else cell for cell in median]
+        rows.append([task, VARIANTS[variant].label, str(len(columns[0])), *cells, *median])
+    return table(["task", "", "seeds", *COLUMNS, "converged at [M steps]", "[s]"], rows)
+
+
+def ranking(results: Results) -> str:
+    """Who converges first, by steps and by seconds: medians over seeds."""
+    rows = []
+    for task in TASKS:
+        cells = []
+        for axis in ("steps", "seconds"):
+            try:
+                times = {method: np.median(results.until(task, method, axis)) for method in METHODS}
+            except NotRunError:
+                break
+            order = sorted(times, key=times.get)
+            cells.append(", ".join(VARIANTS[m].label + (" (never)" if math.isinf(times[m]) else "") for m in order))
+        rows.append([task, *(cells or ["", ""])])
+    return table(["task", "by steps", "by seconds"], rows)
+
+
+def claims_table(verdicts: list[Verdict]) -> str:
+    """The verdicts, and under each claim what they rest on."""
+    rows = [[v.claim.id, v.claim.text, f"**{v.verdict}**", str(v.seeds or "")] for v in verdicts]
+    blocks = [table(["", "the paper's claim", "verdict", "seeds"], rows), "### What the verdicts rest on"]
+    for v in verdicts:
+        if v.parts:
+            head = ["part", "value", "95 % interval", "must be", "verdict"]
+            blocks.append(f"**{v.claim.id}** {v.claim.text}\n\n" + table(head, map(part_row, v.parts)))
+    return "\n\n".join(blocks)
+
+
+def part_row(part) -> list[str]:
+    """A part of a claim as a row."""
+    bounds = [
+        f"> {part.low:g}" if math.isfinite(part.low) else "",
+        f"< {part.high:g}" if math.isfinite(part.high) else "",
+    ]
+    interval = "{:.3g} to {:.3g}".format(*part.interval)
+    return [
+        part.what.replace(">", "&gt;"),
+        f"{part.value:.3g}",
+        interval,
+        " and ".join(filter(None, bounds)),
+        part.verdict,
+    ]
+
+
+def page(data: Path, pictures: Path) -> str:
+    """The generated part of docs/results.md."""
+    results = Results(data)
+    verdicts = [try_claim(claim, results) for claim in CLAIMS]
+    finals = read(data / "final.csv")
+    hours = sum(float(row["seconds"] or 0) for row in finals) / 3600
+    machines = sorted({row["machine"] for row in finals})
+    seeds = {seed for runs in results.curves.values() for seed in runs}
+    blocks = [
+        f"{len(finals)} runs, {hours:.1f} hours of training, each run on one core of {', '.join(machines) or 'none'}; "
+        f"seeds {', '.join(str(seed) for seed in SEEDS if seed in seeds) or 'none yet'}.",
+        "## Verdicts",
+        claims_table(verdicts),
+        "## Rankings",
+        ranking(results),
+        "## Learning rates",
+        search_table(data),
+    ]
+    for name, (variants, tasks, column) in FIGURES.items():
+        blocks.append(f"## {name.capitalize()}")
+        if draw(results, pictures / f"{name}.png", variants, tasks, column):
+            blocks.append(f"![Curves of the experiment: {name}](results/{name}.png)")
+        blocks.append(ends_table(results, name))
+    return "\n\n".join(blocks)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--page", type=Path, default=DATA.parent.parent / "results.md")
+    args = parser.parse_args()
+    new = page(args.data, args.page.parent / "results")
+    begin, end = "<!-- generated by recipes/results.py -->", "<!-- end -->"
+    old = args.page.read_text() if args.page.exists() else f"# Results\n\n{begin}\n{end}\n"
+    with replacing(args.page) as path:
+        path.write_text(re.sub(f"{begin}.*?{end}", lambda _: f"{begin}\n\n{new}\n\n{end}", old, flags=re.DOTALL))
+    print(args.page)
+
+
+if __name__ == "__main__":
+    main()

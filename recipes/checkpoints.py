@@ -16,7 +16,17 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 FORMAT = 1  # of checkpoint.pt; to be raised when an older file can no longer be read
-FREE_ON_RESUME = ("resume", "total_steps", "device", "threads", "compile", "max_skipped", "eval", "logger")
+FREE_ON_RESUME = (
+    "resume",
+    "total_steps",
+    "device",
+    "threads",
+    "compile",
+    "max_skipped",
+    "diagnostics",
+    "eval",
+    "logger",
+)
 
 # A run that resumes goes on in the folder of its checkpoint; hydra.run.dir asks for it by this name.
 OmegaConf.register_new_resolver(

@@ -272,9 +272,8 @@ def c17(r: Results) -> Iterable[Part]:
 
 def c18(r: Results) -> Iterable[Part]:
     """Exact: a gradient is zero or is not."""
-    rows = [
-        x for x in read(r.data / "audit.csv") if x["task"] == "racing" and x["term"] == "gate" and float(x["return"])
-    ]
+    rows = [x for x in read(r.data / "audit.csv") if x["reward"] in ("position", "velocity") and x["term"] == "gate"]
+    rows = [x for x in rows if float(x["mean_return"])]
     if not rows:
         raise NotRunError("the audit of racing")
     norms = [float(row["gradient_norm"]) for row in rows]

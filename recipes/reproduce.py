@@ -19,6 +19,7 @@ import sys
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
+from audits import audit_tasks
 from checkpoints import replacing
 from hydra import compose, initialize_config_dir
 from matrix import EVALUATIONS, EXPERIMENTS, LEARNING_RATES, SEEDS, TASKS, VARIANTS, Job, jobs, search_jobs
@@ -148,6 +149,7 @@ def main() -> None:
     if args.quick and args.data == DATA:
         parser.error("--quick gives no results to keep: name another folder with --data.")
 
+    write(args.data / "audit.csv", audit_tasks())
     rates = LEARNING_RATES[1:2] if args.quick else LEARNING_RATES
     searches = search_jobs(tuple(args.tasks), rates)
     todo = [*searches, *jobs(tuple(args.experiments), tuple(args.tasks), tuple(args.seeds))]

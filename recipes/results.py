@@ -145,6 +145,22 @@ def claims_table(verdicts: list[Verdict]) -> str:
     return "\n\n".join(blocks)
 
 
+def audit_table(data: Path) -> str:
+    """What each term of each reward gives to return and gradient."""
+    rows = [
+        [
+            x["task"],
+            x["reward"],
+            x["term"],
+            f"{float(x['return_share']):.1%}",
+            f"{float(x['gradient_share']):.1%}",
+            x["verdict"],
+        ]
+        for x in read(data / "audit.csv")
+    ]
+    return table(["task", "reward", "term", "share of the return", "share of the gradient", "verdict"], rows)
+
+
 def part_row(part) -> list[str]:
     """A part of a claim as a row."""
     bounds = [
@@ -174,6 +190,8 @@ def page(data: Path, pictures: Path) -> str:
         f"seeds {', '.join(str(seed) for seed in SEEDS if seed in seeds) or 'none yet'}.",
         "## Verdicts",
         claims_table(verdicts),
+        "## Reward audit",
+        audit_table(data),
         "## Rankings",
         ranking(results),
         "## Learning rates",

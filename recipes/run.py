@@ -8,6 +8,7 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +37,17 @@ from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
 import torchrl_quad
-from torchrl_quad import VisitedStateBuffer
+from torchrl_quad import (
+    VisitedStateBuffer,
+    audit_reward,
+    compare_gradients,
+    differentiable_rollout,
+    gradient_statistics,
+)
+from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.render import animate_flight, plot_flight, plot_learning_curve
 
+CELL = 0.5  # [m]: train/start_cells counts the cubes of this size in which horizons have started
 UNITS = {  # how the metrics of an evaluation are printed: factor and unit
     "position_error": (100, "cm (median)"),
     "tracking_rmse": (100, "cm (median)"),
@@ -86,8 +95,10 @@ class Run:
         self.cfg, self.env, self.actor, self.loss, self.buffer = cfg, env, actor, loss, buffer
         self.parts = [loss, *parts, *([env.transform] if cfg.normalize else [])]
         self.iterations = iterations(cfg)
+        self.audits = cfg.get("diagnostics", 0)  # a run begun before there were any has no such setting
         self.steps_per_iteration = cfg.num_envs * cfg.horizon * world_size()
         self.recorded: dict[str, list[float]] = defaultdict(list)
+        self.starts: list[Tensor] = []  # positions in which the horizons since the last row have started
         self.rows: list[dict[str, float]] = []  # of metrics.csv
         self.done, self.seconds, self.skipped = 0, 0.0, 0
         self.best: dict[str, Any] = {"return": -math.inf}
@@ -113,7 +124,9 @@ class Run:
 
     def __iter__(self) -> Iterator[int]:
         if self.is_over:
-            print(f"Finished before: {self.folder}")
+            if rank() == 0:
+                print(f"Finished before: {self.folder}")
+            self._leave()
             return
         if self.cfg.compile and self.done < self.iterations:
             self._warm_up()
@@ -128,6 +141,7 @@ class Run:
             disable=rank() > 0,
         ) as bar:
             for iteration in range(self.done, self.iterations):
+                self.starts.append(self.carry["state", "position"].clone())
                 yield iteration
                 self.done += 1
                 bar.update(step)
@@ -135,11 +149,11 @@ class Run:
                     if rank() == 0:
                         metrics = self._evaluate(start)
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, {metrics['eval/success']:.0%}")
+                    self.starts.clear()
                     self._save(self.folder / "checkpoint.pt")
         if rank() == 0:
             self._finish()
-        if dist.is_initialized():
-            dist.destroy_process_group()
+        self._leave()
 
     def descend(self, name: str, optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
         """One clipped step down a loss, averaged over all processes; records the norm of its gradient.
@@ -185,7 +199,7 @@ class Run:
         """Compile the step and its derivative before the clock starts; change nothing."""
         with torch.random.fork_rng(), drawing_from(self.env, self.cfg.eval.seed):
             rollout = self.env.rollout(2, self.actor, break_when_any_done=False)
-            if self.cfg.algorithm != "ppo":  # which takes no derivative of the step
+            if self.cfg.algorithm != "ppo" or self.audits:  # PPO itself takes no derivative of the step
                 rollout["next", "reward"].sum().backward()
                 self.actor.zero_grad()
 
@@ -201,9 +215,12 @@ class Run:
             "time/seconds": self.seconds,
             "time/steps_per_second": steps / self.seconds,
             **{name: sum(values) / len(values) for name, values in self.recorded.items()},
+            "train/start_cells": len(torch.cat(self.starts).div(CELL).floor().unique(dim=0)),
             "grad/skipped": self.skipped,
             **metrics,
         }
+        if self.audits and (len(self.rows) + 1) % self.audits == 0:
+            row |= self._diagnose()
         self.recorded.clear()
         self.rows.append(row)
         self._write_rows()
@@ -216,6 +233,18 @@ class Run:
             policy = {"actor": self.actor, **({"normalizer": self.env.transform} if self.cfg.normalize else {})}
             weights = {name: copy.deepcopy(module.state_dict()) for name, module in policy.items()}
             self.best = {"return": metrics["eval/return"], "steps": steps, **weights}
+        return metrics
+
+    def _diagnose(self) -> dict[str, float]:
+        """What reward and gradient of the next horizon are made of; changes nothing."""
+        with torch.random.fork_rng(), drawing_from(self.env, self.cfg.eval.seed):
+            rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, self.cfg.horizon)
+            audit = audit_reward(rollout, self.actor, gamma=self.cfg.gamma)
+            metrics = {f"reward/{name}": share for name, share in audit.metrics().items()}
+            if isinstance(self.loss, PathwiseLoss):
+                comparison, statistics = compare_gradients(self.loss, rollout), gradient_statistics(self.loss, rollout)
+                metrics |= {f"grad/{name}": value for name, value in asdict(comparison).items()}
+                metrics |= {"grad/variance": statistics.variance, "grad/signal_to_noise": statistics.signal_to_noise}
         return metrics
 
     def _write_rows(self) -> None:
@@ -274,6 +303,11 @@ class Run:
             self.logger.shutdown()
         write_json(self.folder / "summary.json", summary)
         print_summary(summary, self.folder)
+
+    def _leave(self) -> None:
+        """Part from the other processes."""
+        if dist.is_initialized():
+            dist.destroy_process_group()
 
     # -- stopping and going on -----------------------------------------------------------------------------------------
 

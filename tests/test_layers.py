@@ -16,6 +16,7 @@ ALLOWED = {  # what each part of the package may import of the others
     "modules": set(),
     "objectives": set(),
     "data": set(),
+    "diagnostics": {"data", "objectives"},
     "gym": {"envs"},
 }
 
@@ -27,6 +28,7 @@ LIBRARIES = {
     "modules": TORCHRL,
     "objectives": TORCHRL,
     "data": TORCHRL,
+    "diagnostics": TORCHRL,
     "gym": {"gymnasium", "numpy", "torch"},
 }
 

@@ -146,6 +146,49 @@ def test_the_terminal_value_of_shac_has_its_gradient_in_the_state_and_none_in_th
     assert value.module.weight.grad is None
 
 
+def test_without_its_terminal_gradient_shac_has_the_value_of_shac_and_the_gradient_of_bptt():
+    actor, value, _ = make_networks()
+
+    def value_and_gradient(loss, rollout):
+        loss.make_value_estimator(gamma=GAMMA)
+        actor.module.weight.grad = None
+        objective = loss.loss_actor(rollout)[0]
+        objective.backward()
+        return objective.item(), actor.module.weight.grad.item()
+
+    def rollout():
+        """The next observations depend on the policy, too: they grow by its weight less 2."""
+        rollout = make_rollout(actor)
+        rollout["next", "observation"] = rollout["next", "observation"] + actor.module.weight - 2.0
+        return rollout
+
+    kept = value_and_gradient(SHACLoss(actor, value), rollout())
+    cut = value_and_gradient(SHACLoss(actor, value, terminal_gradient=False), rollout())
+    terminal = [90 / 4 + 50 / 4, 50 / 2]  # gamma^n V(s_n) of each environment, and its derivative: 10 gamma^n
+    assert cut[0] == kept[0] == -(sum(REWARDS) + sum(terminal)) / 2
+    assert cut[1] == value_and_gradient(BPTTLoss(actor), rollout())[1] == -sum(REWARDS) / 2 / 2
+    assert kept[1] == cut[1] - (10 / 4 + 10 / 4 + 10 / 2) / 2
+
+
+def test_the_objective_is_the_sum_of_its_parts():
+    actor, value, _ = make_networks()
+    shac = SHACLoss(actor, value, reduction="none").make_value_estimator(gamma=GAMMA)
+    abpt = make_abpt(actor, 10.0, reduction="none")
+    parts = {
+        BPTTLoss(actor, reduction="none").make_value_estimator(gamma=GAMMA): {"rewards": REWARDS},
+        shac: {"rewards": REWARDS, "terminal_value": [90 / 4 + 50 / 4, 50 / 2]},
+        abpt: {"n_step_return": [(14 + 27 + 15) / 2, (13.5 + 30) / 2], "zero_step_return": [48 / 2, 60 / 2]},
+    }
+    for loss, expected in parts.items():
+        rollout = make_rollout(actor)
+        found = loss.objective_parts(rollout)
+        assert {name: part.tolist() for name, part in found.items()} == expected
+        assert torch.equal(sum(found.values()), -loss.loss_actor(rollout)[0])
+        assert all(part.requires_grad for part in found.values())
+    with pytest.raises(ValueError, match="needs a rollout"):
+        shac.objective_parts(make_rollout(actor)[:, 0])
+
+
 def td_lambda(rewards, next_values, ends, terminations):
     """Backwards: G = r + gamma ((1 - lambda) V' + lambda G'), with V' = 0 when terminated and G' = V' at an end."""
     targets, following = [], None

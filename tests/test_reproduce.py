@@ -220,7 +220,7 @@ def synthetic(tmp_path, strong):
         write(tmp_path / f"curves/{task}.csv", rows)
     runs = [{"task": t, "variant": v, "seed": s} for t in matrix.TASKS for v in matrix.VARIANTS for s in matrix.SEEDS]
     write(tmp_path / "final.csv", [{**run, "lr": "", "time_near_gate": 2.0, "gates_passed": 4} for run in runs])
-    audit = [{"task": "racing", "term": "gate", "return": 5.0, "gradient_norm": 0.0 if strong else 0.3}]
+    audit = [{"reward": "velocity", "term": "gate", "mean_return": 5.0, "gradient_norm": 0.0 if strong else 0.3}]
     write(tmp_path / "audit.csv", audit)
     return Results(tmp_path)
 

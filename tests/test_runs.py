@@ -259,6 +259,28 @@ def test_tensorboard_gets_the_names_of_the_csv_and_forgets_what_is_flown_again(t
         assert [scalar.value for scalar in scalars] == pytest.approx([float(row[name]) for row in table]), name
 
 
+@pytest.mark.parametrize("recipe", ["abpt", "bptt", "shac", "ppo"])
+def test_a_run_with_diagnostics_learns_the_same_bit_for_bit_and_logs_them(recipe, train, tmp_path):
+    options = [*EVERYTHING, "task=landing", *(["buffer.capacity=24"] if recipe == "abpt" else [])]
+    plain = train(recipe, tmp_path / "plain", *options)
+    audited = train(recipe, tmp_path / "audited", *options, "diagnostics=2")
+    for checkpoint in (plain, audited):
+        checkpoint["names"] = [set(row) for row in checkpoint["rows"]]
+    for row, without in zip(audited["rows"], plain["names"], strict=True):
+        for name in set(row) - without:
+            del row[name]
+    news = [a - b for a, b in zip(audited.pop("names"), plain.pop("names"), strict=True)]
+    terms = ("descent", "approach", "success", "crash")
+    shares = {f"reward/{term}_{share}" for term in terms for share in ("return_share", "gradient_share")}
+    norms = {"grad/cosine", "grad/first_order_norm", "grad/value_norm", "grad/variance", "grad/signal_to_noise"}
+    assert news == [set(), shares | (set() if recipe == "ppo" else norms)] * 2
+    assert_equal(plain, audited)
+    first, second, *_ = rows(tmp_path / "audited")
+    assert first["reward/descent_gradient_share"] == "nan" and 0 < float(second["reward/descent_gradient_share"]) <= 1
+    if recipe != "ppo":
+        assert float(second["grad/variance"]) > 0 and (float(second["grad/cosine"]) <= 1 or recipe == "bptt")
+
+
 def test_the_configuration_goes_along_with_the_results(train, tmp_path):
     checkpoint = train("bptt", tmp_path, "env.drone=small_racer")
     saved = yaml.safe_load((tmp_path / "config.yaml").read_text())

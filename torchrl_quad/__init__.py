@@ -3,6 +3,7 @@
 import gymnasium
 
 from torchrl_quad.data import ObservationNormalizer, VisitedStateBuffer, differentiable_rollout
+from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
 from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
 from torchrl_quad.envs import TASKS, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
 from torchrl_quad.modules import make_actor, make_qvalue, make_value
@@ -22,8 +23,12 @@ __all__ = [
     "SHACLoss",
     "TrackingEnv",
     "VisitedStateBuffer",
+    "audit_reward",
     "available_drones",
+    "compare_gradients",
     "differentiable_rollout",
+    "gradient_by_horizon",
+    "gradient_statistics",
     "load_drone",
     "load_track",
     "make_actor",

@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad.objectives.pathwise import PathwiseCriticLoss
+from torchrl_quad.objectives.pathwise import PathwiseCriticLoss, segments
 
 
 class ABPTLoss(PathwiseCriticLoss):
@@ -52,6 +52,7 @@ class ABPTLoss(PathwiseCriticLoss):
     critic_name = "qvalue_network"
     critic_loss_key = "loss_qvalue"
     prediction_key = "state_action_value"
+    value_part = "zero_step_return"
     out_keys = ["loss_actor", "loss_qvalue", "pred_value", "target_value", "explained_variance"]
 
     qvalue_network: TensorDictModule
@@ -92,20 +93,32 @@ class ABPTLoss(PathwiseCriticLoss):
         """
         return self._critic_loss(tensordict)
 
-    def _objective(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        returns = {}
+    def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """What J is the sum of: ``n_step_return`` and ``zero_step_return``, half of each, or the whole of one alone.
+
+        Args:
+            tensordict: a rollout (*, horizon) that carries its graph.
+
+        Returns:
+            the parts by name, each (*,), with their graphs.
+        """
+        self._require_rollout(tensordict)
+        parts = {}
         if self.n_step_return:
-            returns["n_step_return"] = self._n_step_return(tensordict)
+            parts["n_step_return"] = sum(super().objective_parts(tensordict).values())
         if self.zero_step_return:
-            returns["zero_step_return"] = self._zero_step_return(tensordict)
-        objective = sum(returns.values()) / len(returns)
-        return objective, {name: value.detach().mean() for name, value in returns.items()}
+            parts["zero_step_return"] = self._zero_step_return(tensordict)
+        return {name: part / len(parts) for name, part in parts.items()}
+
+    def _objective(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        parts = self.objective_parts(tensordict)
+        return sum(parts.values()), {name: len(parts) * part.detach().mean() for name, part in parts.items()}
 
     def _zero_step_return(self, tensordict: TensorDictBase) -> Tensor:
         """Q(s_0, a_0) of each segment, summed over the segments: (*)."""
         action = tensordict.get(self.tensor_keys.action)
         self._require_graph(action, self.tensor_keys.action)
-        start, _ = self._segments(tensordict)
+        start, _ = segments(tensordict.get(("next", self.tensor_keys.done)))
         first = tensordict.select(*self.qvalue_network.in_keys)[start.squeeze(-1)]
         value = self._critics(first, self._critic_params(target=False)).amin(0)
         return torch.zeros_like(start, dtype=value.dtype).masked_scatter(start, value).sum((-2, -1))

@@ -16,6 +16,20 @@ from torchrl.objectives.utils import ValueEstimators, dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
 
+def segments(done: Tensor) -> tuple[Tensor, Tensor]:
+    """Where segments start and where they end, bool (*, horizon, 1). The horizon's last step ends one, too."""
+    end = done.clone()
+    end[..., -1, :] = True
+    return end.roll(1, -2), end
+
+
+def discounts(done: Tensor, gamma: Tensor) -> Tensor:
+    """gamma^t, where t counts the steps of each segment from 0: (*, horizon, 1)."""
+    start, _ = segments(done)
+    index = torch.arange(done.shape[-2], device=done.device).unsqueeze(-1).expand(done.shape)
+    return gamma ** (index - torch.where(start, index, 0).cummax(-2).values)
+
+
 class PathwiseLoss(LossModule):
     """Base of the losses that differentiate the return of a rollout through the environment's own dynamics.
 
@@ -61,6 +75,7 @@ class PathwiseLoss(LossModule):
     supported_value_estimators: tuple[ValueEstimators, ...] = (ValueEstimators.TD1,)
 
     out_keys = ["loss_actor", "n_step_return"]
+    value_part: str | None = None  # of the parts of the objective, the one that only a critic knows
 
     actor_network: TensorDictModule
     actor_network_params: TensorDictParams
@@ -171,7 +186,6 @@ class PathwiseLoss(LossModule):
         Returns:
             the loss, and a dictionary of what is worth logging.
         """
-        self._require_rollout(tensordict)
         objective, metadata = self._objective(tensordict)
         if self.has_entropy_bonus:
             entropy = self._entropy(tensordict)
@@ -182,35 +196,29 @@ class PathwiseLoss(LossModule):
                 metadata["loss_alpha"] = self._reduce_loss(self.log_alpha * gap)
         return self._reduce_loss(-objective), metadata
 
-    def _objective(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """J of each environment, (*), and what is worth logging of it."""
-        objective = self._n_step_return(tensordict)
-        return objective, {"n_step_return": objective.detach().mean()}
+    def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """What J is the sum of: ``rewards``, those of each segment, discounted; the entropy bonus is not in it.
 
-    def _n_step_return(self, tensordict: TensorDictBase) -> Tensor:
-        """Discounted rewards of each segment and its bootstrap, summed over the segments: (*)."""
+        Args:
+            tensordict: a rollout (*, horizon) that carries its graph.
+
+        Returns:
+            the parts by name, each (*,), with their graphs.
+        """
+        self._require_rollout(tensordict)
         reward = tensordict.get(("next", self.tensor_keys.reward))
         self._require_graph(reward, ("next", self.tensor_keys.reward))
-        gamma = self.value_estimator.gamma.to(reward.dtype)
-        start, end = self._segments(tensordict)
-        index = torch.arange(reward.shape[-2], device=reward.device).unsqueeze(-1).expand(start.shape)
-        age = index - torch.where(start, index, 0).cummax(-2).values
-        discount = gamma**age
-        terminated = tensordict.get(("next", self.tensor_keys.terminated))
-        bootstrap = self._bootstrap(tensordict, (end & ~terminated).squeeze(-1))
-        if bootstrap is not None:
-            reward = reward + gamma * bootstrap
-        return (discount * reward).sum((-2, -1))
+        return {"rewards": (self._discounts(tensordict) * reward).sum((-2, -1))}
 
-    def _bootstrap(self, tensordict: TensorDictBase, where: Tensor) -> Tensor | None:
-        """The value of the next state at the marked steps (*, horizon), zero elsewhere: (*, horizon, 1), or None."""
-        return None
+    def _objective(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """J of each environment, (*), and what is worth logging of it."""
+        objective = sum(self.objective_parts(tensordict).values())
+        return objective, {"n_step_return": objective.detach().mean()}
 
-    def _segments(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Where segments start and where they end, bool (*, horizon, 1). The horizon's last step ends one, too."""
-        end = tensordict.get(("next", self.tensor_keys.done)).clone()
-        end[..., -1, :] = True
-        return end.roll(1, -2), end
+    def _discounts(self, tensordict: TensorDictBase) -> Tensor:
+        """The discount of each step in its segment: (*, horizon, 1)."""
+        gamma = self.value_estimator.gamma.to(tensordict.get(("next", self.tensor_keys.reward)).dtype)
+        return discounts(tensordict.get(("next", self.tensor_keys.done)), gamma)
 
     def _entropy(self, tensordict: TensorDictBase) -> Tensor:
         """Minus the log-probability of the actions taken, averaged over the steps: (*)."""
@@ -278,6 +286,7 @@ class PathwiseCriticLoss(PathwiseLoss):
     critic_name: str  # the attribute under which the critic network stands
     critic_loss_key: str
     prediction_key: str  # the name, among the tensor keys, of what the critic writes
+    value_part = "terminal_value"
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -286,6 +295,17 @@ class PathwiseCriticLoss(PathwiseLoss):
         loss_critic, critic_metadata = self._critic_loss(tensordict)
         losses = {"loss_actor": loss_actor, self.critic_loss_key: loss_critic}
         return TensorDict({**losses, **metadata, **critic_metadata}, [])
+
+    def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """What J is the sum of: the discounted ``rewards`` of each segment, and its ``terminal_value``, gamma^n V(s_n).
+
+        Args:
+            tensordict: a rollout (*, horizon) that carries its graph.
+
+        Returns:
+            the parts by name, each (*,), with their graphs.
+        """
+        return {**super().objective_parts(tensordict), "terminal_value": self._terminal_value(tensordict)}
 
     def write_value_target(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the TD(lambda) target of each step (paper, equations 17 and 18) into a rollout, and return it.
@@ -332,11 +352,14 @@ class PathwiseCriticLoss(PathwiseLoss):
         prefix = "target_" if target else ""
         return getattr(self, f"{prefix}{self.critic_name}_params").detach()
 
-    def _bootstrap(self, tensordict: TensorDictBase, where: Tensor) -> Tensor | None:
-        next_state = tensordict.get("next").select(*self._critic_inputs(), strict=False)[where]
+    def _terminal_value(self, tensordict: TensorDictBase) -> Tensor:
+        """gamma^n V(s_n) of each segment that did not terminate, summed over the segments: (*)."""
+        _, end = segments(tensordict.get(("next", self.tensor_keys.done)))
+        where = end & ~tensordict.get(("next", self.tensor_keys.terminated))
+        next_state = tensordict.get("next").select(*self._critic_inputs(), strict=False)[where.squeeze(-1)]
         value = self._value(next_state, self._critic_params(target=False))
-        reward = tensordict.get(("next", self.tensor_keys.reward))
-        return torch.zeros_like(reward).masked_scatter(where.unsqueeze(-1), value.to(reward.dtype))
+        discount = self.value_estimator.gamma * self._discounts(tensordict)
+        return (discount * torch.zeros_like(discount).masked_scatter(where, value.to(discount.dtype))).sum((-2, -1))
 
     def _critic_inputs(self) -> set[NestedKey]:
         """What the critic, and the actor before it, read of a state."""

@@ -22,6 +22,8 @@ class SHACLoss(PathwiseCriticLoss):
     Args:
         actor_network: the policy that has made the rollout.
         value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
+        terminal_gradient: False cuts the gradient of the terminal value in the state, as what was published with the
+            paper does. The actor then climbs the rewards of the horizon alone, as with BPTT.
         delay_value: keep a target network, to be updated with :class:`torchrl.objectives.SoftUpdate`.
         **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
     """
@@ -48,10 +50,12 @@ class SHACLoss(PathwiseCriticLoss):
         actor_network: TensorDictModule,
         value_network: TensorDictModule,
         *,
+        terminal_gradient: bool = True,
         delay_value: bool = True,
         **kwargs: Any,
     ) -> None:
         super().__init__(actor_network, **kwargs)
+        self.terminal_gradient = terminal_gradient
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -61,6 +65,10 @@ class SHACLoss(PathwiseCriticLoss):
             the loss, and a dictionary of what is worth logging.
         """
         return self._critic_loss(tensordict)
+
+    def _terminal_value(self, tensordict: TensorDictBase) -> Tensor:
+        value = super()._terminal_value(tensordict)
+        return value if self.terminal_gradient else value.detach()
 
     def _critics(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
         inputs = tensordict.select(*self.value_network.in_keys)

@@ -1,0 +1,359 @@
+"""What a reward and a policy gradient are made of, against numbers worked by hand and against the paper's table I."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.envs import PendulumEnv
+
+from torchrl_quad import (
+    ABPTLoss,
+    BPTTLoss,
+    HoveringEnv,
+    SHACLoss,
+    audit_reward,
+    compare_gradients,
+    differentiable_rollout,
+    gradient_by_horizon,
+    gradient_statistics,
+    make_actor,
+    make_env,
+    make_qvalue,
+    make_value,
+)
+
+# -- by hand -----------------------------------------------------------------------------------------------------------
+
+
+class Weigh(nn.Module):
+    """The weighted sum of all entries of its inputs."""
+
+    def __init__(self, *weights):
+        super().__init__()
+        self.weights = nn.Parameter(torch.tensor(weights))
+
+    def forward(self, *x):
+        return (self.weights * torch.cat(x, -1)).sum(-1, keepdim=True)
+
+
+def module(net, in_keys, out_key):
+    return TensorDictModule(net, in_keys=in_keys, out_keys=[out_key])
+
+
+def make_rollout(states=((1.0, 2.0, 3.0), (1.0, 2.0, 3.0)), weight=2.0):
+    """Two environments, three steps, action = 2 s, next state = s + action; terms worth 36, -56, 5, 3 and 0."""
+    actor = module(Weigh(weight), ["observation"], "action")
+    state = torch.tensor(states).unsqueeze(-1)
+    steps = [actor(TensorDict({"observation": s}, s.shape[:1])) for s in state.unbind(1)]
+    terms = [
+        {
+            "linear": 3.0 * td["action"],
+            "quadratic": -td["action"].square(),
+            "bonus": 5.0 * (td["observation"] > 2.5),
+            "alive": torch.ones_like(td["action"]),
+            "crash": torch.zeros_like(td["action"]),
+        }
+        for td in steps
+    ]
+    for td, paid in zip(steps, terms, strict=True):
+        no = torch.zeros_like(td["action"], dtype=torch.bool)
+        ends = {"reward": sum(paid.values()), "reward_terms": paid, "observation": td["observation"] + td["action"]}
+        td["next"] = TensorDict({**ends, "done": no, "terminated": no}, td.batch_size)
+    return torch.stack(steps, 1), actor
+
+
+def test_returns_gradients_and_shares_are_those_worked_by_hand():
+    rollout, actor = make_rollout()
+    audit = audit_reward(rollout, actor)
+    returns = {name: term.mean_return for name, term in audit.items()}
+    assert returns == {"linear": 36.0, "quadratic": -56.0, "bonus": 5.0, "alive": 3.0, "crash": 0.0}
+    shares = {name: round(term.return_share, 6) for name, term in audit.items()}
+    assert shares == {"linear": 0.36, "quadratic": 0.56, "bonus": 0.05, "alive": 0.03, "crash": 0.0}
+    # d/dw of 3 w s and of -(w s)^2 at w = 2, summed over s = 1, 2, 3: 18 and -56
+    norms = {name: term.gradient_norm for name, term in audit.items()}
+    assert norms == {"linear": 18.0, "quadratic": 56.0, "bonus": 0.0, "alive": 0.0, "crash": 0.0}
+    assert audit["linear"].gradient_share == pytest.approx(18 / 74)
+    verdicts = {name: term.verdict for name, term in audit.items()}
+    differentiable = dict.fromkeys(("linear", "quadratic"), "differentiable")
+    assert verdicts == {**differentiable, "bonus": "no gradient", "alive": "constant", "crash": "not seen"}
+    assert actor.module.weights.grad is None
+
+
+def test_returns_are_discounted_anew_in_each_episode():
+    rollout, actor = make_rollout()
+    rollout["next", "done"][0, 1] = True
+    audit = audit_reward(rollout, actor, gamma=0.5)
+    # s = 1, 2, 3 with discounts 1, 1/2, 1 and 1, 1/2, 1/4: sums of 5 and 2.75
+    assert audit["linear"].mean_return == 6 * (5 + 2.75) / 2
+    assert audit["linear"].gradient_norm == 3 * (5 + 2.75) / 2
+    assert audit["bonus"].mean_return == 5 * (1 + 0.25) / 2
+
+
+def test_the_actions_of_a_rollout_stand_for_those_that_were_flown():
+    rollout, actor = make_rollout()
+    audit = audit_reward(rollout, rollout["action"])
+    assert audit["linear"].gradient_norm == pytest.approx(3 / 2 * math.sqrt(6))  # six actions, mean of two returns
+    assert audit["bonus"].verdict == "no gradient"
+    by_weights = audit_reward(rollout, [actor.module.weights])
+    assert by_weights == audit_reward(rollout, actor) == audit_reward(rollout, BPTTLoss(actor))
+
+
+def test_a_table_and_a_flat_dictionary_say_the_same():
+    rollout, actor = make_rollout()
+    audit = audit_reward(rollout, actor)
+    lines = str(audit).splitlines()
+    row = next(line for line in lines if line.startswith("linear"))
+    assert row.split() == ["linear", "36", "36.0%", "18", "24.3%", "differentiable"]
+    assert lines[-1] == "partially differentiable: all but bonus, 5.0% of the return"
+    metrics = audit.metrics()
+    assert metrics["quadratic_return_share"] == audit["quadratic"].return_share
+    assert len(metrics) == 10 and all(isinstance(value, float) for value in metrics.values())
+
+
+def test_a_gradient_that_is_not_finite_is_no_gradient():
+    rollout, actor = make_rollout()
+    root = (rollout["action"] - rollout["action"].detach()).sqrt()
+    rollout["next", "reward_terms", "root"] = root
+    assert audit_reward(rollout, actor)["root"].verdict == "not finite"
+    assert audit_reward(rollout, actor).without_gradient == ["bonus", "root"]
+
+
+# -- the paper's column DIFF -------------------------------------------------------------------------------------------
+
+
+def fly(task, horizon=24, **options):
+    """A horizon in which every term is paid: drones above and beside the pad, before a gate, and in free flight."""
+    env = make_env(task, num_envs=6, seed=0, **options)
+    td = env.reset()
+    state = td["state"]
+    if task == "landing":
+        state["position"][:2] = torch.tensor([2.0, 0.0, 0.25])
+        state["velocity"][:2, 2] = -0.2
+        state["position"][2:4] = torch.tensor([3.0, 0.0, 0.1])
+        state["velocity"][2:4, 2] = -1.0
+    if task == "racing":
+        state["position"][:3] = state["target"][:3] - torch.tensor([0.5, 0.0, 0.0])
+        state["velocity"][:3, 0] = 2.0
+    actor = make_actor(env)
+    rollout, _ = differentiable_rollout(env, actor, env.reset(td, set_state=True), horizon)
+    return rollout, actor
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "without"),
+    [
+        ("hovering", {}, []),
+        ("tracking", {}, []),
+        ("landing", {}, ["success", "crash"]),
+        ("racing", {"reward": "position"}, ["gate"]),
+        ("racing", {"reward": "velocity"}, ["gate"]),
+        ("racing", {"gate_bonus": "log"}, []),
+        ("racing", {"reward": "velocity", "gate_bonus": "reciprocal"}, []),
+    ],
+)
+def test_the_audit_finds_which_rewards_are_fully_and_which_are_partially_differentiable(task, options, without):
+    rollout, actor = fly(task, **options)
+    audit = audit_reward(rollout, actor, gamma=0.99)
+    assert audit.without_gradient == without
+    for name, term in audit.items():
+        expected = "no gradient" if name in without else "constant" if name == "survival" else "differentiable"
+        assert term.verdict == expected, f"{name}\n{audit}"
+    assert sum(term.return_share for term in audit.values()) == pytest.approx(1.0)
+    assert sum(term.gradient_share for term in audit.values()) == pytest.approx(1.0)
+    if task != "hovering":
+        return
+    by_action = audit_reward(rollout, rollout["action"])
+    assert [term.verdict for term in by_action.values()] == [term.verdict for term in audit.values()]
+
+
+def test_of_what_was_never_paid_nothing_is_said():
+    env = make_env("racing", num_envs=2)
+    actor = make_actor(env)
+    rollout, _ = differentiable_rollout(env, actor, None, 5)
+    assert audit_reward(rollout, actor)["gate"].verdict == "not seen"
+
+
+# -- simulator against critic ------------------------------------------------------------------------------------------
+
+
+def shac(rollout_and_actor, critic, **options):
+    rollout, actor = rollout_and_actor
+    loss = SHACLoss(actor, module(Weigh(critic), ["observation"], "state_value"), **options)
+    return loss.make_value_estimator(gamma=0.5), rollout
+
+
+def reward_is_action(rollout_and_actor):
+    rollout_and_actor[0]["next", "reward"] = 1.0 * rollout_and_actor[0]["action"]
+    return rollout_and_actor
+
+
+@pytest.mark.parametrize(("critic", "cosine"), [(4.0, 1.0), (-4.0, -1.0)])
+def test_the_terminal_value_of_shac_pulls_with_the_rewards_or_against_them(critic, cosine):
+    comparison = compare_gradients(*shac(reward_is_action(make_rollout()), critic))
+    assert comparison.cosine == pytest.approx(cosine)
+    assert comparison.first_order_norm == 1 + 2 / 2 + 3 / 4  # of w s
+    assert comparison.value_norm == 4 * 3 / 8  # gamma^3 V(s + w s) at s = 3
+
+
+def test_gradients_in_different_parameters_are_orthogonal():
+    actor = module(nn.Linear(1, 2, bias=False), ["observation"], "action")
+    rollout = actor(TensorDict({"observation": torch.ones(2, 1, 1)}, [2, 1]))
+    paid, seen = rollout["action"].split(1, -1)
+    no = torch.zeros(2, 1, 1, dtype=torch.bool)
+    rollout["next"] = {"reward": 3.0 * paid, "observation": seen, "done": no, "terminated": no}
+    loss, _ = shac((rollout, actor), 8.0)
+    comparison = compare_gradients(loss, rollout)
+    assert (comparison.cosine, comparison.first_order_norm, comparison.value_norm) == (0.0, 3.0, 4.0)
+
+
+@pytest.mark.parametrize(("critic", "cosine"), [(1.0, 1.0), (-1.0, -1.0)])
+def test_abpt_sets_the_0_step_return_against_the_n_step_return(critic, cosine):
+    rollout, actor = reward_is_action(make_rollout())
+    qvalue = module(Weigh(0.0, 0.0), ["observation", "action"], "state_action_value")
+    loss = ABPTLoss(actor, qvalue, num_qvalue_nets=1).make_value_estimator(gamma=0.5)
+    loss.qvalue_network_params["module", "weights"].data.copy_(torch.tensor([[0.0, 4.0 * critic]]))
+    comparison = compare_gradients(loss, rollout)
+    # Q = 4 a at s_0 = 1, and gamma^3 4 w s' with s' = (1 + w) s at s = 3, where a change of w changes s' as well
+    n_step = 2.75 + critic * 4 * (9 + 2 * 3) / 8
+    assert comparison.first_order_norm == pytest.approx(abs(n_step) / 2)
+    assert comparison.value_norm == 4 / 2
+    assert comparison.cosine == pytest.approx(cosine * math.copysign(1, n_step))
+
+
+def test_where_one_of_the_two_gradients_is_missing_the_cosine_is_nan():
+    rollout, actor = make_rollout()
+    bptt = compare_gradients(BPTTLoss(actor), rollout)
+    assert bptt.first_order_norm > 0 and math.isnan(bptt.value_norm) and math.isnan(bptt.cosine)
+    cut = compare_gradients(*shac((rollout, actor), 4.0, terminal_gradient=False))
+    assert cut.value_norm == 0.0 and math.isnan(cut.cosine)
+    qvalue = module(Weigh(1.0, 1.0), ["observation", "action"], "state_action_value")
+    alone = compare_gradients(ABPTLoss(actor, qvalue, n_step_return=False), rollout)
+    assert alone.value_norm > 0 and math.isnan(alone.first_order_norm) and math.isnan(alone.cosine)
+
+
+# -- norm and variance -------------------------------------------------------------------------------------------------
+
+
+def test_the_spread_of_the_gradients_is_that_worked_by_hand():
+    rollout, actor = reward_is_action(make_rollout(states=((1.0, 1.0), (2.0, 4.0), (0.0, 1.0), (9.0, 9.0))))
+    loss = BPTTLoss(actor).make_value_estimator(gamma=1.0)
+    statistics = gradient_statistics(loss, rollout, max_envs=3)  # 2, 6 and 1; the fourth is left out
+    assert (statistics.norm, statistics.variance) == pytest.approx((3.0, 7.0))
+    assert statistics.signal_to_noise == pytest.approx(3 / math.sqrt(7))
+
+
+@pytest.mark.parametrize("name", ["bptt", "shac", "abpt"])
+def test_the_variance_is_that_of_a_loop_with_backward_and_leaves_no_grad_behind(name):
+    env = HoveringEnv(num_envs=5, dtype=torch.float64)
+    actor = make_actor(env, num_cells=(8,))
+    loss = {
+        "bptt": lambda: BPTTLoss(actor, reduction="none"),
+        "shac": lambda: SHACLoss(actor, make_value(env), reduction="none"),
+        "abpt": lambda: ABPTLoss(actor, make_qvalue(env), reduction="none"),
+    }[name]()
+    start = env.reset()
+
+    def rollout(horizon):
+        torch.manual_seed(horizon)
+        env.set_seed(0)
+        return differentiable_rollout(env, actor, start, horizon)[0]
+
+    for horizon in (2, 6):
+        data = rollout(horizon)
+        torch.manual_seed(0)  # for the actions that ABPT samples
+        statistics = gradient_statistics(loss, data)
+        assert all(p.grad is None for p in [*loss.parameters(), *actor.parameters()])
+        torch.manual_seed(0)
+        objectives, naive = -loss.loss_actor(data)[0], []
+        for objective in objectives:
+            objective.backward(retain_graph=True)
+            naive.append(torch.cat([p.grad.flatten() for p in actor.parameters()]))
+            actor.zero_grad()
+        naive = torch.stack(naive)
+        assert statistics.norm == pytest.approx(naive.mean(0).norm().item(), rel=1e-6)
+        assert statistics.variance == pytest.approx(naive.T.cov().trace().item(), rel=1e-6)
+        torch.manual_seed(horizon)
+        env.set_seed(0)
+        if name != "abpt":
+            assert gradient_by_horizon(env, actor, loss, [horizon], start=start) == {horizon: statistics}
+
+
+def test_the_gradient_grows_with_the_horizon():
+    env = HoveringEnv(num_envs=4)
+    actor = make_actor(env)
+    grown = gradient_by_horizon(env, actor, BPTTLoss(actor), (4, 16))
+    assert list(grown) == [4, 16]
+    assert grown[16].norm > grown[4].norm > 0 and grown[16].variance > grown[4].variance > 0
+
+
+# -- other environments ------------------------------------------------------------------------------------------------
+
+
+def test_they_know_no_quadrotor_and_look_at_the_pendulum_of_torchrl():
+    env = PendulumEnv(seed=0)
+
+    class Net(nn.Module):
+        def __init__(self, inputs):
+            super().__init__()
+            self.net = nn.Sequential(nn.Linear(inputs, 8), nn.Tanh(), nn.Linear(8, 1), nn.Tanh())
+
+        def forward(self, th, thdot, *action):
+            return 2.0 * self.net(torch.cat((torch.stack((th.cos(), th.sin(), thdot), -1), *action), -1))
+
+    actor = module(Net(3), ["th", "thdot"], "action")
+    start = env.reset(env.gen_params(batch_size=[6]), set_state=False)
+    rollout, _ = differentiable_rollout(env, actor, start, 12)
+    audit = audit_reward(rollout, actor, terms_key=("next", "reward"))
+    assert audit["reward"].verdict == "differentiable" and audit.without_gradient == []
+    assert audit["reward"].mean_return == pytest.approx(rollout["next", "reward"].sum(1).mean().item())
+    assert audit_reward(rollout, rollout["action"], terms_key=("next", "reward"))["reward"].gradient_norm > 0
+    for loss in (
+        SHACLoss(actor, module(Net(3), ["th", "thdot"], "state_value")),
+        ABPTLoss(actor, module(Net(4), ["th", "thdot", "action"], "state_action_value")),
+    ):
+        comparison = compare_gradients(loss, rollout)
+        assert -1.0 <= comparison.cosine <= 1.0 and comparison.first_order_norm > 0 and comparison.value_norm > 0
+        grown = gradient_by_horizon(env, actor, loss, (2, 8), start=start, max_envs=4)
+        assert grown[8].norm > grown[2].norm and all(x.variance > 0 for x in grown.values())
+
+
+# -- errors ------------------------------------------------------------------------------------------------------------
+
+
+def test_terms_that_do_not_add_up_to_the_reward_are_refused():
+    rollout, actor = make_rollout()
+    # rewards are 3, -3 and -12
+    rollout["next", "scaled"] = 2.0 * rollout["next", "reward"]
+    with pytest.raises(ValueError, match="do not add up to the reward: they are off by up to 12"):
+        audit_reward(rollout, actor, reward_key=("next", "scaled"))
+    rollout["next", "reward_terms", "alive"] = torch.ones(2, 3)
+    with pytest.raises(ValueError, match=r"'alive' has shape \(2, 3\), and the reward \(2, 3, 1\)"):
+        audit_reward(rollout, actor)
+    with pytest.raises(ValueError, match="reads .*'terms'.* which is not in the rollout. Name the terms"):
+        audit_reward(rollout, actor, terms_key=("next", "terms"))
+
+
+def test_what_has_no_gradient_at_all_is_refused_with_advice():
+    rollout, actor = make_rollout()
+    with pytest.raises(RuntimeError, match="carries no gradient. Collectors.*Use differentiable_rollout"):
+        audit_reward(rollout.detach(), actor)
+    with pytest.raises(RuntimeError, match="carries no gradient"):
+        compare_gradients(BPTTLoss(actor), rollout.detach())
+    with pytest.raises(ValueError, match="does not depend on the inputs. Give the actor that has flown this rollout"):
+        audit_reward(rollout, make_rollout()[1])
+    with pytest.raises(ValueError, match="nothing to differentiate with respect to"):
+        audit_reward(rollout, rollout["observation"])
+    with torch.no_grad():
+        assert audit_reward(rollout, actor)["linear"].gradient_norm == 18.0
+
+
+def test_one_environment_has_no_variance():
+    rollout, actor = make_rollout()
+    loss = BPTTLoss(actor)
+    with pytest.raises(ValueError, match="at least two of them, got 1. Fly more side by side, or raise max_envs=1"):
+        gradient_statistics(loss, rollout, max_envs=1)
+    with pytest.raises(ValueError, match="got 1. Fly more"):
+        gradient_statistics(loss, rollout[:1])

@@ -1,0 +1,296 @@
+"""What a reward and a policy gradient are made of: terms without gradient, critic against simulator, variance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch.autograd.graph import GradientEdge
+from torchrl.envs import EnvBase
+
+from torchrl_quad.data import differentiable_rollout
+from torchrl_quad.objectives.pathwise import PathwiseLoss, discounts
+
+Inputs = nn.Module | Tensor | Iterable[Tensor]
+
+
+@dataclass(frozen=True)
+class TermAudit:
+    """What one term gives to the return of a rollout and to its gradient.
+
+    ================  ================================================================================================
+    verdict           meaning
+    ================  ================================================================================================
+    differentiable    its gradient is not zero
+    no gradient       it was paid, and its gradient is exactly zero: a first-order method does not climb it
+    constant          it is paid alike in every step: there is nothing to climb but the length of the episode
+    not seen          it was never paid in this rollout, and nothing can be said
+    not finite        its gradient is NaN or infinite
+    ================  ================================================================================================
+    """
+
+    mean_return: float  # over environments, with its sign
+    return_share: float  # of the mean absolute returns of all terms, 0 to 1
+    gradient_norm: float  # of the gradient of the mean return
+    gradient_share: float  # of these norms of all terms, 0 to 1
+    verdict: str
+
+
+class RewardAudit(dict[str, TermAudit]):
+    """The terms of a reward by name; ``print`` shows a table."""
+
+    @property
+    def without_gradient(self) -> list[str]:
+        """The terms that were paid without a (finite) gradient; where there is none, the reward is "fully DIFF"."""
+        return [name for name, term in self.items() if term.verdict in ("no gradient", "not finite")]
+
+    def metrics(self) -> dict[str, float]:
+        """For loggers: ``<term>_return_share`` and ``<term>_gradient_share``."""
+        shares = ("return_share", "gradient_share")
+        return {f"{name}_{share}": getattr(term, share) for name, term in self.items() for share in shares}
+
+    def __str__(self) -> str:
+        width = max(map(len, self), default=0)
+        lines = [f"{'term':{width}}     return  share   gradient  share  verdict"]
+        lines += [
+            f"{name:{width}} {term.mean_return:10.4g} {term.return_share:6.1%} {term.gradient_norm:10.4g} "
+            f"{term.gradient_share:6.1%}  {term.verdict}"
+            for name, term in self.items()
+        ]
+        lost = self.without_gradient
+        share = sum(self[name].return_share for name in lost)
+        partially = f"partially differentiable: all but {', '.join(lost)}, {share:.1%} of the return"
+        return "\n".join([*lines, partially if lost else "fully differentiable"])
+
+
+@torch.enable_grad()
+def audit_reward(
+    rollout: TensorDictBase,
+    inputs: Inputs,
+    *,
+    gamma: float = 1.0,
+    terms_key: NestedKey = ("next", "reward_terms"),
+    reward_key: NestedKey = ("next", "reward"),
+    done_key: NestedKey = ("next", "done"),
+    tolerance: float = 1e-4,
+) -> RewardAudit:
+    """Find out which terms of a reward have a gradient, and how much each gives to the return and to its gradient.
+
+    Works for the rollouts of any differentiable TorchRL environment. A verdict holds for what this rollout has seen:
+    let it start where all terms are paid, and be longer than the delay between an action and its effect.
+
+    Args:
+        rollout: (*, horizon) with its graph, as ``differentiable_rollout`` returns it.
+        inputs: what to differentiate with respect to: the actor or a loss of it, which stand for the actor's
+            parameters; or tensors that the reward depends on. ``rollout["action"]`` stands for the actions as they
+            were before TorchRL stacked them.
+        gamma: discount of the returns, from 1 at the start of each episode in the rollout.
+        terms_key: where the terms stand, each (*, horizon, 1), by name and weighted; or a reward that is one term.
+        reward_key: their sum, (*, horizon, 1).
+        done_key: where episodes end, bool (*, horizon, 1).
+        tolerance: how far the sum of the terms may be from the reward, in units of 1 + their absolute sum.
+
+    Raises:
+        ValueError: an entry is missing, the terms do not add up to the reward, or it does not depend on the inputs.
+        RuntimeError: the rollout has lost its graph.
+    """
+    for key in (terms_key, reward_key, done_key):
+        if key not in rollout:
+            raise ValueError(
+                f"audit_reward reads {key!r}, which is not in the rollout. Name the terms, the reward and the end as "
+                "they stand there: terms_key, reward_key, done_key."
+            )
+    reward, entry = rollout.get(reward_key), rollout.get(terms_key)
+    if isinstance(entry, Tensor):
+        terms = {terms_key if isinstance(terms_key, str) else terms_key[-1]: entry}
+    else:
+        terms = dict(entry.flatten_keys("/").items())
+    _require_sum(terms, reward, terms_key, tolerance)
+    if not reward.requires_grad:
+        raise RuntimeError(
+            f"{reward_key!r} carries no gradient. Collectors, ParallelEnv, replay buffers, .detach() and "
+            "torch.no_grad() cut it. Use differentiable_rollout(env, actor, carry, horizon) with gradients enabled."
+        )
+    sources = _sources(inputs)
+    if all(g is None for g in torch.autograd.grad(reward.sum(), sources, retain_graph=True, allow_unused=True)):
+        raise ValueError(
+            f"{reward_key!r} does not depend on the inputs. Give the actor that has flown this rollout, or tensors "
+            "from which its actions were computed."
+        )
+    discount = discounts(rollout.get(done_key), torch.as_tensor(gamma, dtype=reward.dtype, device=reward.device))
+    returns = {name: (discount * term).sum((-2, -1)) for name, term in terms.items()}
+    sizes = {name: x.detach().abs().mean().item() for name, x in returns.items()}
+    norms = {name: _gradient(x.mean(), sources).norm().item() for name, x in returns.items()}
+    return RewardAudit(
+        {
+            name: TermAudit(
+                mean_return=returns[name].mean().item(),
+                return_share=_share(sizes, name),
+                gradient_norm=norms[name],
+                gradient_share=_share(norms, name),
+                verdict=_verdict(term, norms[name]),
+            )
+            for name, term in terms.items()
+        }
+    )
+
+
+@dataclass(frozen=True)
+class GradientComparison:
+    """The gradient of what the simulator tells of the return beside that of what a critic tells of it."""
+
+    cosine: float  # between the two, -1 to 1; NaN where one is zero or does not exist
+    first_order_norm: float
+    value_norm: float
+
+
+@torch.enable_grad()
+def compare_gradients(loss: PathwiseLoss, rollout: TensorDictBase) -> GradientComparison:
+    """Compare the first-order and the value gradient of an objective in the actor's parameters (paper, section IV-B).
+
+    With ABPT they are the gradients of the N-step and of the 0-step return, with SHAC those of the rewards of the
+    horizon and of the terminal value; both as they stand in the objective, so that their sum is its gradient, and
+    averaged over environments. BPTT has no value gradient: its cosine and norm are NaN, as they are where ABPT has one
+    of its returns switched off. ABPT samples actions for it, as its loss does. No ``.grad`` is touched.
+
+    Args:
+        loss: of the actor that has flown the rollout.
+        rollout: (*, horizon) with its graph.
+
+    Raises:
+        ValueError, RuntimeError: as the loss does of a rollout that it cannot use.
+    """
+    parts, sources = loss.objective_parts(rollout), _sources(loss)
+    value = [parts.pop(loss.value_part)] if loss.value_part in parts else []
+    first_order, value = (
+        _gradient(sum(part).mean(), sources) if part else torch.full((1,), math.nan, dtype=torch.float64)
+        for part in (parts.values(), value)
+    )
+    norms = first_order.norm().item(), value.norm().item()
+    cosine = (first_order * value.to(first_order)).sum().item() / (math.prod(norms) or math.nan)
+    return GradientComparison(cosine, *norms)
+
+
+@dataclass(frozen=True)
+class GradientStatistics:
+    """The policy gradient of single environments."""
+
+    norm: float  # of their mean
+    variance: float  # over environments, summed over parameters: the trace of the covariance
+    signal_to_noise: float  # the norm of the mean in units of the standard deviation, the root of the variance
+
+
+@torch.enable_grad()
+def gradient_statistics(loss: PathwiseLoss, rollout: TensorDictBase, *, max_envs: int = 16) -> GradientStatistics:
+    """Mean and spread of the gradients that single environments give, of the objective without its entropy bonus.
+
+    Each environment takes a backward pass through the whole rollout. No ``.grad`` is touched.
+
+    Args:
+        loss: of the actor that has flown the rollout.
+        rollout: (*, horizon) with its graph.
+        max_envs: look at so many environments, the first ones.
+
+    Raises:
+        ValueError: these are fewer than two environments; or as the loss does of a rollout that it cannot use.
+        RuntimeError: the rollout has lost its graph.
+    """
+    objectives = sum(loss.objective_parts(rollout).values()).flatten()[:max_envs]
+    if len(objectives) < 2:
+        raise ValueError(
+            f"A variance over environments needs at least two of them, got {len(objectives)}. Fly more side by side, "
+            f"or raise max_envs={max_envs}."
+        )
+    sources = _sources(loss)
+    gradients = torch.stack([_gradient(objective, sources) for objective in objectives])
+    norm, variance = gradients.mean(0).norm(), gradients.var(0).sum()
+    return GradientStatistics(norm.item(), variance.item(), (norm / variance.sqrt()).item())
+
+
+def gradient_by_horizon(
+    env: EnvBase,
+    actor: TensorDictModuleBase,
+    loss: PathwiseLoss,
+    horizons: Iterable[int],
+    *,
+    start: TensorDictBase | None = None,
+    max_envs: int = 16,
+) -> dict[int, GradientStatistics]:
+    """How norm and variance of the policy gradient grow with the horizon, each flown from the same starts.
+
+    Args:
+        env: any differentiable TorchRL environment.
+        actor: the policy of the loss.
+        loss: BPTTLoss, SHACLoss, ABPTLoss or another pathwise loss.
+        horizons: numbers of control steps.
+        start: a reset tensordict of two environments or more; ``env.reset()`` where there is none.
+        max_envs: as for :func:`gradient_statistics`.
+
+    Raises:
+        ValueError, TypeError, RuntimeError: as ``differentiable_rollout`` and :func:`gradient_statistics` do.
+    """
+    start = env.reset() if start is None else start
+    return {
+        horizon: gradient_statistics(loss, differentiable_rollout(env, actor, start, horizon)[0], max_envs=max_envs)
+        for horizon in horizons
+    }
+
+
+def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
+    """The tensors to differentiate with respect to; of a loss or an actor, the actor's parameters."""
+    if isinstance(inputs, nn.Module):
+        inputs = [p for p in getattr(inputs, "actor_network_params", inputs).parameters() if p.requires_grad]
+    if isinstance(inputs, Tensor) and inputs.grad_fn is not None and inputs.grad_fn.name() == "StackBackward0":
+        # A rollout's entries are stacked when it has been flown: what the reward depends on is what was stacked.
+        return [GradientEdge(node, index) for node, index in inputs.grad_fn.next_functions if node is not None]
+    sources = [inputs] if isinstance(inputs, Tensor) else list(inputs)
+    if not sources or not all(isinstance(x, Tensor) and x.requires_grad for x in sources):
+        raise ValueError(
+            "There is nothing to differentiate with respect to: give the actor or its loss with parameters that "
+            "require grad, or tensors that do."
+        )
+    return sources
+
+
+def _gradient(value: Tensor, sources: list[Tensor | GradientEdge]) -> Tensor:
+    """The gradient of a scalar as one vector, in double precision: squares of small numbers are not lost."""
+    grads = [None] * len(sources)
+    if value.requires_grad:
+        grads = torch.autograd.grad(value, sources, retain_graph=True, allow_unused=True)
+    known = zip(grads, sources, strict=True)
+    grads = [torch.zeros_like(x) if g is None else g for g, x in known if g is not None or isinstance(x, Tensor)]
+    return torch.cat([g.flatten().double() for g in grads]) if grads else value.new_zeros(1, dtype=torch.float64)
+
+
+def _share(sizes: dict[str, float], name: str) -> float:
+    return sizes[name] / (sum(sizes.values()) or 1.0)
+
+
+def _verdict(term: Tensor, gradient_norm: float) -> str:
+    if not math.isfinite(gradient_norm):
+        return "not finite"
+    if gradient_norm > 0.0:
+        return "differentiable"
+    if not term.any():
+        return "not seen"
+    return "constant" if term.min() == term.max() else "no gradient"
+
+
+def _require_sum(terms: dict[str, Tensor], reward: Tensor, terms_key: NestedKey, tolerance: float) -> None:
+    for name, term in terms.items():
+        if term.shape != reward.shape:
+            raise ValueError(f"The term {name!r} has shape {tuple(term.shape)}, and the reward {tuple(reward.shape)}.")
+    gap = (sum(terms.values()) - reward).detach().abs()
+    worst = (gap / (1.0 + sum(term.detach().abs() for term in terms.values()))).max().item()
+    if not worst <= tolerance:
+        raise ValueError(
+            f"The terms under {terms_key!r}, {', '.join(terms)}, do not add up to the reward: they are off by up to "
+            f"{gap.max().item():.3g}. Either a term is missing or not weighted, or a transform has changed the reward: "
+            "name the one before it, reward_key=..."
+        )

@@ -72,8 +72,8 @@ class QuadrotorEnv(EnvBase):
         num_envs: number of drones that fly in parallel.
         device: device of all tensors.
         dtype: torch.float32 or torch.float64.
-        seed: seed of the environment's own random generator, or None for another one each time. Copies with one seed, as in
-            ParallelEnv, fly alike: give each its own, or call ``set_seed`` on all of them.
+        seed: seed of the environment's own random generator, or None for another one each time. Copies with one seed,
+            as in ParallelEnv, fly alike: give each its own, or call ``set_seed`` on all of them.
         drone: name of a preset, path of a YAML file, mapping, or :class:`QuadrotorParams`.
         dt: physics step [s].
         control_dt: control step [s], a whole multiple of dt.

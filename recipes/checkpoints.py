@@ -19,7 +19,6 @@ FORMAT = 1  # of checkpoint.pt; to be raised when an older file can no longer be
 FREE_ON_RESUME = (
     "resume",
     "total_steps",
-    "device",
     "threads",
     "compile",
     "max_skipped",
@@ -76,9 +75,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
+        said = (str(error) or repr(error)).splitlines()[0]
         raise ValueError(
             f"{path} cannot be read: it is cut off, or no checkpoint of these recipes, which hold tensors and plain "
-            f"values only (anything else could run code, and is not loaded). torch says: {str(error).splitlines()[0]}"
+            f"values only (anything else could run code, and is not loaded). torch says: {said}"
         ) from error
     if not isinstance(content, dict) or "config" not in content:
         raise ValueError(f"{path} is not a checkpoint of these recipes. Give the path of a checkpoint.pt.")
@@ -94,8 +94,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 def take_over(cfg: DictConfig) -> None:
     """Put the configuration of the checkpoint that ``cfg.resume`` names in the place of this one.
 
-    ``resume=auto`` means the checkpoint in the run's own folder, where there is one. What the command line says must
-    agree with the checkpoint, but for what may change on the way, ``FREE_ON_RESUME``.
+    ``resume=auto`` means the checkpoint in the run's own folder, where there is one; the folder has to be named for
+    that, by hydra.run.dir or hydra.sweep.dir. What the command line says must agree with the checkpoint, but for what
+    may change on the way, ``FREE_ON_RESUME``.
 
     Raises:
         FileExistsError: the folder holds another run, and ``resume`` does not name it.

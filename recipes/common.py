@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -35,7 +36,9 @@ def set_up(cfg: DictConfig) -> tuple[EnvBase, TensorDictModuleBase]:
     take_over(cfg)
     torch.set_num_threads(cfg.threads)
     if "RANK" in os.environ and not dist.is_initialized():
-        gpu = str(cfg.device).startswith("cuda")
+        if ":" in str(cfg.device):
+            raise ValueError(f"Under torchrun each process has a GPU of its own: write device=cuda, not {cfg.device}.")
+        gpu = cfg.device == "cuda"
         if gpu:
             torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
         dist.init_process_group("nccl" if gpu else "gloo")
@@ -98,16 +101,17 @@ def make_optimizer(
         ValueError: the schedule is unknown.
     """
     optimizer = torch.optim.Adam(parameters, cfg.lr, betas=tuple(cfg.betas))
-    steps, decay = max(iterations - 1, 1), cfg.final_lr / cfg.lr
-    schedules = {
-        "constant": lambda: lr_scheduler.ConstantLR(optimizer, 1.0),
-        "linear": lambda: lr_scheduler.LinearLR(optimizer, 1.0, decay, steps),
-        "exponential": lambda: lr_scheduler.ExponentialLR(optimizer, decay ** (1 / steps)),
-        "cosine": lambda: lr_scheduler.CosineAnnealingLR(optimizer, steps, cfg.final_lr),
+    last, decay = max(iterations - 1, 1), cfg.final_lr / cfg.lr
+    schedules = {  # functions of the share of the run that is over, so that a run can be resumed and made longer
+        "constant": lambda share: 1.0,
+        "linear": lambda share: 1.0 + share * (decay - 1.0),
+        "exponential": lambda share: decay**share,
+        "cosine": lambda share: decay + (1.0 - decay) * 0.5 * (1.0 + math.cos(math.pi * share)),
     }
     if cfg.schedule not in schedules:
         raise ValueError(f"Unknown schedule {cfg.schedule!r}. Choose from: {', '.join(schedules)}.")
-    return optimizer, schedules[cfg.schedule]()
+    schedule = schedules[cfg.schedule]
+    return optimizer, lr_scheduler.LambdaLR(optimizer, lambda iteration: schedule(min(iteration / last, 1.0)))
 
 
 # -- experience --------------------------------------------------------------------------------------------------------
@@ -228,11 +232,13 @@ def load_policy(checkpoint: Path, device: str = "cpu") -> tuple[DictConfig, Tens
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is not a checkpoint that these recipes can read.
+        ValueError: the file is not a checkpoint that these recipes can read, or holds no policy.
     """
     saved = read_checkpoint(checkpoint)
     cfg = OmegaConf.create(saved["config"])
     cfg.device = device
+    if "actor" not in saved["best"]:
+        raise ValueError(f"{checkpoint} holds no policy that was evaluated: the run was stopped before.")
     actor = make_policy(cfg, build_env(cfg, 1, 0))
     actor.load_state_dict(saved["best"]["actor"])
     return cfg, actor, saved["best"].get("normalizer")

@@ -17,7 +17,8 @@ STEPS = {  # of a run, for the first-order methods and for PPO, which has more o
     "racing": (6_144_000, 16_384_000),
 }
 TASKS = tuple(STEPS)
-RACING_NETWORKS = ("actor.input_scale=10", "critic.num_cells=[128,128]", "gamma=0.98")  # the same for every method
+EPISODE = {"hovering": 256, "tracking": 512, "landing": 256, "racing": 512}
+RACING = ("env.reward=position", "actor.input_scale=10", "critic.num_cells=[128,128]", "gamma=0.98")  # for all methods
 
 
 @dataclass(frozen=True)
@@ -27,13 +28,21 @@ class Variant:
     algorithm: str
     label: str
     overrides: tuple[str, ...] = ()
+    horizon: int | str | None = None  # another one, or "episode"; with as many steps in an iteration as before
+    searched: bool = False  # whether its learning rate is searched for; the others take that of their method
 
 
+METHODS = {
+    "abpt": Variant("abpt", "ABPT", searched=True),
+    "shac": Variant("shac", "SHAC", searched=True),
+    "bptt": Variant("bptt", "BPTT", searched=True),
+    "ppo": Variant("ppo", "PPO", searched=True),
+}
 VARIANTS = {
-    "abpt": Variant("abpt", "ABPT"),
-    "shac": Variant("shac", "SHAC"),
-    "bptt": Variant("bptt", "BPTT"),
-    "ppo": Variant("ppo", "PPO"),
+    **METHODS,
+    # As published with the paper: BPTT through whole episodes, SHAC without the gradient of its terminal value.
+    "bptt-episode": Variant("bptt", "BPTT, whole episodes", horizon="episode"),
+    "shac-cut": Variant("shac", "SHAC, terminal gradient cut", ("loss.terminal_gradient=false",)),
     # Ablation.
     "abpt-no-0-step": Variant("abpt", "ABPT without 0-step return", ("loss.zero_step_return=false",)),
     "abpt-no-n-step": Variant("abpt", "ABPT without N-step return", ("loss.n_step_return=false",)),
@@ -44,26 +53,26 @@ VARIANTS = {
     "bptt-reciprocal": Variant("bptt", "BPTT, reciprocal bonus", ("env.gate_bonus=reciprocal",)),
     "shac-reciprocal": Variant("shac", "SHAC, reciprocal bonus", ("env.gate_bonus=reciprocal",)),
     # The other reward of racing.
-    "abpt-position": Variant("abpt", "ABPT, position reward", ("env.reward=position",)),
-    "shac-position": Variant("shac", "SHAC, position reward", ("env.reward=position",)),
-    "bptt-position": Variant("bptt", "BPTT, position reward", ("env.reward=position",)),
-    "ppo-position": Variant("ppo", "PPO, position reward", ("env.reward=position",)),
+    **{
+        f"{name}-velocity": Variant(name, f"{x.label}, velocity reward", ("env.reward=velocity",), searched=True)
+        for name, x in METHODS.items()
+    },
     # Where the text and the published settings differ.
-    "shac-cut": Variant("shac", "SHAC, terminal gradient cut", ("loss.terminal_gradient=false",)),
     "abpt-entropy": Variant("abpt", "ABPT, entropy bonus", ("loss.alpha=auto",)),
-    "abpt-horizon-32": Variant("abpt", "ABPT, horizon 32", ("horizon=32",)),
-    "abpt-horizon-96": Variant("abpt", "ABPT, horizon 96", ("horizon=96",)),
-    "shac-horizon-32": Variant("shac", "SHAC, horizon 32", ("horizon=32",)),
-    "shac-horizon-96": Variant("shac", "SHAC, horizon 96", ("horizon=96",)),
+    "abpt-horizon-32": Variant("abpt", "ABPT, horizon 32", horizon=32),
+    "abpt-horizon-96": Variant("abpt", "ABPT, horizon 96", horizon=96),
+    "shac-horizon-32": Variant("shac", "SHAC, horizon 32", horizon=32),
+    "shac-horizon-96": Variant("shac", "SHAC, horizon 96", horizon=96),
 }
 
 EXPERIMENTS = {  # name: variants and tasks, in the order in which they are run
-    "main": (("abpt", "shac", "bptt", "ppo"), TASKS),
+    "main": (tuple(METHODS), TASKS),
+    "published": (("bptt-episode", "shac-cut"), TASKS),
     "ablation": (("abpt-no-0-step", "abpt-no-n-step", "abpt-no-visited"), TASKS),
+    "reward": (tuple(f"{name}-velocity" for name in METHODS), ("racing",)),
     "relaxation": (("bptt-log", "shac-log", "bptt-reciprocal", "shac-reciprocal"), ("racing",)),
-    "reward": (("abpt-position", "shac-position", "bptt-position", "ppo-position"), ("racing",)),
     "differences": (
-        ("shac-cut", "abpt-entropy", "abpt-horizon-32", "abpt-horizon-96", "shac-horizon-32", "shac-horizon-96"),
+        ("abpt-entropy", "abpt-horizon-32", "abpt-horizon-96", "shac-horizon-32", "shac-horizon-96"),
         ("landing", "racing"),
     ),
 }
@@ -84,28 +93,42 @@ class Job:
         search = "" if self.lr is None else f"/lr{self.lr:g}"
         return f"{self.task}/{self.variant}{search}/seed{self.seed}"
 
+    @property
+    def rate_of(self) -> str:
+        """The variant whose learning rate it takes."""
+        variant = VARIANTS[self.variant]
+        return self.variant if variant.searched else variant.algorithm
+
     def overrides(self, lr: float) -> list[str]:
         """Of its recipe's configuration, with the learning rate that the search has found."""
         variant = VARIANTS[self.variant]
         steps = STEPS[self.task][variant.algorithm == "ppo"]
         if self.lr is not None:
             steps, lr = int(SEARCH_FRACTION[self.task] * steps), self.lr
-        networks = [x for x in RACING_NETWORKS if variant.algorithm != "bptt" or "critic" not in x]
+        racing = [x for x in RACING if variant.algorithm != "bptt" or "critic" not in x]
+        horizon = EPISODE[self.task] if variant.horizon == "episode" else variant.horizon
+        batch = 128 * 128 if self.task == "racing" else 64 * 64  # steps in an iteration of the first-order methods
         return [
             f"task={self.task}",
             f"seed={self.seed}",
             f"total_steps={steps}",
             f"actor.lr={lr:g}",
             f"actor.final_lr={lr / 100:g}",
-            *(networks if self.task == "racing" else ()),
+            *(racing if self.task == "racing" else ()),
             *variant.overrides,
+            *([f"horizon={horizon}", f"num_envs={round(batch / horizon)}"] if horizon else ()),
         ]
 
 
-def search_jobs(tasks: tuple[str, ...], rates: tuple[float, ...] = LEARNING_RATES) -> list[Job]:
-    """The search for learning rates: every method, every task, every rate."""
-    methods, _ = EXPERIMENTS["main"]
-    return [Job(task, method, SEARCH_SEED, lr) for task in tasks for method in methods for lr in rates]
+def search_jobs(tasks: tuple[str, ...], variants: set[str], rates: tuple[float, ...] = LEARNING_RATES) -> list[Job]:
+    """The search for the learning rates of these variants: every rate, on every task."""
+    searched = [(task, name) for task in tasks for name in VARIANTS if name in variants and VARIANTS[name].searched]
+    return [
+        Job(task, name, SEARCH_SEED, lr)
+        for task, name in searched
+        if name in METHODS or task == "racing"
+        for lr in rates
+    ]
 
 
 def jobs(experiments: tuple[str, ...], tasks: tuple[str, ...], seeds: tuple[int, ...]) -> list[Job]:

@@ -68,7 +68,8 @@ def command(job: Job, lr: float, folder: Path, quick: bool) -> list[str]:
     else:
         with initialize_config_dir(str(RECIPES / "config"), version_base=None):
             cfg = compose(algorithm, overrides)
-        interval = max(cfg.total_steps // (cfg.num_envs * cfg.horizon) // EVALUATIONS, 1)
+        iterations = cfg.total_steps // (cfg.num_envs * cfg.horizon)
+        interval = math.ceil(iterations / EVALUATIONS)
         overrides = [*overrides, f"eval.interval={interval}"]
     return [sys.executable, str(RECIPES / f"{algorithm}.py"), *overrides, "resume=auto", f"hydra.run.dir={folder}"]
 
@@ -96,7 +97,8 @@ def keep(job: Job, folder: Path, data: Path) -> None:
     ]
     if (folder / "failure.pt").exists():
         summary = {"diverged": "yes"}
-        curve.append({**(curve[-1] if curve else {}), "return": "nan", "success": "0"})
+        curve = curve or [{"steps": "0", "seconds": "0", "return": "nan"}]
+        curve.append({name: x if name in ("steps", "seconds") else "nan" for name, x in curve[-1].items()})
     else:
         summary = json.loads((folder / "summary.json").read_text())
     own = {"variant": job.variant, "lr": "" if job.lr is None else f"{job.lr:g}", "seed": str(job.seed)}
@@ -121,14 +123,14 @@ def is_kept(job: Job, data: Path) -> bool:
     return any((row["task"], row["variant"], row["seed"], row["lr"]) == key for row in read(data / "final.csv"))
 
 
-def best_learning_rate(task: str, algorithm: str, data: Path, rates: tuple[float, ...]) -> float | None:
+def best_learning_rate(task: str, variant: str, data: Path, rates: tuple[float, ...]) -> float | None:
     """The rate whose run of the search ended highest, by the mean of its last tenth of evaluations.
 
     None as long as the search is not complete. A run that diverged counts as the lowest.
     """
     ends = {}
     for lr in rates:
-        rows = [x for x in read(data / f"search/{task}.csv") if x["variant"] == algorithm and x["lr"] == f"{lr:g}"]
+        rows = [x for x in read(data / f"search/{task}.csv") if x["variant"] == variant and x["lr"] == f"{lr:g}"]
         if not rows:
             return None
         last = [float(row["return"]) for row in rows[-max(len(rows) // 10, 1) :]]
@@ -151,8 +153,8 @@ def main() -> None:
 
     write(args.data / "audit.csv", audit_tasks())
     rates = LEARNING_RATES[1:2] if args.quick else LEARNING_RATES
-    searches = search_jobs(tuple(args.tasks), rates)
-    todo = [*searches, *jobs(tuple(args.experiments), tuple(args.tasks), tuple(args.seeds))]
+    reported = jobs(tuple(args.experiments), tuple(args.tasks), tuple(args.seeds))
+    todo = [*search_jobs(tuple(args.tasks), {job.rate_of for job in reported}, rates), *reported]
     waiting = [job for job in todo if not is_kept(job, args.data)]
     running: dict[Future, Job] = {}
     failed: list[str] = []
@@ -163,8 +165,7 @@ def main() -> None:
             for job in list(waiting):
                 if len(running) == args.cores:
                     break
-                algorithm = VARIANTS[job.variant].algorithm
-                lr = job.lr or best_learning_rate(job.task, algorithm, args.data, rates)
+                lr = job.lr or best_learning_rate(job.task, job.rate_of, args.data, rates)
                 if lr is not None:
                     waiting.remove(job)
                     folder = args.output / job.name

@@ -16,7 +16,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from checkpoints import replacing
-from claims import CLAIMS, METHODS, NotRunError, Results, Verdict, try_claim
+from claims import METHODS, NotRunError, Part, Results, Verdict, try_all
 from matrix import EXPERIMENTS, LEARNING_RATES, SEEDS, TASKS, VARIANTS
 from reproduce import DATA, best_learning_rate, read
 
@@ -26,6 +26,7 @@ import matplotlib.pyplot as plt
 COLORS = {"abpt": "#c8452f", "shac": "#2f6db5", "bptt": "#3b9c5a", "ppo": "#7d7d7d"}
 FIGURES = {  # file: experiment, and what is drawn
     "main": (METHODS, TASKS, "return"),
+    "published": (("bptt", "shac", *EXPERIMENTS["published"][0]), TASKS, "return"),
     "ablation": (("abpt", *EXPERIMENTS["ablation"][0]), TASKS, "return"),
     "relaxation": (("abpt", "bptt", "shac", *EXPERIMENTS["relaxation"][0]), ("racing",), "gates_passed"),
     "reward": ((*METHODS, *EXPERIMENTS["reward"][0]), ("racing",), "gates_passed"),
@@ -66,10 +67,9 @@ def draw(results: Results, path: Path, variants: Iterable[str], tasks: Iterable[
                 times, values = (results.column(tasks[k], variant, name) for name in (axis, column))
             except NotRunError:
                 continue
-            # Seeds share their steps, and not their seconds: all are drawn on the grid of the mean.
-            n = min(map(len, times))
-            grid = np.mean([x[:n] for x in times], 0)
-            band = np.array([np.interp(grid, t, y) for t, y in zip(times, values, strict=True)])
+            # Seeds share their steps, and not their seconds: those are drawn at the same times.
+            grid = max(times, key=len) if axis == "steps" else np.linspace(0.0, np.mean([t[-1] for t in times]), 200)
+            band = np.array([np.interp(grid, t, y, left=np.nan) for t, y in zip(times, values, strict=True)])
             color = COLORS.get(variant, shades(i))
             axes[row, k].plot(grid, band.mean(0), color=color, linewidth=1.5, label=VARIANTS[variant].label)
             axes[row, k].fill_between(grid, band.min(0), band.max(0), color=color, alpha=0.15, linewidth=0)
@@ -90,12 +90,16 @@ def search_table(data: Path) -> str:
     """What the search for learning rates found, and what it took."""
     finals = [row for row in read(data / "final.csv") if row["lr"]]
     rows = []
-    for method in METHODS:
-        own = [row for row in finals if row["variant"] == method]
-        found = [best_learning_rate(task, method, data, LEARNING_RATES) for task in TASKS]
-        steps, seconds = (sum(float(row[name] or 0) for row in own) for name in ("steps", "seconds"))
-        rates = ["not complete" if lr is None else f"{lr:g}" for lr in found]
-        rows.append([VARIANTS[method].label, *rates, f"{len(own)}", f"{steps / 1e6:.1f} M", f"{seconds:.0f}"])
+    for name, variant in VARIANTS.items():
+        if not variant.searched:
+            continue
+        own = [row for row in finals if row["variant"] == name]
+        found = {task: best_learning_rate(task, name, data, LEARNING_RATES) for task in TASKS}
+        steps, seconds = (sum(float(row[key] or 0) for row in own) for key in ("steps", "seconds"))
+        if name not in METHODS:  # another reward of racing
+            found |= {task: "" for task in TASKS if task != "racing"}
+        rates = ["not complete" if lr is None else lr and f"{lr:g}" for lr in found.values()]
+        rows.append([variant.label, *rates, f"{len(own)}", f"{steps / 1e6:.1f} M", f"{seconds:.0f}"])
     return table(["", *TASKS, "runs", "control steps", "seconds"], rows)
 
 
@@ -108,12 +112,15 @@ def ends_table(results: Results, experiment: str) -> str:
     for task, variant in ((task, variant) for task in tasks for variant in variants):
         try:
             columns = [results.end(task, variant, name) for name, _, _ in COLUMNS.values()]
-            until = [results.until(task, variant, axis) for axis in ("steps", "seconds")]
+            level = results.level(task, max((results.end(task, x) for x in METHODS), key=np.mean))
+            until = [results.until(task, variant, axis, level) for axis in ("steps", "seconds")]
         except NotRunError:
             continue
         cells = [spread(x, factor, digits) for x, (_, factor, digits) in zip(columns, COLUMNS.values(), strict=True)]
         median = [f"{np.median(x) / scale:.{d}f}" for x, scale, d in zip(until, (1e6, 1), (2, 0), strict=True)]
         median = ["never" if cell == "inf" else cell for cell in median]
+        if experiment in ("reward", "relaxation"):  # whose returns are of another kind
+            median = ["", ""]
         rows.append([task, VARIANTS[variant].label, str(len(columns[0])), *cells, *median])
     return table(["task", "", "seeds", *COLUMNS, "converged at [M steps]", "[s]"], rows)
 
@@ -125,7 +132,8 @@ def ranking(results: Results) -> str:
         cells = []
         for axis in ("steps", "seconds"):
             try:
-                times = {method: np.median(results.until(task, method, axis)) for method in METHODS}
+                level = results.level(task, max((results.end(task, x) for x in METHODS), key=np.mean))
+                times = {method: np.median(results.until(task, method, axis, level)) for method in METHODS}
             except NotRunError:
                 break
             order = sorted(times, key=times.get)
@@ -141,7 +149,8 @@ def claims_table(verdicts: list[Verdict]) -> str:
     for v in verdicts:
         if v.parts:
             head = ["part", "value", "95 % interval", "must be", "verdict"]
-            blocks.append(f"**{v.claim.id}** {v.claim.text}\n\n" + table(head, map(part_row, v.parts)))
+            rows = [part_row(part, len(v.parts)) for part in v.parts]
+            blocks.append(f"**{v.claim.id}** {v.claim.text}\n\n" + table(head, rows))
     return "\n\n".join(blocks)
 
 
@@ -161,26 +170,21 @@ def audit_table(data: Path) -> str:
     return table(["task", "reward", "term", "share of the return", "share of the gradient", "verdict"], rows)
 
 
-def part_row(part) -> list[str]:
+def part_row(part: Part, parts: int) -> list[str]:
     """A part of a claim as a row."""
     bounds = [
         f"> {part.low:g}" if math.isfinite(part.low) else "",
         f"< {part.high:g}" if math.isfinite(part.high) else "",
     ]
-    interval = "{:.3g} to {:.3g}".format(*part.interval)
-    return [
-        part.what.replace(">", "&gt;"),
-        f"{part.value:.3g}",
-        interval,
-        " and ".join(filter(None, bounds)),
-        part.verdict,
-    ]
+    interval = "{:.3g} to {:.3g}".format(*part.interval())
+    must = " and ".join(filter(None, bounds))
+    return [part.what.replace(">", "&gt;"), f"{part.value:.3g}", interval, must, part.verdict(parts)]
 
 
 def page(data: Path, pictures: Path) -> str:
     """The generated part of docs/results.md."""
     results = Results(data)
-    verdicts = [try_claim(claim, results) for claim in CLAIMS]
+    verdicts, published = try_all(data)
     finals = read(data / "final.csv")
     hours = sum(float(row["seconds"] or 0) for row in finals) / 3600
     machines = sorted({row["machine"] for row in finals})
@@ -190,6 +194,9 @@ def page(data: Path, pictures: Path) -> str:
         f"seeds {', '.join(str(seed) for seed in SEEDS if seed in seeds) or 'none yet'}.",
         "## Verdicts",
         claims_table(verdicts),
+        "## Verdicts on BPTT and SHAC as published",
+        "BPTT through whole episodes, and SHAC without the gradient of its terminal value.",
+        claims_table(published),
         "## Reward audit",
         audit_table(data),
         "## Rankings",

@@ -65,8 +65,9 @@ class Run:
     metrics and a checkpoint. The checkpoint holds all that the run needs to go on exactly as if it had not stopped
     (``resume=PATH``), and the best policy so far: the one with the greatest return in these evaluations. That one is
     flown at the end, on other starts. Leaves in the run's folder: ``config.yaml``, ``metrics.csv``, ``checkpoint.pt``,
-    ``summary.json``, ``learning_curve.png``, ``flight.png`` and ``flight.gif``. Set-up, compilation and the final
-    evaluation are outside the seconds. Of several processes the first evaluates, logs and saves.
+    ``summary.json``, ``learning_curve.png``, ``flight.png`` and ``flight.gif``. The seconds are those of the loop
+    alone: set-up, compilation, evaluations and checkpoints are outside. Of several processes the first evaluates, logs
+    and saves.
 
     Args:
         cfg: the configuration, as ``set_up`` left it.
@@ -110,10 +111,14 @@ class Run:
             self.carry = env.reset()
         else:
             self.folder, self.revision = Path(cfg.resume).parent, saved["revision"]
+            if revision() not in self.revision:
+                self.revision = f"{self.revision}, then {revision()}"
             self._load(saved)
         self.is_over = self.done >= self.iterations and (self.folder / "summary.json").exists()
         self.logger = None
         if rank() == 0 and not self.is_over:
+            for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
+                (self.folder / name).unlink(missing_ok=True)
             if self.rows:
                 self._write_rows()  # without those that came after the checkpoint
             self.logger = self._make_logger(saved and saved["wandb"])
@@ -131,7 +136,6 @@ class Run:
         if self.cfg.compile and self.done < self.iterations:
             self._warm_up()
         step = self.steps_per_iteration
-        start = time.perf_counter() - self.seconds
         with tqdm(
             total=self.iterations * step,
             initial=self.done * step,
@@ -142,13 +146,16 @@ class Run:
         ) as bar:
             for iteration in range(self.done, self.iterations):
                 self.starts.append(self.carry["state", "position"].clone())
+                start = time.perf_counter()
                 yield iteration
+                self.seconds += time.perf_counter() - start
                 self.done += 1
                 bar.update(step)
                 if self.done % self.cfg.eval.interval == 0 or self.done == self.iterations:
                     if rank() == 0:
-                        metrics = self._evaluate(start)
+                        metrics = self._evaluate()
                         bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, {metrics['eval/success']:.0%}")
+                    self.recorded.clear()
                     self.starts.clear()
                     self._save(self.folder / "checkpoint.pt")
         if rank() == 0:
@@ -203,12 +210,11 @@ class Run:
                 rollout["next", "reward"].sum().backward()
                 self.actor.zero_grad()
 
-    def _evaluate(self, start: float) -> dict[str, float]:
+    def _evaluate(self) -> dict[str, float]:
         """Fly the policy as it is, and tell what came out, with what was recorded since the last time."""
         with drawing_from(self.env, self.cfg.eval.seed):
             metrics, flight = evaluate(self.env, self.actor)
         steps = self.done * self.steps_per_iteration
-        self.seconds = time.perf_counter() - start
         row = {
             "iteration": self.done,
             "steps": steps,
@@ -221,14 +227,13 @@ class Run:
         }
         if self.audits and (len(self.rows) + 1) % self.audits == 0:
             row |= self._diagnose()
-        self.recorded.clear()
         self.rows.append(row)
         self._write_rows()
         if self.logger is not None:
             self.logger.log_metrics({key: x for key, x in row.items() if "/" in key}, step=steps)
-            every = self.cfg.logger.flight_every
-            if every and len(self.rows) % every == 0:
-                self._log_flight(flight, steps)
+        every = self.cfg.logger.flight_every
+        if every and len(self.rows) % every == 0:
+            self._log_flight(flight, steps)
         if metrics["eval/return"] >= self.best["return"]:
             policy = {"actor": self.actor, **({"normalizer": self.env.transform} if self.cfg.normalize else {})}
             weights = {name: copy.deepcopy(module.state_dict()) for name, module in policy.items()}
@@ -262,9 +267,13 @@ class Run:
             return None
         config = {**OmegaConf.to_container(self.cfg, resolve=True), "revision": self.revision}
         wandb = {"mode": cfg.mode, "project": cfg.project, "group": cfg.group, "config": config}
+        wandb |= {"reinit": "finish_previous"}  # one that a failed run has left in this process
         name = f"{self.cfg.task}_{self.cfg.algorithm}_seed{self.cfg.seed}"
-        saved = saved if cfg.backend == "wandb" else None
-        logger = get_logger(cfg.backend, str(self.folder), name, wandb_kwargs=wandb, state_dict=saved)
+        if saved:
+            wandb["id"] = saved["local"]["id"]
+        logger = get_logger(cfg.backend, str(self.folder), name, wandb_kwargs=wandb)
+        if saved and cfg.backend == "wandb":
+            logger.load_state_dict(saved)
         if self.done and cfg.backend == "tensorboard":  # what was logged after the checkpoint is to be forgotten
             logger.experiment.close()
             logger.experiment = type(logger.experiment)(
@@ -315,7 +324,7 @@ class Run:
         """Write all that the run needs to go on, that of all processes, all or nothing."""
         own = {
             "torch": torch.get_rng_state(),
-            "cuda": torch.cuda.get_rng_state() if self.env.device.type == "cuda" else None,
+            "cuda": torch.cuda.get_rng_state(self.env.device) if self.env.device.type == "cuda" else None,
             "env": generator(self.env).get_state(),
             "carry": self.carry.cpu().to_dict(),
             "buffer": None if self.buffer is None else self.buffer.state_dict(),
@@ -325,9 +334,13 @@ class Run:
         if world_size() > 1:
             processes = [None] * world_size() if rank() == 0 else None
             dist.gather_object(own, processes)
-        if rank() > 0:
-            return
-        if any(process["parameters"] != own["parameters"] for process in processes):
+        if rank() == 0:
+            self._write(path, processes)
+        if world_size() > 1:  # whoever goes on, or gives up, does so when the file is there
+            dist.barrier()
+
+    def _write(self, path: Path, processes: list[dict[str, Any]]) -> None:
+        if len({process["parameters"] for process in processes}) > 1:
             raise RuntimeError(
                 "The processes have drifted apart: their parameters differ. Take every step with run.descend."
             )
@@ -368,7 +381,7 @@ class Run:
         generator(self.env).set_state(own["env"])
         torch.set_rng_state(own["torch"])
         if own["cuda"] is not None:
-            torch.cuda.set_rng_state(own["cuda"])
+            torch.cuda.set_rng_state(own["cuda"], self.env.device)
         self.done, self.seconds, self.skipped = saved["iteration"], saved["seconds"], saved["skipped"]
         self.rows, self.best = saved["rows"], saved["best"]
 

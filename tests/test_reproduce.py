@@ -131,11 +131,18 @@ def test_the_jobs_of_the_matrix_are_valid_runs_of_their_recipes_and_each_is_ther
     everything = matrix.jobs(tuple(matrix.EXPERIMENTS), matrix.TASKS, matrix.SEEDS)
     assert len({job.name for job in everything}) == len(everything)
     assert {job.seed for job in everything[: len(everything) * 3 // 5]} == set(matrix.SEEDS[:3])  # three seeds first
-    jobs = [job for job in everything if job.seed == 42] + matrix.search_jobs(("racing",), (3e-3,))
+    jobs = [job for job in everything if job.seed == 42] + matrix.search_jobs(
+        ("racing",), {"abpt", "ppo-velocity", "shac-cut"}, (3e-3,)
+    )
     with initialize_config_dir(str(reproduce.RECIPES / "config"), version_base=None):
         for job in jobs:
             cfg = compose(matrix.VARIANTS[job.variant].algorithm, job.overrides(1e-3))
             assert cfg.actor.lr == pytest.approx(job.lr or 1e-3)
+            if job.task == "racing":
+                assert cfg.env.reward == ("velocity" if "velocity" in job.variant else "position")
+                assert "critic" not in cfg or cfg.critic.num_cells == [128, 128]
+            if cfg.algorithm != "ppo":
+                assert cfg.num_envs * cfg.horizon == pytest.approx(16384 if job.task == "racing" else 4096, rel=0.02)
             assert cfg.total_steps == matrix.STEPS[job.task][cfg.algorithm == "ppo"] * (0.25 if job.lr else 1)
 
 
@@ -148,27 +155,33 @@ def test_the_statistics_are_those_worked_by_hand():
     assert probability(np.array([-np.inf]), np.array([-np.inf])) == 0.5  # both never
     assert gap(a, b) == pytest.approx(0.5)
     assert claims.roughness(np.array([0.0, 2.0, 1.0, 4.0, 3.0])) == pytest.approx(2 / 4)
-    part = bootstrap("mean", claims.mean, np.random.default_rng(1).normal(3.0, 1.0, 100))
-    assert part.interval[0] == pytest.approx(3.0 - 0.2, abs=0.15) and part.interval[1] == pytest.approx(3.2, abs=0.15)
+    least, most = bootstrap("mean", claims.mean, np.random.default_rng(1).normal(3.0, 1.0, 100)).interval()
+    assert least == pytest.approx(2.8, abs=0.15) and most == pytest.approx(3.2, abs=0.15)
+
+
+def part(least, most, **bounds):
+    return Part("", 0.0, np.linspace(least, most, 10_001), **bounds)
 
 
 @pytest.mark.parametrize(
-    ("interval", "verdict"), [((0.6, 0.9), "supported"), ((0.1, 0.4), "refuted"), ((0.4, 0.9), "undecided")]
+    ("draws", "verdict"), [((0.6, 0.9), "supported"), ((0.1, 0.4), "refuted"), ((0.4, 0.9), "undecided")]
 )
-def test_a_part_is_decided_when_its_interval_is_on_one_side(interval, verdict):
-    assert Part("", 0.5, interval, low=0.5).verdict == verdict
-    assert Part("", 0.5, tuple(-x for x in reversed(interval)), high=-0.5).verdict == verdict
+def test_a_part_is_decided_when_its_interval_is_on_one_side(draws, verdict):
+    assert part(*draws, low=0.5).verdict() == verdict
+    assert part(-draws[1], -draws[0], high=-0.5).verdict() == verdict
 
 
 def test_equality_is_supported_inside_its_bounds_and_refuted_outside():
-    bounds = {"low": -0.1, "high": 0.1}
-    for interval, verdict in (
-        ((-0.05, 0.05), "supported"),
-        ((0.2, 0.3), "refuted"),
-        ((-0.3, -0.2), "refuted"),
-        ((0.0, 0.2), "undecided"),
-    ):
-        assert Part("", 0.0, interval, **bounds).verdict == verdict
+    outcomes = {(-0.05, 0.05): "supported", (0.2, 0.3): "refuted", (-0.3, -0.2): "refuted", (0.0, 0.2): "undecided"}
+    for draws, verdict in outcomes.items():
+        assert part(*draws, low=-0.1, high=0.1).verdict() == verdict
+
+
+def test_one_of_many_parts_is_refuted_by_a_wider_interval_only():
+    alone = part(0.0, 1.0, low=0.98)  # the middle 95 % end at 0.975
+    assert alone.interval() == pytest.approx((0.025, 0.975))
+    assert alone.interval(10) == pytest.approx((0.0025, 0.9975))
+    assert alone.verdict() == "refuted" and alone.verdict(10) == "undecided"
 
 
 def test_a_method_that_ends_higher_with_every_seed_is_supported_and_one_that_does_not_is_refuted(tmp_path):
@@ -191,19 +204,23 @@ def test_fewer_than_five_seeds_of_any_run_are_preliminary(tmp_path):
     assert verdict.verdict == "supported (preliminary)" and verdict.seeds == 3
 
 
-def test_a_method_has_converged_when_it_reaches_90_percent_of_the_best_end(tmp_path):
+def test_methods_have_converged_when_they_reach_nearly_what_both_reach(tmp_path):
     r = data(
         tmp_path,
+        task="landing",
         abpt=lambda s: [9.5, 10],
         shac=lambda s: [8.9, 9.1],
         bptt=lambda s: [math.nan, math.nan],
         ppo=lambda s: [1, 2],
     )
-    assert r.level("hovering") == pytest.approx(9.0)
-    assert r.until("hovering", "abpt", "steps").tolist() == [200] * 5
-    assert r.until("hovering", "shac", "seconds").tolist() == [6] * 5
-    assert r.until("hovering", "ppo", "steps").tolist() == [math.inf] * 5
-    assert r.end("hovering", "bptt").tolist() == [0.0] * 5  # diverged: ends where it began
+    level = r.level("landing", r.end("landing", "abpt"), r.end("landing", "shac"))
+    assert level == pytest.approx(0.9 * 9.1)
+    assert r.level("landing", np.array([-10.0])) == pytest.approx(-11.0)
+    assert r.until("landing", "abpt", "steps", level).tolist() == [200] * 5
+    assert r.until("landing", "shac", "seconds", level).tolist() == [4] * 5
+    assert r.until("landing", "ppo", "steps", level).tolist() == [math.inf] * 5
+    assert r.end("landing", "bptt").tolist() == [0.0] * 5  # diverged: ends where it began
+    assert claims.roughness(np.array([1.0, math.nan])) == math.inf
 
 
 def synthetic(tmp_path, strong):

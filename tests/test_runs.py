@@ -125,6 +125,7 @@ def test_resume_auto_starts_goes_on_and_leaves_alone_what_is_finished(train, lau
     assert (tmp_path / "summary.json").exists()
     longer = train("bptt", tmp_path, "resume=auto", "total_steps=240")
     assert longer["iteration"] == 10 and len(rows(tmp_path)) == 5
+    assert longer["parts"][1]["param_groups"][0]["lr"] == pytest.approx(2e-4)  # the schedule has stretched
     assert json.loads((tmp_path / "summary.json").read_text())["steps"] == 240
 
 
@@ -168,6 +169,30 @@ def test_a_checkpoint_that_cannot_be_read_is_named_with_the_reason(train, tmp_pa
     torch.save(good, tmp_path / "checkpoint.pt")
     with pytest.raises(ValueError, match="was written by 2 processes, and 1 want to go on"):
         train("bptt", tmp_path, "resume=auto")
+
+
+def test_a_run_that_is_made_longer_is_not_over_before_it_is(train, tmp_path, monkeypatch):
+    train("bptt", tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(run.Run, "_finish", lambda self: None)  # killed after the last checkpoint
+        train("bptt", tmp_path, "resume=auto", "total_steps=240")
+    assert not (tmp_path / "summary.json").exists()
+    train("bptt", tmp_path, "resume=auto", "total_steps=240")
+    assert json.loads((tmp_path / "summary.json").read_text())["steps"] == 240
+
+
+def test_a_run_that_other_code_goes_on_with_says_so(train, tmp_path, monkeypatch):
+    first = train("bptt", tmp_path)["revision"]
+    monkeypatch.setattr(run, "revision", lambda: "another")
+    assert train("bptt", tmp_path, "resume=auto", "total_steps=240")["revision"] == f"{first}, then another"
+
+
+def test_a_checkpoint_without_an_evaluated_policy_is_no_policy(train, tmp_path, monkeypatch):
+    poison(monkeypatch, None)
+    with pytest.raises(FloatingPointError):
+        train("bptt", tmp_path, "max_skipped=0")
+    with pytest.raises(ValueError, match="failure.pt holds no policy that was evaluated"):
+        common.load_policy(tmp_path / "failure.pt")
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):

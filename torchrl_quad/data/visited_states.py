@@ -98,7 +98,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             base = base.base_env
         # Of the class: environments in other processes cannot be asked what they know, one that does not know dies.
         if hasattr(type(base), "sample_initial_state"):  # the task's own starts, whatever its resets draw from
-            fresh = TensorDict({"state": env.sample_initial_state(env.num_envs)}, env.batch_size)
+            fresh = TensorDict({"state": env.sample_initial_state(env.num_envs)}, env.batch_size, device=env.device)
         else:
             fresh = env.reset().select(*self.state_keys)
         return env.reset(self._mixed(fresh, fraction), set_state=True)
@@ -112,7 +112,9 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         _require_fraction(fraction)
 
         def draw(n: int) -> TensorDictBase:
-            return self._mixed(TensorDict({"state": env.sample_initial_state(n)}, [n]), fraction).get("state")
+            return self._mixed(TensorDict({"state": env.sample_initial_state(n)}, [n], env.device), fraction).get(
+                "state"
+            )
 
         return draw
 

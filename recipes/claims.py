@@ -142,8 +142,8 @@ class Results:
         return lowest - (1.0 - LEVEL[task]) * abs(lowest)
 
     def seeds(self, runs: Iterable[tuple[str, str]]) -> int:
-        """The least number of seeds of these runs."""
-        return min((len(self.curves.get(run, {})) for run in runs), default=len(SEEDS))
+        """The least number of seeds of these runs; 0 where there are none."""
+        return min((len(self.curves.get(run, {})) for run in runs), default=0)
 
 
 # -- statistics --------------------------------------------------------------------------------------------------------
@@ -404,7 +404,7 @@ def try_claim(claim: Claim, results: Results) -> Verdict:
     each = {part.verdict(len(parts)) for part in parts}
     verdict = "refuted" if "refuted" in each else "undecided" if "undecided" in each else "supported"
     seeds = results.seeds(results.used)
-    return Verdict(claim, verdict if seeds >= len(SEEDS) else f"{verdict} (preliminary)", parts, seeds)
+    return Verdict(claim, f"{verdict} (preliminary)" if 0 < seeds < len(SEEDS) else verdict, parts, seeds)
 
 
 def try_all(data: Path) -> tuple[list[Verdict], list[Verdict]]:

@@ -293,10 +293,8 @@ def c13(r: Results) -> Iterable[Part]:
 def c16(r: Results) -> Iterable[Part]:
     """A lot is a quarter of all episodes, hardly a tenth of the return."""
     lost = [r.end("landing", variant, "success") for variant in ("abpt-no-n-step", "abpt")]
-    difference = bootstrap(
-        "success without N-step return, less that of abpt, landing", lambda a, b: mean(a) - mean(b), *lost, high=-0.25
-    )
-    yield difference
+    what = "success without N-step return, less that of abpt, landing"
+    yield bootstrap(what, lambda a, b: mean(a) - mean(b), *lost, high=-0.25)
     ends = [r.end("racing", variant) for variant in ("abpt-no-n-step", "abpt")]
     yield bootstrap("gap(without N-step return, abpt), racing", gap, *ends, low=-0.1, high=0.1)
 

@@ -103,6 +103,11 @@ def search_table(data: Path) -> str:
     return table(["", *TASKS, "runs", "control steps", "seconds"], rows)
 
 
+def best_level(results: Results, task: str) -> float:
+    """Nearly the highest of the methods' mean ends, which a method has to reach to have converged in the tables."""
+    return results.level(task, max((results.end(task, method) for method in METHODS), key=np.mean))
+
+
 def ends_table(results: Results, experiment: str) -> str:
     """Where the curves of an experiment end, and when they have converged."""
     variants, tasks = EXPERIMENTS[experiment]
@@ -112,7 +117,7 @@ def ends_table(results: Results, experiment: str) -> str:
     for task, variant in ((task, variant) for task in tasks for variant in variants):
         try:
             columns = [results.end(task, variant, name) for name, _, _ in COLUMNS.values()]
-            level = results.level(task, max((results.end(task, x) for x in METHODS), key=np.mean))
+            level = best_level(results, task)
             until = [results.until(task, variant, axis, level) for axis in ("steps", "seconds")]
         except NotRunError:
             continue
@@ -132,7 +137,7 @@ def ranking(results: Results) -> str:
         cells = []
         for axis in ("steps", "seconds"):
             try:
-                level = results.level(task, max((results.end(task, x) for x in METHODS), key=np.mean))
+                level = best_level(results, task)
                 times = {method: np.median(results.until(task, method, axis, level)) for method in METHODS}
             except NotRunError:
                 break

@@ -106,13 +106,13 @@ class Run:
         if world_size() > 1:
             torch.manual_seed(own_seed(cfg))  # the networks are made, and equal
         saved = read_checkpoint(Path(cfg.resume)) if cfg.resume else None
+        self.revision = revision()
         if saved is None:
-            self.folder, self.revision = Path(HydraConfig.get().runtime.output_dir), revision()
+            self.folder = Path(HydraConfig.get().runtime.output_dir)
             self.carry = env.reset()
         else:
-            self.folder, self.revision = Path(cfg.resume).parent, saved["revision"]
-            if revision() not in self.revision:
-                self.revision = f"{self.revision}, then {revision()}"
+            self.folder, before = Path(cfg.resume).parent, saved["revision"]
+            self.revision = before if self.revision in before else f"{before}, then {self.revision}"
             self._load(saved)
         self.is_over = self.done >= self.iterations and (self.folder / "summary.json").exists()
         self.logger = None

@@ -15,7 +15,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-FORMAT = 1  # of checkpoint.pt; to be raised when an older file can no longer be read
+FORMAT = 2  # of checkpoint.pt; to be raised when an older file can no longer be read
 FREE_ON_RESUME = (
     "resume",
     "total_steps",

@@ -30,7 +30,7 @@ DATA = RECIPES.parent / "docs/results/data"
 QUICK = ["num_envs=4", "horizon=4", "total_steps=64", "env.max_episode_steps=20", "compile=false", "eval.interval=1"]
 CURVE = {  # columns of a curve, and where they stand in metrics.csv
     "steps": "steps",
-    "seconds": "time/seconds",
+    "seconds": "time/processor_seconds",  # in one thread: whatever else the machine does
     "return": "eval/return",
     "success": "eval/success",
     "crash": "eval/crash",
@@ -100,7 +100,7 @@ def keep(job: Job, folder: Path, data: Path) -> None:
         curve = curve or [{"steps": "0", "seconds": "0", "return": "nan"}]
         curve.append({name: x if name in ("steps", "seconds") else "nan" for name, x in curve[-1].items()})
     else:
-        summary = json.loads((folder / "summary.json").read_text())
+        summary = json.loads((folder / "summary.json").read_text()) | {"seconds": curve[-1]["seconds"]}
     own = {"variant": job.variant, "lr": "" if job.lr is None else f"{job.lr:g}", "seed": str(job.seed)}
     path = data / ("search" if job.lr is not None else "curves") / f"{job.task}.csv"
     others = [row for row in read(path) if any(row[name] != own[name] for name in own)]

@@ -66,8 +66,8 @@ class Run:
     (``resume=PATH``), and the best policy so far: the one with the greatest return in these evaluations. That one is
     flown at the end, on other starts. Leaves in the run's folder: ``config.yaml``, ``metrics.csv``, ``checkpoint.pt``,
     ``summary.json``, ``learning_curve.png``, ``flight.png`` and ``flight.gif``. The seconds are those of the loop
-    alone: set-up, compilation, evaluations and checkpoints are outside. Of several processes the first evaluates, logs
-    and saves.
+    alone: set-up, compilation, evaluations and checkpoints are outside. Processor seconds are those in which its
+    threads ran: with one, what it takes on a core of its own. Of several processes the first evaluates, logs and saves.
 
     Args:
         cfg: the configuration, as ``set_up`` left it.
@@ -101,7 +101,7 @@ class Run:
         self.recorded: dict[str, list[float]] = defaultdict(list)
         self.starts: list[Tensor] = []  # positions in which the horizons since the last row have started
         self.rows: list[dict[str, float]] = []  # of metrics.csv
-        self.done, self.seconds, self.skipped = 0, 0.0, 0
+        self.done, self.seconds, self.processor_seconds, self.skipped = 0, 0.0, 0.0, 0
         self.best: dict[str, Any] = {"return": -math.inf}
         if world_size() > 1:
             torch.manual_seed(own_seed(cfg))  # the networks are made, and equal
@@ -146,9 +146,10 @@ class Run:
         ) as bar:
             for iteration in range(self.done, self.iterations):
                 self.starts.append(self.carry["state", "position"].clone())
-                start = time.perf_counter()
+                start, processor_start = time.perf_counter(), time.process_time()
                 yield iteration
                 self.seconds += time.perf_counter() - start
+                self.processor_seconds += time.process_time() - processor_start
                 self.done += 1
                 bar.update(step)
                 if self.done % self.cfg.eval.interval == 0 or self.done == self.iterations:
@@ -219,6 +220,7 @@ class Run:
             "iteration": self.done,
             "steps": steps,
             "time/seconds": self.seconds,
+            "time/processor_seconds": self.processor_seconds,
             "time/steps_per_second": steps / self.seconds,
             **{name: sum(values) / len(values) for name, values in self.recorded.items()},
             "train/start_cells": len(torch.cat(self.starts).div(CELL).floor().unique(dim=0)),
@@ -350,7 +352,7 @@ class Run:
             "revision": self.revision,
             "config": OmegaConf.to_yaml(self.cfg, resolve=True),
             "iteration": self.done,
-            "seconds": self.seconds,
+            "seconds": (self.seconds, self.processor_seconds),
             "skipped": self.skipped,
             "rows": self.rows,
             "best": self.best,
@@ -382,7 +384,8 @@ class Run:
         torch.set_rng_state(own["torch"])
         if own["cuda"] is not None:
             torch.cuda.set_rng_state(own["cuda"], self.env.device)
-        self.done, self.seconds, self.skipped = saved["iteration"], saved["seconds"], saved["skipped"]
+        self.done, self.skipped = saved["iteration"], saved["skipped"]
+        self.seconds, self.processor_seconds = saved["seconds"]
         self.rows, self.best = saved["rows"], saved["best"]
 
 

@@ -90,7 +90,7 @@ def test_a_run_that_fails_is_reported_and_the_others_go_on(monkeypatch, tmp_path
         folder.mkdir(parents=True)
         if "shac" in str(folder):
             raise RuntimeError(f"{folder} ended with 1")
-        (folder / "metrics.csv").write_text("steps,time/seconds,eval/return\n10,1.5,2.5\n")
+        (folder / "metrics.csv").write_text("steps,time/processor_seconds,eval/return\n10,1.5,2.5\n")
         (folder / "summary.json").write_text('{"return": 2.5, "steps": 10, "seconds": 1.5}')
 
     monkeypatch.setattr(reproduce, "run", run)
@@ -105,7 +105,7 @@ def test_a_run_that_fails_is_reported_and_the_others_go_on(monkeypatch, tmp_path
 def test_a_run_that_diverged_is_kept_as_one(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / "metrics.csv").write_text("steps,time/seconds,eval/return,eval/success\n10,1.5,2.5,0.1\n")
+    (folder / "metrics.csv").write_text("steps,time/processor_seconds,eval/return,eval/success\n10,1.5,2.5,0.1\n")
     (folder / "failure.pt").write_text("")
     job = Job("hovering", "abpt", 100, 0.03)
     reproduce.keep(job, folder, tmp_path)

@@ -1,9 +1,10 @@
-"""The wheel: what is in it, and that it works without the repository."""
+"""Source distribution and wheel: what is in them, and that they work without the repository."""
 
 import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -13,18 +14,31 @@ ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
+def built(tmp_path_factory):
+    """The folder with the source distribution, and the wheel that was built from it."""
     folder, source = tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("source")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     shutil.copytree(ROOT / "torchrl_quad", source / "torchrl_quad")
-    command = [sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(source)]
+    command = [sys.executable, "-m", "build", "--outdir", str(folder), str(source)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    return next(folder.glob("*.whl"))
+    return folder
 
 
-def test_it_holds_the_package_the_presets_and_its_types_and_nothing_else(wheel):
+@pytest.fixture(scope="module")
+def wheel(built):
+    return next(built.glob("*.whl"))
+
+
+def test_the_source_distribution_holds_every_file_of_the_package(built):
+    with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    ours = {str(p.relative_to(ROOT)) for p in (ROOT / "torchrl_quad").rglob("*") if p.suffix and p.is_file()}
+    assert {path for path in ours if "__pycache__" not in path} | {"README.md", "LICENSE", "pyproject.toml"} <= names
+
+
+def test_the_wheel_holds_the_package_the_presets_and_its_types_and_nothing_else(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     for drone in ("visfly", "flightmare", "crazyflie", "small_racer"):
         assert f"torchrl_quad/dynamics/drones/{drone}.yaml" in names
@@ -32,7 +46,7 @@ def test_it_holds_the_package_the_presets_and_its_types_and_nothing_else(wheel):
     assert {name.split("/")[0].split("-")[0] for name in names} == {"torchrl_quad"}
 
 
-def test_it_works_away_from_the_repository(wheel, tmp_path):
+def test_the_wheel_works_away_from_the_repository(wheel, tmp_path):
     pip = [
         sys.executable,
         "-m",

@@ -54,12 +54,15 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def revision() -> str:
-    """The git commit of the recipes, with "-dirty" when files differ from it; "unknown" outside a repository."""
-    command = ("git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
-    with contextlib.suppress(OSError):
-        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
-        if done.returncode == 0:
-            return done.stdout.strip()
+    """The git commit of the code, with "-dirty" when the code differs from it; "unknown" outside a repository."""
+
+    def git(*words: str) -> str:
+        command = ("git", "--no-optional-locks", *words)
+        return subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True).stdout
+
+    with contextlib.suppress(OSError, subprocess.CalledProcessError):
+        changed = git("status", "--porcelain", "--", ".", "../torchrl_quad")
+        return git("rev-parse", "HEAD").strip() + ("-dirty" if changed else "")
     return "unknown"
 
 

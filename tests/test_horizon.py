@@ -175,6 +175,29 @@ def test_an_action_of_a_horizon_that_is_not_finite_is_refused_with_its_first_ste
         env.rollout(8, policy, break_when_any_done=False)
 
 
+class Patrol(HoveringEnv):
+    """Waypoints (3, 3) of each drone, the next one first."""
+
+    def initial_state(self, n):
+        state = super().initial_state(n)
+        return {**state, "waypoints": state["position"].unsqueeze(1) + self.uniform(n, 3, 3)}
+
+    def advance(self, previous, state):
+        return {**state, "waypoints": previous["waypoints"].roll(-1, 1)}
+
+
+def test_an_entry_of_a_task_may_have_more_than_one_dimension():
+    env = Patrol(num_envs=3, max_episode_steps=7, dtype=torch.float64)
+    start = env.reset()
+    flight = env.rollout(5, make_actor(env), tensordict=start.clone(), auto_reset=False, break_when_any_done=False)
+    torch.testing.assert_close(flight["next", "state", "waypoints"][:, 0], start["state", "waypoints"].roll(-1, 1))
+    torch.testing.assert_close(flight["next", "state", "waypoints"][:, 2], start["state", "waypoints"])
+    start["state", "velocity"][1] = torch.nan  # its state cannot go on, and its waypoints stay
+    after = env.step(start.set("action", env.hover_action.repeat(3, 1)))["next", "state", "waypoints"]
+    torch.testing.assert_close(after[1], start["state", "waypoints"][1])
+    torch.testing.assert_close(after[0], start["state", "waypoints"][0].roll(-1, 0))
+
+
 def test_without_a_cpp_compiler_the_step_stays_eager_and_says_so(monkeypatch):
     monkeypatch.setenv("PATH", "")
     with pytest.warns(UserWarning, match="neither g.. nor clang.. is on the PATH"):

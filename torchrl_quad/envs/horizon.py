@@ -226,7 +226,9 @@ class Stepper:
         state = layout.unpack(rows)
         if env.task_advances:
             advanced = env.advance(previous, state)
-            state |= {key: torch.where(valid, advanced[key], state[key]) for key in env.task_entries}
+            for key in env.task_entries:
+                keep = valid.reshape(-1, *(1 for _ in state[key].shape[1:]))
+                state[key] = torch.where(keep, advanced[key], state[key])
             rows = layout.pack(state)
 
         terms = {name: torch.where(valid, term, 0.0) for name, term in env.reward_terms(state).items()}

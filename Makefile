@@ -3,7 +3,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: train test clean
+.PHONY: train test docs clean
 
 # Train a drone to hover; leaves a checkpoint, metrics and pictures in outputs/. Overrides: make train ARGS="seed=1"
 train: $(READY)
@@ -15,6 +15,10 @@ test: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 -m "not slow"
 
+# Build the documentation site; open docs/_build/html/index.html.
+docs: $(READY)
+	$(BIN)/python -m sphinx -W --keep-going -n -q -c docs . docs/_build/html
+
 $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
@@ -22,4 +26,4 @@ $(READY): pyproject.toml constraints.txt
 	touch $(READY)
 
 clean:
-	rm -rf $(VENV) outputs build dist *.egg-info
+	rm -rf $(VENV) outputs build dist docs/_build *.egg-info

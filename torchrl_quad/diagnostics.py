@@ -35,10 +35,10 @@ class TermAudit:
     ================  ================================================================================================
     """
 
-    mean_return: float  # over environments, with its sign
-    return_share: float  # of the mean absolute returns of all terms, 0 to 1
-    gradient_norm: float  # of the gradient of the mean return
-    gradient_share: float  # of these norms of all terms, 0 to 1
+    mean_return: float  #: over environments, with its sign
+    return_share: float  #: of the mean absolute returns of all terms, 0 to 1
+    gradient_norm: float  #: of the gradient of the mean return
+    gradient_share: float  #: of these norms of all terms, 0 to 1
     verdict: str
 
 
@@ -145,7 +145,7 @@ def audit_reward(
 class GradientComparison:
     """The gradient of what the simulator tells of the return beside that of what a critic tells of it."""
 
-    cosine: float  # between the two, -1 to 1; NaN where one is zero or does not exist
+    cosine: float  #: between the two, -1 to 1; NaN where one is zero or does not exist
     first_order_norm: float
     value_norm: float
 
@@ -164,7 +164,8 @@ def compare_gradients(loss: PathwiseLoss, rollout: TensorDictBase) -> GradientCo
         rollout: (*, horizon) with its graph.
 
     Raises:
-        ValueError, RuntimeError: as the loss does of a rollout that it cannot use.
+        ValueError: as the loss does of a rollout that it cannot use.
+        RuntimeError: the rollout has lost its graph.
     """
     parts, sources = loss.objective_parts(rollout), _sources(loss)
     value = [parts.pop(loss.value_part)] if loss.value_part in parts else []
@@ -181,9 +182,9 @@ def compare_gradients(loss: PathwiseLoss, rollout: TensorDictBase) -> GradientCo
 class GradientStatistics:
     """The policy gradient of single environments."""
 
-    norm: float  # of their mean
-    variance: float  # over environments, summed over parameters: the trace of the covariance
-    signal_to_noise: float  # the norm of the mean in units of the standard deviation, the root of the variance
+    norm: float  #: of their mean
+    variance: float  #: over environments, summed over parameters, which is the trace of the covariance
+    signal_to_noise: float  #: the norm of the mean in units of the standard deviation, the root of the variance
 
 
 @torch.enable_grad()
@@ -233,7 +234,9 @@ def gradient_by_horizon(
         max_envs: as for :func:`gradient_statistics`.
 
     Raises:
-        ValueError, TypeError, RuntimeError: as ``differentiable_rollout`` and :func:`gradient_statistics` do.
+        ValueError: as ``differentiable_rollout`` and :func:`gradient_statistics` do.
+        TypeError: the policy is not a TensorDictModule.
+        RuntimeError: the rollout has lost its graph.
     """
     start = env.reset() if start is None else start
     return {

@@ -18,8 +18,8 @@ from torchrl_quad.dynamics.vector import Vector, clamp, join, multiply_add, take
 class Setpoint(NamedTuple):
     """What an action asks for: collective thrust and body rates (CTBR)."""
 
-    thrust: Vector  # (*, 1) [N]
-    body_rate: Vector  # (*, 3) [rad/s], body frame
+    thrust: Vector  #: (*, 1) [N]
+    body_rate: Vector  #: (*, 3) [rad/s], body frame
 
 
 class FlightController:

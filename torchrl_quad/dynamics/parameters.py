@@ -62,22 +62,22 @@ class QuadrotorParams:
         ValueError: a value has the wrong shape, is not finite, or breaks the rule of its field.
     """
 
-    mass: Tensor  # (1) [kg]
-    inertia: Tensor  # (3) [kg m2], principal axes
-    rotor_positions: Tensor  # (4, 2) [m], x and y of each rotor
-    rotor_spin: Tensor  # (4), sign of the yaw torque that each rotor exerts on the body
-    torque_to_thrust: Tensor  # (1) [m], kappa: yaw torque per thrust
-    thrust_map: Tensor  # (3), k2 [N s2], k1 [N s], k0 [N]: thrust = k2 w^2 + k1 w + k0
-    rotor_speed_min: Tensor  # (1) [rad/s]
-    rotor_speed_max: Tensor  # (1) [rad/s]
-    motor_time_constant: Tensor  # (1) [s]
-    linear_drag: Tensor  # (3) [N s/m]
-    quadratic_drag: Tensor  # (3) [N s2/m2]
-    rate_gain: Tensor  # (3) [1/s], times the inertia
-    rate_damping: Tensor  # (3) [kg m2], on the angular acceleration
-    max_body_rate: Tensor  # (3) [rad/s], commanded at full stick
-    max_thrust_to_weight: Tensor  # (1), commanded at full stick
-    gravity: Tensor  # (1) [m/s2]
+    mass: Tensor  #: (1) [kg]
+    inertia: Tensor  #: (3) [kg m2], principal axes
+    rotor_positions: Tensor  #: (4, 2) [m], x and y of each rotor
+    rotor_spin: Tensor  #: (4), sign of the yaw torque that each rotor exerts on the body
+    torque_to_thrust: Tensor  #: (1) [m], kappa, yaw torque per thrust
+    thrust_map: Tensor  #: (3), k2 [N s2], k1 [N s] and k0 [N] of thrust = k2 w^2 + k1 w + k0
+    rotor_speed_min: Tensor  #: (1) [rad/s]
+    rotor_speed_max: Tensor  #: (1) [rad/s]
+    motor_time_constant: Tensor  #: (1) [s]
+    linear_drag: Tensor  #: (3) [N s/m]
+    quadratic_drag: Tensor  #: (3) [N s2/m2]
+    rate_gain: Tensor  #: (3) [1/s], times the inertia
+    rate_damping: Tensor  #: (3) [kg m2], on the angular acceleration
+    max_body_rate: Tensor  #: (3) [rad/s], commanded at full stick
+    max_thrust_to_weight: Tensor  #: (1), commanded at full stick
+    gravity: Tensor  #: (1) [m/s2]
 
     def __post_init__(self) -> None:
         for name, value in self.fields().items():

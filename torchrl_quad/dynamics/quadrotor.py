@@ -15,11 +15,11 @@ from torchrl_quad.dynamics.vector import Vector, clamp
 class QuadrotorState(NamedTuple):
     """A rigid body with four turning rotors."""
 
-    position: Vector  # (*, 3) [m], world frame
-    quaternion: Vector  # (*, 4), body to world, unit norm
-    velocity: Vector  # (*, 3) [m/s], world frame
-    angular_velocity: Vector  # (*, 3) [rad/s], body frame
-    rotor_speed: Vector  # (*, 4) [rad/s]
+    position: Vector  #: (*, 3) [m], world frame
+    quaternion: Vector  #: (*, 4), body to world, unit norm
+    velocity: Vector  #: (*, 3) [m/s], world frame
+    angular_velocity: Vector  #: (*, 3) [rad/s], body frame
+    rotor_speed: Vector  #: (*, 4) [rad/s]
 
 
 def physics_step(

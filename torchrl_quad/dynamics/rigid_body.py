@@ -10,10 +10,10 @@ from torchrl_quad.dynamics.vector import Vector, along_z, cross, multiply_add
 class RigidBodyState(NamedTuple):
     """Six degrees of freedom."""
 
-    position: Vector  # (*, 3) [m], world frame
-    quaternion: Vector  # (*, 4), body to world, unit norm
-    velocity: Vector  # (*, 3) [m/s], world frame
-    angular_velocity: Vector  # (*, 3) [rad/s], body frame
+    position: Vector  #: (*, 3) [m], world frame
+    quaternion: Vector  #: (*, 4), body to world, unit norm
+    velocity: Vector  #: (*, 3) [m/s], world frame
+    angular_velocity: Vector  #: (*, 3) [rad/s], body frame
 
 
 def drag(velocity_body: Vector, params: QuadrotorParams) -> Vector:

@@ -19,6 +19,7 @@ __all__ = [
     "make_env",
 ]
 
+#: The tasks by name.
 TASKS: dict[str, type[QuadrotorEnv]] = {
     "hovering": HoveringEnv,
     "landing": LandingEnv,

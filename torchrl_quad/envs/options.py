@@ -27,7 +27,8 @@ _DISTRIBUTIONS = {
 class DroneRandomization:
     """Another drone in each episode: any parameter of the drone that flies, drawn at reset.
 
-    A mapping, or a YAML file of one, from fields of :class:`QuadrotorParams` to a distribution and its two numbers:
+    A mapping, or a YAML file of one, from fields of :class:`~torchrl_quad.QuadrotorParams` to a distribution and its
+    two numbers:
 
     .. code-block:: yaml
 
@@ -106,10 +107,10 @@ class Wind:
         ValueError: a value is negative, not finite, or has the wrong number of entries.
     """
 
-    mean: Sequence[float] = (0.0, 0.0, 0.0)  # [m/s], world frame
-    spread: Sequence[float] = (0.0, 0.0, 0.0)  # [m/s], to both sides of the mean; drawn at reset
-    gust: float = 0.0  # [m/s], standard deviation of the gusts
-    gust_time: float = 1.0  # [s], after which a gust has decayed to 1/e
+    mean: Sequence[float] = (0.0, 0.0, 0.0)  #: [m/s], world frame
+    spread: Sequence[float] = (0.0, 0.0, 0.0)  #: [m/s], to both sides of the mean; drawn at reset
+    gust: float = 0.0  #: [m/s], standard deviation of the gusts
+    gust_time: float = 1.0  #: [s], after which a gust has decayed to 1/e
 
     def __post_init__(self) -> None:
         for name in ("mean", "spread"):
@@ -145,11 +146,11 @@ class Sensors:
         ValueError: a standard deviation or the delay is negative.
     """
 
-    position: float = 0.0  # [m], standard deviation per axis, world frame
-    attitude: float = 0.0  # [rad], per body axis
-    velocity: float = 0.0  # [m/s], per axis, world frame
-    angular_velocity: float = 0.0  # [rad/s], per axis, body frame
-    delay: int = 0  # control steps
+    position: float = 0.0  #: [m], standard deviation per axis, world frame
+    attitude: float = 0.0  #: [rad], per body axis
+    velocity: float = 0.0  #: [m/s], per axis, world frame
+    angular_velocity: float = 0.0  #: [rad/s], per axis, body frame
+    delay: int = 0  #: control steps
 
     def __post_init__(self) -> None:
         for name in ("position", "attitude", "velocity", "angular_velocity"):
@@ -207,10 +208,10 @@ class RandomStart:
         ValueError: a value is negative or not finite.
     """
 
-    tilt: float = 0.0  # [rad], at most; about a random horizontal axis
-    yaw: float = 0.0  # [rad], to both sides
-    velocity: float = 0.0  # [m/s], to both sides, per axis of the world frame
-    angular_velocity: float = 0.0  # [rad/s], to both sides, per axis of the body frame
+    tilt: float = 0.0  #: [rad], at most; about a random horizontal axis
+    yaw: float = 0.0  #: [rad], to both sides
+    velocity: float = 0.0  #: [m/s], to both sides, per axis of the world frame
+    angular_velocity: float = 0.0  #: [rad/s], to both sides, per axis of the body frame
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):

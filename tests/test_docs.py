@@ -1,0 +1,191 @@
+"""The documentation: the site builds without a warning, links lead somewhere, and what stands in a code block runs."""
+
+import importlib
+import re
+import runpy
+import shlex
+import sys
+from importlib.metadata import metadata
+from itertools import pairwise
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+import yaml
+from markdown_it import MarkdownIt
+from packaging.requirements import Requirement
+from sphinx.util.inventory import InventoryFile
+from test_examples import BUDGET, EXAMPLES
+from test_recipes import RECIPES, ROOT, SMALL, run
+
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
+PAGES += sorted(ROOT.glob("docs/*.md"))
+PUBLIC = [f"torchrl_quad{part}" for part in ("", ".data", ".dynamics", ".envs", ".modules", ".objectives", ".render")]
+# What stands in blocks beside python and bash: no code, data, and Sphinx's directives, but for those that hold code.
+NOT_RUN = re.compile(r"(|text|yaml|\{(?!code|sourcecode)[\w-]+\}.*)")
+
+
+def name_of(path):
+    return str(path.relative_to(ROOT))
+
+
+# -- the site ----------------------------------------------------------------------------------------------------------
+
+
+def public_names():
+    for module in map(importlib.import_module, PUBLIC):
+        yield from (f"{module.__name__}.{name}" for name in module.__all__)
+    for module in map(importlib.import_module, ("torchrl_quad.diagnostics", "torchrl_quad.gym")):
+        for name, value in vars(module).items():
+            if getattr(value, "__module__", None) == module.__name__ and not name.startswith("_"):
+                yield f"{module.__name__}.{name}"
+
+
+def test_the_site_builds_without_a_warning_and_describes_every_public_name(tmp_path):
+    (command,) = (line for line in make("docs").splitlines() if "-m sphinx" in line)
+    _, *options, folder = shlex.split(command)
+    assert folder == "docs/_build/html"
+    assert {"-W", "--keep-going", "-n"} <= set(options)
+    run(sys.executable, *options, str(tmp_path))
+    with open(tmp_path / "objects.inv", "rb") as file:
+        inventory = InventoryFile.load(file, "", lambda *parts: "".join(parts))
+    described = set().union(*inventory.values())
+    assert [name for name in public_names() if name not in described] == []
+
+
+def test_the_reference_begins_with_a_table_of_what_the_package_exports():
+    (table,) = re.findall(r"\.\. autosummary::\n\n((?:   \w+\n)+)", (ROOT / "docs/api.md").read_text())
+    assert sorted(table.split()) == sorted(importlib.import_module("torchrl_quad").__all__)
+
+
+@pytest.mark.parametrize("page", ["docs/examples.md", "examples/README.md"])
+def test_every_example_is_shown(page):
+    text = (ROOT / page).read_text()
+    assert {example.name for example in EXAMPLES} == set(re.findall(r"\d\d_\w+\.py", text))
+
+
+# -- links -------------------------------------------------------------------------------------------------------------
+
+
+def headings(text):
+    """The names that GitHub gives to the headings of a page."""
+    titles = [after for before, after in pairwise(MarkdownIt().parse(text)) if before.type == "heading_open"]
+    titles = ["".join(child.content for child in title.children) for title in titles]
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", sorted({*PAGES, *ROOT.glob("*.md")}), ids=name_of)
+def test_links_and_pictures_lead_to_files_and_headings_that_exist(page):
+    inline = (token for token in MarkdownIt().parse(page.read_text()) if token.type == "inline")
+    attributes = (child.attrs for token in inline for child in token.children)
+    for link in (values.get("href", values.get("src")) for values in attributes if values):
+        if link.startswith("https://"):
+            continue
+        path, _, heading = unquote(link).partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists() and target.is_relative_to(ROOT), f"{link}: there is no such file in the repository"
+        assert not heading or heading in headings(target.read_text()), f"{link}: there is no such heading"
+
+
+# -- code --------------------------------------------------------------------------------------------------------------
+
+
+def blocks(text, first_line=0):
+    """Language, first line and content of the fenced blocks of a page, and of those in directives such as {note}."""
+    for token in MarkdownIt().parse(text):
+        if token.type == "fence":
+            language, line = token.info.strip(), first_line + token.map[0] + 1
+            yield language, line, token.content
+            if language.startswith("{"):
+                yield from blocks(token.content, line)
+
+
+def code(page, language):
+    return [(line, content) for kind, line, content in blocks(page.read_text()) if kind == language]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_nothing_escapes_these_tests_behind_another_name(page):
+    for language, line, content in blocks(page.read_text()):
+        known = language in ("python", "bash") or NOT_RUN.fullmatch(language)
+        assert known, f"{page}:{line}: {language!r}. Write python or bash, which are run, or text, which is not code."
+        if language == "yaml":
+            yaml.safe_load(content)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if code(page, "python")], ids=name_of)
+def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
+    lines = []  # the code, at the lines where it stands in the page
+    for line, content in code(page, "python"):
+        lines += [""] * (line - len(lines)) + content.splitlines()
+    program = tmp_path / f"{page.stem}.py"
+    program.write_text(BUDGET.sub(r"\1 = 2", "\n".join(lines)))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    runpy.run_path(str(program), run_name="__main__")
+
+
+def commands():
+    for page in PAGES:
+        for _, content in code(page, "bash"):
+            for command in content.replace("\\\n", " ").splitlines():
+                if words := shlex.split(command, comments=True):
+                    yield pytest.param(words, id=f"{name_of(page)}: {shlex.join(words)}")
+
+
+@pytest.mark.parametrize("command", list(commands()))
+def test_every_command_runs(command, launch, monkeypatch, capsys, tmp_path):
+    program, *words = command
+    script = next((word for word in words if word.endswith(".py")), "")
+    if program == "make":
+        make(*words)  # what it does has tests of its own, and `make test` runs this one
+    elif program == "pip":
+        installs(words)
+    elif program in ("python", "torchrun") and Path(script).stem in (*RECIPES, "evaluate"):
+        recipe(program, words, launch, tmp_path)
+    elif program == "python" and script.startswith("examples/"):
+        assert ROOT / script in EXAMPLES and words == [script]  # which have a test of their own
+    elif program == "python" and script.startswith(("recipes/", "benchmarks/")):
+        monkeypatch.setattr(sys, "argv", [*words, "--help"])  # these have tests of their own, too
+        monkeypatch.syspath_prepend(ROOT / "benchmarks")
+        with pytest.raises(SystemExit, match="^0$"):
+            runpy.run_path(str(ROOT / script), run_name="__main__")
+        usage = capsys.readouterr().out
+        assert {word for word in words if word.startswith("--")} <= set(re.findall(r"--[\w-]+", usage))
+    else:
+        pytest.fail(f"No test knows how to try {program!r}: add it here, or fence as text what cannot be tried.")
+
+
+def make(*arguments):
+    """What make would do."""
+    return run("make", "--dry-run", *arguments)
+
+
+def installs(words):
+    """Try what can be tried of pip without a network: that what is named is what the project has."""
+    assert words.pop(0) == "install"
+    extras, needs = (metadata("torchrl_quad").get_all(name) for name in ("Provides-Extra", "Requires-Dist"))
+    known = {Requirement(need).name for need in needs} | {"torchrl_quad"}
+    while words:
+        word = words.pop(0)
+        if word in ("--constraint", "-c"):
+            assert (ROOT / words.pop(0)).is_file()
+        elif word not in ("--editable", "-e"):
+            wanted = Requirement(re.sub(r"^\.(?=\[|$)", "torchrl_quad", word))
+            assert wanted.name in known and wanted.extras <= set(extras)
+
+
+def recipe(program, words, launch, folder):
+    """Run a recipe on a reduced budget; one that goes on from a checkpoint, from that of another small run."""
+    name = next(Path(word).stem for word in words if word.endswith(".py"))
+    arguments = [word for word in words if "=" in word and not word.startswith(("-", "hydra.run.", "hydra.sweep."))]
+    if program == "torchrun" or "--multirun" in words:
+        program = [sys.executable, *(["-m", "torch.distributed.run"] if program == "torchrun" else [])]
+        target = f"hydra.{'sweep' if '--multirun' in words else 'run'}.dir={folder}"
+        run(*program, *(word.replace("cuda", "cpu") for word in words), *SMALL, target)
+    elif "checkpoint.pt" in " ".join(words):
+        launch("abpt" if name == "evaluate" else name, *SMALL, "total_steps=48", f"hydra.run.dir={folder}")
+        arguments = [re.sub("=outputs/.*checkpoint.pt", f"={folder}/checkpoint.pt", word) for word in arguments]
+        launch(name, *arguments, *([] if name == "evaluate" else ["total_steps=96"]))
+    else:
+        launch(name, *arguments, *SMALL, f"hydra.run.dir={folder}")

@@ -8,11 +8,9 @@ from pathlib import Path
 import hydra
 import torch
 from checkpoints import write_json
-from common import final_evaluation, load_policy
+from common import build_env, final_evaluation, load_policy
 from omegaconf import DictConfig
-from run import print_summary
-
-from torchrl_quad.render import plot_flight
+from run import draw_flight, print_summary, publish_flight
 
 
 @hydra.main(config_path="config", config_name="evaluate", version_base=None)
@@ -22,7 +20,9 @@ def main(cfg: DictConfig) -> None:
     summary, flight = final_evaluation(trained, actor, normalizer, cfg.episodes, cfg.seed)
     folder = Path(cfg.checkpoint).parent
     write_json(folder / "evaluation.json", summary)
-    plot_flight(flight, folder / "evaluation.png", control_dt=trained.env.control_dt)
+    path = folder / "evaluation"
+    draw_flight(flight, path, trained.env.control_dt)
+    publish_flight(flight, path.with_suffix(".pdf"), path.with_suffix(".html"), build_env(trained, 1, 0))
     print_summary(summary, folder)
 
 

@@ -45,7 +45,7 @@ from torchrl_quad import (
     gradient_statistics,
 )
 from torchrl_quad.objectives import PathwiseLoss
-from torchrl_quad.render import animate_flight, plot_flight, plot_learning_curve
+from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, write_replay
 
 CELL = 0.5  # [m]: train/start_cells counts the cubes of this size in which horizons have started
 UNITS = {  # how the metrics of an evaluation are printed: factor and unit
@@ -65,9 +65,10 @@ class Run:
     metrics and a checkpoint. The checkpoint holds all that the run needs to go on exactly as if it had not stopped
     (``resume=PATH``), and the best policy so far: the one with the greatest return in these evaluations. That one is
     flown at the end, on other starts. Leaves in the run's folder: ``config.yaml``, ``metrics.csv``, ``checkpoint.pt``,
-    ``summary.json``, ``learning_curve.png``, ``flight.png`` and ``flight.gif``. The seconds are those of the loop
-    alone: set-up, compilation, evaluations and checkpoints are outside. Processor seconds are those in which its
-    threads ran: with one, what it takes on a core of its own. Of several processes the first evaluates, logs and saves.
+    ``summary.json``, ``learning_curve.png``, and the flight as ``flight.png``, ``flight.gif``, ``flight.html`` and
+    ``episode.pdf``. The seconds are those of the loop alone: set-up, compilation, evaluations and checkpoints are
+    outside. Processor seconds are those in which its threads ran: with one, what it takes on a core of its own. Of
+    several processes the first evaluates, logs and saves.
 
     Args:
         cfg: the configuration, as ``set_up`` left it.
@@ -285,8 +286,7 @@ class Run:
 
     def _log_flight(self, flight: TensorDictBase, steps: int) -> None:
         """Draw a flight, as picture and as film, and hand both to the logger."""
-        plot_flight(flight, self.folder / "flight.png", control_dt=self.cfg.env.control_dt)
-        animate_flight(flight, self.folder / "flight.gif", control_dt=self.cfg.env.control_dt)
+        draw_flight(flight, self.folder / "flight", self.cfg.env.control_dt)
         if self.cfg.logger.backend == "wandb":
             import wandb
 
@@ -300,12 +300,16 @@ class Run:
         summary |= {"steps": steps, "best_steps": self.best["steps"], "seconds": round(self.seconds, 2)}
         summary |= {"revision": self.revision}
         self._log_flight(flight, steps)
-        plot_learning_curve(self.folder / "metrics.csv", self.folder / "learning_curve.png")
+        publish_flight(flight, self.folder / "episode.pdf", self.folder / "flight.html", self.env)
+        with replacing(self.folder / "learning_curve.png") as path:
+            plot_learning_curve(self.folder / "metrics.csv", path)
         if self.cfg.logger.backend == "wandb":
             import wandb
 
             experiment = self.logger.experiment
-            experiment.log({"eval/learning_curve": wandb.Image(str(self.folder / "learning_curve.png"))})
+            curve = wandb.Image(str(self.folder / "learning_curve.png"))
+            page = wandb.Html(str(self.folder / "flight.html"), inject=False)  # as it is
+            experiment.log({"eval/learning_curve": curve, "eval/replay": page})
             experiment.summary.update({f"final/{name}": value for name, value in summary.items()})
             checkpoint = wandb.Artifact(f"{self.cfg.task}_{self.cfg.algorithm}_{experiment.id}", type="model")
             checkpoint.add_file(str(self.folder / "checkpoint.pt"))
@@ -387,6 +391,20 @@ class Run:
         self.done, self.skipped = saved["iteration"], saved["skipped"]
         self.seconds, self.processor_seconds = saved["seconds"]
         self.rows, self.best = saved["rows"], saved["best"]
+
+
+def draw_flight(flight: TensorDictBase, path: Path, control_dt: float) -> None:
+    """Write a flight as a picture and as a film: the path with .png and .gif."""
+    for draw, suffix in ((plot_flight, ".png"), (animate_flight, ".gif")):
+        with replacing(path.with_suffix(suffix)) as temporary:
+            draw(flight, temporary, control_dt=control_dt)
+
+
+def publish_flight(flight: TensorDictBase, figure: Path, page: Path, env: EnvBase) -> None:
+    """Write the first episode of a flight as a figure for a paper, and the flight as a page to play it in a browser."""
+    with replacing(figure) as temporary:
+        plot_episode(flight, temporary, control_dt=env.control_dt)
+    write_replay(flight, page, env=env)  # whole or not at all, by itself
 
 
 def print_summary(summary: dict[str, Any], folder: Path | None = None) -> None:

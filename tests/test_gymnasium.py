@@ -15,7 +15,7 @@ import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence, data_shares_objects
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import PassiveEnvChecker, TimeLimit
+from gymnasium.wrappers import PassiveEnvChecker, RenderCollection, TimeLimit
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 from torchrl import envs as torchrl_envs
 
@@ -76,7 +76,7 @@ def test_registering_again_changes_nothing_and_warns_of_nothing():
 
 @pytest.mark.parametrize("task", TASKS)
 def test_gymnasium_s_checker_finds_nothing(task):
-    check_env(gymnasium.make(name(task), max_episode_steps=-1).unwrapped)
+    check_env(gymnasium.make(name(task), max_episode_steps=-1, render_mode="rgb_array").unwrapped)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -229,6 +229,53 @@ def test_a_reset_mask_leaves_the_other_drones_where_they_are():
     assert env._now["state", "step"].flatten().tolist() == [3, 0, 3]
 
 
+# -- pictures ----------------------------------------------------------------------------------------------------------
+
+
+def test_gymnasium_s_wrapper_collects_a_picture_of_every_step():
+    env = RenderCollection(gymnasium.make(HOVERING, control_dt=0.04, render_mode="rgb_array"))
+    assert env.metadata["render_fps"] == 25
+    env.reset(seed=0)
+    for actions in some_actions(9, 1):
+        env.step(actions[0])
+    pictures = env.render()
+    assert [picture.shape for picture in pictures] == 10 * [(336, 336, 3)]
+    assert all(picture.dtype == np.uint8 for picture in pictures)
+    assert (pictures[0] != pictures[-1]).any()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_many_drones_give_a_picture_each_of_where_they_are(mode):
+    options = {"dtype": torch.float64, "max_episode_steps": 7, "render_mode": "rgb_array"}
+    env = sinking(GymVectorEnv("hovering", 2, autoreset_mode=mode, **options), [0.05, 1.5])
+    env.reset()
+    for actions in some_actions(20, 2):
+        _, _, terminated, truncated, _ = env.step(actions)
+        over = terminated | truncated
+        if terminated[0] and not truncated[1]:
+            break
+    if mode is AutoresetMode.DISABLED:
+        env.reset(options={"reset_mask": over})
+    elif mode is AutoresetMode.NEXT_STEP:
+        env.step(actions)
+    assert env._now["state", "step"][0] == 0 < env._now["state", "step"][1]  # one has begun anew, the other flies on
+    first, second = env.render()
+    assert (first != second).any()
+    env.torchrl_env.reset(env._now.clone(), set_state=True)
+    for i, picture in enumerate((first, second)):
+        np.testing.assert_array_equal(picture, env.torchrl_env.render([i]))
+
+
+def test_without_a_render_mode_or_an_episode_there_is_no_picture():
+    env = GymEnv("hovering")
+    env.reset()
+    with pytest.warns(UserWarning, match='draws nothing without render_mode="rgb_array"'):
+        assert env.render() is None
+    for build in (GymEnv, GymVectorEnv):
+        with pytest.raises(ResetNeeded, match=r"call reset\(\) first"):
+            build("hovering", render_mode="rgb_array").render()
+
+
 # -- random numbers, memory, gradients ---------------------------------------------------------------------------------
 
 
@@ -334,7 +381,7 @@ def test_unknown_options_are_refused_with_those_that_exist():
     with pytest.raises(ValueError, match="num_envs is for many drones, .* Write gymnasium.make_vec instead."):
         gymnasium.make(HOVERING, num_envs=2)
     for build in (GymEnv, GymVectorEnv):
-        with pytest.raises(ValueError, match="Unknown render_mode 'human': these environments draw no pictures."):
+        with pytest.raises(ValueError, match="Unknown render_mode 'human'. Choose \"rgb_array\""):
             build("hovering", render_mode="human")
     with pytest.raises(TypeError, match="control_dt"):
         GymEnv("hovering", frameskip=2)

@@ -1,6 +1,7 @@
 """The two towers meet in the recipes alone."""
 
 import ast
+import subprocess
 import sys
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torchrl_quad
 PACKAGE = Path(torchrl_quad.__file__).parent
 ALLOWED = {  # what each part of the package may import of the others
     "dynamics": set(),
-    "envs": {"dynamics"},
+    "envs": {"dynamics", "render"},  # render only within env.render(), see below
     "render": {"dynamics", "envs"},
     "modules": set(),
     "objectives": set(),
@@ -23,8 +24,8 @@ ALLOWED = {  # what each part of the package may import of the others
 TORCHRL = {"torch", "torchrl", "tensordict"}
 LIBRARIES = {
     "dynamics": {"torch", "numpy", "yaml"},
-    "envs": TORCHRL,
-    "render": {"tensordict", "torch", "matplotlib", "PIL", "numpy"},
+    "envs": TORCHRL | {"numpy"},
+    "render": {"tensordict", "torch", "matplotlib", "mpl_toolkits", "plotly", "PIL", "numpy"},
     "modules": TORCHRL,
     "objectives": TORCHRL,
     "data": TORCHRL,
@@ -52,6 +53,12 @@ def test_each_part_imports_only_what_it_may(part):
         assert parts <= ALLOWED[part], path
         outside = {name.split(".")[0] for name in names} - sys.stdlib_module_names - {"torchrl_quad"}
         assert outside <= LIBRARIES[part], path
+
+
+def test_environments_load_what_draws_only_when_they_are_asked_to_draw():
+    program = "import sys, torchrl_quad; assert not {'torchrl_quad.render', 'matplotlib'} & set(sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_every_public_part_is_covered():

@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 import time
+from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -210,7 +211,7 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
 # -- watch -------------------------------------------------------------------------------------------------------------
 
 
-def test_wandb_gets_configuration_metrics_pictures_films_and_the_checkpoint(train, tmp_path):
+def test_wandb_gets_configuration_metrics_pictures_films_replay_and_checkpoint(train, tmp_path):
     train("bptt", tmp_path, "logger.backend=wandb", "logger.flight_every=4")
     resumed = train("bptt", tmp_path, "resume=auto", "total_steps=240")
     logs = sorted(tmp_path.glob("wandb/offline-run-*/*.wandb"))
@@ -229,8 +230,18 @@ def test_wandb_gets_configuration_metrics_pictures_films_and_the_checkpoint(trai
     assert names <= set(curves[0])
     assert {name.split("/")[0] for name in names} == {"train", "eval", "reward", "grad", "time"}
     assert [row["eval/return"] for row in curves] == [row["eval/return"] for row in resumed["rows"][:4]]
-    media = [name for row in history for name in row if name in ("eval/flight", "eval/film", "eval/learning_curve")]
-    assert sorted(media) == ["eval/film", "eval/film", "eval/flight", "eval/flight", "eval/learning_curve"]
+    # The last evaluation and the final one draw the flight; the page comes with the final one alone.
+    items = [item for record in first["history"] for item in record.history.item]
+    media = [(item.nested_key[0], json.loads(item.value_json)) for item in items if item.nested_key[1:] == ["path"]]
+    kinds = {
+        "eval/flight": (2, b"\x89PNG"),
+        "eval/film": (2, b"GIF89a"),
+        "eval/learning_curve": (1, b"\x89PNG"),
+        "eval/replay": (1, b"<!doctype html>"),
+    }
+    assert Counter(name for name, path in media) == {name: count for name, (count, _) in kinds.items()}
+    for name, path in media:
+        assert (logs[0].parent / "files" / path).read_bytes().startswith(kinds[name][1]), name
     assert first["artifact"][0].artifact.type == "model"
     assert [entry.path for entry in first["artifact"][0].artifact.manifest.contents] == ["checkpoint.pt"]
     assert [logged(r)["eval/step"] for r in second["history"] if "eval/return" in logged(r)] == [240]

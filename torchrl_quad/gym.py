@@ -40,7 +40,7 @@ class GymVectorEnv(VectorEnv):
         task: "hovering", "landing", "racing" or "tracking".
         num_envs: number of drones.
         autoreset_mode: "NextStep", "SameStep" or "Disabled", or the ``AutoresetMode``.
-        render_mode: None; there are no pictures.
+        render_mode: "rgb_array" for pictures, which need matplotlib; None for none.
         **kwargs: for the task's environment. Without ``seed`` the first starts differ from run to run, as is usual in
             gymnasium.
 
@@ -49,7 +49,7 @@ class GymVectorEnv(VectorEnv):
         ResetNeeded: a step before the first reset, or, with "Disabled", after an episode's end.
     """
 
-    metadata = {"render_modes": []}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
 
     def __init__(
         self,
@@ -63,16 +63,17 @@ class GymVectorEnv(VectorEnv):
         modes = [mode.value for mode in AutoresetMode]
         if autoreset_mode not in (*modes, *AutoresetMode):
             raise ValueError(f"Unknown autoreset_mode {autoreset_mode!r}. Choose from: {', '.join(modes)}.")
-        if render_mode is not None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(
-                f"Unknown render_mode {render_mode!r}: these environments draw no pictures. Leave it out, and see "
-                "torchrl_quad.render for figures of a flight."
+                f'Unknown render_mode {render_mode!r}. Choose "rgb_array", for pictures as arrays, or leave it out.'
             )
+        self.render_mode = render_mode
         self.torchrl_env = make_env(task, num_envs=num_envs, **kwargs)
         if "seed" not in kwargs:
             self.torchrl_env.set_seed(None)
         self.num_envs, self.autoreset_mode = num_envs, AutoresetMode(autoreset_mode)
-        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        fps = round(1 / self.torchrl_env.control_dt)
+        self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
         size = self.torchrl_env.observation_spec["observation"].shape[-1]
         self.single_observation_space = Box(-_LIMIT, _LIMIT, (size,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (4,), np.float32)
@@ -123,6 +124,21 @@ class GymVectorEnv(VectorEnv):
         everyone = np.ones(self.num_envs, dtype=bool)
         return _observation(self._now), reward, terminated, truncated, {**info, **_info(self._now, everyone)}
 
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """A picture (336, 336, 3) of each drone, uint8; None without ``render_mode="rgb_array"``.
+
+        Of an episode that has ended, with "SameStep", it shows the start of the next, as gymnasium's own do.
+
+        Raises:
+            ResetNeeded: before the first reset.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn('render() draws nothing without render_mode="rgb_array", an argument of make_vec.')
+            return None
+        if self._now is None:
+            raise ResetNeeded("A picture needs an episode to show: call reset() first.")
+        return tuple(self.torchrl_env.render([i]) for i in range(self.num_envs))
+
     def close_extras(self, **kwargs: Any) -> None:
         """Close the TorchRL environment."""
         self.torchrl_env.close()
@@ -131,6 +147,7 @@ class GymVectorEnv(VectorEnv):
         fresh = self.torchrl_env.reset()
         keep = self._now is not None and not mask.all()
         self._now = fresh.where(torch.as_tensor(mask, device=self.torchrl_env.device), self._now) if keep else fresh
+        self.torchrl_env._see(self._now["state"])  # where the others are, too: the reset was that of all drones
         self._over = self._over & ~mask
 
     def _final(self, after: Any) -> dict[str, Any]:
@@ -161,14 +178,15 @@ class GymEnv(gymnasium.Env):
         ResetNeeded: a step before the first reset, or after the end of an episode.
     """
 
-    metadata = {"render_modes": []}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
 
     def __init__(self, task: str, **kwargs: Any) -> None:
         for name in ("num_envs", "autoreset_mode"):
             if name in kwargs:
                 raise ValueError(f"{name} is for many drones, and GymEnv flies one. Write gymnasium.make_vec instead.")
         self._drones = GymVectorEnv(task, autoreset_mode=AutoresetMode.DISABLED, **kwargs)
-        self.torchrl_env = self._drones.torchrl_env
+        self.torchrl_env, self.render_mode = self._drones.torchrl_env, self._drones.render_mode
+        self.metadata = {name: self._drones.metadata[name] for name in self.metadata}
         self.observation_space = self._drones.single_observation_space
         self.action_space = self._drones.single_action_space
 
@@ -184,6 +202,11 @@ class GymEnv(gymnasium.Env):
         """Fly one control step with an action (4)."""
         observation, *told, info = self._drones.step(_checked(action, self.action_space.shape)[None])
         return observation[0], *(x.item() for x in told), _first(info)
+
+    def render(self) -> np.ndarray | None:
+        """A picture (336, 336, 3), uint8; None without ``render_mode="rgb_array"``."""
+        frames = self._drones.render()
+        return None if frames is None else frames[0]
 
     def close(self) -> None:
         """Close the TorchRL environment."""

@@ -11,9 +11,9 @@ import numbers
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -32,8 +32,13 @@ from torchrl_quad.dynamics import (
 from torchrl_quad.dynamics.parameters import RawParams
 from torchrl_quad.envs import horizon, options
 
+if TYPE_CHECKING:
+    import numpy as np
+
 # The Markov state by name, each entry (num_envs, ...); ("drone", field) is the name of a randomised parameter.
 State = dict[Any, Tensor]
+
+_DRAWN = "position", "quaternion", "target"
 
 
 class QuadrotorEnv(EnvBase):
@@ -74,7 +79,7 @@ class QuadrotorEnv(EnvBase):
         dtype: torch.float32 or torch.float64.
         seed: seed of the environment's own random generator, or None for another one each time. Copies with one seed,
             as in ParallelEnv, fly alike: give each its own, or call ``set_seed`` on all of them.
-        drone: name of a preset, path of a YAML file, mapping, or :class:`QuadrotorParams`.
+        drone: name of a preset, path of a YAML file, mapping, or :class:`~torchrl_quad.QuadrotorParams`.
         dt: physics step [s].
         control_dt: control step [s], a whole multiple of dt.
         action_delay: control steps between an action and its effect.
@@ -156,6 +161,7 @@ class QuadrotorEnv(EnvBase):
         self.dt, self.control_dt, self.substeps = dt, control_dt, substeps
         self.action_delay, self.integrator, self.max_episode_steps = action_delay, integrator, max_episode_steps
         self.observe_last_action = observe_last_action
+        #: where resets start, see :meth:`set_initial_state_source`; None for the task's own starts
         self.initial_state_source: Callable[[int], TensorDictBase] | None = None
         params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone)
         for name, value in params.fields().items():
@@ -173,6 +179,7 @@ class QuadrotorEnv(EnvBase):
         self.wind = None if wind is None else options.build(options.Wind, "wind", wind)
         self.random_start = options.build(options.RandomStart, "random_start", random_start or {})
         self.randomization = options.DroneRandomization(randomize or {}, self.nominal)
+        self._seen: State = {}  # what render() draws
         self._set_seed(seed)
         self.set_up()
         # Stands in for a state that is not finite, so that its environment computes on with harmless numbers.
@@ -206,8 +213,8 @@ class QuadrotorEnv(EnvBase):
     def is_success(self, state: State) -> Tensor:
         """Where the state, by itself, fulfils the task, bool (num_envs, 1)."""
 
-    weights: Mapping[str, float] = {}  # of the reward's terms, which an argument of the same name overrides
-    ends_on_success = False  # whether success terminates the episode, too
+    weights: Mapping[str, float] = {}  #: of the reward's terms, which an argument of the same name overrides
+    ends_on_success = False  #: whether success terminates the episode, too
 
     def set_up(self) -> None:
         """Make the constant tensors of the task; called when device and precision are known, and after a move."""
@@ -344,6 +351,7 @@ class QuadrotorEnv(EnvBase):
         self.set_up()
         self.set_seed(self._seed)
         self.stepper = horizon.Stepper(self, self.stepper.options)
+        self._seen = {}
         return self
 
     def set_initial_state_source(self, source: Callable[[int], TensorDictBase] | None) -> None:
@@ -368,14 +376,17 @@ class QuadrotorEnv(EnvBase):
             self.rng.manual_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False) -> TensorDictBase:
-        if not set_state:
-            return self._tensordict(self.first_entries(self.draw_start()))
-        source = "reset(..., set_state=True)"
-        _require(
-            tensordict is not None and "state" in tensordict,
-            f'{source} needs a tensordict with the state to set under "state"; got none.',
-        )
-        return self._tensordict(self.first_entries(self._checked_state(tensordict.get("state"), source)))
+        if set_state:
+            source = "reset(..., set_state=True)"
+            _require(
+                tensordict is not None and "state" in tensordict,
+                f'{source} needs a tensordict with the state to set under "state"; got none.',
+            )
+            state = self._checked_state(tensordict.get("state"), source)
+        else:
+            state = self.draw_start()
+        self._see(state, None if tensordict is None else tensordict.get("_reset", None))
+        return self._tensordict(self.first_entries(state))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         stepper, action = self.stepper, tensordict.get("action", None)
@@ -386,9 +397,9 @@ class QuadrotorEnv(EnvBase):
         # TorchRL resets by itself: what the episode after this one would start from is not used.
         end = stepper(state, valid, action, noise, state.detach(), self._no_observation)
         horizon.require_finite(action)
-        return self._tensordict(
-            {"observation": end.observation, **horizon.nested(stepper.entries(end.state, end.told))}
-        )
+        entries = horizon.nested(stepper.entries(end.state, end.told))
+        self._see(entries["state"])
+        return self._tensordict({"observation": end.observation, **entries})
 
     def rollout(self, max_steps: int, policy: Any = None, callback: Any = None, **options: Any) -> TensorDictBase:
         """As TorchRL's rollout; several times faster where it flies on through the ends of episodes.
@@ -402,9 +413,52 @@ class QuadrotorEnv(EnvBase):
         if quick and set(options) <= {"break_when_any_done", "auto_reset", "tensordict"}:
             start = self.reset() if start is None else start
             if horizon.can_fly(self, policy, start):
-                return horizon.fly(self, policy, start, max_steps)
+                rollout = horizon.fly(self, policy, start, max_steps)
+                last = rollout["next", "state"]
+                self._see({key: last[key][:, -1].clone() for key in _DRAWN if key in last})  # not all of its memory
+                return rollout
             options |= {"tensordict": start, "auto_reset": False}
         return super().rollout(max_steps, policy, callback, **options)
+
+    def render(self, drones: Sequence[int] | None = None, *, size: int = 336) -> np.ndarray:
+        """Draw the drones as the last reset, step or rollout has left them, with their targets, into one picture.
+
+        That is what TorchRL's ``PixelRenderTransform`` asks for, and ``VideoRecorder`` makes a video of:
+        ``TransformedEnv(env, Compose(PixelRenderTransform(), VideoRecorder(logger, "flight", fps=50)))`` films every
+        control step. Keywords of the transform come here: ``PixelRenderTransform(drones=[0, 1], size=480)``. The view
+        grows when a drone leaves it.
+
+        Args:
+            drones: indices of those to draw; by default the first six.
+            size: width and height [pixels].
+
+        Returns:
+            the picture (size, size, 3), uint8.
+
+        Raises:
+            ValueError: there is no state yet, as before the first reset and after ``to``; or an argument is out of its
+                range.
+            ImportError: matplotlib is missing.
+        """
+        _require(
+            bool(self._seen),
+            "render() draws the state that the last reset or step has led to, and there is none yet. Call env.reset() "
+            "first.",
+        )
+        from torchrl_quad.render.frames import draw_frame  # only who draws needs matplotlib
+
+        return draw_frame(self, self._seen, drones, size)
+
+    def _see(self, state: Mapping[str, Tensor], mask: Tensor | None = None) -> None:
+        """Keep of a state what render() draws; a mask tells which environments it is of.
+
+        A step stays a pure function: nothing reads this but render(). Detached, it keeps no graph alive, and refers to
+        tensors that are there anyway. A weak reference would be gone as soon as the caller has made a copy.
+        """
+        seen = {key: state[key].detach() for key in _DRAWN if key in state}
+        if mask is not None and self._seen:
+            seen = {key: torch.where(mask.reshape(-1, 1), x, self._seen[key]) for key, x in seen.items()}
+        self._seen = seen
 
     # -- one step, as a function of its input --------------------------------------------------------------------------
 

@@ -62,7 +62,7 @@ def plot_flight(rollout: TensorDictBase, path: str | Path, *, num_envs: int = 12
     from matplotlib.ticker import MaxNLocator
 
     space = figure.add_axes((0.02, 0.03, 0.42, 0.9), projection="3d")
-    over_time = figure.add_axes((0.52, 0.12, 0.46, 0.83))
+    over_time = figure.add_axes((0.54, 0.12, 0.44, 0.83))
     for i, color in enumerate(shades(len(position))):
         x, y, z = np.concatenate((start[i : i + 1], position[i, first[i]])).T
         space.plot(x, y, z, color=color, linewidth=1.2)
@@ -75,8 +75,8 @@ def plot_flight(rollout: TensorDictBase, path: str | Path, *, num_envs: int = 12
     space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="Flights from fresh starts")
     for axis in (space.xaxis, space.yaxis, space.zaxis):
         axis.set_major_locator(MaxNLocator(4))
-    over_time.set(xlabel="time [s]", ylabel=label, yscale=scale)
-    over_time.yaxis.set_major_formatter("{x:g}")
+    over_time.set(xlabel="time [s]", ylabel=label)
+    _set_scale(over_time, scale)
     over_time.grid(alpha=0.3)
     figure.savefig(path, dpi=130)
 
@@ -106,7 +106,7 @@ def plot_episode(rollout: TensorDictBase, path: str | Path, *, env_index: int = 
     flight = flight[: int(QuadrotorEnv.first_episode(flight.unsqueeze(0)).sum())]
     figure = make_figure(figsize=(_WIDTH, 3.4))
     from matplotlib import rc_context
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+    from matplotlib.ticker import MaxNLocator
 
     with rc_context(_PAPER):
         space = figure.add_axes((0.0, 0.2, 0.44, 0.8), projection="3d", computed_zorder=False)
@@ -115,11 +115,7 @@ def plot_episode(rollout: TensorDictBase, path: str | Path, *, env_index: int = 
         times = control_dt * np.arange(len(flight) + 1)
         label, scale, lines = _errors(flight)
         _draw_lines(axes[0], times, lines, label)
-        axes[0].set_yscale(scale)
-        if scale == "log":
-            axes[0].yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-            axes[0].yaxis.set_major_formatter("{x:g}")
-            axes[0].yaxis.set_minor_formatter(NullFormatter())
+        _set_scale(axes[0], scale)
         actions = dict(zip(("thrust", "roll rate", "pitch rate", "yaw rate"), flight["action"].T.numpy(), strict=True))
         _draw_lines(axes[1], times[:-1], actions, "action", drawstyle="steps-post")
         speeds = {f"rotor {i + 1}": x for i, x in enumerate(_with_start(flight, "rotor_speed").T)}
@@ -219,8 +215,7 @@ def plot_learning_curve(metrics: str | Path, path: str | Path) -> None:
         )
         upper.set_xlabel("control steps", color=INK)
         if "error" in label:
-            axis.set_yscale("log")
-            axis.yaxis.set_major_formatter("{x:g}")
+            _set_scale(axis, "log")
     figure.savefig(path, dpi=130)
 
 
@@ -318,6 +313,17 @@ def _draw_lines(axis: Any, time: np.ndarray, lines: dict[str, np.ndarray], label
     axis.set_ylabel(label)
     axis.yaxis.set_label_coords(-0.13, 0.5, transform=axis.transAxes)  # those of all panels in one line
     axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.02), ncols=4)
+
+
+def _set_scale(axis: Any, scale: str) -> None:
+    """ "linear" or "log" for the vertical axis, with plain numbers at its ticks."""
+    axis.set_yscale(scale)
+    if scale == "log":
+        from matplotlib.ticker import LogLocator, NullFormatter
+
+        axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+        axis.yaxis.set_minor_formatter(NullFormatter())
+    axis.yaxis.set_major_formatter("{x:g}")
 
 
 def _places(target: Tensor) -> Tensor | None:

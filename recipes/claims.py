@@ -4,7 +4,7 @@ A claim is one part or several, and every part is a number with a bootstrap over
 95 % interval lies on the right side of the threshold. It is refuted when an interval that is wider, by the number m of
 parts (quantiles 0.025 / m and 1 - 0.025 / m), lies on the wrong side: of many parts one will look refuted by chance.
 A claim is supported when all its parts are, refuted when one of them is, and undecided otherwise. With fewer than five
-seeds of any run that it needs it is preliminary.
+seeds of any run that it needs it is preliminary, with fewer than three it has no verdict.
 
 Three statistics carry most of it:
 
@@ -35,6 +35,7 @@ METHODS = tuple(METHOD_VARIANTS)
 FIRST_ORDER = ("abpt", "shac", "bptt")
 PUBLISHED = {"bptt": "bptt-episode", "shac": "shac-cut"}  # the same methods as published with the paper
 LEVEL = {"hovering": 0.98, "tracking": 0.98, "landing": 0.9, "racing": 0.9}
+LEAST_SEEDS = 3  # for a verdict
 EQUAL = 0.02  # share of the return within which two methods are equal in hovering and tracking
 
 
@@ -402,6 +403,8 @@ def try_claim(claim: Claim, results: Results) -> Verdict:
     each = {part.verdict(len(parts)) for part in parts}
     verdict = "refuted" if "refuted" in each else "undecided" if "undecided" in each else "supported"
     seeds = results.seeds(results.used)
+    if 0 < seeds < LEAST_SEEDS:
+        return Verdict(claim, "too few seeds", [], seeds)
     return Verdict(claim, f"{verdict} (preliminary)" if 0 < seeds < len(SEEDS) else verdict, parts, seeds)
 
 

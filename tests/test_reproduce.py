@@ -198,10 +198,11 @@ def test_a_method_that_ends_higher_with_every_seed_is_supported_and_one_that_doe
     )
 
 
-def test_fewer_than_five_seeds_of_any_run_are_preliminary(tmp_path):
-    r = data(tmp_path, seeds=(42, 0, 1), abpt=lambda s: [9], shac=lambda s: [8])
-    verdict = try_claim(Claim("A", "", lambda r: claims.higher_end(r, ["hovering"], "abpt", ["shac"])), r)
-    assert verdict.verdict == "supported (preliminary)" and verdict.seeds == 3
+@pytest.mark.parametrize(("seeds", "verdict"), [((42, 0, 1), "supported (preliminary)"), ((42, 0), "too few seeds")])
+def test_fewer_than_five_seeds_of_any_run_are_preliminary_and_fewer_than_three_no_verdict(tmp_path, seeds, verdict):
+    r = data(tmp_path, seeds=seeds, abpt=lambda s: [9], shac=lambda s: [8])
+    claim = Claim("A", "", lambda r: claims.higher_end(r, ["hovering"], "abpt", ["shac"]))
+    assert try_claim(claim, r).verdict == verdict and try_claim(claim, r).seeds == len(seeds)
 
 
 def test_methods_have_converged_when_they_reach_nearly_what_both_reach(tmp_path):

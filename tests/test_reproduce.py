@@ -137,7 +137,7 @@ def test_the_jobs_of_the_matrix_are_valid_runs_of_their_recipes_and_each_is_ther
     with initialize_config_dir(str(reproduce.RECIPES / "config"), version_base=None):
         for job in jobs:
             cfg = compose(matrix.VARIANTS[job.variant].algorithm, job.overrides(1e-3))
-            assert cfg.actor.lr == pytest.approx(job.lr or 1e-3)
+            assert cfg.actor.lr == pytest.approx((job.lr or 1e-3) * matrix.VARIANTS[job.variant].rate)
             if job.task == "racing":
                 assert cfg.env.reward == ("velocity" if "velocity" in job.variant else "position")
                 assert "critic" not in cfg or cfg.critic.num_cells == [128, 128]

@@ -235,7 +235,7 @@ class Run:
         if self.logger is not None:
             self.logger.log_metrics({key: x for key, x in row.items() if "/" in key}, step=steps)
         every = self.cfg.logger.flight_every
-        if every and len(self.rows) % every == 0:
+        if every and len(self.rows) % every == 0 and self.done < self.iterations:  # at the end the best one is drawn
             self._log_flight(flight, steps)
         if metrics["eval/return"] >= self.best["return"]:
             policy = {"actor": self.actor, **({"normalizer": self.env.transform} if self.cfg.normalize else {})}

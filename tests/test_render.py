@@ -17,7 +17,8 @@ from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 from torchrl.record.loggers.wandb import WandbLogger
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_env
-from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve
+from torchrl_quad.render import animate_flight, figures, plot_episode, plot_flight, plot_learning_curve, write_replay
+from torchrl_quad.render.frames import Scene
 
 TASKS = ["hovering", "landing", "racing", "tracking"]
 
@@ -79,7 +80,14 @@ def lines(axis):
 # -- pictures and films ------------------------------------------------------------------------------------------------
 
 
-def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(tmp_path):
+def flown(flight):
+    """The positions (time + 1, 3) of each first episode, from its start to its end."""
+    start, ends = flight["state", "position"], flight["next", "state", "position"]
+    steps = flight["next", "done"][..., 0].int().argmax(1) + 1
+    return [torch.cat((s[:1], e[:n])) for s, e, n in zip(start, ends, steps, strict=True)]
+
+
+def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(drawn, tmp_path):
     env = HoveringEnv(num_envs=3, max_episode_steps=40)
     td = env.reset()
     td["state", "position"][1] = torch.tensor([1.0, 0.0, 5.99])
@@ -87,24 +95,110 @@ def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(tm
     flight = env.rollout(60, tensordict=env.reset(td, set_state=True), auto_reset=False, break_when_any_done=False)
     assert flight["next", "terminated"][1].any()
     plot_flight(flight, tmp_path / "flight.png")
-    assert (tmp_path / "flight.png").stat().st_size > 10_000
+    space, over_time = drawn[0].axes
+    for path, line, expected in zip(space.lines, over_time.lines, flown(flight), strict=True):
+        np.testing.assert_array_equal(np.stack(path.get_data_3d(), -1), expected)
+        distance = (expected - flight["state", "target"][0, 0]).norm(dim=-1)
+        time = 0.02 * torch.arange(len(expected))
+        np.testing.assert_allclose(line.get_xydata(), torch.stack((time, distance), -1), rtol=1e-5)
 
 
-@pytest.mark.parametrize("task", ["landing", "racing", "tracking"])
-def test_a_flight_of_every_task_is_drawn(task, tmp_path):
-    env = make_env(task, num_envs=2, max_episode_steps=30)
-    plot_flight(env.rollout(70, break_when_any_done=False), tmp_path / "flight.png")
-    assert (tmp_path / "flight.png").stat().st_size > 10_000
+class Wandering(HoveringEnv):
+    """To another place in each episode."""
+
+    def initial_state(self, n):
+        return super().initial_state(n) | {"target": self.uniform(n, 3) + self.tensor([0.0, 0.0, 3.0])}
+
+
+@pytest.mark.parametrize("task", ["landing", "racing", "tracking", "wandering"])
+def test_the_targets_of_a_flight_are_those_of_its_first_episodes(task, drawn, monkeypatch, tmp_path):
+    scenes = []
+    monkeypatch.setattr(figures, "Scene", lambda *args, **still: scenes.append(still) or Scene(*args, **still))
+    options = {"num_envs": 2, "max_episode_steps": 30}
+    env = Wandering(**options) if task == "wandering" else make_env(task, **options)
+    flight = env.rollout(70, break_when_any_done=False)
+    plot_flight(flight, tmp_path / "flight.png")
+    animate_flight(flight, tmp_path / "flight.gif")
+    space, over_time = drawn[0].axes
+    assert over_time.get_ylabel() == ("gates passed" if task == "racing" else "distance to the target [m]")
+    name = "gate" if task == "racing" else "target"
+    if task == "tracking":
+        (line,) = [line for line in space.lines if line.get_label() == name]
+        shown, expected = np.stack(line.get_data_3d(), -1), flight["state", "target"][0, :30]
+        np.testing.assert_array_equal(shown[:30], expected)
+        assert np.linalg.norm(np.diff(shown, axis=0), axis=-1).max() < 0.1  # without a chord to the next start
+    else:
+        (marks,) = [marks for marks in space.collections if marks.get_label() == name]
+        shown = np.stack(marks._offsets3d, -1)
+        expected = [episode[:n] for episode, n in zip(flight["next", "state", "target"], (30, 30), strict=True)]
+        expected = torch.cat((flight["state", "target"][:, 0], *expected)).unique(dim=0)
+        np.testing.assert_allclose(shown, expected, atol=6e-4)
+    (still,) = scenes[0].values()
+    np.testing.assert_array_equal(still, shown)
 
 
 def test_a_flight_is_filmed_in_real_time_until_its_episodes_end(tmp_path):
     env = make_env("racing", num_envs=3, max_episode_steps=60)
     animate_flight(env.rollout(100, break_when_any_done=False), tmp_path / "flight.gif", fps=10)
     with Image.open(tmp_path / "flight.gif") as film:
-        assert film.n_frames == 20
+        assert film.n_frames == 21
         assert film.info["duration"] == 100  # [ms], five control steps
-        first, last = (np.asarray(film.convert("RGB")) for _ in map(film.seek, (0, 19)))
+        first, last = (np.asarray(film.convert("RGB")) for _ in map(film.seek, (0, 20)))
     assert (first != last).any()
+
+
+def test_a_film_keeps_step_with_the_clock_and_shows_the_end(tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(
+        Scene, "draw", lambda self, *args, draw=Scene.draw, **kw: shown.append(args) or draw(self, *args, **kw)
+    )
+    flight = HoveringEnv(num_envs=1, control_dt=0.005).rollout(100)
+    animate_flight(flight, tmp_path / "flight.gif", control_dt=0.005)
+    with Image.open(tmp_path / "flight.gif") as film:
+        starts = np.cumsum([0] + [film.info["duration"] for _ in map(film.seek, range(film.n_frames))])
+    np.testing.assert_allclose(starts[:-1], [*range(0, 500, 65), 500], atol=5)  # [ms], of 13 control steps
+    torch.testing.assert_close(shown[-1][0], flight["next", "state", "position"][:, -1])
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+@pytest.mark.parametrize("drones", [[0], [0, 1]])
+def test_positions_that_are_not_finite_are_left_out_of_every_picture(value, drones, drawn, tmp_path):
+    env = HoveringEnv(num_envs=2)
+    flight = env.rollout(8, break_when_any_done=False)
+    state = env.reset()
+    for position in (flight["state", "position"], flight["next", "state", "position"], state["state", "position"]):
+        position[drones] = value
+    plot_flight(flight, tmp_path / "flight.png")
+    plot_episode(flight, tmp_path / "episode.png")
+    animate_flight(flight, tmp_path / "flight.gif")
+    for figure in drawn:
+        space = figure.axes[0]
+        limits = np.array([space.get_xlim(), space.get_ylim(), space.get_zlim()])
+        assert np.ptp(limits, axis=1).max() < 8
+    env.reset(state, set_state=True)
+    assert (env.render() != 255).any(-1).sum() > 1000
+    state["state", "position"][1] = torch.tensor([30.0, 0.0, 5.0])
+    env.reset(state, set_state=True)
+    assert (np.abs(env.render().astype(int) - [140, 212, 70]).sum(-1) < 90).any()  # the view follows the second drone
+
+
+@pytest.mark.parametrize("shape", [(1,), (2, 3)])
+def test_a_target_that_is_no_position_is_not_drawn(shape, drawn, tmp_path):
+    class Own(Climbing):
+        def initial_state(self, n):
+            return super().initial_state(n) | {"target": torch.ones(n, *shape)}
+
+    env = Own(num_envs=2, max_episode_steps=3)
+    flight = env.rollout(8, break_when_any_done=False)
+    plot_flight(flight, tmp_path / "flight.png")
+    plot_episode(flight, tmp_path / "episode.png")
+    animate_flight(flight, tmp_path / "flight.gif")
+    write_replay(flight, tmp_path / "replay.html", env=env)
+    assert drawn[0].axes[1].get_ylabel() == "reward" and set(lines(drawn[1].axes[2])) == {"reward"}
+    td = env.rollout(2)[:, -1]
+    before = env.render()
+    env.reset(td.set("_reset", torch.tensor([[True], [False]])), set_state=False)
+    assert (env.render() != before).any()
 
 
 @pytest.mark.parametrize("cls", [Climbing, Measured])
@@ -148,7 +242,8 @@ def test_an_episode_of_every_task_is_drawn_with_what_flew(task, drawn, tmp_path)
     shown = lines(action)
     assert list(shown) == ["thrust", "roll rate", "pitch rate", "yaw rate"]
     for line, values in zip(shown.values(), first["action"].detach().T, strict=True):
-        np.testing.assert_array_equal(line[:, 1], values)
+        np.testing.assert_allclose(line[:, 0], time)
+        np.testing.assert_array_equal(line[:, 1], [*values, values[-1]])  # the last one, too, lasts a step
     for line, values in zip(lines(rotors).values(), first["next", "state", "rotor_speed"].detach().T, strict=True):
         np.testing.assert_array_equal(line[1:, 1], values)
 
@@ -190,8 +285,13 @@ def test_what_cannot_be_drawn_is_named(tmp_path):
     for draw in (plot_flight, plot_episode, animate_flight):
         with pytest.raises(ValueError, match=rf"{draw.__name__} .*\(num_envs, time\).* got \(5,\).*unsqueeze\(0\)"):
             draw(flight[0], path)
+        with pytest.raises(ValueError, match=rf"{draw.__name__} .* got \(2, 0\)"):
+            draw(flight[:, :0], path)
         with pytest.raises(ValueError, match=rf"{draw.__name__}: the rollout lacks .*'position'.*Hand it over whole"):
             draw(flight.exclude(("next", "state", "position")), path)
+    for draw in (plot_flight, animate_flight):
+        with pytest.raises(ValueError, match=f"{draw.__name__}: num_envs must be at least 1, got 0"):
+            draw(flight, path, num_envs=0)
     with pytest.raises(ValueError, match=r"the rollout lacks \('state', 'rotor_speed'\), "):
         plot_episode(flight.exclude(("state", "rotor_speed"), ("next", "state", "rotor_speed")), path)
     with pytest.raises(IndexError, match="env_index=2, and the rollout has 2 environments"):
@@ -342,7 +442,7 @@ def test_the_chosen_drones_are_drawn_in_the_chosen_size_and_a_view_follows_who_l
     td = env.reset()
     pictures = [env.render(drones) for drones in ([0], [1], [0, 1])]
     assert all((a != b).any() for a, b in zip(pictures, pictures[1:] + pictures[:1], strict=True))
-    assert env.render(range(3), size=200).shape == (200, 200, 3)
+    assert env.render(np.arange(3), size=200).shape == (200, 200, 3)
     before = env.render([2])
     td["state", "position"][2] = torch.tensor([30.0, 0.0, 5.0])
     env.reset(td, set_state=True)
@@ -378,12 +478,36 @@ def test_an_environment_that_has_been_rendered_is_copied_and_forgotten():
 # -- learning ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_learning_curve_is_drawn_from_its_csv(tmp_path):
+def test_a_learning_curve_is_drawn_from_its_csv(drawn, tmp_path):
     (tmp_path / "metrics.csv").write_text(
         "steps,time/seconds,eval/return,eval/success,eval/position_error\n100,1.0,5.0,0.0,1.0\n200,2.0,20.0,1.0,0.02\n"
     )
     plot_learning_curve(tmp_path / "metrics.csv", tmp_path / "curve.png")
-    assert (tmp_path / "curve.png").stat().st_size > 10_000
+    shown = {axis.get_ylabel(): axis.lines[0].get_xydata().tolist() for axis in drawn[0].axes}
+    assert shown == {
+        "return": [[1, 5], [2, 20]],
+        "success [%]": [[1, 0], [2, 100]],
+        "median error [cm]": [[1, 100], [2, 2]],
+    }
+
+
+def test_a_learning_curve_of_nothing_is_refused(tmp_path):
+    path = tmp_path / "metrics.csv"
+    for text, message in (("steps,eval/return\n", "has no row yet"), ("steps\n1\n", "needs the columns .* has steps")):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            plot_learning_curve(path, tmp_path / "curve.png")
+
+
+def test_a_run_draws_no_flight_twice(launch, monkeypatch, tmp_path):
+    import run
+
+    drawn = []
+    monkeypatch.setattr(run.Run, "_log_flight", lambda self, flight, steps: drawn.append(steps))
+    monkeypatch.setattr(run, "publish_flight", lambda *_: None)
+    small = ["num_envs=4", "horizon=6", "total_steps=48", "eval.interval=1", "env.max_episode_steps=6", "compile=false"]
+    launch("bptt", *small, "logger.flight_every=1", f"hydra.run.dir={tmp_path}")
+    assert drawn == [24, 48]
 
 
 @pytest.mark.parametrize("draw", [plot_flight, plot_episode, animate_flight, "render"])

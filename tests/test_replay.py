@@ -66,6 +66,9 @@ def open_page(browser):
             points = self.trace("body")
             return points.reshape(self.page.locator("#environment option").count() - 1, -1, 3)
 
+        def picture(self):
+            return self.page.locator("#space").screenshot(timeout=TIMEOUT)
+
         def scrub(self, frame):
             self.page.locator("#time").fill(str(frame))
 
@@ -184,7 +187,8 @@ def test_positions_and_attitudes_are_all_a_replay_needs(open_page, tmp_path):
 
 
 def test_play_moves_the_drones_and_pause_stops_them(replay):
-    before, picture = replay.bodies(), replay.page.locator("#space").screenshot(timeout=TIMEOUT)
+    before, picture = replay.bodies(), replay.picture()
+    assert replay.picture() == picture
     replay.page.click("#play")
     replay.wait("step >= 10")
     replay.page.click("#play")
@@ -194,7 +198,7 @@ def test_play_moves_the_drones_and_pause_stops_them(replay):
     replay.page.evaluate(frames)
     assert replay.step() == step
     np.testing.assert_array_equal(replay.bodies(), paused)
-    assert replay.page.locator("#space").screenshot(timeout=TIMEOUT) != picture
+    assert replay.picture() != picture
 
 
 def test_the_slider_scrubs_to_the_state_of_the_rollout(replay, flight):
@@ -298,6 +302,39 @@ def test_the_keyboard_plays_steps_and_chooses(replay):
     assert replay.page.inner_text("#play") == "Play"
 
 
+def test_keys_of_the_browser_are_left_to_it_and_those_of_the_page_work_after_a_choice(replay):
+    keyboard = replay.page.keyboard
+    replay.page.evaluate("document.activeElement.blur()")  # the slider has keys of its own
+    for key in ("Alt+ArrowRight", "Control+ArrowRight", "Meta+ArrowRight"):
+        keyboard.press(key)
+    assert replay.step() == 0
+    replay.page.focus("#environment")
+    replay.page.select_option("#environment", "1")
+    keyboard.press("ArrowRight")
+    assert replay.step() == 1
+    keyboard.down(" ")
+    keyboard.down(" ")  # held, it repeats
+    keyboard.up(" ")
+    assert replay.page.inner_text("#play") == "Pause"
+
+
+def test_a_drone_is_seen_until_its_position_is_no_longer_finite(open_page, tmp_path):
+    rollout = HoveringEnv(num_envs=2).rollout(6, break_when_any_done=False)
+    position = rollout["next", "state", "position"]
+    last = position[0, 2].clone()
+    position[0, 3:] = torch.nan
+    write_replay(rollout, tmp_path / "replay.html")
+    position[:], rollout["state", "position"][:] = torch.nan, torch.nan
+    write_replay(rollout, tmp_path / "nowhere.html")
+    replay = open_page(tmp_path / "replay.html")
+    replay.scrub(3)
+    np.testing.assert_allclose(replay.bodies()[0, 0], last, atol=1e-6)
+    replay.scrub(4)
+    assert np.isfinite(replay.bodies()[:, 0]).all(1).tolist() == [False, True]
+    replay.close()
+    open_page(tmp_path / "nowhere.html").close()
+
+
 def test_the_next_gate_stands_out(replay, flight):
     env, rollout = flight
     for i in range(NUM_ENVS):
@@ -330,6 +367,23 @@ def test_a_drone_stays_where_its_episode_has_ended_and_the_page_says_how(open_pa
 
 
 # -- without a browser -------------------------------------------------------------------------------------------------
+
+
+def test_what_is_not_known_of_the_start_is_left_out_there(tmp_path):
+    rollout = HoveringEnv(num_envs=2).rollout(3)
+    write_replay(rollout.exclude(("state", "target"), ("state", "velocity")), tmp_path / "replay.html")
+    _, numbers = read(tmp_path / "replay.html")
+    target = numbers("target", 2, 4, 3)
+    assert target[:, 0].isnan().all() and torch.equal(target[:, 1:], rollout["next", "state", "target"])
+    torch.testing.assert_close(numbers("position", 2, 4, 3)[:, 0], rollout["state", "position"][:, 0])
+
+
+def test_drones_of_other_environments_than_those_shown_are_refused(tmp_path):
+    env = HoveringEnv(num_envs=2)
+    env = HoveringEnv(num_envs=2, drone=env.params.replace(mass=torch.tensor([[0.3], [0.4]])))
+    write_replay(env.rollout(2), tmp_path / "replay.html", env=env)
+    with pytest.raises(ValueError, match="env has a mass for each of its 2 environments, and 3 are to be shown"):
+        write_replay(HoveringEnv(num_envs=3).rollout(2), tmp_path / "replay.html", env=env)
 
 
 def test_a_rollout_with_its_graph_in_double_precision_is_written_under_transforms_too(tmp_path):
@@ -390,18 +444,14 @@ def test_what_cannot_be_shown_is_refused(tmp_path):
     path = tmp_path / "replay.html"
     env = HoveringEnv(num_envs=2)
     rollout = env.rollout(3)
-    with pytest.raises(ValueError, match=r"batch size \(num_envs, time\), got \(3,\).*rollout.unsqueeze\(0\)"):
+    with pytest.raises(ValueError, match=r"batch size \(num_envs, time\).* got \(3,\).*rollout.unsqueeze\(0\)"):
         write_replay(rollout[0], path)
-    with pytest.raises(ValueError, match=r"needs the quaternion \(4\).*it has none"):
+    with pytest.raises(ValueError, match=r"write_replay: the rollout lacks .*'quaternion'"):
         write_replay(rollout.exclude(("next", "state", "quaternion")), path)
-    with pytest.raises(ValueError, match="Nothing to show: num_envs=0"):
+    with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
         write_replay(rollout, path, num_envs=0)
-    with pytest.raises(ValueError, match="Nothing to show"):
+    with pytest.raises(ValueError, match=r"got \(2, 0\)"):
         write_replay(rollout[:, :0], path)
-    lost = rollout.clone()
-    lost["next", "state", "position"].fill_(torch.nan)
-    with pytest.raises(ValueError, match="no finite position"):
-        write_replay(lost, path)
     with pytest.raises(TypeError, match="env must be a QuadrotorEnv.*got str"):
         write_replay(rollout, path, env="hovering")
     assert not list(tmp_path.iterdir())

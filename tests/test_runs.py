@@ -212,7 +212,7 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
 
 
 def test_wandb_gets_configuration_metrics_pictures_films_replay_and_checkpoint(train, tmp_path):
-    train("bptt", tmp_path, "logger.backend=wandb", "logger.flight_every=4")
+    train("bptt", tmp_path, "logger.backend=wandb", "logger.flight_every=3")
     resumed = train("bptt", tmp_path, "resume=auto", "total_steps=240")
     logs = sorted(tmp_path.glob("wandb/offline-run-*/*.wandb"))
     assert len(logs) == 2 and len({log.stem for log in logs}) == 1  # one run, of two parts

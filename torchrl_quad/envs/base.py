@@ -38,7 +38,14 @@ if TYPE_CHECKING:
 # The Markov state by name, each entry (num_envs, ...); ("drone", field) is the name of a randomised parameter.
 State = dict[Any, Tensor]
 
-_DRAWN = "position", "quaternion", "target"
+
+def drawn(state: Mapping[str, Tensor]) -> State:
+    """What pictures show of a state; a target that is no position, such as a height, is none of it."""
+    return {
+        key: state[key]
+        for key in ("position", "quaternion", "target")
+        if key in state and (key != "target" or state[key].shape == state["position"].shape)
+    }
 
 
 class QuadrotorEnv(EnvBase):
@@ -414,8 +421,8 @@ class QuadrotorEnv(EnvBase):
             start = self.reset() if start is None else start
             if horizon.can_fly(self, policy, start):
                 rollout = horizon.fly(self, policy, start, max_steps)
-                last = rollout["next", "state"]
-                self._see({key: last[key][:, -1].clone() for key in _DRAWN if key in last})  # not all of its memory
+                # Copied, so that not all of the rollout's memory is kept.
+                self._see({key: x[:, -1].clone() for key, x in drawn(rollout["next", "state"]).items()})
                 return rollout
             options |= {"tensordict": start, "auto_reset": False}
         return super().rollout(max_steps, policy, callback, **options)
@@ -455,7 +462,7 @@ class QuadrotorEnv(EnvBase):
         A step stays a pure function: nothing reads this but render(). Detached, it keeps no graph alive, and refers to
         tensors that are there anyway. A weak reference would be gone as soon as the caller has made a copy.
         """
-        seen = {key: state[key].detach() for key in _DRAWN if key in state}
+        seen = {key: x.detach() for key, x in drawn(state).items()}
         if mask is not None and self._seen:
             seen = {key: torch.where(mask.reshape(-1, 1), x, self._seen[key]) for key, x in seen.items()}
         self._seen = seen

@@ -1,4 +1,4 @@
-"""Pictures and films of flights, and of learning, with matplotlib (extra: ``render``)."""
+"""Pictures, films and replays of flights, and pictures of learning (extra: ``render``)."""
 
 from torchrl_quad.render.figures import animate_flight, plot_episode, plot_flight, plot_learning_curve
 from torchrl_quad.render.replay import write_replay

@@ -12,8 +12,20 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_quad.envs import QuadrotorEnv
-from torchrl_quad.render.frames import BLUE, INK, RED, Scene, box, make_figure, set_box, shades
+from torchrl_quad.render.frames import (
+    BLUE,
+    INK,
+    RED,
+    Scene,
+    bounds,
+    box,
+    checked,
+    episode_steps,
+    first_episodes,
+    make_figure,
+    set_box,
+    shades,
+)
 
 _PAPER = {  # of figures that are as wide as a page of two columns
     "font.size": 8,
@@ -39,7 +51,7 @@ _COLORS = INK, BLUE, RED, "#d99a1c"
 def plot_flight(rollout: TensorDictBase, path: str | Path, *, num_envs: int = 12, control_dt: float = 0.02) -> None:
     """Draw the first episodes of a flight: paths in space with their targets, and over time how well they go.
 
-    That is the metric ``gates_passed`` where there is one, else the distance to the target, and for a task without
+    That is the number of gates passed where there are gates, else the distance to the target, and for a task without
     targets its first metric, or the reward.
 
     Args:
@@ -49,14 +61,15 @@ def plot_flight(rollout: TensorDictBase, path: str | Path, *, num_envs: int = 12
         control_dt: control step of the environment [s].
 
     Raises:
-        ValueError: the rollout has another shape, or lacks the position.
+        ValueError: the rollout has another shape or lacks the position, or ``num_envs`` is less than 1.
     """
-    flight = _checked(rollout, "plot_flight", "position")[:num_envs].detach().cpu()
-    first = QuadrotorEnv.first_episode(flight).squeeze(-1).numpy()
-    position = flight["next", "state", "position"].numpy()
-    start = flight["state", "position"][:, 0].numpy()
-    label, scale, progress = _progress(flight)
-    time = control_dt * np.arange(1, position.shape[1] + 1)
+    flight = checked(rollout, "plot_flight", num_envs, *_keys("position"))
+    steps, position = episode_steps(flight), first_episodes(flight, "position").numpy()
+    label, scale, lines = _progress(flight)
+    name, values = next(iter(lines.items()))
+    if (passed := first_episodes(flight, "gates_passed")) is not None:
+        label, scale, name, values = "", "linear", "gates passed", passed.squeeze(-1).numpy()
+    time = control_dt * np.arange(position.shape[1])
 
     figure = make_figure(figsize=(11, 4.6))
     from matplotlib.ticker import MaxNLocator
@@ -64,18 +77,18 @@ def plot_flight(rollout: TensorDictBase, path: str | Path, *, num_envs: int = 12
     space = figure.add_axes((0.02, 0.03, 0.42, 0.9), projection="3d")
     over_time = figure.add_axes((0.54, 0.12, 0.44, 0.83))
     for i, color in enumerate(shades(len(position))):
-        x, y, z = np.concatenate((start[i : i + 1], position[i, first[i]])).T
-        space.plot(x, y, z, color=color, linewidth=1.2)
-        space.scatter(*start[i], color=color, s=14)
-        over_time.plot(time[first[i]], progress[i, first[i]], color=color, linewidth=1.2)
-    target = flight["state"].get("target", None)
+        flown = slice(int(steps[i]) + 1)
+        space.plot(*position[i, flown].T, color=color, linewidth=1.2)
+        space.scatter(*position[i, 0], color=color, s=14)
+        over_time.plot(time[flown], values[i, flown], color=color, linewidth=1.2)
+    target = first_episodes(flight, "target")
     if target is not None:
-        _draw_targets(space, target, "gate" if "gate" in flight["state"] else "target")
+        _draw_targets(space, _still(target, steps), "gate" if "gate" in flight["state"] else "target")
         space.legend(loc="upper left", frameon=False)
     space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="Flights from fresh starts")
     for axis in (space.xaxis, space.yaxis, space.zaxis):
         axis.set_major_locator(MaxNLocator(4))
-    over_time.set(xlabel="time [s]", ylabel=label)
+    over_time.set(xlabel="time [s]", ylabel=f"distance {name} [m]" if label else name)
     _set_scale(over_time, scale)
     over_time.grid(alpha=0.3)
     figure.savefig(path, dpi=130)
@@ -99,11 +112,12 @@ def plot_episode(rollout: TensorDictBase, path: str | Path, *, env_index: int = 
             not know the suffix.
         IndexError: there is no such environment.
     """
-    rollout = _checked(rollout, "plot_episode", "position", "velocity", "rotor_speed")
-    if not -len(rollout) <= env_index < len(rollout):
-        raise IndexError(f"plot_episode: env_index={env_index}, and the rollout has {len(rollout)} environments.")
-    flight = rollout[env_index].detach().cpu()
-    flight = flight[: int(QuadrotorEnv.first_episode(flight.unsqueeze(0)).sum())]
+    keys = _keys("position", "velocity", "rotor_speed")
+    flight = checked(rollout, "plot_episode", None, *keys, ("action",))
+    if not -len(flight) <= env_index < len(flight):
+        raise IndexError(f"plot_episode: env_index={env_index}, and the rollout has {len(flight)} environments.")
+    flight = flight[[env_index]]
+    flight = flight[:, : int(episode_steps(flight))]
     figure = make_figure(figsize=(_WIDTH, 3.4))
     from matplotlib import rc_context
     from matplotlib.ticker import MaxNLocator
@@ -112,17 +126,18 @@ def plot_episode(rollout: TensorDictBase, path: str | Path, *, env_index: int = 
         space = figure.add_axes((0.0, 0.2, 0.44, 0.8), projection="3d", computed_zorder=False)
         _draw_path(space, figure.add_axes((0.09, 0.12, 0.26, 0.02)), flight)
         axes = figure.subplots(3, 1, sharex=True, gridspec_kw=_BESIDE)
-        times = control_dt * np.arange(len(flight) + 1)
-        label, scale, lines = _errors(flight)
-        _draw_lines(axes[0], times, lines, label)
+        times = control_dt * np.arange(flight.shape[1] + 1)
+        label, scale, lines = _progress(flight)
+        _draw_lines(axes[0], times, {name: x[0] for name, x in lines.items()}, label)
         _set_scale(axes[0], scale)
-        actions = dict(zip(("thrust", "roll rate", "pitch rate", "yaw rate"), flight["action"].T.numpy(), strict=True))
-        _draw_lines(axes[1], times[:-1], actions, "action", drawstyle="steps-post")
-        speeds = {f"rotor {i + 1}": x for i, x in enumerate(_with_start(flight, "rotor_speed").T)}
+        actions = flight["action"][0].T.numpy()
+        actions = np.concatenate((actions, actions[:, -1:]), 1)  # each lasts until the next instant
+        actions = dict(zip(("thrust", "roll rate", "pitch rate", "yaw rate"), actions, strict=True))
+        _draw_lines(axes[1], times, actions, "action", drawstyle="steps-post")
+        speeds = {f"rotor {i + 1}": x for i, x in enumerate(first_episodes(flight, "rotor_speed")[0].T.numpy())}
         _draw_lines(axes[2], times, speeds, "rotor speed\n[rad/s]")
-        if "gates_passed" in flight["state"]:
-            passed = _with_start(flight, "gates_passed")[:, 0]
-            for time in times[1:][np.diff(passed) > 0]:
+        if (passed := first_episodes(flight, "gates_passed")) is not None:
+            for time in times[1:][passed[0, :, 0].diff() > 0]:
                 for axis in axes:
                     axis.axvline(time, color=RED, linestyle=":", linewidth=0.6, zorder=0)
         axes[2].set(xlabel="time [s]", xlim=(0, times[-1]))
@@ -147,42 +162,37 @@ def animate_flight(
         path: where the GIF file goes.
         num_envs: how many environments are shown.
         control_dt: control step of the environment [s].
-        fps: frames per second, at least; as many as go into whole control steps.
+        fps: frames per second, at least, and up to 50; as many as go into whole control steps.
         max_seconds: what is filmed of a longer flight.
 
     Raises:
-        ValueError: the rollout has another shape, or lacks the position or the quaternion.
+        ValueError: the rollout has another shape or lacks the position or the quaternion, or ``num_envs`` is less than
+            1.
     """
-    flight = _checked(rollout, "animate_flight", "position", "quaternion")
-    flight = flight[:num_envs, : max(round(max_seconds / control_dt), 1)].detach().cpu()
-    # A drone stays where its episode has ended.
-    last = QuadrotorEnv.first_episode(flight).sum(1, keepdim=True) - 1
-    index = torch.arange(flight.shape[1])[None, :, None].minimum(last)
-    states = {
-        name: flight["next", "state", name].take_along_dim(index, 1)
-        for name in ("position", "quaternion", "target")
-        if name in flight["next", "state"]
-    }
-    position, target = states["position"], states.get("target")
-    standing = {}
-    if target is not None:
-        places = _places(flight["state", "target"])
-        standing = {"curve": target[0]} if places is None else {"places": places}
-    scene = Scene(position, len(position), **standing)
+    flight = checked(rollout, "animate_flight", num_envs, *_keys("position", "quaternion"))
+    flight = flight[:, : max(round(max_seconds / control_dt), 1)]
+    position, attitude, target = (first_episodes(flight, name) for name in ("position", "quaternion", "target"))
+    still = {} if target is None else _still(target, episode_steps(flight))
+    scene = Scene(position, len(position), 336, **still)
     trail = max(round(1.0 / control_dt), 1)
-    stride = max(int(1.0 / (fps * control_dt)), 1)
+    stride = max(int(1.0 / (min(fps, 50) * control_dt) + 1e-6), 1)
+    instants = np.append(np.arange(0, flight.shape[1], stride), flight.shape[1])
     frames = [
         scene.draw(
-            *(x[:, t] for x in states.values()),
+            position[:, t],
+            attitude[:, t],
+            None if target is None else target[:, t],
             trails=position[:, max(t - trail, 0) : t + 1],
-            text=f"{control_dt * (t + 1):.1f} s",
+            text=f"{control_dt * t:.1f} s",
         )
-        for t in range(0, flight.shape[1], stride)
+        for t in instants
     ]
     from PIL import Image
 
+    # A GIF counts in 10 ms: rounded instants keep step with the clock where rounded intervals would not.
+    lasts = 10 * np.diff(np.round(100 * control_dt * np.append(instants, instants[-1] + stride)))
     first, *rest = map(Image.fromarray, frames)
-    first.save(path, save_all=True, append_images=rest, duration=1000 * stride * control_dt, loop=0)
+    first.save(path, save_all=True, append_images=rest, duration=lasts.tolist(), loop=0)
 
 
 def plot_learning_curve(metrics: str | Path, path: str | Path) -> None:
@@ -191,9 +201,14 @@ def plot_learning_curve(metrics: str | Path, path: str | Path) -> None:
     Args:
         metrics: the CSV file of a training run.
         path: where the picture goes, PNG, PDF or SVG by its suffix.
+
+    Raises:
+        ValueError: the file has no row, or none of the columns to draw.
     """
     with open(metrics, newline="") as file:
         rows = list(csv.DictReader(file))
+    if not rows:
+        raise ValueError(f"plot_learning_curve: {metrics} has no row yet; a run writes one at each evaluation.")
     columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
     panels = [
         ("eval/return", "return", 1.0),
@@ -202,7 +217,13 @@ def plot_learning_curve(metrics: str | Path, path: str | Path) -> None:
         ("eval/tracking_rmse", "median tracking error [cm]", 100.0),
         ("eval/position_error", "median error [cm]", 100.0),
     ]
+    known = [name for name, *_ in panels]
     panels = [panel for panel in panels if panel[0] in columns][:3]
+    if not panels or not {"time/seconds", "steps"} <= columns.keys():
+        raise ValueError(
+            f"plot_learning_curve needs the columns time/seconds, steps, and one of {', '.join(known)}; {metrics} has "
+            f"{', '.join(columns)}."
+        )
     figure = make_figure(figsize=(3.7 * len(panels), 3.2), layout="constrained")
     axes = figure.subplots(1, len(panels), squeeze=False)
     for axis, (name, label, scale) in zip(axes[0], panels, strict=True):
@@ -222,59 +243,36 @@ def plot_learning_curve(metrics: str | Path, path: str | Path) -> None:
 # -- what they share ---------------------------------------------------------------------------------------------------
 
 
-def _checked(rollout: TensorDictBase, who: str, *names: str) -> TensorDictBase:
-    """The rollout, if it is one with these entries of the state."""
-    if rollout.dim() != 2 or not rollout.numel():
-        raise ValueError(
-            f"{who} draws a rollout of batch size (num_envs, time), such as env.rollout(...) returns; got "
-            f"{tuple(rollout.shape)}. Of one drone, write rollout.unsqueeze(0)."
-        )
-    entries = rollout.keys(include_nested=True)
-    needed = [*((*place, "state", name) for place in ((), ("next",)) for name in names), ("next", "done")]
-    missing = [key for key in [*needed, *(["action"] if who == "plot_episode" else [])] if key not in entries]
-    if missing:
-        raise ValueError(
-            f"{who}: the rollout lacks {', '.join(map(str, missing))}. Hand it over whole, as "
-            "env.rollout(...) returns it."
-        )
-    return rollout
+def _keys(*names: str) -> list[tuple[str, ...]]:
+    """The keys of a rollout under which these entries of the state stand, and that of its ends."""
+    return [*((*place, "state", name) for place in ((), ("next",)) for name in names), ("next", "done")]
 
 
-def _progress(flight: TensorDictBase) -> tuple[str, str, np.ndarray]:
-    """What tells how well flights (num_envs, time) go: its name, the scale of its axis, and its values."""
+def _progress(flight: TensorDictBase) -> tuple[str, str, dict[str, np.ndarray]]:
+    """What tells how well the first episodes of flights (num_envs, time) go.
+
+    Returns:
+        the label of the axis, "" where the names say it all; the scale of the axis; and the lines (num_envs, time + 1)
+        by name, that which tells most first. Metrics and rewards are those of steps, and NaN at the start.
+    """
+
+    def told(x: Tensor) -> np.ndarray:
+        return torch.nn.functional.pad(x.squeeze(-1).float(), (1, 0), value=torch.nan).numpy()
+
     ends = flight["next"]
-    metrics = ends.get("metrics", {})
-    if "gates_passed" in metrics:
-        return "gates passed", "linear", metrics["gates_passed"].squeeze(-1).numpy()
-    if "target" in ends["state"]:
-        distance = (ends["state", "position"] - ends["state", "target"]).norm(dim=-1)
-        return "distance to the target [cm]", "log", 100 * distance.numpy()
-    for name, value in metrics.items():
-        return name.replace("_", " "), "linear", value.squeeze(-1).numpy()
-    return "reward", "linear", ends["reward"].squeeze(-1).numpy()
-
-
-def _errors(flight: TensorDictBase) -> tuple[str, str, dict[str, np.ndarray]]:
-    """How far an episode (time) is from what it is to reach: label, scale of the axis, lines (time + 1) by name."""
-    ends = flight["next"]
-    told = {name: np.append(np.nan, value[:, 0]) for name, value in ends.get("metrics", {}).items()}
-    if "target" not in flight["state"] and told:
-        return "metrics", "linear", {name.replace("_", " "): x for name, x in told.items()}
-    if "target" not in flight["state"]:
-        return "reward", "linear", {"per step": np.append(np.nan, ends["reward"][:, 0])}
-    distance = np.linalg.norm(_with_start(flight, "position") - _with_start(flight, "target"), axis=-1)
-    lines = {"to the next gate" if "gate" in flight["state"] else "to the target": distance}
-    ground = told.get("position_error", distance)
-    if not np.allclose(ground[1:], distance[1:], atol=1e-5):
+    metrics = {name.replace("_", " "): told(x) for name, x in ends.get("metrics", {}).items()}
+    target = first_episodes(flight, "target")
+    if target is None:
+        return "", "linear", metrics or {"reward": told(ends["reward"])}
+    distance = (first_episodes(flight, "position") - target).norm(dim=-1).numpy()
+    racing = "gate" in ends["state"]
+    lines = {"to the next gate" if racing else "to the target": distance}
+    ground = metrics.get("position error", distance)
+    if not np.allclose(ground[:, 1:], distance[:, 1:], atol=1e-5, equal_nan=True):
         lines["over ground"] = ground
-    if "tracking_rmse" in told:
-        lines["RMSE"] = told["tracking_rmse"]
-    return "distance [m]", "linear" if "gate" in flight["state"] else "log", lines
-
-
-def _with_start(flight: TensorDictBase, name: str) -> np.ndarray:
-    """An entry of the state over an episode (time), (time + 1, k), from its start to its end."""
-    return torch.cat((flight["state", name][:1], flight["next", "state", name])).numpy()
+    if "tracking rmse" in metrics:
+        lines["RMSE"] = metrics["tracking rmse"]
+    return "distance [m]", "linear" if racing else "log", lines
 
 
 def _draw_path(space: Any, below: Any, flight: TensorDictBase) -> None:
@@ -282,25 +280,23 @@ def _draw_path(space: Any, below: Any, flight: TensorDictBase) -> None:
     from matplotlib.patheffects import withStroke
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-    position = _with_start(flight, "position")
-    speed = np.linalg.norm(_with_start(flight, "velocity"), axis=-1)
+    position, velocity, target = (first_episodes(flight, name) for name in ("position", "velocity", "target"))
+    speed, points = velocity[0].norm(dim=-1).numpy(), [position]
+    position = position[0].numpy()
     path = Line3DCollection(np.stack((position[:-1], position[1:]), 1), cmap="viridis", linewidth=1.5, zorder=5)
     path.set_array(0.5 * (speed[:-1] + speed[1:]))
     space.add_collection(path)
     space.scatter(*position[0], color=INK, s=10, zorder=6)
-    points, state = [position], flight["state"]
-    if "gate" in state:
-        gates = dict(zip(state["gate"][:, 0].tolist(), state["target"].numpy(), strict=True))
-        points.extend(gates.values())
-        _draw_targets(space, state["target"], "gate")
-        for gate, point in gates.items():
+    if target is not None:
+        still = _still(target, episode_steps(flight))
+        points.extend(still.values())
+        _draw_targets(space, still, "gate" if "gate" in flight["state"] else "target")
+    if target is not None and "gate" in flight["state"]:
+        gates = first_episodes(flight, "gate").flatten().int().tolist()
+        for gate, point in dict(zip(gates, target[0].tolist(), strict=True)).items():
             halo = [withStroke(linewidth=2, foreground="white")]
             space.text(*point, f"   {gate + 1}", color=RED, zorder=11, path_effects=halo)
-    elif "target" in state:
-        points.append(_with_start(flight, "target"))
-        _draw_targets(space, state["target"], "target")
-    points = torch.as_tensor(np.vstack(points))
-    set_box(space, *box(points.amin(0), points.amax(0)), zoom=0.86)
+    set_box(space, *box(*bounds(*points)), zoom=0.86)
     bar = space.figure.colorbar(path, cax=below, orientation="horizontal")
     bar.set_label("speed [m/s]")
     bar.outline.set_linewidth(0.6)
@@ -326,20 +322,22 @@ def _set_scale(axis: Any, scale: str) -> None:
     axis.yaxis.set_major_formatter("{x:g}")
 
 
-def _places(target: Tensor) -> Tensor | None:
-    """The places (*, 3) of targets (*, time, 3), or None where they move all the time, and not from gate to gate."""
-    moves = (target.diff(dim=-2) != 0).any(-1).flatten()
-    return None if 2 * moves.sum() > len(moves) else target.reshape(-1, 3).mul(1e3).round().div(1e3).unique(dim=0)
+def _still(target: Tensor, steps: Tensor) -> dict[str, Tensor]:
+    """What of targets (num_envs, time + 1, 3) in episodes of so many steps (num_envs) stands still.
+
+    As keywords of :class:`Scene`, each (*, 3): their places, or, where they move all the time and not from gate to
+    gate, the curve along which that of the longest episode moves.
+    """
+    if 2 * (target.diff(dim=1).abs() > 0).any(-1).sum() > steps.sum():
+        return {"curve": target[steps.argmax()]}
+    return {"places": target.flatten(0, 1).mul(1e3).round().div(1e3).unique(dim=0)}
 
 
-def _draw_targets(space: Any, target: Tensor, name: str) -> None:
-    """Targets (*, time, 3) where they stand still, or the line along which the first moves."""
-    places = _places(target)
-    if places is None:
-        line = target.reshape(-1, target.shape[-2], 3)[0]
-        space.plot(*line.T.numpy(), color=RED, linestyle="--", linewidth=1.0, label=name, zorder=3)
-    elif name == "gate":
-        style = {"marker": "o", "facecolor": "none", "linewidth": 1.5, "depthshade": False}
-        space.scatter(*places.T.numpy(), edgecolor=RED, s=90, label=name, zorder=10, **style)
-    else:
-        space.scatter(*places.T.numpy(), color=RED, marker="*", s=140, label=name, zorder=10)
+def _draw_targets(space: Any, still: dict[str, Tensor], name: str) -> None:
+    """What of targets stands still."""
+    if "curve" in still:
+        space.plot(*still["curve"].T.numpy(), color=RED, linestyle="--", linewidth=1.0, label=name, zorder=3)
+        return
+    gate = {"marker": "o", "facecolor": "none", "edgecolor": RED, "linewidth": 1.5, "depthshade": False, "s": 90}
+    style = gate if name == "gate" else {"marker": "*", "color": RED, "s": 140}
+    space.scatter(*still["places"].T.numpy(), label=name, zorder=10, **style)

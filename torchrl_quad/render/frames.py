@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
+import numbers
 import weakref
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs import QuadrotorEnv, RacingEnv, TrackingEnv
+from torchrl_quad.envs.base import drawn
 
 INK, BLUE, RED = "#222222", "#2f6db5", "#c8452f"
-SIZE = 336  # [pixels], of the edges of a frame
 _DOTS_PER_INCH = 80
 _ARMS = torch.tensor([[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [0.0, 0.0, 0.0], [1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]])
 
@@ -24,26 +26,25 @@ class Scene:
     """A view into which drones are drawn again and again; axes, and what stands still, are drawn once.
 
     Args:
-        points: (*, 3) [m]; all of them, and the ground below, are in view.
+        points: (*, 3) [m]; those that are finite, and the ground below, are in view.
         num_drones: how many are drawn into a frame.
+        size: of the edges of a frame [pixels].
         places: (*, 3) [m], where targets stand still.
         curve: (*, 3) [m], along which targets move.
-        size: of the edges of a frame [pixels].
     """
 
     def __init__(
         self,
         points: Tensor,
         num_drones: int,
+        size: int,
         *,
         places: Tensor | None = None,
         curve: Tensor | None = None,
-        size: int = SIZE,
     ) -> None:
-        points = torch.cat([x.detach().cpu().double().reshape(-1, 3) for x in (points, places, curve) if x is not None])
-        self.low, self.high = points.amin(0), points.amax(0)
-        self.low[2].clamp_(max=0.0)
-        self.low, self.high = box(self.low, self.high)
+        low, high = bounds(*(x for x in (points, places, curve) if x is not None))
+        low[2].clamp_(max=0.0)
+        self.low, self.high = box(low, high)
         extent = self.high - self.low
         self.arms = (0.04 * extent.amax()).float() * _ARMS
 
@@ -101,33 +102,31 @@ class Scene:
 _scenes: weakref.WeakKeyDictionary[QuadrotorEnv, dict[tuple[int, int], Scene]] = weakref.WeakKeyDictionary()
 
 
-def draw_frame(
-    env: QuadrotorEnv, state: Mapping[str, Tensor], drones: Sequence[int] | None, size: int = SIZE
-) -> np.ndarray:
+def draw_frame(env: QuadrotorEnv, state: Mapping[str, Tensor], drones: Sequence[int] | None, size: int) -> np.ndarray:
     """A state of an environment as a frame; see :meth:`~torchrl_quad.envs.QuadrotorEnv.render`."""
     chosen = list(range(min(env.num_envs, 6)) if drones is None else drones)
-    if not chosen or not all(isinstance(i, int) and 0 <= i < env.num_envs for i in chosen):
+    if not chosen or not all(isinstance(i, numbers.Integral) and 0 <= i < env.num_envs for i in chosen):
         raise ValueError(
             f"render: drones are indices from 0 to {env.num_envs - 1}, at least one, such as drones=[0]; got {chosen}."
         )
     if size < 100:
         raise ValueError(f"render: size must be at least 100 pixels, got {size}.")
-    shown = [state[key][chosen].cpu() for key in ("position", "quaternion", "target") if key in state]
-    points = torch.cat(shown[::2]).double()
+    shown = {key: x[chosen].cpu() for key, x in state.items()}
+    points = [x for key, x in shown.items() if key != "quaternion"]
     scenes = _scenes.setdefault(env, {})
     scene = scenes.get((len(chosen), size))
     if scene is None:  # what the task shows, and half a metre around it
-        more = [*(env.fallback[key] for key in ("position", "target") if key in env.fallback), *scenery(env).values()]
-        points = torch.cat((points, *(x.detach().cpu().reshape(-1, 3) for x in more)))
-        low, high = points.amin(0) - torch.tensor([0.5, 0.5, 0.0]), points.amax(0) + 0.5
+        starts = (env.fallback[key] for key in shown if key != "quaternion")
+        low, high = bounds(*points, *starts, *scenery(env).values())
+        low, high = low - torch.tensor([0.5, 0.5, 0.0]), high + 0.5
     else:  # to the sides that have become too near it grows by half, so that it need not at every step
-        low, high, room = points.amin(0), points.amax(0), 0.5 * (scene.high - scene.low)
-        low = torch.where(low < scene.low, low - room, scene.low)
-        high = torch.where(high > scene.high, high + room, scene.high)
+        low, high = bounds(*points, scene.low, scene.high)
+        room = 0.5 * (scene.high - scene.low)
+        low, high = low - room * (low < scene.low), high + room * (high > scene.high)
     if scene is None or (low < scene.low).any() or (high > scene.high).any():
         corners = torch.stack((low, high))
-        scenes[len(chosen), size] = scene = Scene(corners, len(chosen), **scenery(env), size=size)
-    return scene.draw(*shown)
+        scenes[len(chosen), size] = scene = Scene(corners, len(chosen), size, **scenery(env))
+    return scene.draw(*shown.values())
 
 
 def scenery(env: QuadrotorEnv) -> dict[str, Tensor]:
@@ -140,7 +139,49 @@ def scenery(env: QuadrotorEnv) -> dict[str, Tensor]:
     return {}
 
 
-# -- what figures share with it ----------------------------------------------------------------------------------------
+# -- what all pictures share -------------------------------------------------------------------------------------------
+
+
+def checked(rollout: TensorDictBase, who: str, num_envs: int | None, *keys: tuple[str, ...]) -> TensorDictBase:
+    """The first environments of a rollout, all for None, without graph and on the CPU, if it has these entries."""
+    if rollout.dim() != 2 or 0 in rollout.shape:
+        raise ValueError(
+            f"{who} needs a rollout of batch size (num_envs, time), such as env.rollout(...) returns; got "
+            f"{tuple(rollout.shape)}. Of one drone, write rollout.unsqueeze(0)."
+        )
+    if num_envs is not None and num_envs < 1:
+        raise ValueError(f"{who}: num_envs must be at least 1, got {num_envs}.")
+    entries = rollout.keys(include_nested=True)
+    missing = [key for key in keys if key not in entries]
+    if missing:
+        raise ValueError(
+            f"{who}: the rollout lacks {', '.join(map(str, missing))}. Hand it over whole, as env.rollout(...) and "
+            "differentiable_rollout(...) return it."
+        )
+    return rollout[:num_envs].detach().cpu()
+
+
+def episode_steps(flight: TensorDictBase) -> Tensor:
+    """The control steps of the first episodes of a flight (num_envs, time), (num_envs)."""
+    if ("next", "done") not in flight.keys(include_nested=True):
+        return torch.full(flight.shape[:1], flight.shape[1])
+    return QuadrotorEnv.first_episode(flight).sum((1, 2))
+
+
+def first_episodes(flight: TensorDictBase, name: str) -> Tensor | None:
+    """An entry of the state (num_envs, time + 1, k): where first episodes start, and what each step has led to.
+
+    It stays as it was at the end of the episode, and is NaN where it is infinite, and at a start of which nothing is
+    known. None where there is no such entry, or the target is no position.
+    """
+    ends = flight["next", "state"]
+    if name not in ends or (name == "target" and name not in drawn(ends)):
+        return None
+    value = ends[name].float()
+    start = flight.get(("state", name), torch.full_like(value, math.nan))[:, :1]
+    instants = torch.arange(flight.shape[1] + 1).minimum(episode_steps(flight)[:, None])
+    value = torch.cat((start.float(), value), 1).take_along_dim(instants.unsqueeze(-1), 1)
+    return value.nan_to_num(math.nan, math.nan, math.nan)
 
 
 def make_figure(**options: Any) -> Any:
@@ -153,6 +194,15 @@ def make_figure(**options: Any) -> Any:
     figure = Figure(**options)
     FigureCanvasAgg(figure)
     return figure
+
+
+def bounds(*points: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the greatest coordinates (3) of those points, each (*, 3), that are finite; a cube if none is."""
+    rows = torch.cat([x.detach().cpu().double().reshape(-1, 3) for x in points])
+    rows = rows[rows.isfinite().all(-1)]
+    if not len(rows):
+        rows = torch.tensor([[-0.5, -0.5, 0.0], [0.5, 0.5, 1.0]])
+    return rows.amin(0), rows.amax(0)
 
 
 def box(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:

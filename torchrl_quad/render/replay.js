@@ -28,7 +28,8 @@ function between(array, k, i, mirrored = false) {
   let dot = 0;
   for (let j = 0; mirrored && j < k; j++) dot += array[a + j] * array[b + j];
   const sign = dot < 0 ? -1 : 1; // q and -q are one attitude
-  return Array.from({ length: k }, (_, j) => array[a + j] + part * (sign * array[b + j] - array[a + j]));
+  // At a frame only that frame counts: the next may not be finite.
+  return Array.from({ length: k }, (_, j) => array[a + j] + (part && part * (sign * array[b + j] - array[a + j])));
 }
 
 function turned([w, x, y, z]) {
@@ -146,7 +147,7 @@ function bounds(...arrays) {
       most[index % 3] = Math.max(most[index % 3], value);
     });
   }
-  return [least, most];
+  return least[0] <= most[0] ? [least, most] : [[-0.5, -0.5, 0], [0.5, 0.5, 1]]; // nothing is finite
 }
 
 function spaceRange(j) {
@@ -341,7 +342,10 @@ function choose(i) {
 function options(id, values, label, value, change) {
   element(id).append(...values.map((v) => new Option(label(v), v ?? "all")));
   element(id).value = value ?? "all";
-  element(id).addEventListener("change", (event) => change(event.target.value));
+  element(id).addEventListener("change", (event) => {
+    change(event.target.value);
+    event.target.blur(); // so that the keys are those of the page again
+  });
 }
 
 const sizes = [1, 2, 3, 5, 10, 20, 50];
@@ -364,9 +368,10 @@ window.addEventListener("resize", moveCursor);
 document.addEventListener("visibilitychange", () => { last = null; });
 document.addEventListener("keydown", (event) => {
   const key = event.key;
+  if (event.altKey || event.ctrlKey || event.metaKey) return; // the browser's own
   if (event.target.tagName === "SELECT" || (key === " " && event.target.tagName === "BUTTON")) return;
   const next = (chosen ?? -1) + (key === "ArrowDown" ? 1 : -1);
-  if (key === " ") play(!playing);
+  if (key === " ") { if (!event.repeat) play(!playing); } // held, it must not scroll either
   else if (key === "ArrowLeft" || key === "ArrowRight") {
     play(false);
     seek(Math.round(frame) + (key === "ArrowRight" ? 1 : -1));

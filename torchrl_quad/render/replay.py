@@ -21,6 +21,7 @@ from torchrl_quad.dynamics.parameters import RawParams
 from torchrl_quad.dynamics.rotors import Rotors
 from torchrl_quad.envs import QuadrotorEnv, RacingEnv
 from torchrl_quad.envs.terms import norm
+from torchrl_quad.render.frames import checked, episode_steps, first_episodes
 
 _X_FRAME = [[0.053, 0.053], [-0.053, 0.053], [-0.053, -0.053], [0.053, -0.053]]  # [m], where no drone is known
 
@@ -52,14 +53,16 @@ def write_replay(
     Raises:
         ImportError: plotly is not installed.
         TypeError: ``env`` is no :class:`~torchrl_quad.envs.QuadrotorEnv`.
-        ValueError: the rollout is not (num_envs, time), has no position or quaternion, or has nothing to show.
+        ValueError: the rollout is not (num_envs, time), or has no position or quaternion; ``num_envs`` is less than 1;
+            or ``env`` has drones of its own for fewer environments than are shown.
     """
     plotlyjs = _plotlyjs()
     while hasattr(env, "base_env"):
         env = env.base_env
     if not isinstance(env, QuadrotorEnv | None):
         raise TypeError(f"env must be a QuadrotorEnv, also under transforms, or None; got {type(env).__name__}.")
-    flight = _checked(rollout, num_envs)
+    keys = (("next", "state", name) for name in ("position", "quaternion"))
+    flight = checked(rollout, "write_replay", num_envs, *keys)
     content = json.dumps(_content(flight, env, control_dt if env is None else env.control_dt))
     page = {
         "title": html.escape(f"{'Flight' if env is None else type(env).__name__}, {len(flight)} environments"),
@@ -70,7 +73,7 @@ def write_replay(
     # In one pass, so that nothing is looked for in what has been put in.
     text = re.sub(r"\{\{(\w+)\}\}", lambda match: page[match[1]], _asset("replay.html"))
     path = Path(path)
-    temporary = path.with_name(f".{path.name}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         temporary.write_text(text, encoding="utf-8")
         os.replace(temporary, path)
@@ -78,47 +81,16 @@ def write_replay(
         temporary.unlink(missing_ok=True)
 
 
-def _checked(rollout: TensorDictBase, num_envs: int) -> TensorDictBase:
-    """The environments to show, if there is anything to show."""
-    if rollout.dim() != 2:
-        raise ValueError(
-            f"A replay needs a rollout of batch size (num_envs, time), got {tuple(rollout.shape)}. Of one environment: "
-            "rollout.unsqueeze(0); of more dimensions: rollout.flatten(0, -2)."
-        )
-    for name, size in (("position", 3), ("quaternion", 4)):
-        value = rollout.get(("next", "state", name), None)
-        if value is None or value.shape[2:] != (size,):
-            found = "it has none" if value is None else f"its shape is {tuple(value.shape)}"
-            raise ValueError(
-                f'A replay needs the {name} ({size}) of the drones in rollout["next", "state", "{name}"], and {found}. '
-                "Give what env.rollout(...) or differentiable_rollout(...) return, with its state."
-            )
-    flight = rollout[: max(num_envs, 0)].detach().cpu()
-    if flight.numel() == 0 or not flight["next", "state", "position"].isfinite().all(-1).any():
-        raise ValueError(
-            f"Nothing to show: num_envs={num_envs} of a rollout (num_envs, time) = {tuple(rollout.shape)} has no "
-            "finite position."
-        )
-    return flight
-
-
 def _content(flight: TensorDictBase, env: QuadrotorEnv | None, control_dt: float) -> dict[str, Any]:
     """What the page shows. Frame 0 is the start of the first step, frame k what the k-th step has led to."""
     n, time = flight.shape
-    steps, endings = _episodes(flight)
-    frames = torch.arange(time + 1)
-    knows_start = all(("state", name) in flight.keys(True) for name in ("position", "quaternion"))
-    first = 0 if knows_start else 1
+    steps, frames = episode_steps(flight), torch.arange(time + 1)
+    first = 0 if all(("state", name) in flight.keys(True) for name in ("position", "quaternion")) else 1
 
     def state(name: str) -> Tensor | None:
-        """An entry of the state (num_envs, frames, k), which stays as it was at the end of the episode."""
-        after = flight.get(("next", "state", name), None)
-        if after is None:
-            return None
-        before = flight["state", name][:, :1] if knows_start else after[:, :1]
-        value = torch.cat((before, after), 1).float()
-        index = frames.minimum(steps[:, None])[:, first:]
-        return value.gather(1, index.unsqueeze(-1).expand(-1, -1, value.shape[-1]))
+        """An entry of the state (num_envs, frames, k), where there is one."""
+        value = first_episodes(flight, name)
+        return None if value is None else value[:, first:]
 
     def panel(label: str, names: list[str], value: Tensor, **more: Any) -> dict[str, Any]:
         """A time series of which there is nothing after the end of the episode."""
@@ -126,8 +98,6 @@ def _content(flight: TensorDictBase, env: QuadrotorEnv | None, control_dt: float
         return {"label": label, "names": names, "values": _encoded(value), **more}
 
     position, target, velocity, rotor_speed = map(state, ("position", "target", "velocity", "rotor_speed"))
-    if target is not None and target.shape != position.shape:
-        target = None
     rotors, lift = _rotors(flight, env, rotor_speed)
     content = {
         "environments": n,
@@ -135,7 +105,7 @@ def _content(flight: TensorDictBase, env: QuadrotorEnv | None, control_dt: float
         "start": first * control_dt,
         "control_dt": control_dt,
         "ended": (steps - first).tolist(),
-        "endings": endings,
+        "endings": _endings(flight),
         "knows_drone": env is not None,
         "rotors": _encoded(rotors),
         "position": _encoded(position),
@@ -169,11 +139,11 @@ def _content(flight: TensorDictBase, env: QuadrotorEnv | None, control_dt: float
     return {**content, "panels": panels}
 
 
-def _episodes(flight: TensorDictBase) -> tuple[Tensor, list[str]]:
-    """The control steps of each first episode, (num_envs), and how it ended: "" where it did not."""
-    if ("next", "done") not in flight.keys(True):
-        return torch.full(flight.shape[:1], flight.shape[1]), [""] * len(flight)
-    endings = [""] * len(flight)
+def _endings(flight: TensorDictBase) -> list[str]:
+    """How each first episode ended: "" where it did not."""
+    endings, done = [""] * len(flight), flight.get(("next", "done"), None)
+    if done is None:
+        return endings
     # The later ones override the earlier ones.
     for name, word in (
         ("done", "ended"),
@@ -184,9 +154,9 @@ def _episodes(flight: TensorDictBase) -> tuple[Tensor, list[str]]:
     ):
         flags = flight.get(("next", name), None)
         if flags is not None:
-            flags = QuadrotorEnv.at_the_end(flight, flags & flight["next", "done"]).tolist()
+            flags = QuadrotorEnv.at_the_end(flight, flags & done).tolist()
             endings = [word if flag else ending for flag, ending in zip(flags, endings, strict=True)]
-    return QuadrotorEnv.first_episode(flight).sum((1, 2)), endings
+    return endings
 
 
 def _rotors(flight: TensorDictBase, env: QuadrotorEnv | None, speed: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -204,7 +174,12 @@ def _rotors(flight: TensorDictBase, env: QuadrotorEnv | None, speed: Tensor | No
         drawn = flight.get(("next", "state", "drone", name), None)
         if drawn is not None:
             value = drawn[:, 0]
-        elif value.dim() > QuadrotorParams.dim(name):
+        elif value.dim() > QuadrotorParams.dim(name) and len(value) > 1:
+            if len(value) < n:
+                raise ValueError(
+                    f"write_replay: env has a {name} for each of its {len(value)} environments, and {n} are to be "
+                    f"shown. Give the environment that flew, or num_envs={len(value)}."
+                )
             value = value[:n]
         shape = value.shape[-QuadrotorParams.dim(name) :]
         fields[name] = value.detach().cpu().float().reshape(-1, 1, *shape)

@@ -230,7 +230,7 @@ def test_wandb_gets_configuration_metrics_pictures_films_replay_and_checkpoint(t
     assert names <= set(curves[0])
     assert {name.split("/")[0] for name in names} == {"train", "eval", "reward", "grad", "time"}
     assert [row["eval/return"] for row in curves] == [row["eval/return"] for row in resumed["rows"][:4]]
-    # The last evaluation and the final one draw the flight; the page comes with the final one alone.
+    # The third evaluation and the final one draw the flight; the page comes with the final one alone.
     items = [item for record in first["history"] for item in record.history.item]
     media = [(item.nested_key[0], json.loads(item.value_json)) for item in items if item.nested_key[1:] == ["path"]]
     kinds = {

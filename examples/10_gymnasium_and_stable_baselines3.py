@@ -4,6 +4,7 @@
 import gymnasium
 import numpy as np
 from stable_baselines3 import PPO
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 STEPS = 300_000
@@ -42,31 +43,17 @@ class DronesVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper, indices=None):
         return [False for _ in self._get_indices(indices)]
 
-    def _one_by_one(self, *args, **kwargs):
-        raise NotImplementedError("The drones are one environment, and none can be changed alone: see env.torchrl_env.")
-
-    set_attr = env_method = _one_by_one
+    set_attr = env_method = None  # the drones are one environment, and none can be changed alone
 
 
 def train(seed=0):
-    """A policy that PPO has trained for the budget."""
-    drones = DronesVecEnv(gymnasium.make_vec(TASK, num_envs=128, autoreset_mode="SameStep"))
+    """Train PPO for the budget; its mean return afterwards, over an episode of each drone, 25.6 at most."""
+    drones = VecNormalize(DronesVecEnv(gymnasium.make_vec(TASK, num_envs=128, autoreset_mode="SameStep")))
     options = {"n_steps": 32, "batch_size": 1024, "n_epochs": 5, "learning_rate": 1e-3}
-    ppo = PPO("MlpPolicy", VecNormalize(drones), **options, seed=seed, device="cpu").learn(STEPS)
-    return lambda seen: ppo.predict(ppo.get_vec_normalize_env().normalize_obs(seen), deterministic=True)[0]
-
-
-def mean_return(policy, seed, num_envs=128):
-    """Over the first episode of each drone; a policy maps observations (num_envs, k) to actions (num_envs, 4)."""
-    env = gymnasium.make_vec(TASK, num_envs=num_envs)
-    (observation, _), total, first = env.reset(seed=seed), 0.0, np.ones(num_envs, dtype=bool)
-    while first.any():
-        observation, reward, terminated, truncated, _ = env.step(policy(observation))
-        total, first = total + reward * first, first & ~(terminated | truncated)
-    return total.mean()
+    ppo = PPO("MlpPolicy", drones, **options, seed=seed, device="cpu").learn(STEPS)
+    drones.training = drones.norm_reward = False
+    return evaluate_policy(ppo, drones, n_eval_episodes=drones.num_envs, warn=False)[0]
 
 
 if __name__ == "__main__":
-    random = np.random.default_rng(0)
-    print("mean return of random actions:", mean_return(lambda seen: random.uniform(-1, 1, (len(seen), 4)), seed=1))
-    print("mean return of what PPO learnt:", mean_return(train(), seed=1))
+    print("mean return:", train())

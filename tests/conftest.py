@@ -39,3 +39,13 @@ def launch(monkeypatch, capsys):
         return capsys.readouterr().out
 
     return launch
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Runs in this process draw nothing, which is most of what a small one does."""
+    import run
+
+    monkeypatch.setattr(run, "draw_flight", lambda *args: None)
+    monkeypatch.setattr(run, "publish_flight", lambda *args: None)
+    monkeypatch.setattr(run, "plot_learning_curve", lambda metrics, path: path.touch())

@@ -35,7 +35,7 @@ EVERYTHING = [  # that draws random numbers or keeps a memory
 
 
 @pytest.fixture
-def train(launch):
+def train(launch, no_pictures):
     def train(recipe, folder, *overrides):
         launch(recipe, *SMALL, f"hydra.run.dir={folder}", *overrides)
         return checkpoints.read_checkpoint(folder / "checkpoint.pt")
@@ -211,9 +211,11 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
 # -- watch -------------------------------------------------------------------------------------------------------------
 
 
-def test_wandb_gets_configuration_metrics_pictures_films_replay_and_checkpoint(train, tmp_path):
-    train("bptt", tmp_path, "logger.backend=wandb", "logger.flight_every=3")
-    resumed = train("bptt", tmp_path, "resume=auto", "total_steps=240")
+def test_wandb_gets_configuration_metrics_pictures_films_replay_and_checkpoint(launch, tmp_path):
+    small = [*SMALL, f"hydra.run.dir={tmp_path}"]
+    launch("bptt", *small, "logger.backend=wandb", "logger.flight_every=3")
+    launch("bptt", *small, "resume=auto", "total_steps=240")
+    resumed = checkpoints.read_checkpoint(tmp_path / "checkpoint.pt")
     logs = sorted(tmp_path.glob("wandb/offline-run-*/*.wandb"))
     assert len(logs) == 2 and len({log.stem for log in logs}) == 1  # one run, of two parts
     first, second = (wandb_records(log) for log in logs)

@@ -28,6 +28,20 @@ def env64():
 
 
 @pytest.fixture
+def crashing():
+    """Flies an environment of hovering for some steps, in which drone 1 soon hits the ceiling."""
+
+    def fly(env, steps):
+        td = env.reset()
+        td["state", "position"][1] = torch.tensor([1.0, 0.0, 5.95])
+        td["state", "velocity"][1, 2] = 5.0
+        start = env.reset(td, set_state=True)
+        return env.rollout(steps, tensordict=start, auto_reset=False, break_when_any_done=False)
+
+    return fly
+
+
+@pytest.fixture
 def launch(monkeypatch, capsys):
     """``python recipes/NAME.py ARGUMENTS``, but in this process, where it starts quicker and parts can be replaced."""
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")

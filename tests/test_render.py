@@ -87,12 +87,8 @@ def flown(flight):
     return [torch.cat((s[:1], e[:n])) for s, e, n in zip(start, ends, steps, strict=True)]
 
 
-def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(drawn, tmp_path):
-    env = HoveringEnv(num_envs=3, max_episode_steps=40)
-    td = env.reset()
-    td["state", "position"][1] = torch.tensor([1.0, 0.0, 5.99])
-    td["state", "velocity"][1, 2] = 5.0
-    flight = env.rollout(60, tensordict=env.reset(td, set_state=True), auto_reset=False, break_when_any_done=False)
+def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(drawn, crashing, tmp_path):
+    flight = crashing(HoveringEnv(num_envs=3, max_episode_steps=40), 60)
     assert flight["next", "terminated"][1].any()
     plot_flight(flight, tmp_path / "flight.png")
     space, over_time = drawn[0].axes

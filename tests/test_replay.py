@@ -345,12 +345,9 @@ def test_the_next_gate_stands_out(replay, flight):
         np.testing.assert_allclose(np.linalg.norm(ring - gate.numpy(), axis=-1), 0.3, atol=1e-5)
 
 
-def test_a_drone_stays_where_its_episode_has_ended_and_the_page_says_how(open_page, tmp_path):
+def test_a_drone_stays_where_its_episode_has_ended_and_the_page_says_how(open_page, crashing, tmp_path):
     env = HoveringEnv(num_envs=2, max_episode_steps=30)
-    td = env.reset()
-    td["state", "position"][1] = torch.tensor([1.0, 0.0, 5.95])
-    td["state", "velocity"][1, 2] = 5.0
-    rollout = env.rollout(50, tensordict=env.reset(td, set_state=True), auto_reset=False, break_when_any_done=False)
+    rollout = crashing(env, 50)
     end = rollout["next", "terminated"][1, :, 0].int().argmax()
     assert end < 10
     write_replay(rollout, tmp_path / "replay.html", env=env)

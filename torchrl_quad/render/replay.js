@@ -295,7 +295,7 @@ function show() {
   Plotly.restyle("space", { x: all("x"), y: all("y"), z: all("z") }, MOVING.map(indexOf));
   moveCursor();
   element("time").value = Math.round(frame);
-  element("clock").textContent = `${now().toFixed(2)} s of ${seconds(frames - 1)}`;
+  element("clock").textContent = `${seconds(frame)} of ${seconds(frames - 1)}`;
   const counts = new Map();
   for (const i of shown()) {
     const word = endings[i] && frame >= ended[i] ? endings[i] : "flying";

@@ -31,6 +31,7 @@ FIGURES = {  # file: experiment, and what is drawn
     "relaxation": (("abpt", "bptt", "shac", *EXPERIMENTS["relaxation"][0]), ("racing",), "gates_passed"),
     "reward": ((*METHODS, *EXPERIMENTS["reward"][0]), ("racing",), "gates_passed"),
     "differences": (("abpt", "shac", *EXPERIMENTS["differences"][0]), ("landing", "racing"), "return"),
+    "critic": (("abpt", "abpt-no-0-step", "abpt-critic"), TASKS, "return"),
     "rate": (("abpt", "shac", "bptt", *EXPERIMENTS["rate"][0]), TASKS, "return"),
 }
 COLUMNS = {  # of the table of ends: heading, column of the curves, factor, digits

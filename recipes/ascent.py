@@ -1,0 +1,135 @@
+"""How much of the ascent that there is does a first-order gradient find? Its parts against the simulator.
+
+python recipes/ascent.py outputs/.../checkpoint.pt [more checkpoints]
+
+In states that the policy of a checkpoint visits, the true gradient of the return in the next action is measured: the
+action is changed a little up and down, and the policy flies on with the same noise, gates and crashes included. Beside
+it stands what the objective of abpt.py, shac.py or bptt.py says of the same action, and what its parts say.
+
+The ascent of an estimate is the sum over states of the slope in its direction, in units of the sum of the steepest
+slopes: 1 finds the steepest way everywhere, 0 is no better than a random direction, and less than 0 leads downhill.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+from checkpoints import read_checkpoint
+from common import build_env, make_policy, network
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.autograd.graph import GradientEdge
+from torch.nn.functional import normalize
+from torchrl.envs import EnvBase
+
+from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss, differentiable_rollout, make_qvalue, make_value
+from torchrl_quad.objectives import PathwiseLoss
+
+CRITICS = {"abpt": (ABPTLoss, make_qvalue), "shac": (SHACLoss, make_value)}
+SEED = 3_000_000
+
+
+def load_loss(saved: dict, cfg: DictConfig, env: EnvBase) -> PathwiseLoss:
+    """The loss of a checkpoint, with the policy and the critics as they were at last."""
+    actor = make_policy(cfg, env)
+    if cfg.algorithm == "bptt":
+        loss = BPTTLoss(actor, **cfg.loss).make_value_estimator(gamma=cfg.gamma)
+    else:
+        kind, make_critic = CRITICS[cfg.algorithm]
+        loss = kind(actor, make_critic(env, **network(cfg, "critic")), **cfg.loss)
+        loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
+    loss.load_state_dict(saved["parts"][0])
+    return loss
+
+
+def estimates(loss: PathwiseLoss, rollout: TensorDictBase) -> dict[str, Tensor]:
+    """The gradient of the objective, and of its parts where it has several, in the first action: each (envs, 4)."""
+    node, index = rollout["action"].grad_fn.next_functions[0]  # the actions were stacked when it had been flown
+    parts = loss.objective_parts(rollout)
+    parts |= {"objective": sum(parts.values())}
+    return {
+        name: torch.autograd.grad(part.sum(), GradientEdge(node, index), retain_graph=True)[0].squeeze(1)
+        for name, part in parts.items()
+    }
+
+
+@torch.no_grad()
+def slopes(
+    env: EnvBase, loss: PathwiseLoss, start: TensorDictBase, action: Tensor, steps: int, size: float
+) -> tuple[Tensor, Tensor]:
+    """The true gradient of the discounted return in an action, by central differences, and the return.
+
+    Args:
+        start: what reset has given (envs).
+        action: (envs, 4), to be taken first; the policy flies on with the same noise each time.
+        steps: control steps until which rewards count; they count to the end of the episode at most.
+        size: how much each component is changed up and down.
+
+    Returns:
+        the gradient (envs, 4) and the return (envs).
+    """
+    gamma = loss.value_estimator.gamma.item()
+
+    def flown(action: Tensor) -> Tensor:
+        torch.manual_seed(SEED)
+        first = env.step(start.clone().set("action", action))
+        rest, _ = differentiable_rollout(env, loss.actor_network, env.step_mdp(first), steps - 1)
+        reward = torch.cat([first["next", "reward"], rest["next", "reward"].squeeze(-1)], 1)
+        done = torch.cat([first["next", "done"], rest["next", "done"].squeeze(-1)], 1)
+        counts = torch.cat([torch.ones_like(reward[:, :1]), (~done[:, :-1]).float().cumprod(1)], 1)
+        return (gamma ** torch.arange(steps) * counts * reward).sum(1)
+
+    changes = size * torch.eye(action.shape[-1])
+    ends = torch.stack([torch.stack([flown(action + change), flown(action - change)]) for change in changes])
+    return (ends[:, 0] - ends[:, 1]).mT / (2.0 * size), ends.mean((0, 1))
+
+
+def examine(path: Path, states: int, repeats: int, steps: int, size: float) -> dict[str, object]:
+    """What the gradient of a checkpoint finds: one row."""
+    saved = read_checkpoint(path)
+    cfg = OmegaConf.create(saved["config"])
+    if cfg.normalize:
+        raise ValueError(f"{path} was trained under a normaliser; only policies without one can be examined.")
+    torch.manual_seed(SEED)
+    env = build_env(cfg, states * repeats, SEED)
+    loss = load_loss(saved, cfg, env)
+    with torch.no_grad():
+        flight, _ = differentiable_rollout(env, loss.actor_network, None, env.max_episode_steps // 2)
+    visited = flight[torch.arange(states), torch.randint(flight.shape[1], (states,))].select("state")
+    start = env.reset(visited.repeat_interleave(repeats), set_state=True)
+    rollout, _ = differentiable_rollout(env, loss.actor_network, start, cfg.horizon)
+    told = estimates(loss, rollout)
+    action = rollout["action"][:, 0].detach()
+    true, returns = slopes(env, loss, start, action, steps, size)
+
+    def each(x: Tensor) -> Tensor:  # state: the mean over repeats, whose noise differs
+        return x.unflatten(0, (states, repeats)).mean(1)
+
+    steepest = each(true).norm(dim=-1).sum()
+    row = {"task": cfg.task, "reward": cfg.env.get("reward", ""), "variant": path.parent.parent.name, "seed": cfg.seed}
+    row |= {"return": saved["rows"][-1]["eval/return"], "explained_variance": ""}
+    if isinstance(loss, ABPTLoss):
+        first = rollout[:, 0].select(*loss.qvalue_network.in_keys).detach()
+        known = loss._critics(first, loss._critic_params(target=False)).amin(0).squeeze(-1)
+        row["explained_variance"] = (1.0 - each(returns - known).var() / each(returns).var()).item()
+    return row | {name: ((each(true) * normalize(each(x), dim=-1)).sum() / steepest).item() for name, x in told.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkpoints", nargs="+", type=Path)
+    parser.add_argument("--states", type=int, default=64)
+    parser.add_argument("--repeats", type=int, default=8, help="flights from each of them, each with its own noise")
+    parser.add_argument("--steps", type=int, default=256, help="control steps until which rewards count")
+    parser.add_argument("--size", type=float, default=0.1, help="of the change of an action, from -1 to 1")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    for path in args.checkpoints:
+        print(examine(path, args.states, args.repeats, args.steps, args.size), flush=True)
+
+
+if __name__ == "__main__":
+    main()

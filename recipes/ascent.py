@@ -1,6 +1,6 @@
 """How much of the ascent that there is does a first-order gradient find? Its parts against the simulator.
 
-python recipes/ascent.py outputs/.../checkpoint.pt [more checkpoints]
+python recipes/ascent.py outputs/reproduce/*/{abpt,shac,bptt}/seed*/checkpoint.pt --output docs/results/data/ascent.csv
 
 In states that the policy of a checkpoint visits, the true gradient of the return in the next action is measured: the
 action is changed a little up and down, and the policy flies on with the same noise, gates and crashes included. Beside
@@ -8,22 +8,26 @@ it stands what the objective of abpt.py, shac.py or bptt.py says of the same act
 
 The ascent of an estimate is the sum over states of the slope in its direction, in units of the sum of the steepest
 slopes: 1 finds the steepest way everywhere, 0 is no better than a random direction, and less than 0 leads downhill.
+The slopes are measured with noise, and a second measurement of them stands beside it: no estimate can find more.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
 import torch
 from checkpoints import read_checkpoint
 from common import build_env, make_policy, network
 from omegaconf import DictConfig, OmegaConf
+from reproduce import read, write
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.autograd.graph import GradientEdge
 from torch.nn.functional import normalize
 from torchrl.envs import EnvBase
+from tqdm import tqdm
 
 from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss, differentiable_rollout, make_qvalue, make_value
 from torchrl_quad.objectives import PathwiseLoss
@@ -57,19 +61,14 @@ def estimates(loss: PathwiseLoss, rollout: TensorDictBase) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def slopes(
-    env: EnvBase, loss: PathwiseLoss, start: TensorDictBase, action: Tensor, steps: int, size: float
-) -> tuple[Tensor, Tensor]:
-    """The true gradient of the discounted return in an action, by central differences, and the return.
+def slopes(env: EnvBase, loss: PathwiseLoss, start: TensorDictBase, action: Tensor, steps: int, size: float) -> Tensor:
+    """The true gradient of the discounted return in an action, by central differences: (envs, 4).
 
     Args:
         start: what reset has given (envs).
         action: (envs, 4), to be taken first; the policy flies on with the same noise each time.
         steps: control steps until which rewards count; they count to the end of the episode at most.
         size: how much each component is changed up and down.
-
-    Returns:
-        the gradient (envs, 4) and the return (envs).
     """
     gamma = loss.value_estimator.gamma.item()
 
@@ -83,39 +82,37 @@ def slopes(
         return (gamma ** torch.arange(steps) * counts * reward).sum(1)
 
     changes = size * torch.eye(action.shape[-1])
-    ends = torch.stack([torch.stack([flown(action + change), flown(action - change)]) for change in changes])
-    return (ends[:, 0] - ends[:, 1]).mT / (2.0 * size), ends.mean((0, 1))
+    return torch.stack([flown(action + x) - flown(action - x) for x in changes], -1) / (2.0 * size)
 
 
-def examine(path: Path, states: int, repeats: int, steps: int, size: float) -> dict[str, object]:
-    """What the gradient of a checkpoint finds: one row."""
+def examine(path: Path, states: int, repeats: int, steps: int, size: float) -> dict[str, str]:
+    """What the gradient of a checkpoint finds."""
     saved = read_checkpoint(path)
     cfg = OmegaConf.create(saved["config"])
     if cfg.normalize:
         raise ValueError(f"{path} was trained under a normaliser; only policies without one can be examined.")
     torch.manual_seed(SEED)
-    env = build_env(cfg, states * repeats, SEED)
+    scout, env = (build_env(cfg, number, SEED) for number in (states, states * repeats))
     loss = load_loss(saved, cfg, env)
     with torch.no_grad():
-        flight, _ = differentiable_rollout(env, loss.actor_network, None, env.max_episode_steps // 2)
+        flight, _ = differentiable_rollout(scout, loss.actor_network, None, env.max_episode_steps // 2)
     visited = flight[torch.arange(states), torch.randint(flight.shape[1], (states,))].select("state")
     start = env.reset(visited.repeat_interleave(repeats), set_state=True)
     rollout, _ = differentiable_rollout(env, loss.actor_network, start, cfg.horizon)
     told = estimates(loss, rollout)
     action = rollout["action"][:, 0].detach()
-    true, returns = slopes(env, loss, start, action, steps, size)
+    true = slopes(env, loss, start, action, steps, size)
 
     def each(x: Tensor) -> Tensor:  # state: the mean over repeats, whose noise differs
-        return x.unflatten(0, (states, repeats)).mean(1)
+        return x.unflatten(0, (states, -1)).mean(1)
 
-    steepest = each(true).norm(dim=-1).sum()
-    row = {"task": cfg.task, "reward": cfg.env.get("reward", ""), "variant": path.parent.parent.name, "seed": cfg.seed}
-    row |= {"return": saved["rows"][-1]["eval/return"], "explained_variance": ""}
-    if isinstance(loss, ABPTLoss):
-        first = rollout[:, 0].select(*loss.qvalue_network.in_keys).detach()
-        known = loss._critics(first, loss._critic_params(target=False)).amin(0).squeeze(-1)
-        row["explained_variance"] = (1.0 - each(returns - known).var() / each(returns).var()).item()
-    return row | {name: ((each(true) * normalize(each(x), dim=-1)).sum() / steepest).item() for name, x in told.items()}
+    def ascent(told: Tensor, true: Tensor) -> float:
+        return ((true * normalize(told, dim=-1)).sum() / true.norm(dim=-1).sum()).item()
+
+    halves = true.unflatten(0, (states, 2, -1)).mean(2).unbind(1)
+    row = {"explained_variance": saved["rows"][-1].get("train/explained_variance", math.nan)}
+    row |= {"second_measurement": ascent(*halves)} | {name: ascent(each(x), each(true)) for name, x in told.items()}
+    return {name: f"{x:.4g}" for name, x in row.items()}
 
 
 def main() -> None:
@@ -125,10 +122,18 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=8, help="flights from each of them, each with its own noise")
     parser.add_argument("--steps", type=int, default=256, help="control steps until which rewards count")
     parser.add_argument("--size", type=float, default=0.1, help="of the change of an action, from -1 to 1")
+    parser.add_argument("--output", type=Path, required=True, help="a CSV file; what stands there is not done again")
     args = parser.parse_args()
+    if args.repeats % 2:
+        parser.error("--repeats has to be even: halves of them are compared.")
     torch.set_num_threads(1)
-    for path in args.checkpoints:
-        print(examine(path, args.states, args.repeats, args.steps, args.size), flush=True)
+    rows = read(args.output)
+    for path in tqdm(args.checkpoints):
+        task, variant, seed = path.parts[-4:-1]
+        own = {"task": task, "variant": variant, "seed": seed.removeprefix("seed")}
+        if not any(own.items() <= row.items() for row in rows):
+            rows.append(own | examine(path, args.states, args.repeats, args.steps, args.size))
+            write(args.output, rows)
 
 
 if __name__ == "__main__":

@@ -177,6 +177,27 @@ def audit_table(data: Path) -> str:
     return table(["task", "reward", "term", "share of the return", "share of the gradient", "verdict"], rows)
 
 
+def ascent_table(data: Path) -> str:
+    """How much of the ascent the gradients of the last policies find, by ascent.py."""
+    columns = {
+        "objective": "objective",
+        "N-step return": "n_step_return",
+        "0-step return": "zero_step_return",
+        "a second measurement": "second_measurement",
+        "explained variance of the critic": "explained_variance",
+    }
+    runs: dict[tuple[str, str], list[dict[str, str]]] = {}
+    for row in read(data / "ascent.csv"):
+        runs.setdefault((row["task"], row["variant"]), []).append(row)
+    order = sorted(runs, key=lambda run: (TASKS.index(run[0]), list(VARIANTS).index(run[1])))
+    rows = [
+        [task, VARIANTS[variant].label, str(len(runs[task, variant]))]
+        + [spread(np.array([float(x.get(name) or "nan") for x in runs[task, variant]])) for name in columns.values()]
+        for task, variant in order
+    ]
+    return table(["task", "", "seeds", *columns], rows)
+
+
 def part_row(part: Part, parts: int) -> list[str]:
     """A part of a claim as a row."""
     bounds = [
@@ -216,6 +237,7 @@ def page(data: Path, pictures: Path) -> str:
         if draw(results, pictures / f"{name}.png", variants, tasks, column):
             blocks.append(f"![Curves of the experiment: {name}](results/{name}.png)")
         blocks.append(ends_table(results, name))
+    blocks += ["## Ascent", ascent_table(data)]
     return "\n\n".join(blocks)
 
 

@@ -249,8 +249,9 @@ def page(data: Path, pictures: Path) -> str:
         f"seeds {', '.join(str(seed) for seed in SEEDS if seed in seeds) or 'none yet'}.",
         "## Verdicts",
         claims_table(verdicts),
-        "## Verdicts on BPTT and SHAC as published",
-        "BPTT through whole episodes, and SHAC without the gradient of its terminal value.",
+        "## Verdicts on BPTT, SHAC and ABPT as published",
+        "BPTT through whole episodes, SHAC without the gradient of its terminal value, ABPT with an entropy bonus in "
+        "landing and racing.",
         claims_table(published),
         "## Reward audit",
         audit_table(data),

@@ -98,18 +98,15 @@ def test_a_shrunken_matrix_runs_goes_on_where_it_was_stopped_and_gives_a_page(mo
 
 
 def test_backpropagation_through_all_steps_knows_the_true_slopes():
-    env = make_env("hovering", num_envs=16, seed=0)
+    smooth = {"velocity": 0.0, "angular_velocity": 0.0}  # norms, which have a kink where the drone rests
+    env = make_env("hovering", num_envs=16, seed=0, dtype=torch.float64, weights=smooth)
     loss = BPTTLoss(make_actor(env, scale_init=1e-4)).make_value_estimator(gamma=0.9)
     start = env.reset()
-    for name in ("velocity", "angular_velocity"):  # at rest their norms have no derivative
-        start["state", name] = torch.randn(env.num_envs, 3, generator=torch.Generator().manual_seed(0))
-    start = env.reset(start, set_state=True)
-    torch.manual_seed(0)
     rollout, _ = differentiable_rollout(env, loss.actor_network, start, 20)
     told = ascent.estimates(loss, rollout)["objective"]
-    true = ascent.slopes(env, loss, start, rollout["action"][:, 0].detach(), steps=20, size=0.05)
-    assert torch.nn.functional.cosine_similarity(told.flatten(), true.flatten(), 0) > 0.98
-    torch.testing.assert_close(told.norm(), true.norm(), rtol=0.05, atol=0.0)
+    true = ascent.slopes(env, loss, start, rollout["action"][:, 0].detach(), steps=20, size=1e-3)
+    assert torch.nn.functional.cosine_similarity(told, true, dim=-1).min() > 0.99
+    torch.testing.assert_close(told.norm(), true.norm(), rtol=0.02, atol=0.0)
 
 
 def test_quick_results_never_get_among_the_real_ones(monkeypatch, capsys):

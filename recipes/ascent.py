@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss, differentiable_rollout, make_qvalue, make_value
 from torchrl_quad.objectives import PathwiseLoss
+from torchrl_quad.objectives.pathwise import discounts
 
 CRITICS = {"abpt": (ABPTLoss, make_qvalue), "shac": (SHACLoss, make_value)}
 SEED = 3_000_000
@@ -68,16 +69,15 @@ def slopes(env: EnvBase, loss: PathwiseLoss, start: TensorDictBase, action: Tens
         steps: control steps until which rewards count; they count to the end of the episode at most.
         size: how much each component is changed up and down.
     """
-    gamma = loss.value_estimator.gamma.item()
+    gamma = loss.value_estimator.gamma
 
     def flown(action: Tensor) -> Tensor:
         torch.manual_seed(SEED)
         first = env.step(start.clone().set("action", action))
         rest, _ = differentiable_rollout(env, loss.actor_network, env.step_mdp(first), steps - 1)
-        reward = torch.cat([first["next", "reward"], rest["next", "reward"].squeeze(-1)], 1)
-        done = torch.cat([first["next", "done"], rest["next", "done"].squeeze(-1)], 1)
-        counts = torch.cat([torch.ones_like(reward[:, :1]), (~done[:, :-1]).float().cumprod(1)], 1)
-        return (gamma ** torch.arange(steps) * counts * reward).sum(1)
+        flight = torch.cat([x.select(("next", "reward"), ("next", "done")) for x in (first.unsqueeze(1), rest)], 1)
+        discount = discounts(flight["next", "done"], gamma) * env.first_episode(flight)
+        return (discount * flight["next", "reward"]).sum((1, 2))
 
     changes = size * torch.eye(action.shape[-1])
     return torch.stack([flown(action + x) - flown(action - x) for x in changes], -1) / (2.0 * size)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-SMALL = "num_envs=4 horizon=4 total_steps=16"
+SMALL = "num_envs=4 horizon=4 env.max_episode_steps=20 compile=false"
 
 
 @pytest.mark.parametrize(
@@ -17,8 +17,8 @@ SMALL = "num_envs=4 horizon=4 total_steps=16"
     [
         ("throughput", "--num-envs 4 8 --modes eager --horizon 2 --rounds 1", 10),
         ("memory", "--num-envs 4 --modes eager recompute --horizon 2 --rounds 1", 2),
-        ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL}", 1),
-        ("profile_recipes", "--algorithms bptt --iterations 2 --skip 1 --overrides num_envs=4 horizon=4", 1),
+        ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),
+        ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
     ],
 )
 def test_a_benchmark_writes_a_table(name, arguments, rows, tmp_path):

@@ -187,7 +187,7 @@ def recipe(program, words, launch, folder):
     if program == "torchrun" or "--multirun" in words:
         program = [sys.executable, *(["-m", "torch.distributed.run"] if program == "torchrun" else [])]
         target = f"hydra.{'sweep' if '--multirun' in words else 'run'}.dir={folder}"
-        words = [re.sub(r"^(seed=[^,]*),.*", r"\1", word) for word in words]  # one seed of each
+        words = [re.sub(r"^(\w+=[^,]*),.*", r"\1", word) for word in words]  # a sweep of one run
         run(*program, *words, *SMALL, target)
     elif "checkpoint.pt" in " ".join(words):
         launch("abpt" if name == "evaluate" else name, *SMALL, "total_steps=48", f"hydra.run.dir={folder}")

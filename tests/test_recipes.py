@@ -43,7 +43,7 @@ def read(folder):
         return list(csv.DictReader(file))
 
 
-def test_a_compiled_run_learns_what_an_eager_one_does(train, tmp_path):
+def test_a_compiled_run_learns_what_an_eager_one_does(train, no_pictures, tmp_path):
     small = ["env.integrator=euler", "hydra.job_logging.root.level=WARNING"]
     for mode in ("false", "true"):
         train("bptt", tmp_path / mode, *small, f"compile={mode}")
@@ -134,17 +134,15 @@ def test_an_unknown_schedule_names_those_that_exist():
         make_optimizer(cfg, [torch.nn.Parameter(torch.zeros(1))], 101)
 
 
-def test_a_missing_or_foreign_checkpoint_is_named(tmp_path):
-    def fails(path):
-        command = (sys.executable, "recipes/evaluate.py", f"checkpoint={path}")
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stderr
-
-    assert f"No checkpoint at {tmp_path}/none.pt. Train one first" in fails(tmp_path / "none.pt")
+def test_a_missing_or_foreign_checkpoint_is_named(launch, tmp_path):
+    with pytest.raises(FileNotFoundError, match=f"No checkpoint at {tmp_path}/none.pt. Train one first"):
+        launch("evaluate", f"checkpoint={tmp_path}/none.pt")
     torch.save({"weights": torch.zeros(1)}, tmp_path / "foreign.pt")
-    assert "foreign.pt is not a checkpoint of these recipes" in fails(tmp_path / "foreign.pt")
+    with pytest.raises(ValueError, match="foreign.pt is not a checkpoint of these recipes"):
+        launch("evaluate", f"checkpoint={tmp_path}/foreign.pt")
 
 
-def test_two_runs_with_one_seed_are_equal_and_another_seed_differs(train, tmp_path):
+def test_two_runs_with_one_seed_are_equal_and_another_seed_differs(train, no_pictures, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         train("abpt", tmp_path / name, f"seed={seed}")
     a, b, c = ([row["train/loss_actor"] for row in read(tmp_path / name)] for name in "abc")
@@ -152,7 +150,7 @@ def test_two_runs_with_one_seed_are_equal_and_another_seed_differs(train, tmp_pa
 
 
 @pytest.mark.parametrize("recipe", FIRST_ORDER)
-def test_the_entropy_bonus_is_an_option_and_its_coefficient_can_be_learned(train, recipe, tmp_path):
+def test_the_entropy_bonus_is_an_option_and_its_coefficient_can_be_learned(train, no_pictures, recipe, tmp_path):
     train(recipe, tmp_path, "loss.alpha=auto")
     first, last = (float(row["train/alpha"]) for row in read(tmp_path))
     assert first != last

@@ -184,11 +184,11 @@ def recipe(program, words, launch, folder):
     """Run a recipe on a reduced budget; one that goes on from a checkpoint, from that of another small run."""
     name = next(Path(word).stem for word in words if word.endswith(".py"))
     arguments = [word for word in words if "=" in word and not word.startswith(("-", "hydra.run.", "hydra.sweep."))]
-    if program == "torchrun" or "--multirun" in words:
-        program = [sys.executable, *(["-m", "torch.distributed.run"] if program == "torchrun" else [])]
-        target = f"hydra.{'sweep' if '--multirun' in words else 'run'}.dir={folder}"
-        words = [re.sub(r"^(\w+=[^,]*),.*", r"\1", word) for word in words]  # a sweep of one run
-        run(*program, *words, *SMALL, target)
+    if program == "torchrun":
+        run(sys.executable, "-m", "torch.distributed.run", *words, *SMALL, f"hydra.run.dir={folder}")
+    elif "--multirun" in words:  # one run of it, in this process; a test of their own has several side by side
+        arguments = [re.sub(r"^(\w+=[^,]*),.*", r"\1", word) for word in arguments]
+        launch(name, "--multirun", *arguments, *SMALL, f"hydra.sweep.dir={folder}", "hydra/launcher=basic")
     elif "checkpoint.pt" in " ".join(words):
         launch("abpt" if name == "evaluate" else name, *SMALL, "total_steps=48", f"hydra.run.dir={folder}")
         arguments = [re.sub("=outputs/.*checkpoint.pt", f"={folder}/checkpoint.pt", word) for word in arguments]

@@ -53,7 +53,9 @@ def test_a_compiled_run_learns_what_an_eager_one_does(train, no_pictures, tmp_pa
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_every_recipe_trains_on_every_task_and_leaves_what_it_promises(launch, recipe, tmp_path):
+def test_every_recipe_trains_on_every_task_and_leaves_what_it_promises(launch, recipe, tmp_path, request):
+    if recipe != "abpt":  # the others draw the same pictures, and do so in other tests
+        request.getfixturevalue("no_pictures")
     sweep = [f"task={','.join(TASKS)}", f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=${task}"]
     printed = launch(recipe, "--multirun", *SMALL, *sweep, "hydra/launcher=basic")
     for task in TASKS:
@@ -66,11 +68,12 @@ def test_every_recipe_trains_on_every_task_and_leaves_what_it_promises(launch, r
         assert any(name.startswith("train/loss_") for name in rows[0])
         may_be_missing = {"eval/lap_time", "eval/landing_speed"}
         assert all(math.isfinite(float(row[name])) for row in rows for name in set(row) - may_be_missing)
-        for picture in ("learning_curve.png", "flight.png"):
-            assert (folder / picture).read_bytes().startswith(b"\x89PNG")
-        assert (folder / "flight.gif").read_bytes().startswith(b"GIF89a")
-        assert (folder / "episode.pdf").read_bytes().startswith(b"%PDF")
-        assert (folder / "flight.html").read_text().startswith("<!doctype html>")
+        if recipe == "abpt":
+            for picture in ("learning_curve.png", "flight.png"):
+                assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+            assert (folder / "flight.gif").read_bytes().startswith(b"GIF89a")
+            assert (folder / "episode.pdf").read_bytes().startswith(b"%PDF")
+            assert (folder / "flight.html").read_text().startswith("<!doctype html>")
         summary = json.loads((folder / "summary.json").read_text())
         assert summary["episodes"] == 256
         assert summary["steps"] == 96

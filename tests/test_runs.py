@@ -477,18 +477,14 @@ def descend_on_own_data(rank, port):
 # -- sweeps ------------------------------------------------------------------------------------------------------------
 
 
-def test_the_runs_of_a_sweep_go_side_by_side_and_a_second_time_are_skipped(tmp_path):
-    sweep = ["task=hovering,tracking", "resume=auto", f"hydra.sweep.dir={tmp_path}"]
-    command = [sys.executable, "recipes/bptt.py", "--multirun", *SMALL, *sweep, "hydra.sweep.subdir=${task}"]
-
-    def launch():
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
-
-    assert launch().count("fresh episodes") == 2
+def test_the_runs_of_a_sweep_go_side_by_side_and_a_second_time_are_skipped(launch, tmp_path):
+    sweep = ["--multirun", *SMALL, "task=hovering,tracking", "resume=auto", f"hydra.sweep.dir={tmp_path}"]
+    sweep += ["hydra.sweep.subdir=${task}"]
+    command = [sys.executable, "recipes/bptt.py", *sweep]
+    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=True).stdout
+    assert printed.count("fresh episodes") == 2
     folders = [tmp_path / task for task in ("hovering", "tracking")]
     started = [(folder / "config.yaml").stat().st_mtime for folder in folders]
     ended = [(folder / "summary.json").stat().st_mtime for folder in folders]
     assert max(started) < min(ended)  # the second had started before the first was over
-    assert launch().count("Finished before") == 2
+    assert launch("bptt", *sweep, "hydra/launcher=basic").count("Finished before") == 2

@@ -103,8 +103,9 @@ def test_a_compiled_step_has_exact_derivatives():
     assert torch.autograd.gradcheck(flight, (actions, *params), fast_mode=True, atol=1e-6, rtol=1e-5)
 
 
-def test_compiled_flights_equal_eager_ones_and_never_recompile():
-    env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, gate_bonus="log", **EVERYTHING)
+@pytest.mark.parametrize("options", [{}, {"gate_bonus": "log", **EVERYTHING}], ids=["plain", "everything"])
+def test_compiled_flights_equal_eager_ones_and_never_recompile(options):
+    env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, **options)
     actor = make_actor(env)
 
     def train():

@@ -1,13 +1,16 @@
 """The environment: specs, resets, ends, seeds, delay, and what happens to broken states."""
 
+import pickle
+
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
 
-from torchrl_quad import HoveringEnv, QuadrotorParams, differentiable_rollout, load_drone, make_env
+from torchrl_quad import HoveringEnv, QuadrotorParams, differentiable_rollout, load_drone, make_actor, make_env
 from torchrl_quad.dynamics import quaternion
+from torchrl_quad.envs import TASKS
 
 
 def fly(env, td, actions):
@@ -329,6 +332,25 @@ def test_different_masses_all_hover_with_their_own_nominal_drone():
     env = HoveringEnv(num_envs=2, drone=per_env)
     flight = fly(env, env.reset(), hold(env, 50))
     torch.testing.assert_close(flight["next", "state", "velocity"][..., 2], torch.zeros(2, 50), atol=1e-4, rtol=0)
+
+
+def test_the_drone_that_flies_can_be_set_through_transforms_and_takes_precision_and_gradient(env64):
+    wrapped = TransformedEnv(env64, StepCounter())
+    mass = torch.tensor([0.9], requires_grad=True)
+    wrapped.set_params(load_drone("visfly").replace(mass=mass))
+    assert env64.params.mass.dtype is torch.float64
+    height = wrapped.rollout(3, make_actor(env64))["next", "state", "position"][..., 2]
+    assert torch.autograd.grad(height.sum(), mass)[0] < 0
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_an_environment_can_be_pickled_and_flies_the_same(task):
+    env = make_env(task, num_envs=2)
+    again = pickle.loads(pickle.dumps(env))
+    start = env.reset()
+    action = env.hover_action.expand(2, 4)
+    ends = [e.step(start.copy().set("action", action))["next"] for e in (env, again)]
+    assert (ends[0] == ends[1]).all()
 
 
 def test_make_env_builds_by_name_and_lists_the_names():

@@ -17,6 +17,7 @@ from torchrl_quad import (
     TrackingEnv,
     VisitedStateBuffer,
     differentiable_rollout,
+    load_drone,
     load_track,
     make_actor,
     make_env,
@@ -25,6 +26,7 @@ from torchrl_quad import (
 )
 
 nan = float("nan")
+visfly = load_drone("visfly")
 
 
 @pytest.fixture
@@ -89,6 +91,14 @@ def test_an_unknown_option_is_told_the_closest_one_and_all_of_them(task, kwargs,
         ),
         ({"weights": {"velocity": nan}}, "weights: velocity must be a finite number, got nan"),
         ({"weights": {"velocity": "much"}}, "weights: velocity must be a finite number, got 'much'"),
+        ({"weights": {"velocity": torch.ones(3)}}, "weights: velocity must be a finite number, got tensor"),
+        ({"weights": {"velocity": torch.tensor(nan)}}, "weights: velocity must be a finite number, got tensor"),
+        ({"drone": visfly.replace(mass=460.0)}, r"to hover, its rotors would have to turn at .* Check mass \[kg\]"),
+        ({"drone": visfly.replace(max_thrust_to_weight=0.8)}, "max_thrust_to_weight .* must be above 1 to hover; got"),
+        (
+            {"drone": visfly.replace(rotor_positions=[[0.1 * i, 0.03 * i] for i in (-3, -1, 1, 3)])},
+            "the four rotors cannot make thrust and torque about each axis on their own",
+        ),
         ({"drone": None}, "Unknown drone None. Choose from: crazyflie"),
     ],
 )
@@ -106,6 +116,59 @@ def test_an_unknown_task_is_told_the_known_ones(task):
 def test_a_gate_without_end_is_none():
     with pytest.raises(ValueError, match="gate_radius must be a positive number .m., got inf"):
         load_track({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": float("inf")})
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong", "message"),
+    [
+        (
+            "observe",
+            lambda _, s: s["position"][:, 0],
+            r"observe\(state\) must be a tensor \(4, k\), torch.float32",
+        ),
+        ("observe", lambda _, s: s["position"].double(), r"got \(4, 3\), torch.float64"),
+        ("reward_terms", lambda _, s: {"near": -s["position"]}, r"reward_terms\(state\)\['near'\] must .* keepdim"),
+        ("reward_terms", lambda _, s: {"near": -s["position"][:, 0]}, r"\['near'\] must .*; got \(4,\)"),
+        ("reward_terms", lambda _, s: {"near": 0.1}, r"\['near'\] must be a tensor \(4, 1\), .*; got float"),
+        (
+            "metrics",
+            lambda _, s: {"far": s["position"]},
+            r"metrics\(state\)\['far'\] must be a tensor \(4, 1\)",
+        ),
+        (
+            "is_crash",
+            lambda _, s: s["position"][:, :1],
+            r"is_crash\(state\) must be a tensor \(4, 1\), torch.bool",
+        ),
+        ("is_success", lambda _, s: s["position"] > 0, r"is_success\(state\) must .* got \(4, 3\), torch.bool"),
+        (
+            "advance",
+            lambda _, p, s: {"position": s["position"]},
+            "advance must return the whole state, and 'target'",
+        ),
+        ("advance", lambda _, p, s: {**s, "target": s["target"].double()}, "float32.; got .* torch.float64"),
+        (
+            "initial_state",
+            lambda self, n: {**HoveringEnv.initial_state(self, n), "legs": torch.zeros(n)},
+            r"initial_state: entry 'legs' must be a tensor \(4, ...\) of at least two dimensions; got \(4,\)",
+        ),
+    ],
+)
+def test_a_task_of_another_form_is_refused_by_the_name_of_its_method(method, wrong, message):
+    with pytest.raises(ValueError, match="OwnEnv." + (message if message.startswith(method) else ".*" + message)):
+        type("OwnEnv", (HoveringEnv,), {method: wrong})(num_envs=4)
+
+
+@pytest.mark.parametrize(
+    ("params", "error", "message"),
+    [
+        ("visfly", TypeError, "params must be QuadrotorParams, such as env.params.replace.*; got str"),
+        (visfly.replace(mass=[[0.4]] * 3), ValueError, "field 'mass' is for 3 environments, and num_envs=4"),
+    ],
+)
+def test_parameters_that_do_not_fit_are_refused(env, params, error, message):
+    with pytest.raises(error, match=message):
+        env.params = params
 
 
 # -- actions -----------------------------------------------------------------------------------------------------------
@@ -189,6 +252,19 @@ def test_a_state_that_is_not_whole_is_refused_by_a_step_a_rollout_and_a_reset(en
         if "state" in td:
             with pytest.raises(ValueError, match=message):
                 env.reset(td.copy(), set_state=True)
+
+
+def test_a_state_that_no_drone_can_fly_from_is_refused_by_a_reset(env):
+    td = env.reset()
+    td["state", "quaternion"][1] *= 2.0
+    td["state", "velocity"][3] = nan
+    with pytest.raises(ValueError, match="the states of environments 1, 3 are none to fly from: not finite, a quatern"):
+        env.reset(td.copy(), set_state=True)
+    env.set_initial_state_source(lambda n: td["state"])
+    with pytest.raises(ValueError, match="initial_state_source: the states of environments 1, 3 are none to fly from"):
+        env.reset()
+    others = torch.tensor([[True], [False], [True], [False]])
+    env.reset(td.copy().set("_reset", others), set_state=True)
 
 
 def test_a_state_of_another_device_or_precision_is_refused_by_a_step_and_converted_by_a_reset(env):

@@ -1,5 +1,7 @@
 """The quick rollout against TorchRL's own, and the compiled step against the eager one."""
 
+import copy
+
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
@@ -81,6 +83,21 @@ def test_any_other_policy_flies_in_torchrls_loop(env):
         assert env.rollout(5, policy, break_when_any_done=False).shape == (4, 5)
 
 
+class Paid(HoveringEnv):
+    """Gives another reward in a step of its own."""
+
+    def _step(self, tensordict):
+        return super()._step(tensordict).set("reward", torch.full((2, 1), 7.0))
+
+
+def test_a_step_of_one_s_own_is_flown_and_an_output_that_nobody_wants_does_no_harm():
+    env = Paid(num_envs=2)
+    actor = make_actor(env)
+    assert (env.rollout(3, actor, break_when_any_done=False)["next", "reward"] == 7.0).all()
+    policy = TensorDictModule(lambda x: (x[:, :4].tanh(), x), in_keys=["observation"], out_keys=["action", "_"])
+    assert HoveringEnv(num_envs=2).rollout(3, policy, break_when_any_done=False).shape == (2, 3)
+
+
 def test_a_compiled_step_has_exact_derivatives():
     # Not from rest, where the norm of the velocity has a kink.
     start_moving = {"velocity": 1.0, "angular_velocity": 1.0}
@@ -147,7 +164,10 @@ def test_a_compiled_environment_follows_changes_and_shares_nothing_with_others()
     for env, survival in ((first, 0.1), (second, 0.7), (first, 0.1)):
         assert env.rollout(2)["next", "reward_terms", "survival"].flatten().tolist() == pytest.approx([survival] * 4)
     first.weights = {**first.weights, "survival": 0.3}
-    assert first.rollout(2)["next", "reward_terms", "survival"].flatten().tolist() == pytest.approx([0.3] * 4)
+    copied = copy.deepcopy(first)
+    copied.weights = {**copied.weights, "survival": 0.5}
+    for env, survival in ((first, 0.3), (copied, 0.5)):
+        assert env.rollout(2)["next", "reward_terms", "survival"].flatten().tolist() == pytest.approx([survival] * 4)
 
 
 def test_a_drone_that_is_not_sound_crashes_alone_in_a_compiled_step():

@@ -7,6 +7,7 @@ from torchrl.envs import check_env_specs
 
 from torchrl_quad import HoveringEnv, VisitedStateBuffer, differentiable_rollout, load_drone, make_actor, make_env
 from torchrl_quad.dynamics import quaternion
+from torchrl_quad.envs.options import Sensors
 
 EVERYTHING = {
     "wind": {"mean": [1.0, 0.0, 0.0], "spread": [0.5, 0.5, 0.0], "gust": 0.5},
@@ -32,6 +33,12 @@ def fly(env, td, actions):
 
 def hold(env, steps):
     return [env.hover_action.expand(env.num_envs, 4)] * steps
+
+
+def test_sensors_that_are_given_whole_keep_their_delay():
+    for kwargs, delay in (({}, 3), ({"observation_delay": 1}, 1)):
+        env = HoveringEnv(num_envs=2, observation_noise=Sensors(position=0.1, delay=3), **kwargs)
+        assert env.reset()["state", "measurements"].shape == (2, delay + 1, 13)
 
 
 @pytest.mark.parametrize("task", ["hovering", "landing", "racing", "tracking"])

@@ -171,10 +171,10 @@ def test_positions_that_are_not_finite_are_left_out_of_every_picture(value, dron
         space = figure.axes[0]
         limits = np.array([space.get_xlim(), space.get_ylim(), space.get_zlim()])
         assert np.ptp(limits, axis=1).max() < 8
-    env.reset(state, set_state=True)
+    env._see(state["state"])
     assert (env.render() != 255).any(-1).sum() > 1000
     state["state", "position"][1] = torch.tensor([30.0, 0.0, 5.0])
-    env.reset(state, set_state=True)
+    env._see(state["state"])
     assert (np.abs(env.render().astype(int) - [140, 212, 70]).sum(-1) < 90).any()  # the view follows the second drone
 
 
@@ -485,6 +485,14 @@ def test_a_learning_curve_is_drawn_from_its_csv(drawn, tmp_path):
         "success [%]": [[1, 0], [2, 100]],
         "median error [cm]": [[1, 100], [2, 2]],
     }
+
+
+@pytest.mark.parametrize("rows", ["0,0.0,5.0,,\n", "0,0.0,5.0,,none\n100,1.0,6.0,0.5,none\n"])
+def test_a_learning_curve_has_gaps_where_cells_are_empty(drawn, tmp_path, rows):
+    (tmp_path / "metrics.csv").write_text("steps,time/seconds,eval/return,eval/success,note\n" + rows)
+    plot_learning_curve(tmp_path / "metrics.csv", tmp_path / "curve.png")
+    shown = drawn[0].axes[1].lines[0].get_ydata()
+    assert len(shown) == rows.count("\n") and np.isnan(shown[0])
 
 
 def test_a_learning_curve_of_nothing_is_refused(tmp_path):

@@ -19,7 +19,8 @@ class ObservationNormalizer(ObservationNorm):
 
         normalizer = ObservationNormalizer(env)
         env = TransformedEnv(env, normalizer)
-        rollout, carry = differentiable_rollout(env, actor, carry, 64)
+        actor = make_actor(env, input_scale=1.0)  # the normalizer has scaled already
+        rollout, carry = differentiable_rollout(env, actor, env.reset(), 64)
         normalizer.update(rollout)
         carry = env.reset(carry.select("state"), set_state=True)  # what it observes was written before the update
 

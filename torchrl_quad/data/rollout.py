@@ -21,7 +21,8 @@ def differentiable_rollout(
     """Fly a horizon, and keep the graph from every reward back to every action.
 
     Environments that finish are reset on the way; the gradient is cut exactly there, and ``"next"`` keeps the true last
-    state. Works for any differentiable TorchRL environment and any stack of transforms.
+    state. Works for any differentiable TorchRL environment and any stack of transforms. Without transforms an
+    environment of ours begins all episodes within 32 steps at one start: see its ``rollout``.
 
     Args:
         env: the environment.

@@ -29,7 +29,7 @@ class FlightController:
     flows into that.
 
     Raises:
-        ValueError: the rotor layout cannot make thrust and torque about each axis.
+        ValueError: the rotor layout cannot make thrust and torque about each axis, or the drone cannot hover.
     """
 
     def __init__(self, nominal: QuadrotorParams) -> None:
@@ -43,6 +43,7 @@ class FlightController:
         self.half_range = 0.5 * nominal.max_thrust_to_weight * weight
         self.hover_speed = self.rotors.speed(transform(self.mixer, pad(weight, (0, 3))))
         self.hover_action = pad(2.0 / nominal.max_thrust_to_weight - 1.0, (0, 3))
+        _require_hover(nominal, self.hover_speed)
 
     def take_apart(self) -> FlightController:
         """The same on components: its numbers become constants of the code that is compiled with it."""
@@ -80,9 +81,26 @@ class FlightController:
         return self.rotors.speed(clamp(thrust, self.thrust_min, self.thrust_max))
 
 
+def _require_hover(nominal: QuadrotorParams, speed: Tensor) -> None:
+    low, high = nominal.rotor_speed_min, nominal.rotor_speed_max
+    if not ((low < speed) & (speed < high)).all():
+        raise ValueError(
+            f"drone: to hover, its rotors would have to turn at {speed.tolist()} rad/s, and they can at "
+            f"{low.tolist()} to {high.tolist()}. Check mass [kg], gravity, thrust_map and rotor_positions."
+        )
+    if not (nominal.max_thrust_to_weight > 1).all():
+        raise ValueError(
+            "drone: max_thrust_to_weight is what full thrust commands, in units of the weight, and must be above 1 to "
+            f"hover; got {nominal.max_thrust_to_weight.tolist()}."
+        )
+
+
 def _inverse(allocation: Tensor) -> Tensor:
-    inverse, info = torch.linalg.inv_ex(allocation)
-    if info.any() or not inverse.isfinite().all():
+    # Rounding makes rotors on one line look invertible: with rows of one length drones have conditions below 100.
+    rows = allocation.double()
+    rows = rows / rows.norm(dim=-1, keepdim=True).clamp_min(1e-30)
+    inverse, _ = torch.linalg.inv_ex(allocation)
+    if not (torch.linalg.cond(rows) < 1e4).all():
         raise ValueError(
             "drone: with these rotor_positions and rotor_spin the four rotors cannot make thrust and torque about each "
             "axis on their own. Put them off one line, and let two of them spin each way."

@@ -51,7 +51,7 @@ _RULES = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class QuadrotorParams:
     """The physical parameters of a quadrotor, SI units, body frame x forward, y left, z up.
 

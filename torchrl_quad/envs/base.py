@@ -75,7 +75,8 @@ class QuadrotorEnv(EnvBase):
     reset the terms are zero.
 
     ``env.params`` is the drone that flies and ``env.nominal`` what its controller believes. To change the drone, assign
-    ``env.params = env.params.replace(mass=0.5)``; a tensor that requires grad can so be fitted.
+    ``env.params = env.params.replace(mass=0.5)``, or under transforms ``env.set_params(...)``; a tensor that requires
+    grad can so be fitted.
 
     The action is (4) in [-1, 1]: collective thrust (-1..1 maps to 0..max_thrust_to_weight times the nominal weight),
     then roll, pitch and yaw rate in units of the drone's max_body_rate.
@@ -85,7 +86,8 @@ class QuadrotorEnv(EnvBase):
         device: device of all tensors.
         dtype: torch.float32 or torch.float64.
         seed: seed of the environment's own random generator, or None for another one each time. Copies with one seed,
-            as in ParallelEnv, fly alike: give each its own, or call ``set_seed`` on all of them.
+            as in ParallelEnv, fly alike: give each its own, or call ``set_seed`` on all of them. A run that shall go on
+            as if it had not been stopped keeps ``env.rng.get_state()``, and gives it to ``env.rng.set_state``.
         drone: name of a preset, path of a YAML file, mapping, or :class:`~torchrl_quad.QuadrotorParams`.
         dt: physics step [s].
         control_dt: control step [s], a whole multiple of dt.
@@ -171,14 +173,9 @@ class QuadrotorEnv(EnvBase):
         #: where resets start, see :meth:`set_initial_state_source`; None for the task's own starts
         self.initial_state_source: Callable[[int], TensorDictBase] | None = None
         params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone)
-        for name, value in params.fields().items():
-            batch = value.shape[0] if value.dim() > params.dim(name) else 1
-            _require(
-                batch in (1, num_envs), f"drone: field {name!r} is for {batch} environments, and num_envs={num_envs}."
-            )
-        params = params.to(device=self.device, dtype=dtype)
-        self.controller = FlightController(params)
-        self.params = params if params.requires_grad else self.nominal
+        self.set_params(params)
+        self.controller = FlightController(self.params)
+        self.params = self.params if params.requires_grad else self.nominal
         self.weights = {**self.weights, **self._checked_weights({} if weights is None else weights)}
         self.sensors = options.build(
             options.Sensors, "observation_noise", observation_noise or {}, delay=observation_delay
@@ -193,6 +190,7 @@ class QuadrotorEnv(EnvBase):
         self.fallback = self.sample_initial_state(num_envs)
         self.task_entries = [key for key in self.initial_state(num_envs) if key not in QuadrotorState._fields]
         self.task_advances = type(self).advance is not QuadrotorEnv.advance
+        self._check_task()
         self._no_observation = self.observation(self.fallback)
         self._make_specs()
         self.stepper = horizon.Stepper(self)
@@ -242,8 +240,33 @@ class QuadrotorEnv(EnvBase):
         return self.controller.nominal
 
     @property
+    def params(self) -> QuadrotorParams:
+        """The drone that flies."""
+        return self._params
+
+    @params.setter
+    def params(self, params: QuadrotorParams) -> None:
+        self.set_params(params)
+
+    def set_params(self, params: QuadrotorParams) -> None:
+        """Set :attr:`params`, also through a TransformedEnv, where assigning the attribute would not."""
+        if not isinstance(params, QuadrotorParams):
+            raise TypeError(
+                f"params must be QuadrotorParams, such as env.params.replace(mass=0.5) or load_drone('visfly'); got "
+                f"{type(params).__name__}."
+            )
+        for name, value in params.fields().items():
+            batch = value.shape[0] if value.dim() > params.dim(name) else 1
+            _require(
+                batch in (1, self.num_envs),
+                f"drone: field {name!r} is for {batch} environments, and num_envs={self.num_envs}.",
+            )
+        fits = all(x.dtype == self.dtype and x.device == self.device for x in params.fields().values())
+        self._params = params if fits else params.to(device=self.device, dtype=self.dtype)
+
+    @property
     def hover_action(self) -> Tensor:
-        """The action (4) that holds the nominal drone where it is."""
+        """The action (4) that holds the nominal drone where it is; (num_envs, 4) where drones differ in it."""
         return self.controller.hover_action
 
     def hover_state(self, position: Tensor) -> State:
@@ -351,7 +374,7 @@ class QuadrotorEnv(EnvBase):
         super().to(device)
         follows = self.params is self.nominal
         self.controller = FlightController(self.nominal.to(device=self.device))
-        self.params = self.nominal if follows else self.params.to(device=self.device)
+        self.params = self.nominal if follows else self.params
         self.fallback = {key: value.to(self.device) for key, value in self.fallback.items()}
         self._no_observation = self._no_observation.to(self.device)
         self.randomization = options.DroneRandomization(self.randomization.spec, self.nominal)
@@ -383,6 +406,7 @@ class QuadrotorEnv(EnvBase):
             self.rng.manual_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
         if set_state:
             source = "reset(..., set_state=True)"
             _require(
@@ -390,9 +414,10 @@ class QuadrotorEnv(EnvBase):
                 f'{source} needs a tensordict with the state to set under "state"; got none.',
             )
             state = self._checked_state(tensordict.get("state"), source)
+            self._require_sound(state, source, mask)
         else:
             state = self.draw_start()
-        self._see(state, None if tensordict is None else tensordict.get("_reset", None))
+        self._see(state, mask)
         return self._tensordict(self.first_entries(state))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -412,11 +437,14 @@ class QuadrotorEnv(EnvBase):
         """As TorchRL's rollout; several times faster where it flies on through the ends of episodes.
 
         That is with ``break_when_any_done=False``, a policy that is a TensorDictModule and reads the observation or
-        the state, and no other option than ``tensordict`` (with ``auto_reset=False``).
+        the state, and no other option than ``tensordict`` (with ``auto_reset=False``). New starts are then drawn for 32
+        steps at once: an environment whose episode ends twice within them begins at the same one both times.
         """
         _require_count("max_steps", max_steps, 1)
         start, auto_reset = options.get("tensordict"), options.get("auto_reset", True)
         quick = callback is None and options.get("break_when_any_done") is False and auto_reset == (start is None)
+        cls = type(self)  # a step of a subclass's own is none that could be flown quickly
+        quick = quick and (cls._step, cls._reset) == (QuadrotorEnv._step, QuadrotorEnv._reset)
         if quick and set(options) <= {"break_when_any_done", "auto_reset", "tensordict"}:
             start = self.reset() if start is None else start
             if horizon.can_fly(self, policy, start):
@@ -482,7 +510,9 @@ class QuadrotorEnv(EnvBase):
         """States for all environments to begin an episode with."""
         if self.initial_state_source is None:
             return self.sample_initial_state(self.num_envs)
-        return self._checked_state(self.initial_state_source(self.num_envs), "initial_state_source")
+        state = self._checked_state(self.initial_state_source(self.num_envs), "initial_state_source")
+        self._require_sound(state, "initial_state_source")
+        return state
 
     def first_entries(self, state: State) -> dict[str, Any]:
         """What a reset to a state tells."""
@@ -523,6 +553,18 @@ class QuadrotorEnv(EnvBase):
             return self.params
         drawn = {name: state["drone", name] for name in self.randomization.spec}
         return RawParams(**{**self.params.fields(), **drawn})
+
+    def _require_sound(self, state: State, source: str, mask: Tensor | None = None) -> None:
+        """Refuse states from which the next step could not fly, in the environments that the mask tells, or in all."""
+        if horizon.cannot_look():
+            return
+        broken = ~self.stepper.sound(self.stepper.layout.pack(state).floats)[1]
+        broken &= True if mask is None else mask.flatten()
+        _require(
+            not broken.any(),
+            f"{source}: the states of environments {horizon.first_ten(broken)} are none to fly from: not finite, a "
+            "quaternion that is not of unit norm, or a speed beyond all bounds.",
+        )
 
     def required_state(self, state: Any, source: str) -> State:
         """The entries of a state, if all are there and of the right shape, precision and device."""
@@ -565,9 +607,51 @@ class QuadrotorEnv(EnvBase):
         unknown = [str(name) for name in weights if name not in self.weights]
         _require(not unknown, f"weights: unknown term {_names(unknown)}. Choose from: {_names(self.weights)}.")
         for name, value in weights.items():
-            is_finite = isinstance(value, Tensor) or (isinstance(value, numbers.Real) and math.isfinite(value))
+            x = value.detach() if isinstance(value, Tensor) else value
+            is_number = x.numel() == 1 if isinstance(x, Tensor) else isinstance(x, numbers.Real)
+            is_finite = is_number and math.isfinite(float(x))
             _require(is_finite, f"weights: {name} must be a finite number, got {value!r}.")
         return weights
+
+    def _check_task(self) -> None:
+        """Refuse a task whose methods return something else than the base class says.
+
+        Rows that are not as many as they should be would be read as those of another entry.
+        """
+        state, n = self.fallback, self.num_envs
+
+        def check(method: str, x: Any, dtype: torch.dtype | None, columns: int | None = 1, hint: str = "") -> None:
+            is_right = isinstance(x, Tensor) and x.shape == (n, columns or x.shape[-1:].numel())
+            if not is_right or dtype not in (None, x.dtype):
+                got = f"{tuple(x.shape)}, {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
+                raise ValueError(
+                    f"{type(self).__name__}.{method} must be a tensor ({n}, {columns or 'k'})"
+                    f"{'' if dtype is None else f', {dtype}'}; got {got}.{hint}"
+                )
+
+        for key, x in state.items():
+            _require(
+                isinstance(x, Tensor) and x.dim() > 1 and len(x) == n,
+                f"{type(self).__name__}.initial_state: entry {key!r} must be a tensor ({n}, ...) of at least two "
+                f"dimensions; got {tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__}.",
+            )
+        check("observe(state)", self.observe(state), self.dtype, None)
+        for name, term in self.reward_terms(state).items():
+            hint = " Sum a vector over its components: .sum(-1, keepdim=True)."
+            check(f"reward_terms(state)[{name!r}]", term, self.dtype, hint=hint)
+        for name, metric in self.metrics(state).items():
+            check(f"metrics(state)[{name!r}]", metric, None)
+        for method in ("is_crash", "is_success"):
+            check(f"{method}(state)", getattr(self, method)(state), torch.bool)
+        advanced = self.advance(state, dict(state))
+        for key in self.task_entries:
+            like, x = state[key], advanced.get(key)
+            got = None if x is None else (tuple(x.shape), x.dtype)
+            _require(
+                got == (tuple(like.shape), like.dtype),
+                f"{type(self).__name__}.advance must return the whole state, and {key!r} as initial_state gives it, "
+                f"{(tuple(like.shape), like.dtype)}; got {got}. Start from {{**state, ...}}.",
+            )
 
     def _refuse(self, unknown: Mapping[str, Any]) -> None:
         """Say of options that no task knows what they may have meant."""

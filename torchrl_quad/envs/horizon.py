@@ -139,16 +139,25 @@ class Stepper:
         self.inverse_limits = 1.0 / limits
 
         self.options, self.is_compiled = options, options is not None
+        self.control_step = self.forward = self.adjoint = None
         if self.is_compiled:
             state, told = torch.zeros_like(self.fallback), torch.zeros_like(self.told_layout.pack(told).floats)
             observation = torch.zeros_like(observation)
             self.zeros = state, told, observation, state, observation  # gradients of ends that nothing depends on
-            self.control_step = CompiledControlStep(env.controller, env.dt, env.substeps, env.integrator)
-            mode = torch._inductor.list_mode_options(options["mode"]) if options.get("mode") else {}
-            more = {**mode, **options.get("options", {}), "guard_filter_fn": _watched, "cpp.vec_isa_ok": True}
-            options = {"fullgraph": True, "dynamic": False, **options, "mode": None, "options": more}
-            self.forward = torch.compile(_own(self._forward), **options)
-            self.adjoint = torch.compile(_own(self._adjoint), **options)
+            self._compile()
+
+    def _compile(self) -> None:
+        env, options = self.env, self.options
+        self.control_step = CompiledControlStep(env.controller, env.dt, env.substeps, env.integrator)
+        mode = torch._inductor.list_mode_options(options["mode"]) if options.get("mode") else {}
+        more = {**mode, **options.get("options", {}), "guard_filter_fn": _watched, "cpp.vec_isa_ok": True}
+        options = {"fullgraph": True, "dynamic": False, **options, "mode": None, "options": more}
+        self.forward = torch.compile(_own(self._forward), **options)
+        self.adjoint = torch.compile(_own(self._adjoint), **options)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled functions stay bound to the environment that they were made of: a copy makes its own.
+        return {**self.__dict__, "control_step": None, "forward": None, "adjoint": None}
 
     def __call__(
         self, state: Rows, valid: Tensor, action: Tensor, noise: Mapping[str, Tensor], fresh: Rows, first: Tensor
@@ -173,6 +182,8 @@ class Stepper:
             raise ValueError(f"The action is on {action.device}, and the environment on {state.floats.device}.")
         action = action.to(state.floats.dtype)
         if self.is_compiled:
+            if self.forward is None:
+                self._compile()
             theta = () if self.env.params is self.env.nominal else self.env.params.plant()
             return Ends.of(_Step.apply(self, *state[1:], valid, noise, fresh, first, state.floats, action, *theta))
         floats, applied, valid = self._begin(state.floats, action, valid)
@@ -366,7 +377,7 @@ class _Step(torch.autograd.Function):
 
 def can_fly(env: QuadrotorEnv, policy: Any, tensordict: TensorDictBase) -> bool:
     """Whether :func:`fly` gives what TorchRL's own loop does: the policy reads nothing but observation and state."""
-    if not isinstance(policy, TensorDictModuleBase):
+    if not isinstance(policy, TensorDictModuleBase) or "_" in policy.out_keys:
         return False
     state = {_path("state", *_tuple(key)) for key in env.stepper.layout.place}
     needed = {"observation", *env.stepper.told_layout.place} - {"reward"}
@@ -450,20 +461,29 @@ def require_finite(action: Tensor) -> None:
     Raises:
         ValueError: some are not, with their environments and the first step.
     """
-    if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():
-        return  # nobody can look at a value there
+    if cannot_look():
+        return
     finite = action.isfinite().all(-1)
     if finite.all():
         return
     broken = ~finite if action.dim() == 3 else ~finite.unsqueeze(1)
-    who, when = (broken.any(dim).nonzero().flatten().tolist() for dim in (1, 0))
-    names = ", ".join(str(i) for i in who[:10]) + (", ..." if len(who) > 10 else "")
-    at = f", first at step {when[0]} of the rollout" if action.dim() == 3 else ""
+    at = f", first at step {broken.any(0).nonzero()[0].item()} of the rollout" if action.dim() == 3 else ""
     raise ValueError(
-        f"The action is not finite in environments {names}{at}: the weights of the policy are broken, or what it reads "
-        "is. Look for NaN in both; if training made them, clip the norm of the gradient, and skip updates whose "
-        "gradient is not finite."
+        f"The action is not finite in environments {first_ten(broken.any(1))}{at}: the weights of the policy are "
+        "broken, or what it reads is. Look for NaN in both; if training made them, clip the norm of the gradient, and "
+        "skip updates whose gradient is not finite."
     )
+
+
+def cannot_look() -> bool:
+    """Whether no value of a tensor can be looked at here."""
+    return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
+
+
+def first_ten(flags: Tensor) -> str:
+    """The indices of the first flags (n) that are set, for a message."""
+    who = flags.nonzero().flatten().tolist()
+    return ", ".join(str(i) for i in who[:10]) + (", ..." if len(who) > 10 else "")
 
 
 def flat(entries: Mapping[Any, Any], *prefix: str) -> dict[Key, Tensor]:

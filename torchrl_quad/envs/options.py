@@ -234,13 +234,13 @@ class RandomStart:
 
 
 def build(cls: type, name: str, spec: Any, **more: Any) -> Any:
-    """An option from its mapping, or the option itself.
+    """An option from its mapping, or the option itself, with what is given (not zero) beside it.
 
     Raises:
         ValueError: it is neither, or has an unknown key.
     """
     if isinstance(spec, cls):
-        return dataclasses.replace(spec, **more)
+        return dataclasses.replace(spec, **{name: value for name, value in more.items() if value})
     allowed = [field.name for field in dataclasses.fields(cls) if field.name not in more]
     if not isinstance(spec, Mapping):
         raise ValueError(f"{name} must be a mapping with any of {', '.join(allowed)}; got {spec!r}.")

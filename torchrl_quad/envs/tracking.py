@@ -1,5 +1,6 @@
 """The tracking task."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -14,31 +15,24 @@ from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, 
 Curve = Callable[[Tensor], Tensor]
 
 
-def circle(centre: tuple[float, float, float], radius: float) -> Curve:
+def circle(phase: Tensor, centre: tuple[float, float, float], radius: float) -> Tensor:
     """A level circle, flown counter-clockwise from +x; centre and radius in m."""
-
-    def position(phase: Tensor) -> Tensor:
-        x, y, z = centre
-        return torch.stack((x + radius * phase.cos(), y + radius * phase.sin(), torch.full_like(phase, z)), -1)
-
-    return position
+    x, y, z = centre
+    return torch.stack((x + radius * phase.cos(), y + radius * phase.sin(), torch.full_like(phase, z)), -1)
 
 
-def lemniscate(centre: tuple[float, float, float], half_length: float) -> Curve:
+def lemniscate(phase: Tensor, centre: tuple[float, float, float], half_length: float) -> Tensor:
     """A level figure of eight (Gerono's) along x, half as wide as long; centre and half_length in m."""
-
-    def position(phase: Tensor) -> Tensor:
-        x, y, z = centre
-        sine, cosine = phase.sin(), phase.cos()
-        return torch.stack((x + half_length * cosine, y + half_length * sine * cosine, torch.full_like(phase, z)), -1)
-
-    return position
+    x, y, z = centre
+    sine, cosine = phase.sin(), phase.cos()
+    return torch.stack((x + half_length * cosine, y + half_length * sine * cosine, torch.full_like(phase, z)), -1)
 
 
 CURVES: dict[str, tuple[Curve, float]] = {  # by name: the curve, and its period [s]
-    "slow_circle": (circle((2.0, 0.0, 1.0), 2.0), 10.0),
-    "fast_circle": (circle((3.0, 0.0, 2.0), 1.5), 2.0),
-    "lemniscate": (lemniscate((2.0, 0.0, 1.5), 2.0), 8.0),  # size and period chosen here
+    "slow_circle": (functools.partial(circle, centre=(2.0, 0.0, 1.0), radius=2.0), 10.0),
+    "fast_circle": (functools.partial(circle, centre=(3.0, 0.0, 2.0), radius=1.5), 2.0),
+    # Size and period chosen here.
+    "lemniscate": (functools.partial(lemniscate, centre=(2.0, 0.0, 1.5), half_length=2.0), 8.0),
 }
 
 
@@ -110,7 +104,7 @@ class TrackingEnv(QuadrotorEnv):
             period = default_period if period is None else period
         if period is None or not 0 < period < math.inf:
             raise ValueError(f"A curve of your own needs a period in seconds, such as period=10.0; got {period}.")
-        self.curve = lambda phase: curve(phase)  # not itself: an environment registers modules as its own
+        self.curve = functools.partial(curve)  # not itself: an environment registers modules as its own
         self.period = period
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
 

@@ -166,9 +166,11 @@ def animate_flight(
         max_seconds: what is filmed of a longer flight.
 
     Raises:
-        ValueError: the rollout has another shape or lacks the position or the quaternion, or ``num_envs`` is less than
-            1.
+        ValueError: the rollout has another shape or lacks the position or the quaternion, or a number is not positive.
     """
+    for name, value in (("control_dt", control_dt), ("fps", fps), ("max_seconds", max_seconds)):
+        if not value > 0:
+            raise ValueError(f"animate_flight: {name} must be positive, got {value!r}.")
     flight = checked(rollout, "animate_flight", num_envs, *_keys("position", "quaternion"))
     flight = flight[:, : max(round(max_seconds / control_dt), 1)]
     position, attitude, target = (first_episodes(flight, name) for name in ("position", "quaternion", "target"))
@@ -209,7 +211,6 @@ def plot_learning_curve(metrics: str | Path, path: str | Path) -> None:
         rows = list(csv.DictReader(file))
     if not rows:
         raise ValueError(f"plot_learning_curve: {metrics} has no row yet; a run writes one at each evaluation.")
-    columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
     panels = [
         ("eval/return", "return", 1.0),
         ("eval/success", "success [%]", 100.0),
@@ -218,25 +219,29 @@ def plot_learning_curve(metrics: str | Path, path: str | Path) -> None:
         ("eval/position_error", "median error [cm]", 100.0),
     ]
     known = [name for name, *_ in panels]
-    panels = [panel for panel in panels if panel[0] in columns][:3]
-    if not panels or not {"time/seconds", "steps"} <= columns.keys():
+    panels = [panel for panel in panels if panel[0] in rows[0]][:3]
+    if not panels or not {"time/seconds", "steps"} <= rows[0].keys():
         raise ValueError(
             f"plot_learning_curve needs the columns time/seconds, steps, and one of {', '.join(known)}; {metrics} has "
-            f"{', '.join(columns)}."
+            f"{', '.join(rows[0])}."
         )
+    names = ["time/seconds", "steps", *(name for name, *_ in panels)]
+    columns = {name: np.array([float(row[name] or "nan") for row in rows]) for name in names}  # a cell may be empty
     figure = make_figure(figsize=(3.7 * len(panels), 3.2), layout="constrained")
     axes = figure.subplots(1, len(panels), squeeze=False)
     for axis, (name, label, scale) in zip(axes[0], panels, strict=True):
         axis.plot(columns["time/seconds"], scale * columns[name], color=BLUE, marker="o", markersize=3, linewidth=1.4)
         axis.set(xlabel="training time [s]", ylabel=label)
         axis.grid(alpha=0.3)
+        if "error" in label:
+            _set_scale(axis, "log")
+        if not columns["steps"][-1]:
+            continue  # one evaluation, before the first step
         seconds_per_step = columns["time/seconds"][-1] / columns["steps"][-1]
         upper = axis.secondary_xaxis(
             "top", functions=(lambda s, k=seconds_per_step: s / k, lambda n, k=seconds_per_step: n * k)
         )
         upper.set_xlabel("control steps", color=INK)
-        if "error" in label:
-            _set_scale(axis, "log")
     figure.savefig(path, dpi=130)
 
 

@@ -5,7 +5,7 @@ import torch
 from torchrl.envs import CatTensors, PendulumEnv, StepCounter, TransformedEnv, UnsqueezeTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import HoveringEnv, make_actor, make_qvalue, make_value
+from torchrl_quad import HoveringEnv, load_drone, make_actor, make_qvalue, make_value
 
 
 @pytest.mark.parametrize("wrap", [False, True])
@@ -31,6 +31,31 @@ def test_the_first_action_can_be_chosen_and_is_the_middle_of_the_range_elsewhere
     action = make_actor(pendulum)(pendulum.reset())["action"]
     assert action.shape == (1,)
     assert action.abs() < 0.1
+
+
+def test_each_entry_may_have_a_scale_of_its_own():
+    env = HoveringEnv(num_envs=3)
+    keys = ["observation", ("state", "rotor_speed")]
+    td = make_actor(env)(env.reset())
+    for make, extra in ((make_actor, 0), (make_value, 0), (make_qvalue, 1)):
+        net = make(env, in_keys=keys, input_scale=(10.0, 1e-3))
+        seen = []
+        mlp = next(m for m in net.modules() if hasattr(m, "mlp")).mlp
+        mlp.register_forward_pre_hook(lambda _, x, seen=seen: seen.append(x[0]))
+        net(td.clone())
+        entries = torch.cat((10.0 * td["observation"], 1e-3 * td["state", "rotor_speed"]), -1)
+        torch.testing.assert_close(seen[0][:, : entries.shape[1]], entries)
+        assert seen[0].shape[1] == entries.shape[1] + 4 * extra
+        with pytest.raises(ValueError, match="input_scale must be a number, or one for each of the 2 in_keys"):
+            make(env, in_keys=keys, input_scale=(10.0, 1.0, 1.0))
+
+
+def test_a_policy_for_drones_that_differ_starts_with_the_mean_of_their_hovering():
+    drone = load_drone("visfly").replace(max_thrust_to_weight=[[2.0], [4.0]])
+    env = HoveringEnv(num_envs=2, drone=drone)
+    assert env.hover_action[:, 0].tolist() == pytest.approx([0.0, -0.5])
+    action = make_actor(env, action_init=None)(env.reset())["action"]
+    assert action[:, 0].tolist() == pytest.approx([-0.25, -0.25], abs=0.03)
 
 
 def test_every_network_has_the_precision_of_the_environment():

@@ -36,7 +36,7 @@ def make_actor(
     *,
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
-    input_scale: float = 10.0,
+    input_scale: float | Sequence[float] = 10.0,
     action_init: Tensor | None = None,
     scale_init: float = 0.1,
     return_log_prob: bool = False,
@@ -51,17 +51,18 @@ def make_actor(
         num_cells: widths of the hidden layers.
         in_keys: the entries that are concatenated into the network's input, each (*, k).
         activation: of the hidden layers; smooth ones give smooth policy gradients.
-        input_scale: multiplies the input. The tasks observe a tenth of their SI units, as the paper does, which makes
-            for inputs that are too small to learn from quickly.
+        input_scale: multiplies the input; a number, or one for each of ``in_keys``. The tasks observe a tenth of their
+            SI units, as the paper does, which makes for inputs that are too small to learn from quickly. With an
+            ObservationNormalizer it is 1.
         action_init: the mean action at the start, (k), strictly between the bounds; by default ``env.hover_action``
             where the environment has one, so that a drone does not begin by flying away, and the middle of the range
-            elsewhere.
+            elsewhere. Where drones differ it is the mean of theirs.
         scale_init: standard deviation at the start.
         return_log_prob: write the log-probability of the action as well, which an entropy bonus and PPO need.
 
     Raises:
-        ValueError: an entry is unknown or of more than one dimension, a width is none, or the first action is not
-            inside the bounds.
+        ValueError: an entry is unknown or of more than one dimension, a width is none, the scales are not as many as
+            the entries, or the first action is not inside the bounds.
     """
     spec = env.action_spec_unbatched
     if not isinstance(spec, Bounded):
@@ -70,6 +71,7 @@ def make_actor(
     middle = 0.5 * (low + high)
     if action_init is None:
         action_init = getattr(_single(env), "hover_action", middle)
+        action_init = action_init.mean(0) if action_init.dim() > middle.dim() else action_init
     action_init = torch.as_tensor(action_init).to(middle)
     if action_init.shape != spec.shape or not ((low < action_init) & (action_init < high)).all():
         raise ValueError(
@@ -102,13 +104,14 @@ def make_value(
     *,
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
-    input_scale: float = 10.0,
+    input_scale: float | Sequence[float] = 10.0,
 ) -> ValueOperator:
     """A state value V(s), written to ``state_value``, (*, 1). The arguments are those of :func:`make_actor`.
 
     Its hidden layers are normalised (LayerNorm): the policy follows the critic's gradient, which is far off without.
 
-    With in_keys such as ``("observation", ("state", "rotor_speed"))`` the critic sees more than the actor.
+    With ``in_keys=("observation", ("state", "rotor_speed"))`` the critic sees more than the actor. Rotors turn at some
+    1000 rad/s: ``input_scale=(10.0, 1e-3)`` brings both to about one.
     """
     net = _network(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
     return ValueOperator(net, in_keys=list(in_keys))
@@ -120,7 +123,7 @@ def make_qvalue(
     *,
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
-    input_scale: float = 10.0,
+    input_scale: float | Sequence[float] = 10.0,
     action_scale: float = 0.3,
 ) -> ValueOperator:
     """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); as :func:`make_value` otherwise.
@@ -139,13 +142,19 @@ def _network(
     out_features: int,
     num_cells: Sequence[int],
     activation: type[nn.Module],
-    input_scale: float,
-    action_scale: float = 1.0,
+    input_scale: float | Sequence[float],
+    action_scale: float | None = None,
     layer_norm: bool = False,
 ) -> Network:
     if isinstance(in_keys, str) or not in_keys:
         raise ValueError(f'in_keys must be a list of entries, such as ["observation"]; got {in_keys!r}.')
     specs = [_spec(env, key) for key in in_keys]
+    own = len(in_keys) - (action_scale is not None)  # without the action of a critic
+    scales = [input_scale] * own if isinstance(input_scale, numbers.Real) else list(input_scale)
+    if len(scales) != own:
+        raise ValueError(f"input_scale must be a number, or one for each of the {own} in_keys; got {input_scale!r}.")
+    if action_scale is not None:
+        scales.append(action_scale)
     if isinstance(num_cells, int) or not all(isinstance(n, numbers.Integral) and n >= 1 for n in num_cells):
         raise ValueError(f"num_cells must be the widths of the hidden layers, such as (64, 64); got {num_cells!r}.")
     norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": cells} for cells in num_cells]}
@@ -158,7 +167,7 @@ def _network(
         **(norm if layer_norm else {}),
     )
     dtype = next((spec.dtype for spec in specs if spec.dtype.is_floating_point), None)
-    return Network(mlp.to(dtype), [action_scale if key == "action" else input_scale for key in in_keys])
+    return Network(mlp.to(dtype), scales)
 
 
 def _single(env: EnvBase) -> EnvBase:

@@ -58,6 +58,10 @@ VARIANTS = {
         f"{name}-velocity": Variant(name, f"{x.label}, velocity reward", ("env.reward=velocity",), searched=True)
         for name, x in METHODS.items()
     },
+    # Added when all five seeds of the other four were there.
+    "abpt-no-0-step-velocity": Variant(
+        "abpt", "ABPT without 0-step return, velocity reward", ("loss.zero_step_return=false", "env.reward=velocity")
+    ),
     # Where the text and the published settings differ.
     "abpt-entropy": Variant("abpt", "ABPT, entropy bonus", ("loss.alpha=auto",)),
     "abpt-horizon-32": Variant("abpt", "ABPT, horizon 32", horizon=32),
@@ -77,7 +81,7 @@ EXPERIMENTS = {  # name: variants and tasks, in the order in which they are run
     "main": (tuple(METHODS), TASKS),
     "published": (("bptt-episode", "shac-cut"), TASKS),
     "ablation": (("abpt-no-0-step", "abpt-no-n-step", "abpt-no-visited"), TASKS),
-    "reward": (tuple(f"{name}-velocity" for name in METHODS), ("racing",)),
+    "reward": ((*(f"{name}-velocity" for name in METHODS), "abpt-no-0-step-velocity"), ("racing",)),
     "relaxation": (("bptt-log", "shac-log", "bptt-reciprocal", "shac-reciprocal"), ("racing",)),
     "differences": (
         ("abpt-entropy", "abpt-horizon-32", "abpt-horizon-96", "shac-horizon-32", "shac-horizon-96"),
@@ -105,9 +109,10 @@ class Job:
 
     @property
     def rate_of(self) -> str:
-        """The variant whose learning rate it takes."""
+        """The variant whose learning rate it takes: that of its method, under the same reward."""
         variant = VARIANTS[self.variant]
-        return self.variant if variant.searched else variant.algorithm
+        reward = "-velocity" if "env.reward=velocity" in variant.overrides else ""
+        return self.variant if variant.searched else variant.algorithm + reward
 
     def overrides(self, lr: float) -> list[str]:
         """Of its recipe's configuration, with the learning rate that the search has found."""

@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 from checkpoints import read_checkpoint
 from common import build_env, make_policy, network
+from matrix import VARIANTS
 from omegaconf import DictConfig, OmegaConf
 from reproduce import read, write
 from tensordict import TensorDictBase
@@ -33,6 +34,12 @@ from torchrl_quad.objectives.pathwise import discounts
 
 CRITICS = {"abpt": (ABPTLoss, make_qvalue), "shac": (SHACLoss, make_value)}
 SEED = 3_000_000
+
+
+def name(path: Path, cfg: DictConfig) -> dict[str, str]:
+    """Task, variant and seed of a run; a variant of matrix.py is known by its folder, <task>/<variant>/seed<seed>."""
+    variant = next((x for x in path.resolve().parts[-3:-2] if x in VARIANTS), cfg.algorithm)
+    return {"task": cfg.task, "variant": variant, "seed": str(cfg.seed)}
 
 
 def load_loss(saved: dict, cfg: DictConfig, env: EnvBase) -> PathwiseLoss:
@@ -83,12 +90,8 @@ def slopes(env: EnvBase, loss: PathwiseLoss, start: TensorDictBase, action: Tens
     return torch.stack([flown(action + x) - flown(action - x) for x in changes], -1) / (2.0 * size)
 
 
-def examine(path: Path, states: int, repeats: int, steps: int, size: float) -> dict[str, str]:
+def examine(saved: dict, cfg: DictConfig, states: int, repeats: int, steps: int, size: float) -> dict[str, str]:
     """What the gradient of a checkpoint finds."""
-    saved = read_checkpoint(path)
-    cfg = OmegaConf.create(saved["config"])
-    if cfg.normalize:
-        raise ValueError(f"{path} was trained under a normaliser; only policies without one can be examined.")
     torch.manual_seed(SEED)
     scout, env = (build_env(cfg, number, SEED) for number in (states, states * repeats))
     loss = load_loss(saved, cfg, env)
@@ -128,10 +131,15 @@ def main() -> None:
     torch.set_num_threads(1)
     rows = read(args.output)
     for path in tqdm(args.checkpoints):
-        task, variant, seed = path.parts[-4:-1]
-        own = {"task": task, "variant": variant, "seed": seed.removeprefix("seed")}
+        saved = read_checkpoint(path)
+        cfg = OmegaConf.create(saved["config"])
+        if cfg.algorithm == "ppo":
+            parser.error(f"{path} was trained with PPO, which follows no gradient of the simulator.")
+        if cfg.normalize:
+            parser.error(f"{path} was trained under a normaliser; only policies without one can be examined.")
+        own = name(path, cfg)
         if not any(own.items() <= row.items() for row in rows):
-            rows.append(own | examine(path, args.states, args.repeats, args.steps, args.size))
+            rows.append(own | examine(saved, cfg, args.states, args.repeats, args.steps, args.size))
             write(args.output, rows)
 
 

@@ -14,6 +14,7 @@ import json
 import math
 import os
 import platform
+import signal
 import subprocess
 import sys
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -39,6 +40,14 @@ CURVE = {  # columns of a curve, and where they stand in metrics.csv
     "gates_passed": "eval/gates_passed",
     "start_cells": "train/start_cells",
 }
+RUNNING: set[subprocess.Popen] = set()
+
+
+def stop(number: int, _: object) -> None:
+    """End the runs with this process: they would write into folders that the next one takes over."""
+    for process in list(RUNNING):
+        process.terminate()
+    sys.exit(128 + number)
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -82,8 +91,13 @@ def run(command: list[str], folder: Path) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "RL_LOGGING_LEVEL": "WARNING"}
-    with open(folder / "log.txt", "w") as log:
-        code = subprocess.run(command, stdout=log, stderr=log, env=environment, check=False).returncode
+    with (
+        open(folder / "log.txt", "w") as log,
+        subprocess.Popen(command, stdout=log, stderr=log, env=environment) as process,
+    ):
+        RUNNING.add(process)
+        code = process.wait()
+        RUNNING.remove(process)
     if code and not (folder / "failure.pt").exists():
         said = [line for line in (folder / "log.txt").read_text().splitlines() if "Error" in line]
         raise RuntimeError(f"{folder} ended with {code}: {' '.join(said[-1:])} See log.txt there.")
@@ -187,4 +201,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, stop)
     main()

@@ -388,6 +388,21 @@ def test_abpt_needs_a_return_and_a_critic():
         ABPTLoss(actor, qvalue, num_qvalue_nets=0)
 
 
+def test_a_loss_goes_on_from_a_checkpoint_with_its_discounts():
+    def make(critic):
+        actor, value, qvalue = make_networks(critic=critic)
+        return nn.ModuleDict({"bptt": BPTTLoss(actor), "shac": SHACLoss(actor, value), "abpt": ABPTLoss(actor, qvalue)})
+
+    saved, loaded = make(10.0), make(3.0)
+    for loss in saved.values():
+        loss.make_value_estimator(gamma=0.5)
+    loaded.load_state_dict(saved.state_dict())
+    assert {key: x.tolist() for key, x in loaded.state_dict().items()} == {
+        key: x.tolist() for key, x in saved.state_dict().items()
+    }
+    assert [loss.value_estimator.gamma.item() for loss in loaded.values()] == [0.5] * 3
+
+
 def test_a_critic_may_see_more_than_the_actor():
     env = HoveringEnv(num_envs=2)
     actor = make_actor(env)

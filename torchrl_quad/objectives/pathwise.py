@@ -160,6 +160,12 @@ class PathwiseLoss(LossModule):
         self._forward_value_estimator_keys()
         return self
 
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        # The estimator is made when it is first needed, and a checkpoint may hold one already.
+        if self._value_estimator is None and any(key.startswith(f"{prefix}_value_estimator.") for key in state_dict):
+            self.make_value_estimator()
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
     def _forward_value_estimator_keys(self, **_: Any) -> None:
         self._in_keys = None
         if self._value_estimator is not None:

@@ -10,7 +10,7 @@ LEARNING_RATES = (1e-3, 3e-3, 1e-2, 3e-2)  # of the actor: the same four for eve
 SEARCH_FRACTION = {"hovering": 1.0, "tracking": 1.0, "landing": 0.5, "racing": 0.25}  # of a run's steps
 EVALUATIONS = 40  # along a run, for its curve
 
-STEPS = {  # of a run, for the first-order methods and for PPO, which has more of them in about the same time
+STEPS = {  # of a run, for the first-order methods and for PPO, which has more of them, since its steps are cheaper
     "hovering": (245_760, 1_966_080),
     "tracking": (491_520, 3_932_160),
     "landing": (983_040, 3_932_160),

@@ -129,6 +129,8 @@ def test_a_gate_without_end_is_none():
         ("observe", lambda _, s: s["position"].double(), r"got \(4, 3\), torch.float64"),
         ("reward_terms", lambda _, s: {"near": -s["position"]}, r"reward_terms\(state\)\['near'\] must .* keepdim"),
         ("reward_terms", lambda _, s: {"near": -s["position"][:, 0]}, r"\['near'\] must .*; got \(4,\)"),
+        ("reward_terms", lambda _, s: -s["position"], r"reward_terms\(state\) must be a mapping .*; got Tensor"),
+        ("advance", lambda _, p, s: None, r"advance\(previous, state\) must be a mapping .*; got NoneType"),
         ("reward_terms", lambda _, s: {"near": 0.1}, r"\['near'\] must be a tensor \(4, 1\), .*; got float"),
         (
             "metrics",

@@ -618,38 +618,45 @@ class QuadrotorEnv(EnvBase):
 
         Rows that are not as many as they should be would be read as those of another entry.
         """
-        state, n = self.fallback, self.num_envs
+        task, state, n = type(self).__name__, self.fallback, self.num_envs
 
         def check(method: str, x: Any, dtype: torch.dtype | None, columns: int | None = 1, hint: str = "") -> None:
             is_right = isinstance(x, Tensor) and x.shape == (n, columns or x.shape[-1:].numel())
             if not is_right or dtype not in (None, x.dtype):
                 got = f"{tuple(x.shape)}, {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
                 raise ValueError(
-                    f"{type(self).__name__}.{method} must be a tensor ({n}, {columns or 'k'})"
+                    f"{task}.{method} must be a tensor ({n}, {columns or 'k'})"
                     f"{'' if dtype is None else f', {dtype}'}; got {got}.{hint}"
                 )
+
+        def named(method: str, entries: Any) -> Mapping[Any, Any]:
+            _require(
+                isinstance(entries, Mapping),
+                f"{task}.{method} must be a mapping from names to tensors; got {type(entries).__name__}.",
+            )
+            return entries
 
         for key, x in state.items():
             _require(
                 isinstance(x, Tensor) and x.dim() > 1 and len(x) == n,
-                f"{type(self).__name__}.initial_state: entry {key!r} must be a tensor ({n}, ...) of at least two "
+                f"{task}.initial_state: entry {key!r} must be a tensor ({n}, ...) of at least two "
                 f"dimensions; got {tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__}.",
             )
         check("observe(state)", self.observe(state), self.dtype, None)
-        for name, term in self.reward_terms(state).items():
+        for name, term in named("reward_terms(state)", self.reward_terms(state)).items():
             hint = " Sum a vector over its components: .sum(-1, keepdim=True)."
             check(f"reward_terms(state)[{name!r}]", term, self.dtype, hint=hint)
-        for name, metric in self.metrics(state).items():
+        for name, metric in named("metrics(state)", self.metrics(state)).items():
             check(f"metrics(state)[{name!r}]", metric, None)
         for method in ("is_crash", "is_success"):
             check(f"{method}(state)", getattr(self, method)(state), torch.bool)
-        advanced = self.advance(state, dict(state))
+        advanced = named("advance(previous, state)", self.advance(state, dict(state)))
         for key in self.task_entries:
             like, x = state[key], advanced.get(key)
             got = None if x is None else (tuple(x.shape), x.dtype)
             _require(
                 got == (tuple(like.shape), like.dtype),
-                f"{type(self).__name__}.advance must return the whole state, and {key!r} as initial_state gives it, "
+                f"{task}.advance must return the whole state, and {key!r} as initial_state gives it, "
                 f"{(tuple(like.shape), like.dtype)}; got {got}. Start from {{**state, ...}}.",
             )
 

@@ -129,7 +129,7 @@ def main() -> None:
     if args.repeats % 2:
         parser.error("--repeats has to be even: halves of them are compared.")
     torch.set_num_threads(1)
-    rows = read(args.output)
+    rows, seen = read(args.output), []
     for path in tqdm(args.checkpoints):
         saved = read_checkpoint(path)
         cfg = OmegaConf.create(saved["config"])
@@ -138,6 +138,11 @@ def main() -> None:
         if cfg.normalize:
             parser.error(f"{path} was trained under a normaliser; only policies without one can be examined.")
         own = name(path, cfg)
+        if own in seen:
+            parser.error(
+                f"{path} is a second {' '.join(own.values())}. Give runs that differ in more an --output each."
+            )
+        seen.append(own)
         if not any(own.items() <= row.items() for row in rows):
             rows.append(own | examine(saved, cfg, args.states, args.repeats, args.steps, args.size))
             write(args.output, rows)

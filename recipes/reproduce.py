@@ -17,6 +17,7 @@ import platform
 import signal
 import subprocess
 import sys
+import threading
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
@@ -41,10 +42,12 @@ CURVE = {  # columns of a curve, and where they stand in metrics.csv
     "start_cells": "train/start_cells",
 }
 RUNNING: set[subprocess.Popen] = set()
+STOPPED = threading.Event()
 
 
 def stop(number: int, _: object) -> None:
     """End the runs with this process: they would write into folders that the next one takes over."""
+    STOPPED.set()
     for process in list(RUNNING):
         process.terminate()
     sys.exit(128 + number)
@@ -96,6 +99,8 @@ def run(command: list[str], folder: Path) -> None:
         subprocess.Popen(command, stdout=log, stderr=log, env=environment) as process,
     ):
         RUNNING.add(process)
+        if STOPPED.is_set():
+            process.terminate()
         code = process.wait()
         RUNNING.remove(process)
     if code and not (folder / "failure.pt").exists():

@@ -96,6 +96,9 @@ def test_a_gradient_is_examined_of_any_run_that_has_one(launch, no_pictures, mon
     run_main(monkeypatch, ascent, tmp_path / "bptt/checkpoint.pt", *sizes)
     (row,) = reproduce.read(tmp_path / "ascent.csv")
     assert (row["task"], row["variant"], row["seed"]) == ("hovering", "bptt", "7")
+    with pytest.raises(SystemExit):
+        run_main(monkeypatch, ascent, *(2 * [tmp_path / "bptt/checkpoint.pt"]), *sizes)
+    assert "is a second hovering bptt 7: give runs that differ in more an --output each" in capsys.readouterr().err
     launch("ppo", *reproduce.QUICK, "batch_size=8", f"hydra.run.dir={tmp_path}/ppo")
     with pytest.raises(SystemExit):
         run_main(monkeypatch, ascent, tmp_path / "ppo/checkpoint.pt", *sizes)

@@ -140,7 +140,7 @@ def main() -> None:
         own = name(path, cfg)
         if own in seen:
             parser.error(
-                f"{path} is a second {' '.join(own.values())}. Give runs that differ in more an --output each."
+                f"{path} is a second {' '.join(own.values())}: give runs that differ in more an --output each."
             )
         seen.append(own)
         if not any(own.items() <= row.items() for row in rows):

@@ -328,11 +328,15 @@ def test_the_page_is_made_of_the_results_and_what_is_written_by_hand_stays(monke
     assert all(f"| {claim.id} | {claim.text} |" in text for claim in claims.CLAIMS)
     assert (tmp_path / "results/main.png").read_bytes().startswith(b"\x89PNG")
 
-    for _ in range(2):
-        run_main(monkeypatch, results, "--data", tmp_path / "nothing")
-        text = (tmp_path / "nothing/results.md").read_text()
-        assert all(f"| {claim.id} | {claim.text} | **not run** |" in text for claim in claims.CLAIMS)
-        assert text.count("## Verdicts\n") == 1
+    nothing = tmp_path / "nothing/results.md"
+    nothing.parent.mkdir()
+    nothing.write_text(text)
+    run_main(monkeypatch, results, "--data", nothing.parent)
+    text = nothing.read_text()
+    assert text.startswith("# Results\n\nWritten by hand.") and text.endswith("The end.\n")
+    assert all(f"| {claim.id} | {claim.text} | **not run** |" in text for claim in claims.CLAIMS)
+    run_main(monkeypatch, results, "--data", nothing.parent)
+    assert nothing.read_text() == text
 
 
 def test_other_results_leave_the_page_of_the_project_alone(monkeypatch, tmp_path):

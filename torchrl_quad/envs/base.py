@@ -413,8 +413,7 @@ class QuadrotorEnv(EnvBase):
                 tensordict is not None and "state" in tensordict,
                 f'{source} needs a tensordict with the state to set under "state"; got none.',
             )
-            state = self._checked_state(tensordict.get("state"), source)
-            self._require_sound(state, source, mask)
+            state = self._checked_state(tensordict.get("state"), source, mask)
         else:
             state = self.draw_start()
         self._see(state, mask)
@@ -510,9 +509,7 @@ class QuadrotorEnv(EnvBase):
         """States for all environments to begin an episode with."""
         if self.initial_state_source is None:
             return self.sample_initial_state(self.num_envs)
-        state = self._checked_state(self.initial_state_source(self.num_envs), "initial_state_source")
-        self._require_sound(state, "initial_state_source")
-        return state
+        return self._checked_state(self.initial_state_source(self.num_envs), "initial_state_source")
 
     def first_entries(self, state: State) -> dict[str, Any]:
         """What a reset to a state tells."""
@@ -554,18 +551,6 @@ class QuadrotorEnv(EnvBase):
         drawn = {name: state["drone", name] for name in self.randomization.spec}
         return RawParams(**{**self.params.fields(), **drawn})
 
-    def _require_sound(self, state: State, source: str, mask: Tensor | None = None) -> None:
-        """Refuse states from which the next step could not fly, in the environments that the mask tells, or in all."""
-        if horizon.cannot_look():
-            return
-        broken = ~self.stepper.sound(self.stepper.layout.pack(state).floats)[1]
-        broken &= True if mask is None else mask.flatten()
-        _require(
-            not broken.any(),
-            f"{source}: the states of environments {horizon.first_ten(broken)} are none to fly from: not finite, a "
-            "quaternion that is not of unit norm, or a speed beyond all bounds.",
-        )
-
     def required_state(self, state: Any, source: str) -> State:
         """The entries of a state, if all are there and of the right shape, precision and device."""
         checked = self._complete_state(state, source)
@@ -578,9 +563,19 @@ class QuadrotorEnv(EnvBase):
             )
         return checked
 
-    def _checked_state(self, state: Any, source: str) -> State:
+    def _checked_state(self, state: Any, source: str, mask: Tensor | None = None) -> State:
+        """A copy of a state that the next step can fly from, in the environments that the mask tells, or in all."""
         state = self._complete_state(state, source)
-        return {key: state[key].to(x.device, x.dtype, copy=True) for key, x in self.fallback.items()}
+        state = {key: state[key].to(x.device, x.dtype, copy=True) for key, x in self.fallback.items()}
+        if not horizon.cannot_look():
+            broken = ~self.stepper.sound(self.stepper.layout.pack(state).floats)[1]
+            broken &= True if mask is None else mask.flatten()
+            _require(
+                not broken.any(),
+                f"{source}: the states of environments {horizon.first_ten(broken)} are none to fly from: not finite, a "
+                "quaternion that is not of unit norm, or a speed beyond all bounds.",
+            )
+        return state
 
     def _complete_state(self, state: Any, source: str) -> State:
         _require(

@@ -13,10 +13,11 @@ PACKAGE = Path(torchrl_quad.__file__).parent
 ALLOWED = {  # what each part of the package may import of the others
     "dynamics": set(),
     "envs": {"dynamics", "render"},  # render only within env.render(), see below
-    "render": {"dynamics", "envs"},
+    "render": {"dynamics", "envs", "files"},
     "modules": set(),
     "objectives": set(),
     "data": set(),
+    "files": set(),
     "diagnostics": {"data", "objectives"},
     "gym": {"envs"},
 }
@@ -29,6 +30,7 @@ LIBRARIES = {
     "modules": TORCHRL,
     "objectives": TORCHRL,
     "data": TORCHRL,
+    "files": set(),
     "diagnostics": TORCHRL,
     "gym": {"gymnasium", "numpy", "torch"},
 }

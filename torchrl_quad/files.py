@@ -1,0 +1,51 @@
+"""Files that are complete or not there."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Write a file atomically: ``with replacing(path) as temporary: temporary.write_text(...)``.
+
+    The temporary file sits beside ``path``, carries the process id in its name, and keeps the suffix. It replaces
+    ``path`` when the block ends, and disappears when the block raises. What a killed process left behind is deleted by
+    the next one that writes the same path.
+
+    Raises:
+        OSError: the folder does not exist, is read-only or is full; ``path`` is then as it was.
+    """
+    path = Path(path)
+    _delete_leftovers(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process of this machine is alive."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # it belongs to somebody else
+        return True
+    return True
+
+
+def _delete_leftovers(path: Path) -> None:
+    name = re.compile(rf"\.{re.escape(path.stem)}\.(\d+){re.escape(path.suffix)}")
+    for other in path.parent.glob(".*"):
+        match = name.fullmatch(other.name)
+        if match and not is_running(int(match[1])):
+            other.unlink(missing_ok=True)

@@ -44,10 +44,14 @@ VARIANTS = {
     # As published with the paper: BPTT through whole episodes, SHAC without the gradient of its terminal value.
     "bptt-episode": Variant("bptt", "BPTT, whole episodes", horizon="episode"),
     "shac-cut": Variant("shac", "SHAC, terminal gradient cut", ("loss.terminal_gradient=false",)),
+    "shac-xu": Variant(
+        "shac", "SHAC as in Xu et al. 2022", ("loss.target_bootstrap=true", "loss.average_over_horizon=true")
+    ),
+    "abpt-now": Variant("abpt", "ABPT, present dynamics"),
     # Ablation.
     "abpt-no-0-step": Variant("abpt", "ABPT without 0-step return", ("loss.zero_step_return=false",)),
     "abpt-no-n-step": Variant("abpt", "ABPT without N-step return", ("loss.n_step_return=false",)),
-    "abpt-no-visited": Variant("abpt", "ABPT without visited states", ("buffer.fraction=null",)),
+    "abpt-no-visited": Variant("abpt", "ABPT without visited states", ("buffer.fraction=null", "restart_fraction=0")),
     # Relaxed gate bonus.
     "bptt-log": Variant("bptt", "BPTT, log bonus", ("env.gate_bonus=log",)),
     "shac-log": Variant("shac", "SHAC, log bonus", ("env.gate_bonus=log",)),
@@ -79,6 +83,8 @@ VARIANTS = {
 
 EXPERIMENTS = {  # name: variants and tasks, in the order in which they are run
     "main": (tuple(METHODS), TASKS),
+    "dynamics": (("abpt-now", "abpt-no-visited"), TASKS),
+    "published-xu": (("shac-xu",), ("landing", "racing")),
     "published": (("bptt-episode", "shac-cut"), TASKS),
     "ablation": (("abpt-no-0-step", "abpt-no-n-step", "abpt-no-visited"), TASKS),
     "reward": ((*(f"{name}-velocity" for name in METHODS), "abpt-no-0-step-velocity"), ("racing",)),

@@ -12,7 +12,21 @@ from torch.nn.functional import pad
 from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import gyroscopic_torque
 from torchrl_quad.dynamics.rotors import Rotors, thrust_limits
-from torchrl_quad.dynamics.vector import Vector, clamp, join, multiply_add, take_apart, take_apart_rows, transform
+from torchrl_quad.dynamics.vector import (
+    Vector,
+    clamp,
+    greatest,
+    is_same,
+    join,
+    least,
+    maximum,
+    multiply_add,
+    take_apart,
+    take_apart_rows,
+    transform,
+    where_positive,
+    where_same,
+)
 
 
 class Setpoint(NamedTuple):
@@ -40,6 +54,12 @@ class FlightController:
         self.thrust_min, self.thrust_max = thrust_limits(nominal)
         self.gain = nominal.inertia * nominal.rate_gain
         weight = nominal.mass * nominal.gravity
+        self.tiny = 1e-6 * weight
+        # What a rotor contributes to collective thrust, and its limits and yaw thrust in units of the collective.
+        self.share = self.mixer[..., 0]
+        self.lowest, self.highest = self.thrust_min / self.share, self.thrust_max / self.share
+        self.reach = self.highest.amin(-1, keepdim=True) - self.lowest.amax(-1, keepdim=True)
+        self.yaw_share = self.mixer[..., 3] / self.share
         self.half_range = 0.5 * nominal.max_thrust_to_weight * weight
         self.hover_speed = self.rotors.speed(transform(self.mixer, pad(weight, (0, 3))))
         self.hover_action = pad(2.0 / nominal.max_thrust_to_weight - 1.0, (0, 3))
@@ -56,7 +76,7 @@ class FlightController:
             }
         )
         apart.rotors, apart.mixer = self.rotors.take_apart(), take_apart_rows(self.mixer)
-        for name in ("thrust_min", "thrust_max", "gain"):
+        for name in ("thrust_min", "thrust_max", "gain", "tiny", "share", "lowest", "highest", "reach", "yaw_share"):
             setattr(apart, name, take_apart(getattr(self, name), constant=True))
         return apart
 
@@ -78,7 +98,33 @@ class FlightController:
         torque = multiply_add(gyroscopic, self.gain, setpoint.body_rate - angular_velocity)
         torque = torque - self.nominal.rate_damping * acceleration
         thrust = transform(self.mixer, join(setpoint.thrust, torque))
-        return self.rotors.speed(clamp(thrust, self.thrust_min, self.thrust_max))
+        return self.rotors.speed(self._within_limits(thrust, setpoint.thrust, torque[..., 2:]))
+
+    def _within_limits(self, thrust: Vector, collective: Vector, yaw_torque: Vector) -> Vector:
+        """The rotor thrusts (*, 4) [N] that can be flown, and give up yaw first.
+
+        Where a rotor saturates: the yaw torque shrinks; if that is not enough the collective thrust moves to make room
+        for roll and pitch, up as well as down (airmode); roll and pitch shrink only where they need more than the whole
+        range. Thrusts within the limits pass unchanged.
+
+        Args:
+            thrust: what the mixer asks of each rotor (*, 4) [N].
+            collective: the part of it that is collective thrust (*, 1) [N].
+            yaw_torque: the part of it that is torque about body z (*, 1) [N m].
+        """
+        limited = clamp(thrust, self.thrust_min, self.thrust_max)
+        if is_same(limited, thrust):
+            return limited
+        # In units of collective thrust: every rotor has its share of it.
+        yaw = self.yaw_share * yaw_torque
+        tilt = thrust / self.share - yaw - collective
+        tilt = tilt * (self.reach / maximum(greatest(tilt) - least(tilt), self.tiny)).clamp_max(1.0)
+        level = collective + tilt
+        level = level + greatest(self.lowest - level).clamp_min(0.0) - greatest(level - self.highest).clamp_min(0.0)
+        room = where_positive(yaw, self.highest - level, level - self.lowest)
+        level = level + yaw * least(room / maximum(yaw.abs(), self.tiny)).clamp_min(0.0).clamp_max(1.0)
+        possible = clamp(level * self.share, self.thrust_min, self.thrust_max)
+        return where_same(limited, thrust, possible)
 
 
 def _require_hover(nominal: QuadrotorParams, speed: Tensor) -> None:

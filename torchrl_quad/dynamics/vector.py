@@ -6,6 +6,7 @@ no indices, so that a compiler makes one loop over drones of everything and keep
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
 from collections.abc import Callable, Sequence
@@ -64,6 +65,9 @@ class Components:
 
     def clamp_min(self, low: float) -> Components:
         return Components([x.clamp_min(low) for x in self.components])
+
+    def clamp_max(self, high: float) -> Components:
+        return Components([x.clamp_max(high) for x in self.components])
 
 
 Vector = Tensor | Components
@@ -141,6 +145,43 @@ def minimum(a: Vector, b: Vector) -> Vector:
     if isinstance(a, Tensor):
         return torch.minimum(a, b)
     return _each(lambda x, y: torch.minimum(x, y) if isinstance(y, Tensor) else x.clamp_max(y), a, b)
+
+
+def greatest(x: Vector) -> Vector:
+    """The greatest entry, (*, 1)."""
+    return x.amax(-1, keepdim=True) if isinstance(x, Tensor) else Components([_reduce(torch.maximum, x.components)])
+
+
+def least(x: Vector) -> Vector:
+    """The least entry, (*, 1)."""
+    return x.amin(-1, keepdim=True) if isinstance(x, Tensor) else Components([_reduce(torch.minimum, x.components)])
+
+
+def where_positive(condition: Vector, a: Vector, b: Vector) -> Vector:
+    """a where the condition is above zero, b elsewhere, entry by entry."""
+    if isinstance(condition, Tensor):
+        return torch.where(condition > 0, a, b)
+    entries = zip(condition.components, a.components, b.components, strict=True)
+    return Components([torch.where(x > 0, y, z) for x, y, z in entries])
+
+
+def is_same(a: Vector, b: Vector) -> bool:
+    """Whether a tensor on the processor equals another, where a look at its values is free; False where it is not."""
+    if not isinstance(a, Tensor) or a.device.type != "cpu":
+        return False
+    return not (torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()) and torch.equal(a, b)
+
+
+def where_same(a: Vector, b: Vector, other: Vector) -> Vector:
+    """b (*, k) for those drones whose entries all equal those of a, the other for the rest."""
+    if isinstance(a, Tensor):
+        return torch.where((a == b).all(-1, keepdim=True), b, other)
+    same = _reduce(torch.logical_and, [x == y for x, y in zip(a.components, b.components, strict=True)])
+    return Components([torch.where(same, x, y) for x, y in zip(b.components, other.components, strict=True)])
+
+
+def _reduce(function: Callable, values: Sequence[Component]) -> Component:
+    return functools.reduce(function, values)
 
 
 def _each(function: Callable, a: Components, b: Components | float) -> Components:

@@ -293,6 +293,7 @@ class PathwiseCriticLoss(PathwiseLoss):
     critic_loss_key: str
     prediction_key: str  # the name, among the tensor keys, of what the critic writes
     value_part = "terminal_value"
+    target_bootstrap = False  # whether the terminal value is that of the target network
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -363,7 +364,7 @@ class PathwiseCriticLoss(PathwiseLoss):
         _, end = segments(tensordict.get(("next", self.tensor_keys.done)))
         where = end & ~tensordict.get(("next", self.tensor_keys.terminated))
         next_state = tensordict.get("next").select(*self._critic_inputs(), strict=False)[where.squeeze(-1)]
-        value = self._value(next_state, self._critic_params(target=False))
+        value = self._value(next_state, self._critic_params(target=self.target_bootstrap))
         discount = self.value_estimator.gamma * self._discounts(tensordict)
         return (discount * torch.zeros_like(discount).masked_scatter(where, value.to(discount.dtype))).sum((-2, -1))
 

@@ -51,11 +51,14 @@ class SHACLoss(PathwiseCriticLoss):
         value_network: TensorDictModule,
         *,
         terminal_gradient: bool = True,
+        target_bootstrap: bool = False,
+        average_over_horizon: bool = False,
         delay_value: bool = True,
         **kwargs: Any,
     ) -> None:
         super().__init__(actor_network, **kwargs)
         self.terminal_gradient = terminal_gradient
+        self.target_bootstrap, self.average_over_horizon = target_bootstrap, average_over_horizon
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -65,6 +68,12 @@ class SHACLoss(PathwiseCriticLoss):
             the loss, and a dictionary of what is worth logging.
         """
         return self._critic_loss(tensordict)
+
+    def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """What J is the sum of, as with every critic; divided by the steps where ``average_over_horizon`` asks for it."""
+        parts = super().objective_parts(tensordict)
+        steps = tensordict.shape[-1] if self.average_over_horizon else 1
+        return {name: part / steps for name, part in parts.items()}
 
     def _terminal_value(self, tensordict: TensorDictBase) -> Tensor:
         value = super()._terminal_value(tensordict)

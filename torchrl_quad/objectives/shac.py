@@ -70,7 +70,7 @@ class SHACLoss(PathwiseCriticLoss):
         return self._critic_loss(tensordict)
 
     def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """What J is the sum of, as with every critic; divided by the steps where ``average_over_horizon`` asks for it."""
+        """What J is the sum of, divided by the steps of the rollout with ``average_over_horizon``."""
         parts = super().objective_parts(tensordict)
         steps = tensordict.shape[-1] if self.average_over_horizon else 1
         return {name: part / steps for name, part in parts.items()}

@@ -10,7 +10,7 @@ camera_drone = {
     "inertia": [0.030, 0.034, 0.055],
     "rotor_positions": [[0.16, 0.16], [-0.16, 0.16], [-0.16, -0.16], [0.16, -0.16]],  # x forward, y left
     "rotor_spin": [1, -1, 1, -1],
-    "torque_to_thrust": 0.02,
+    "yaw_torque_coefficient": 0.02,
     "thrust_map": [1.0e-5, 0.0, 0.0],  # thrust [N] = 1e-5 w^2, w in rad/s
     "rotor_speed_min": 100.0,
     "rotor_speed_max": 1150.0,

@@ -195,7 +195,7 @@ def test_allocation_is_r_cross_f_for_any_layout():
     forces = torch.zeros(4, 3, dtype=F64)
     forces[:, 2] = thrust
     torque = torch.linalg.cross(arms, forces).sum(0)
-    torque[2] += (params.torque_to_thrust * params.rotor_spin * thrust).sum()
+    torque[2] += (params.yaw_torque_coefficient * params.rotor_spin * thrust).sum()
     torch.testing.assert_close(allocation_matrix(params) @ thrust, torch.cat((thrust.sum()[None], torque)))
 
 

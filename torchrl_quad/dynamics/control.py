@@ -14,16 +14,16 @@ from torchrl_quad.dynamics.rigid_body import gyroscopic_torque
 from torchrl_quad.dynamics.rotors import Rotors, thrust_limits
 from torchrl_quad.dynamics.vector import (
     Vector,
+    cat,
     clamp,
     greatest,
     is_same,
-    join,
     least,
+    matvec,
     maximum,
     multiply_add,
-    take_apart,
-    take_apart_rows,
-    transform,
+    unbind,
+    unbind_rows,
     where_positive,
     where_same,
 )
@@ -61,23 +61,23 @@ class FlightController:
         self.reach = self.highest.amin(-1, keepdim=True) - self.lowest.amax(-1, keepdim=True)
         self.yaw_share = self.mixer[..., 3] / self.share
         self.half_range = 0.5 * nominal.max_thrust_to_weight * weight
-        self.hover_speed = self.rotors.speed(transform(self.mixer, pad(weight, (0, 3))))
+        self.hover_speed = self.rotors.speed(matvec(self.mixer, pad(weight, (0, 3))))
         self.hover_action = pad(2.0 / nominal.max_thrust_to_weight - 1.0, (0, 3))
         _require_hover(nominal, self.hover_speed)
 
-    def take_apart(self) -> FlightController:
+    def unbind(self) -> FlightController:
         """The same on components: its numbers become constants of the code that is compiled with it."""
         apart = copy.copy(self)
         apart.nominal = RawParams(
             **{
-                name: take_apart(value, constant=True)
+                name: unbind(value, constant=True)
                 for name, value in self.nominal.fields().items()
                 if name != "rotor_positions"
             }
         )
-        apart.rotors, apart.mixer = self.rotors.take_apart(), take_apart_rows(self.mixer)
+        apart.rotors, apart.mixer = self.rotors.unbind(), unbind_rows(self.mixer)
         for name in ("thrust_min", "thrust_max", "gain", "tiny", "share", "lowest", "highest", "reach", "yaw_share"):
-            setattr(apart, name, take_apart(getattr(self, name), constant=True))
+            setattr(apart, name, unbind(getattr(self, name), constant=True))
         return apart
 
     def setpoint(self, action: Tensor) -> Setpoint:
@@ -97,7 +97,7 @@ class FlightController:
         acceleration = (wrench[..., 1:] - gyroscopic) / inertia
         torque = multiply_add(gyroscopic, self.gain, setpoint.body_rate - angular_velocity)
         torque = torque - self.nominal.rate_damping * acceleration
-        thrust = transform(self.mixer, join(setpoint.thrust, torque))
+        thrust = matvec(self.mixer, cat(setpoint.thrust, torque))
         return self.rotors.speed(self._within_limits(thrust, setpoint.thrust, torque[..., 2:]))
 
     def _within_limits(self, thrust: Vector, collective: Vector, yaw_torque: Vector) -> Vector:

@@ -16,39 +16,33 @@ from torchrl_quad.dynamics import presets
 
 _DRONES = resources.files(__package__) / "drones"
 
-# Per field: the shape of one drone's value, and the rule its numbers obey.
+# Per field: the shape of one drone's value, and the least and the greatest number that makes sense for it. Beyond them
+# the numbers of a drone that could never fly overflow, and their derivatives with them.
 _FIELDS = {
-    "mass": ((1,), "positive"),
-    "inertia": ((3,), "positive"),
-    "rotor_positions": ((4, 2), "finite"),
-    "rotor_spin": ((4,), "+1 or -1"),
-    "torque_to_thrust": ((1,), "positive"),
-    "thrust_map": ((3,), "finite, k2 positive"),
-    "rotor_speed_min": ((1,), "zero or positive"),
-    "rotor_speed_max": ((1,), "positive"),
-    "motor_time_constant": ((1,), "positive"),
-    "linear_drag": ((3,), "zero or positive"),
-    "quadratic_drag": ((3,), "zero or positive"),
-    "rate_gain": ((3,), "positive"),
-    "rate_damping": ((3,), "zero or positive"),
-    "max_body_rate": ((3,), "positive"),
-    "max_thrust_to_weight": ((1,), "positive"),
-    "gravity": ((1,), "positive"),
+    "mass": ((1,), 1e-3, 1e3),
+    "inertia": ((3,), 1e-8, 1e3),
+    "rotor_positions": ((4, 2), -1e1, 1e1),
+    "rotor_spin": ((4,), -1.0, 1.0),
+    "yaw_torque_coefficient": ((1,), 1e-5, 1e1),
+    "thrust_map": ((3,), -1e3, 1e3),
+    "rotor_speed_min": ((1,), 0.0, 1e5),
+    "rotor_speed_max": ((1,), 1e0, 1e5),
+    "motor_time_constant": ((1,), 1e-4, 1e1),
+    "linear_drag": ((3,), 0.0, 1e2),
+    "quadratic_drag": ((3,), 0.0, 1e2),
+    "rate_gain": ((3,), 1e-3, 1e4),
+    "rate_damping": ((3,), 0.0, 1e3),
+    "max_body_rate": ((3,), 1e-2, 1e2),
+    "max_thrust_to_weight": ((1,), 1e-1, 1e2),
+    "gravity": ((1,), 1e-2, 1e3),
 }
+LIMITS = {name: (low, high) for name, (_, low, high) in _FIELDS.items()}
 # What the flight controller alone reads, from its nominal drone, and what the drone that flies is made of.
 CONTROLLER_FIELDS = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
 PLANT_FIELDS = tuple(name for name in _FIELDS if name not in CONTROLLER_FIELDS)
 
 # As QuadrotorParams, but unchecked and of any form: for drones that are drawn at random, and for compiled code.
 RawParams = collections.namedtuple("RawParams", _FIELDS, defaults=[None] * len(_FIELDS))
-
-_RULES = {
-    "finite": lambda x: x.isfinite(),
-    "positive": lambda x: x > 0,
-    "zero or positive": lambda x: x >= 0,
-    "+1 or -1": lambda x: x.abs() == 1,
-    "finite, k2 positive": lambda x: torch.cat((x[..., :1] > 0, x[..., 1:].isfinite()), -1),
-}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,7 +60,7 @@ class QuadrotorParams:
     inertia: Tensor  #: (3) [kg m2], principal axes
     rotor_positions: Tensor  #: (4, 2) [m], x and y of each rotor
     rotor_spin: Tensor  #: (4), sign of the yaw torque that each rotor exerts on the body
-    torque_to_thrust: Tensor  #: (1) [m], kappa, yaw torque per thrust
+    yaw_torque_coefficient: Tensor  #: (1) [m], kappa, yaw torque per thrust
     thrust_map: Tensor  #: (3), k2 [N s2], k1 [N s] and k0 [N] of thrust = k2 w^2 + k1 w + k0
     rotor_speed_min: Tensor  #: (1) [rad/s]
     rotor_speed_max: Tensor  #: (1) [rad/s]
@@ -178,7 +172,7 @@ def available_drones() -> list[str]:
 
 
 def _check(name: str, value: Tensor, source: str) -> None:
-    shape, rule = _FIELDS[name]
+    shape, low, high = _FIELDS[name]
     if value.shape != shape and value.shape[1:] != shape:
         batched = ("num_envs", *shape)
         raise ValueError(
@@ -186,5 +180,10 @@ def _check(name: str, value: Tensor, source: str) -> None:
             f"or {batched} for one per environment."
         )
     with torch.no_grad():
-        if not (value.isfinite() & _RULES[rule](value)).all():
-            raise ValueError(f"{source}: field {name!r} must be {rule}, got {value.tolist()}.")
+        fits, rule = (value >= low) & (value <= high), f"between {low:g} and {high:g}"
+        if name == "rotor_spin":
+            fits, rule = value.abs() == 1, "+1 or -1"
+        if name == "thrust_map" and not (value[..., 0] > 0).all():
+            fits, rule = value > 0, "rising at high speed, k2 above zero"
+        if not fits.all():
+            raise ValueError(f"{source}: field {name!r} must be {rule}, in SI units; got {value.tolist()}.")

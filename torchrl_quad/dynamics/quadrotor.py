@@ -1,15 +1,20 @@
-"""The whole drone: rate controller, rotors and rigid body over one control step."""
+"""The whole quadrotor: rate controller, rotors and rigid body over one control step."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
+from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Setpoint
 from torchrl_quad.dynamics.integrators import INTEGRATORS
-from torchrl_quad.dynamics.parameters import QuadrotorParams
+from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
 from torchrl_quad.dynamics.rotors import Rotors
-from torchrl_quad.dynamics.vector import Vector, clamp
+from torchrl_quad.dynamics.vector import Components, Vector, cat, clamp, stack
 
 
 class QuadrotorState(NamedTuple):
@@ -34,8 +39,7 @@ def physics_step(
 ) -> QuadrotorState:
     """One physics step of dt [s]: the present rotor speeds make the wrench, and the controller sets their next target.
 
-    ``rotors`` are those of ``params``; the controller knows its own, and flies by them. ``wind`` is (*, 3) [m/s], world
-    frame.
+    ``rotors`` are those of ``params``; the controller flies by its own. ``wind`` is (*, 3) [m/s], world frame.
     """
     speed = state.rotor_speed
     wrench = rotors.wrench(speed)
@@ -64,3 +68,72 @@ def control_step(
     for _ in range(substeps):
         state = physics_step(state, setpoint, params, rotors, controller, dt, integrator, wind)
     return state
+
+
+class Quadrotor:
+    """The quadrotor as environments fly it: an implementation of :class:`~torchrl_quad.dynamics.Dynamics`.
+
+    Args:
+        nominal: the drone that the flight controller believes in.
+        dt: physics step [s].
+        substeps: physics steps in a control step.
+        integrator: name of the integrator.
+    """
+
+    sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3, "rotor_speed": 4}
+    plant_fields = PLANT_FIELDS
+
+    def __init__(self, nominal: QuadrotorParams, dt: float, substeps: int, integrator: str) -> None:
+        self.controller = FlightController(nominal)
+        self.nominal, self.hover_action = self.controller.nominal, self.controller.hover_action
+        self.dt, self.substeps, self.integrator = dt, substeps, integrator
+        self.limits = {"rotor_speed": 2.0 * self.nominal.rotor_speed_max}
+
+    def rest(self, position: Tensor) -> dict[str, Tensor]:
+        """Level, still, rotors at hover speed, at the positions (n, 3) [m]."""
+        return {
+            "position": position,
+            "quaternion": quaternion.identity(position),
+            "velocity": torch.zeros_like(position),
+            "angular_velocity": torch.zeros_like(position),
+            "rotor_speed": self.controller.hover_speed.expand(len(position), 4).clone(),
+        }
+
+    def control_step(
+        self, state: dict[str, Tensor], action: Tensor, params: QuadrotorParams, wind: Tensor | None
+    ) -> dict[str, Tensor]:
+        """The entries of the drone after one control step; see :func:`control_step`."""
+        drone = QuadrotorState(*(state[name] for name in self.sizes))
+        after = control_step(drone, action, params, self.controller, self.dt, self.substeps, self.integrator, wind)
+        return after._asdict()
+
+    def setpoint_rows(self, action: Tensor) -> Tensor:
+        """Thrust [N] and body rates [rad/s] of an action (n, 4), as rows (4, n)."""
+        return torch.cat([x.t() for x in self.controller.setpoint(action)])
+
+    def rows_step(self) -> Callable[..., Tensor]:
+        """A physics step on rows (17, n), for a compiler, with the nominal parameters as constants of its code."""
+        controller, dt, integrator = self.controller.unbind(), self.dt, self.integrator
+
+        def step(x: Tensor, setpoint: Tensor, plant: tuple[Tensor, ...], wind: tuple[Tensor, ...]) -> Tensor:
+            state = _split(Components(x.unbind()), self.sizes.values())
+            thrust, rates = _split(Components(setpoint.unbind()), (1, 3))
+            params, rotors = controller.nominal, controller.rotors
+            if plant:
+                params = RawParams(**{k: Components(v.unbind()) for k, v in zip(PLANT_FIELDS, plant, strict=True)})
+                rotors = Rotors(params)
+            air = Components(wind[0].unbind()) if wind else None
+            after = physics_step(
+                QuadrotorState(*state), Setpoint(thrust, rates), params, rotors, controller, dt, integrator, air
+            )
+            return stack(cat(*after))
+
+        return step
+
+
+def _split(x: Components, sizes) -> list[Components]:
+    parts = []
+    for size in sizes:
+        parts.append(x[..., :size])
+        x = x[..., size:]
+    return parts

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchrl_quad.dynamics.vector import Vector, cross, dot, join, multiply_add
+from torchrl_quad.dynamics.vector import Vector, cat, cross, dot, multiply_add
 
 
 def multiply(p: Tensor, q: Tensor) -> Tensor:
@@ -44,7 +44,7 @@ def derivative(q: Vector, angular_velocity: Vector) -> Vector:
     """Time derivative (*, 4) [1/s] under the body-frame angular velocity (*, 3) [rad/s]: half of q (0, w)."""
     half = q * 0.5
     w, u = half[..., :1], half[..., 1:]
-    return join(-dot(u, angular_velocity), multiply_add(cross(u, angular_velocity), w, angular_velocity))
+    return cat(-dot(u, angular_velocity), multiply_add(cross(u, angular_velocity), w, angular_velocity))
 
 
 def from_axis_angle(axis_angle: Tensor) -> Tensor:

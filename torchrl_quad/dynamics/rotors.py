@@ -14,11 +14,11 @@ from torchrl_quad.dynamics.parameters import QuadrotorParams
 from torchrl_quad.dynamics.vector import (
     Components,
     Vector,
+    matvec,
     maximum,
     multiply_add,
-    take_apart,
-    take_apart_rows,
-    transform,
+    unbind,
+    unbind_rows,
 )
 
 
@@ -37,11 +37,11 @@ class Rotors:
         self.time_constant = params.motor_time_constant
         self.allocation = allocation_matrix(params)
 
-    def take_apart(self) -> Rotors:
+    def unbind(self) -> Rotors:
         """The same on components."""
         apart = copy.copy(self)
         for name, value in vars(self).items():
-            setattr(apart, name, take_apart_rows(value) if name == "allocation" else take_apart(value, constant=True))
+            setattr(apart, name, unbind_rows(value) if name == "allocation" else unbind(value, constant=True))
         return apart
 
     def thrust(self, speed: Vector) -> Vector:
@@ -59,7 +59,7 @@ class Rotors:
 
     def wrench(self, speed: Vector) -> Vector:
         """The wrench (*, 4) on the body at the rotor speeds (*, 4) [rad/s]."""
-        return transform(self.allocation, self.thrust(speed))
+        return matvec(self.allocation, self.thrust(speed))
 
     def follow(self, speed: Vector, commanded: Vector, dt: float) -> Vector:
         """Rotor speed (*, 4) after dt [s] of first-order lag towards a constant command: exact for any dt."""
@@ -78,7 +78,7 @@ def allocation_matrix(params: QuadrotorParams) -> Tensor | tuple[Components, ...
     Torque is r x F of each rotor, (y f, -x f), plus the drag torque kappa s f about z. The paper prints the matrix of a
     "+" frame; published drones are X frames.
     """
-    yaw = params.torque_to_thrust * params.rotor_spin
+    yaw = params.yaw_torque_coefficient * params.rotor_spin
     if isinstance(yaw, Components):  # then the positions are (x, y, x, y, ...)
         x, y = params.rotor_positions[..., 0::2], params.rotor_positions[..., 1::2]
         return Components([1.0]), y, -x, yaw

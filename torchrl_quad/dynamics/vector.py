@@ -73,18 +73,18 @@ class Components:
 Vector = Tensor | Components
 
 
-def take_apart(vector: Tensor, constant: bool = False) -> Components:
+def unbind(vector: Tensor, constant: bool = False) -> Components:
     """The components of a vector (*, k); of a constant that all drones share, as numbers."""
     shared = constant and vector.numel() == vector.shape[-1]
     return Components(vector.flatten().tolist() if shared else vector.unbind(-1))
 
 
-def take_apart_rows(matrix: Tensor) -> list[Components]:
+def unbind_rows(matrix: Tensor) -> list[Components]:
     """The rows of a constant matrix (*, k, k), each taken apart."""
-    return [take_apart(row, constant=True) for row in matrix.unbind(-2)]
+    return [unbind(row, constant=True) for row in matrix.unbind(-2)]
 
 
-def put_together(vector: Components) -> Tensor:
+def stack(vector: Components) -> Tensor:
     """The components, each a tensor (n), as rows (k, n)."""
     return torch.stack(vector.components)
 
@@ -109,14 +109,14 @@ def multiply_add(a: Vector, b: Vector, c: Vector) -> Vector:
     return torch.addcmul(a, b, c) if isinstance(c, Tensor) else a + b * c
 
 
-def transform(matrix: Tensor | Sequence[Components], vector: Vector) -> Vector:
+def matvec(matrix: Tensor | Sequence[Components], vector: Vector) -> Vector:
     """The product (*, k) of a matrix (*, k, k), or its rows, and a vector (*, k)."""
     if isinstance(vector, Tensor):
         return (matrix * vector.unsqueeze(-2)).sum(-1)
     return Components([_sum((row * vector).components) for row in matrix])
 
 
-def join(*vectors: Vector) -> Vector:
+def cat(*vectors: Vector) -> Vector:
     """The entries of several vectors as one."""
     if isinstance(vectors[0], Tensor):
         return torch.cat(vectors, -1)

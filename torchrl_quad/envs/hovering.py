@@ -4,7 +4,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_quad.envs.base import QuadrotorEnv, State
+from torchrl_quad.engine import State
+from torchrl_quad.envs.base import QuadrotorEnv
+from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric
 from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, outside, target_reward
 
 
@@ -36,6 +39,7 @@ class HoveringEnv(QuadrotorEnv):
     box_height = 6.0  # [m]
     weights = TARGET_WEIGHTS
     success_radius = 0.1  # [m]
+    metric_info = {**EPISODE_METRICS, "position_error": Metric("position error", "cm", 100.0, median=True, log=True)}
 
     def initial_state(self, n: int) -> State:
         target = self.tensor(self.target).repeat(n, 1)
@@ -60,10 +64,10 @@ class HoveringEnv(QuadrotorEnv):
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Takes ``position_error`` as the mean over the last second of the episode [m]."""
         metrics = super().episode_metrics(rollout)
-        first = self.first_episode(rollout)
+        first = first_episode(rollout)
         steps_left = first.sum(1, keepdim=True) - first.cumsum(1)
         last_second = first & (steps_left < round(1 / self.control_dt))
         error = rollout["next", "metrics", "position_error"]
         error = ((error * last_second).sum(1) / last_second.sum(1)).squeeze(-1)
-        success = (error < self.success_radius) * (1 - metrics["crash"])
-        return {**metrics, "success": success, "position_error": error}
+        solved = (error < self.success_radius) * (1 - metrics["crash"])
+        return {**metrics, "solved": solved, "position_error": error}

@@ -4,7 +4,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_quad.envs.base import QuadrotorEnv, State
+from torchrl_quad.engine import State
+from torchrl_quad.envs.base import QuadrotorEnv
+from torchrl_quad.envs.episodes import at_episode_end
+from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric
 from torchrl_quad.envs.terms import body_observation, norm, outside
 
 
@@ -51,6 +54,11 @@ class LandingEnv(QuadrotorEnv):
     success_radius = 0.3  # [m], along x and along y
     success_speed = 0.3  # [m/s]
     ends_on_success = True
+    metric_info = {
+        **EPISODE_METRICS,
+        "position_error": Metric("distance over ground", "cm", 100.0, median=True, log=True),
+        "landing_speed": Metric("landing speed", "m/s"),
+    }
 
     def initial_state(self, n: int) -> State:
         start = self.tensor(self.start_centre) + self.start_range * self.uniform(n, 3)
@@ -94,6 +102,6 @@ class LandingEnv(QuadrotorEnv):
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Gives a ``landing_speed`` only to drones that came down."""
         metrics = super().episode_metrics(rollout)
-        height = self.at_the_end(rollout, rollout["next", "state", "position"][..., 2:])
+        height = at_episode_end(rollout, rollout["next", "state", "position"][..., 2:])
         came_down = height <= self.success_height
         return {**metrics, "landing_speed": torch.where(came_down, metrics["landing_speed"], torch.nan)}

@@ -10,7 +10,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import presets
-from torchrl_quad.envs.base import QuadrotorEnv, State
+from torchrl_quad.engine import State
+from torchrl_quad.envs.base import QuadrotorEnv
+from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
 from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, norm, outside, target_reward
 
 WEIGHTS = {  # of the reward's terms, by reward
@@ -73,6 +76,12 @@ class RacingEnv(QuadrotorEnv):
     box_height = 6.0  # [m]; a track that is higher has 4 m above it
     max_rewarded_speed = 15.0  # [m/s]
     success_gates = 8
+    metric_info = {
+        **EPISODE_METRICS,
+        "gates_passed": Metric("gates passed"),
+        "lap_time": Metric("lap time", "s"),
+        "time_near_gate": Metric("time near a gate", "s"),
+    }
 
     def __init__(
         self,
@@ -187,8 +196,12 @@ class RacingEnv(QuadrotorEnv):
         """Gives a ``lap_time`` only to drones that flew a full lap; adds ``time_near_gate``, within 1 m of the next."""
         metrics = super().episode_metrics(rollout)
         lap_time = torch.where(metrics["lap_time"] > 0, metrics["lap_time"], torch.nan)
-        near = (distance(rollout["next", "state"]) < 1.0) & self.first_episode(rollout)
+        near = (distance(rollout["next", "state"]) < 1.0) & first_episode(rollout)
         return {**metrics, "lap_time": lap_time, "time_near_gate": self.control_dt * near.sum((1, 2)).to(self.dtype)}
+
+    def scenery(self) -> Scenery:
+        radius = self.track["gate_radius"]
+        return Scenery("next gate", gates=self.gates, gate_radius=radius, progress="gates_passed")
 
 
 def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:

@@ -9,7 +9,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_quad.envs.base import QuadrotorEnv, State
+from torchrl_quad.engine import State
+from torchrl_quad.envs.base import QuadrotorEnv
+from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
 from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, norm, outside, target_reward
 
 Curve = Callable[[Tensor], Tensor]
@@ -84,6 +86,11 @@ class TrackingEnv(QuadrotorEnv):
     box_height = 6.0  # [m]
     weights = TARGET_WEIGHTS
     success_radius = 0.1  # [m]
+    metric_info = {
+        **EPISODE_METRICS,
+        "tracking_rmse": Metric("tracking RMSE", "cm", 100.0, median=True, log=True),
+        "position_error": Metric("position error", "cm", 100.0, median=True, log=True),
+    }
 
     def __init__(
         self,
@@ -156,8 +163,12 @@ class TrackingEnv(QuadrotorEnv):
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Judges the episode by its ``tracking_rmse``."""
         metrics = super().episode_metrics(rollout)
-        success = (metrics["tracking_rmse"] < self.success_radius) * (1 - metrics["crash"])
-        return {**metrics, "success": success}
+        solved = (metrics["tracking_rmse"] < self.success_radius) * (1 - metrics["crash"])
+        return {**metrics, "solved": solved}
+
+    def scenery(self) -> Scenery:
+        phase = torch.linspace(0, 2 * math.pi, 129, device=self.device, dtype=self.dtype)
+        return Scenery(curve=self.curve(phase))
 
     @property
     def settling_steps(self) -> int:

@@ -1,4 +1,4 @@
-"""What may make any task harder, or more like the real one: other drones, wind, sensors, starts."""
+"""What makes any task harder, or more like the real one: other drones, wind, sensors, starts, and your own."""
 
 from __future__ import annotations
 
@@ -6,25 +6,47 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import QuadrotorParams, presets, quaternion
-from torchrl_quad.dynamics.parameters import CONTROLLER_FIELDS
-
-if TYPE_CHECKING:
-    from torchrl_quad.envs.base import QuadrotorEnv, State
+from torchrl_quad.dynamics.parameters import CONTROLLER_FIELDS, PLANT_FIELDS
+from torchrl_quad.engine import State
+from torchrl_quad.envs.randomness import Randomness
 
 _DISTRIBUTIONS = {
     "uniform": "low and high",
     "scale": "low and high, as factors of the nominal value",
     "normal": "mean and standard deviation, cut off at three of them",
 }
+MAX_WIND = 100.0  # [m/s]
 
 
-class DroneRandomization:
+class Disturbance:
+    """The protocol of all disturbances. A new one overrides what it does; ``disturbances=[MyOwn()]`` switches it on.
+
+    What it keeps between steps are entries of the state, each (n, ...): they are restored, stored and compiled with it.
+    An entry ``("drone", field)`` changes a parameter of the drone that flies, ``wind`` the air it flies in.
+    """
+
+    noise_size = 0  #: standard normal numbers that each environment needs for ``advance``
+
+    def start(self, random: Randomness, state: State) -> State:
+        """The entries that it adds to the start of an episode, or changes there; it draws from ``random`` alone."""
+        return {}
+
+    def advance(self, state: State, noise: Tensor | None, dt: float) -> State:
+        """The entries that a control step of dt [s] changes, from the state after it and noise (n, noise_size)."""
+        return {}
+
+    def observe(self, state: State) -> State:
+        """The state as the policy sees it. Rewards, crashes and success know the truth."""
+        return state
+
+
+class DroneRandomization(Disturbance):
     """Another drone in each episode: any parameter of the drone that flies, drawn at reset.
 
     A mapping, or a YAML file of one, from fields of :class:`~torchrl_quad.QuadrotorParams` to a distribution and its
@@ -37,13 +59,15 @@ class DroneRandomization:
         linear_drag: {normal: [0.005, 0.001]}        # cut off at three standard deviations
 
     "uniform" and "normal" give all entries of a field the same two numbers, "scale" each its own nominal value. The
-    values drawn stand in the state under ``("drone", field)``. The controller keeps the nominal drone.
+    values drawn are entries of the state, ``("drone", field)``. The controller keeps the nominal drone.
 
     Raises:
         ValueError: a field or distribution is unknown, belongs to the controller, or may give an impossible drone.
     """
 
-    def __init__(self, spec: str | Path | Mapping, nominal: QuadrotorParams) -> None:
+    def __init__(
+        self, spec: str | Path | Mapping, nominal: QuadrotorParams, plant_fields: Sequence[str] = PLANT_FIELDS
+    ) -> None:
         source, self.spec = presets.read("randomize", spec)
         fields = nominal.fields()
         for name, distribution in self.spec.items():
@@ -52,8 +76,8 @@ class DroneRandomization:
                     f"{source}: {name!r} belongs to the flight controller, which keeps the nominal drone; a random one "
                     "would change nothing. Give another drone instead."
                 )
-            if name not in fields or name == "rotor_spin":
-                allowed = ", ".join(field for field in fields if field not in (*CONTROLLER_FIELDS, "rotor_spin"))
+            if name not in plant_fields or name == "rotor_spin":
+                allowed = ", ".join(field for field in plant_fields if field != "rotor_spin")
                 raise ValueError(f"{source}: unknown field {name!r}. Choose from: {allowed}.")
             if not (
                 isinstance(distribution, Mapping)
@@ -78,13 +102,13 @@ class DroneRandomization:
             except ValueError as error:
                 raise ValueError(f"{source}: the drones that may be drawn are not all possible: {error}") from error
 
-    def initial(self, env: QuadrotorEnv, n: int) -> State:
-        """Draw n drones."""
+    def start(self, random: Randomness, state: State) -> State:
+        """Draw a drone for each start."""
         drawn = {}
         for name, nominal in self.nominal.items():
-            shape = (n, *nominal.shape[-QuadrotorParams.dim(name) :])
+            shape = (len(state["position"]), *nominal.shape[-QuadrotorParams.dim(name) :])
             is_normal = "normal" in self.spec[name]
-            unit = env.normal(*shape).clamp(-3.0, 3.0) / 3.0 if is_normal else env.uniform(*shape)
+            unit = random.normal(*shape).clamp(-3.0, 3.0) / 3.0 if is_normal else random.uniform(*shape)
             drawn["drone", name] = self._value(name, unit)
         return drawn
 
@@ -98,10 +122,10 @@ class DroneRandomization:
 
 
 @dataclasses.dataclass(frozen=True)
-class Wind:
+class Wind(Disturbance):
     """A mean wind for each episode, and gusts about it: a first-order Gauss-Markov process, per axis and in time.
 
-    Stands in the state as ``mean_wind`` and ``wind``, each (3) [m/s], world frame, and is held over a control step.
+    Entries of the state: ``mean_wind`` and ``wind``, each (3) [m/s], world frame, held over a control step.
 
     Raises:
         ValueError: a value is negative, not finite, or has the wrong number of entries.
@@ -122,24 +146,38 @@ class Wind:
             raise ValueError(f"wind: gust must be zero or positive [m/s], got {self.gust!r}.")
         if not (_is_number(self.gust_time) and self.gust_time > 0):
             raise ValueError(f"wind: gust_time must be positive [s], got {self.gust_time!r}.")
+        strongest = max(abs(m) + s for m, s in zip(self.mean, self.spread, strict=True)) + 5.0 * self.gust
+        if strongest > MAX_WIND:
+            raise ValueError(
+                f"wind: mean, spread and five times the gust add up to {strongest:g} m/s; the model holds up to "
+                f"{MAX_WIND:g} m/s."
+            )
 
-    def initial(self, env: QuadrotorEnv, n: int) -> State:
-        """Draw n mean winds, and gusts in their steady state."""
-        mean = env.tensor(self.mean) + env.tensor(self.spread) * env.uniform(n, 3)
-        return {"mean_wind": mean, "wind": mean + self.gust * env.normal(n, 3) if self.gust else mean.clone()}
+    @property
+    def noise_size(self) -> int:
+        """Gusts need one number for each axis."""
+        return 3 if self.gust else 0
 
-    def advance(self, state: State, noise: Tensor, time: float) -> State:
-        """The wind a time [s] later, with standard normal noise (*, 3)."""
-        decay = math.exp(-time / self.gust_time)
+    def start(self, random: Randomness, state: State) -> State:
+        """Draw mean winds, and gusts in their steady state."""
+        n = len(state["position"])
+        mean = random.tensor(self.mean) + random.tensor(self.spread) * random.uniform(n, 3)
+        return {"mean_wind": mean, "wind": mean + self.gust * random.normal(n, 3) if self.gust else mean.clone()}
+
+    def advance(self, state: State, noise: Tensor | None, dt: float) -> State:
+        """The wind a time dt [s] later."""
+        if noise is None:
+            return {}
+        decay = math.exp(-dt / self.gust_time)
         gust = self.gust * math.sqrt(1.0 - decay * decay) * noise
         return {"wind": torch.lerp(state["mean_wind"], state["wind"], decay) + gust}
 
 
 @dataclasses.dataclass(frozen=True)
-class Sensors:
-    """What the policy is told of the drone: late, and with white noise. Rewards, crashes and success know the truth.
+class Sensors(Disturbance):
+    """What the policy sees of the drone: late, and with white noise. Rewards, crashes and success know the truth.
 
-    Stands in the state as ``measurements`` (delay + 1, 13), oldest first: position, quaternion, velocity and angular
+    Entry of the state: ``measurements`` (delay + 1, 13), oldest first: position, quaternion, velocity and angular
     velocity, as measured.
 
     Raises:
@@ -160,25 +198,21 @@ class Sensors:
             raise ValueError(f"observation_delay must be zero or more control steps, got {self.delay!r}.")
 
     @property
-    def has_noise(self) -> bool:
-        """Whether measurements differ from the truth."""
-        return any((self.position, self.attitude, self.velocity, self.angular_velocity))
+    def noise_size(self) -> int:
+        """Three numbers for each of the four measurements."""
+        return 12 if any((self.position, self.attitude, self.velocity, self.angular_velocity)) else 0
 
-    @property
-    def are_perfect(self) -> bool:
-        """Whether the policy is told the truth, and at once."""
-        return not self.has_noise and self.delay == 0
-
-    def initial(self, state: State, noise: Tensor | None) -> State:
-        """A queue full of the first measurement, with standard normal noise (*, 12)."""
+    def start(self, random: Randomness, state: State) -> State:
+        """A queue full of the first measurement."""
+        noise = random.normal(len(state["position"]), 12) if self.noise_size else None
         return {"measurements": self._measure(state, noise).expand(-1, self.delay + 1, -1).clone()}
 
-    def advance(self, state: State, noise: Tensor | None) -> State:
-        """Measure once more, with standard normal noise (*, 12), and forget the oldest measurement."""
+    def advance(self, state: State, noise: Tensor | None, dt: float) -> State:
+        """Measure once more, and forget the oldest measurement."""
         return {"measurements": torch.cat((state["measurements"][:, 1:], self._measure(state, noise)), 1)}
 
-    def observed(self, state: State) -> State:
-        """The state as the policy is told: the oldest measurement in the place of the truth."""
+    def observe(self, state: State) -> State:
+        """The state with the oldest measurement instead of the truth."""
         position, attitude, velocity, angular_velocity = state["measurements"][:, 0].split((3, 4, 3, 3), -1)
         return {
             **state,
@@ -201,7 +235,7 @@ class Sensors:
 
 
 @dataclasses.dataclass(frozen=True)
-class RandomStart:
+class RandomStart(Disturbance):
     """Episodes that do not start level and at rest: what is drawn here is added to the task's own start.
 
     Raises:
@@ -219,22 +253,22 @@ class RandomStart:
             if not (_is_number(value) and value >= 0):
                 raise ValueError(f"random_start: {field.name} must be zero or positive, got {value!r}.")
 
-    def initial(self, env: QuadrotorEnv, state: State) -> State:
+    def start(self, random: Randomness, state: State) -> State:
         """Turn and push the starts of a task."""
         n = len(state["position"])
-        heading, tilt = math.pi * env.uniform(n, 1), 0.5 * self.tilt * (env.uniform(n, 1) + 1.0)
+        heading, tilt = math.pi * random.uniform(n, 1), 0.5 * self.tilt * (random.uniform(n, 1) + 1.0)
         zero = torch.zeros_like(tilt)
         tilting = quaternion.from_axis_angle(torch.cat((tilt * heading.cos(), tilt * heading.sin(), zero), -1))
-        turning = quaternion.from_axis_angle(torch.cat((zero, zero, self.yaw * env.uniform(n, 1)), -1))
+        turning = quaternion.from_axis_angle(torch.cat((zero, zero, self.yaw * random.uniform(n, 1)), -1))
         return {
             "quaternion": quaternion.multiply(turning, quaternion.multiply(tilting, state["quaternion"])),
-            "velocity": state["velocity"] + self.velocity * env.uniform(n, 3),
-            "angular_velocity": state["angular_velocity"] + self.angular_velocity * env.uniform(n, 3),
+            "velocity": state["velocity"] + self.velocity * random.uniform(n, 3),
+            "angular_velocity": state["angular_velocity"] + self.angular_velocity * random.uniform(n, 3),
         }
 
 
 def build(cls: type, name: str, spec: Any, **more: Any) -> Any:
-    """An option from its mapping, or the option itself, with what is given (not zero) beside it.
+    """A disturbance from its mapping, or the disturbance itself, with what is given (not zero) beside it.
 
     Raises:
         ValueError: it is neither, or has an unknown key.
@@ -251,8 +285,36 @@ def build(cls: type, name: str, spec: Any, **more: Any) -> Any:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _is_numbers(value: Any, count: int) -> bool:
     return isinstance(value, Sequence) and len(value) == count and all(_is_number(x) for x in value)
+
+
+def choose_disturbances(
+    nominal: QuadrotorParams,
+    plant_fields: Sequence[str],
+    random_start: Any,
+    randomize: Any,
+    wind: Any,
+    observation_noise: Any,
+    observation_delay: int,
+    more: Sequence[Disturbance],
+) -> dict[str, Disturbance]:
+    """The disturbances that an environment's arguments ask for, by name, in the order in which they act."""
+    chosen: dict[str, Disturbance] = {}
+    if random_start:
+        chosen["random_start"] = build(RandomStart, "random_start", random_start)
+    if randomize:
+        chosen["randomize"] = DroneRandomization(randomize, nominal, plant_fields)
+    if wind is not None:
+        chosen["wind"] = build(Wind, "wind", wind)
+    sensors = build(Sensors, "observation_noise", observation_noise or {}, delay=observation_delay)
+    if sensors.noise_size or sensors.delay:
+        chosen["sensors"] = sensors
+    for disturbance in more:
+        if not isinstance(disturbance, Disturbance):
+            raise TypeError(f"disturbances: each must be a Disturbance, got {type(disturbance).__name__}.")
+        chosen[f"{type(disturbance).__name__}_{len(chosen)}"] = disturbance
+    return chosen

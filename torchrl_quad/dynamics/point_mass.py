@@ -1,0 +1,96 @@
+"""A point mass with an attitude: the simplification that much of the literature trains on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchrl_quad.dynamics import quaternion
+from torchrl_quad.dynamics.control import FlightController
+from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
+from torchrl_quad.dynamics.rigid_body import drag
+from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, stack
+
+
+class PointMass:
+    """Thrust and body rates follow the command at once: no rotors, no rate controller, no moments.
+
+    An implementation of :class:`~torchrl_quad.dynamics.Dynamics`. Drag, mass and gravity are those of the drone. Each
+    physics step turns the attitude with the commanded rate, then moves velocity and position (semi-implicit Euler, the
+    only integrator here). It flies commands that the rotors of the drone may not reach.
+
+    Args:
+        nominal: the drone whose weight and limits scale the action.
+        dt: physics step [s].
+        substeps: physics steps in a control step.
+        integrator: must be "semi_implicit_euler".
+
+    Raises:
+        ValueError: another integrator is asked for.
+    """
+
+    sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}
+    plant_fields = ("mass", "linear_drag", "quadratic_drag", "gravity")
+
+    def __init__(self, nominal: QuadrotorParams, dt: float, substeps: int, integrator: str) -> None:
+        if integrator != "semi_implicit_euler":
+            raise ValueError(
+                f'dynamics="point_mass" knows the integrator "semi_implicit_euler" alone, got {integrator!r}.'
+            )
+        self.controller = FlightController(nominal)
+        self.nominal, self.hover_action = self.controller.nominal, self.controller.hover_action
+        self.dt, self.substeps, self.limits = dt, substeps, {}
+
+    def rest(self, position: Tensor) -> dict[str, Tensor]:
+        """Level and still, at the positions (n, 3) [m]."""
+        still = torch.zeros_like(position)
+        level = quaternion.identity(position)
+        return {"position": position, "quaternion": level, "velocity": still, "angular_velocity": still.clone()}
+
+    def control_step(
+        self, state: dict[str, Tensor], action: Tensor, params: QuadrotorParams, wind: Tensor | None
+    ) -> dict[str, Tensor]:
+        """The entries of the drone after one control step."""
+        thrust, rates = self.controller.setpoint(action)
+        position, attitude, velocity = state["position"], state["quaternion"], state["velocity"]
+        for _ in range(self.substeps):
+            position, attitude, velocity = _step(position, attitude, velocity, thrust, rates, params, self.dt, wind)
+        return {"position": position, "quaternion": attitude, "velocity": velocity, "angular_velocity": rates}
+
+    def setpoint_rows(self, action: Tensor) -> Tensor:
+        """Thrust [N] and body rates [rad/s] of an action (n, 4), as rows (4, n)."""
+        return torch.cat([x.t() for x in self.controller.setpoint(action)])
+
+    def rows_step(self) -> Callable[..., Tensor]:
+        """A physics step on rows (13, n), for a compiler."""
+        nominal, dt = self.controller.unbind().nominal, self.dt
+
+        def step(x: Tensor, setpoint: Tensor, plant: tuple[Tensor, ...], wind: tuple[Tensor, ...]) -> Tensor:
+            rows, command = Components(x.unbind()), Components(setpoint.unbind())
+            thrust, rates, params = command[..., :1], command[..., 1:], nominal
+            if plant:
+                params = RawParams(**{k: Components(v.unbind()) for k, v in zip(self.plant_fields, plant, strict=True)})
+            air = Components(wind[0].unbind()) if wind else None
+            after = _step(rows[..., :3], rows[..., 3:7], rows[..., 7:10], thrust, rates, params, dt, air)
+            return stack(cat(*after, rates))
+
+        return step
+
+
+def _step(
+    position: Vector,
+    attitude: Vector,
+    velocity: Vector,
+    thrust: Vector,
+    rates: Vector,
+    params: QuadrotorParams,
+    dt: float,
+    wind: Vector | None,
+) -> tuple[Vector, Vector, Vector]:
+    attitude = quaternion.normalize(attitude + quaternion.derivative(attitude, rates) * dt)
+    air = velocity if wind is None else velocity - wind
+    force = drag(quaternion.rotate_inverse(attitude, air), params) + along_z(thrust)
+    velocity = velocity + (quaternion.rotate(attitude, force / params.mass) - along_z(params.gravity)) * dt
+    return position + velocity * dt, attitude, velocity

@@ -1,0 +1,12 @@
+"""The engine: a pure control step becomes a fast horizon with its graph. It knows no quadrotor.
+
+It takes a :class:`Simulation`, packs its entries into rows, compiles it and its derivative where asked to, and loops it
+through the ends of episodes.
+"""
+
+from torchrl_quad.engine.horizon import can_fly, fly
+from torchrl_quad.engine.packing import flat, nested
+from torchrl_quad.engine.simulation import Simulation, State, Transition
+from torchrl_quad.engine.stepper import Stepper
+
+__all__ = ["Simulation", "State", "Stepper", "Transition", "can_fly", "flat", "fly", "nested"]

@@ -1,0 +1,94 @@
+"""How the many entries of a state become the rows of a few tensors, and how names of nested entries are written.
+
+A tensordict with its thirty entries costs far more than the physics of a step. Inside a horizon all entries of one kind
+lie below each other as the rows of one tensor. Only the finished horizon becomes a tensordict again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+Key = str | tuple[str, ...]
+Entries = Mapping[Any, Tensor]
+
+
+class Rows(NamedTuple):
+    """Entries of a batch of n, below each other by kind; each (rows, n), or (time, rows, n) for a horizon."""
+
+    floats: Tensor
+    integers: Tensor
+    flags: Tensor
+
+    def detach(self) -> Rows:
+        """The same without gradient."""
+        return Rows(*(x.detach() for x in self))
+
+    def where(self, condition: Tensor, other: Rows) -> Rows:
+        """These where the condition holds, the others elsewhere."""
+        return Rows(*(torch.where(condition, mine, its) for mine, its in zip(self, other, strict=True)))
+
+
+class Layout:
+    """Which rows hold which entry (n, ...), in the order of the entries."""
+
+    def __init__(self, entries: Entries) -> None:
+        self.place: dict[Key, tuple[int, slice, torch.Size]] = {}
+        heights = [0, 0, 0]
+        for key, x in entries.items():
+            kind = 0 if x.is_floating_point() else 2 if x.dtype == torch.bool else 1
+            height = x[0].numel()
+            self.place[key] = (kind, slice(heights[kind], heights[kind] + height), x.shape[1:])
+            heights[kind] += height
+        self.dtypes = next(x.dtype for x in entries.values() if x.is_floating_point()), torch.int64, torch.bool
+
+    def pack(self, entries: Entries) -> Rows:
+        """The rows of the entries, each (n, ...)."""
+        columns: list[list[Tensor]] = [[], [], []]
+        for key, (kind, _, _) in self.place.items():
+            columns[kind].append(entries[key].flatten(1).t())
+        like = next(iter(entries.values()))
+        return Rows(
+            *(
+                torch.cat(column) if column else like.new_empty((0, len(like)), dtype=dtype)
+                for column, dtype in zip(columns, self.dtypes, strict=True)
+            )
+        )
+
+    def unpack(self, rows: Rows) -> dict[Key, Tensor]:
+        """Views of the entries, each (n, ...), or (n, time, ...) of a horizon."""
+        entries = {}
+        for key, (kind, where, shape) in self.place.items():
+            x = rows[kind][..., where, :].movedim(-1, 0)
+            entries[key] = x if len(shape) == 1 else x.unflatten(-1, shape)
+        return entries
+
+
+def flat(entries: Mapping[Any, Any], *prefix: str) -> dict[Key, Tensor]:
+    """The entries of nested mappings, by one key each."""
+    result = {}
+    for key, value in entries.items():
+        path = (*prefix, *key) if isinstance(key, tuple) else (*prefix, key)
+        result |= flat(value, *path) if isinstance(value, Mapping) else {flat_key(path): value}
+    return result
+
+
+def nested(entries: Entries) -> dict[str, Any]:
+    """The reverse of :func:`flat`."""
+    result: dict[str, Any] = {}
+    for key, value in entries.items():
+        *path, last = key if isinstance(key, tuple) else (key,)
+        inner = result
+        for name in path:
+            inner = inner.setdefault(name, {})
+        inner[last] = value
+    return result
+
+
+def flat_key(key: Any, *more: str) -> Key:
+    """A key of a tensordict as :func:`flat` writes it: a string, or a tuple of two strings and more."""
+    path = (*key, *more) if isinstance(key, tuple) else (key, *more)
+    return path if len(path) > 1 else path[0]

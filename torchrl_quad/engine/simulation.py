@@ -1,0 +1,56 @@
+"""What the engine flies: any control step that is a pure function, in three parts."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+from torch import Tensor
+
+State = dict[Any, Tensor]  # entries (n, ...) by name; a nested entry has a tuple of names
+
+
+class Transition(NamedTuple):
+    """Where a control step leads."""
+
+    state: State  #: the state at its end
+    outputs: State  #: observation, reward, flags and so on
+    valid: Tensor  #: bool (n): False where the numbers became meaningless; no gradient passes through those
+
+
+class Simulation(Protocol):
+    """A control step, whole for an eager flight, and in three parts for a compiled one.
+
+    The parts exist because a compiler that sees a whole step unrolls its physics steps and takes minutes.
+    """
+
+    substeps: int
+    """How often ``substep`` runs between ``begin`` and ``finish``."""
+
+    parameters: tuple[Tensor, ...]
+    """Tensors beside state and action that gradients may reach, such as the mass of a drone."""
+
+    def example(self) -> tuple[State, State]:
+        """A state, and outputs of the kind that a step gives; the engine reads names, shapes and types."""
+
+    def check_action(self, action: Tensor | None) -> None:
+        """Refuse an action of the wrong shape, precision or device."""
+
+    def guard(self, state: State) -> tuple[State, Tensor]:
+        """The state with safe entries where it is meaningless, and bool (n) that says where it was meaningful."""
+
+    def __call__(self, state: State, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Transition:
+        """The whole step."""
+
+    def begin(
+        self, state: State, valid: Tensor, action: Tensor, parameters: tuple[Tensor, ...]
+    ) -> tuple[State, Tensor, Tensor, tuple[Any, ...]]:
+        """The state with the action in it, ``valid``, the rows ``x`` (k, n) that substeps move, and their inputs.
+
+        Every input of a substep is a tensor (k, n), or a tuple of some.
+        """
+
+    def rows_step(self) -> Any:
+        """The function ``substep(x, *inputs)``, which returns the next ``x``."""
+
+    def finish(self, before: State, x: Tensor, valid: Tensor, noise: dict[str, Tensor]) -> Transition:
+        """The end of the step, from what ``begin`` returned and the last ``x``."""

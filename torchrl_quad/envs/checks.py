@@ -1,0 +1,300 @@
+"""What environments refuse, with what is wrong, why, and what to write instead."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import math
+import numbers
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_quad.dynamics import DYNAMICS, INTEGRATORS, QuadrotorParams
+from torchrl_quad.engine import State
+from torchrl_quad.envs.guard import is_traced
+
+# Beyond these an environment would not fit into memory, or take for ever to build.
+MAX_ENVS, MAX_DELAY, MAX_STEPS = 10_000_000, 1_000, 2**31
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise a ValueError with this message unless the condition holds."""
+    if not condition:
+        raise ValueError(message)
+
+
+def require_count(name: str, value: Any, least: int, most: int, rule: str | None = None) -> None:
+    """Refuse what is not a whole number from ``least`` to ``most``."""
+    is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    require(is_whole, f"{name} must be a whole number, got {value!r}.")
+    require(value >= least, f"{name} must be {rule or f'at least {least}'}, got {value}.")
+    require(value <= most, f"{name} must be at most {most:,}, got {value}.")
+
+
+def names(keys: Iterable[Any]) -> str:
+    """Keys in a sentence."""
+    return ", ".join(str(key) for key in keys)
+
+
+# -- arguments ---------------------------------------------------------------------------------------------------------
+
+
+def check_arguments(
+    num_envs: Any,
+    dtype: Any,
+    seed: Any,
+    dynamics: Any,
+    dt: Any,
+    control_dt: Any,
+    action_delay: Any,
+    integrator: Any,
+    max_episode_steps: Any,
+    observe_last_action: Any,
+) -> int:
+    """Refuse arguments of an environment that are out of range; return the physics steps in a control step."""
+    require_count("num_envs", num_envs, 1, MAX_ENVS)
+    require(dtype in (torch.float32, torch.float64), f"dtype must be torch.float32 or torch.float64, got {dtype}.")
+    is_seed = seed is None or (isinstance(seed, numbers.Integral) and 0 <= seed < 2**63)
+    require(is_seed, f"seed must be a whole number from 0, or None for another one each time; got {seed!r}.")
+    require(dynamics in list(DYNAMICS), f"Unknown dynamics {dynamics!r}. Choose from: {names(DYNAMICS)}.")
+    for name, value in (("dt", dt), ("control_dt", control_dt)):
+        is_time = isinstance(value, numbers.Real) and 0 < value < math.inf
+        require(is_time, f"{name} must be positive and finite, got {value!r}.")
+    substeps = round(control_dt / dt)
+    require(
+        1 <= substeps <= MAX_DELAY and math.isclose(substeps * dt, control_dt, rel_tol=1e-6),
+        f"control_dt must be a whole multiple of dt, and at most {MAX_DELAY} of them; got {control_dt} and {dt}. Try "
+        f"control_dt={min(max(substeps, 1), MAX_DELAY) * dt:g}.",
+    )
+    require_count("action_delay", action_delay, 0, MAX_DELAY, "zero or more control steps")
+    require(integrator in INTEGRATORS, f"Unknown integrator {integrator!r}. Choose from: {names(INTEGRATORS)}.")
+    require_count("max_episode_steps", max_episode_steps, 1, MAX_STEPS)
+    require(
+        action_delay > 0 or not observe_last_action,
+        "observe_last_action shows the commands that are on their way; with action_delay=0 there are none.",
+    )
+    return substeps
+
+
+def refuse_unknown(cls: type, unknown: Iterable[str]) -> None:
+    """Refuse keyword arguments that a task does not have, with the closest one that it has."""
+    for name in unknown:
+        known = sorted(set(inspect.signature(cls).parameters) - {"kwargs"})
+        close = difflib.get_close_matches(name, known, 1)
+        hint = f" Did you mean {close[0]!r}?" if close else ""
+        raise TypeError(
+            f"{cls.__name__} got an unexpected keyword argument {name!r}.{hint} Choose from: {names(known)}."
+        )
+
+
+def full_signature(cls: type, base: type) -> inspect.Signature:
+    """All arguments of a task: its own, then those it hands on to its base, then ``compile``, which TorchRL takes."""
+    arguments: dict[str, inspect.Parameter] = {}
+    for owner in cls.__mro__[: cls.__mro__.index(base)]:
+        parameters = inspect.signature(vars(owner)["__init__"]).parameters if "__init__" in vars(owner) else {}
+        for name, argument in parameters.items():
+            if name != "self" and argument.kind is not argument.VAR_KEYWORD:
+                arguments.setdefault(name, argument)
+    option = inspect.Parameter("compile", inspect.Parameter.KEYWORD_ONLY, default=False, annotation="bool | dict")
+    return inspect.Signature([*arguments.values(), option])
+
+
+def checked_weights(weights: Any, known: Mapping[str, float]) -> Mapping[str, float]:
+    """Weights of reward terms, if the task has these terms and they are finite numbers."""
+    require(
+        isinstance(weights, Mapping), f"weights must be a mapping from terms of the reward to numbers, got {weights!r}."
+    )
+    unknown = [str(name) for name in weights if name not in known]
+    require(not unknown, f"weights: unknown term {names(unknown)}. Choose from: {names(known)}.")
+    for name, value in weights.items():
+        x = value.detach() if isinstance(value, Tensor) else value
+        is_number = x.numel() == 1 if isinstance(x, Tensor) else isinstance(x, numbers.Real)
+        require(is_number and math.isfinite(float(x)), f"weights: {name} must be a finite number, got {value!r}.")
+    return weights
+
+
+def check_params(params: Any, num_envs: int) -> None:
+    """Refuse what is not a drone, or a drone for another number of environments."""
+    if not isinstance(params, QuadrotorParams):
+        raise TypeError(
+            f"params must be QuadrotorParams, such as env.params.replace(mass=0.5) or load_drone('visfly'); got "
+            f"{type(params).__name__}."
+        )
+    for name, value in params.fields().items():
+        batch = value.shape[0] if value.dim() > params.dim(name) else 1
+        require(batch in (1, num_envs), f"drone: field {name!r} is for {batch} environments, and num_envs={num_envs}.")
+
+
+def check_task(env: Any, state: State) -> None:
+    """Refuse a task whose methods do not return what the base class says.
+
+    A tensor with more columns than it should have would shift all that lies behind it.
+    """
+    task, n = type(env).__name__, env.num_envs
+
+    def check(method: str, x: Any, dtype: torch.dtype | None, columns: int | None = 1, hint: str = "") -> None:
+        is_right = isinstance(x, Tensor) and x.shape == (n, columns or x.shape[-1:].numel())
+        if not is_right or dtype not in (None, x.dtype):
+            got = f"{tuple(x.shape)}, {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
+            kind = "" if dtype is None else f", {dtype}"
+            raise ValueError(f"{task}.{method} must be a tensor ({n}, {columns or 'k'}){kind}; got {got}.{hint}")
+
+    def named(method: str, entries: Any) -> Mapping[Any, Any]:
+        message = f"{task}.{method} must be a mapping from names to tensors; got {type(entries).__name__}."
+        require(isinstance(entries, Mapping), message)
+        return entries
+
+    for key, x in state.items():
+        require(
+            isinstance(x, Tensor) and x.dim() > 1 and len(x) == n,
+            f"{task}.initial_state: entry {key!r} must be a tensor ({n}, ...) of at least two dimensions; got "
+            f"{tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__}.",
+        )
+        if isinstance(key, tuple) and key[0] == "drone":
+            fields = env.dynamics.plant_fields
+            require(key[1] in fields, f"Entry {key!r} changes no parameter of the drone. Choose from: {names(fields)}.")
+    check("observe(state)", env.observe(state), env.dtype, None)
+    for name, term in named("reward_terms(state)", env.reward_terms(state)).items():
+        hint = " Sum a vector over its components: .sum(-1, keepdim=True)."
+        check(f"reward_terms(state)[{name!r}]", term, env.dtype, hint=hint)
+    for name, metric in named("metrics(state)", env.metrics(state)).items():
+        check(f"metrics(state)[{name!r}]", metric, None)
+    for method in ("is_crash", "is_success"):
+        check(f"{method}(state)", getattr(env, method)(state), torch.bool)
+    advanced = named("advance(previous, state)", env.advance(state, dict(state)))
+    for key in env.task_entries:
+        x = advanced.get(key)
+        kind, got = (tuple(state[key].shape), state[key].dtype), None if x is None else (tuple(x.shape), x.dtype)
+        require(
+            got == kind,
+            f"{task}.advance must return the whole state, and {key!r} as initial_state gives it, {kind}; got {got}. "
+            "Start from {**state, ...}.",
+        )
+
+
+# -- states and actions ------------------------------------------------------------------------------------------------
+
+
+def read_state(state: Any, safe_state: State, source: str) -> State:
+    """The entries of a state (a tensordict), if all are there with the right shape, precision and device."""
+    require(
+        isinstance(state, TensorDictBase),
+        f'{source}: a state is a tensordict, such as env.reset()["state"]; got {type(state).__name__}.',
+    )
+    entries = {key: state.get(key, None) for key in safe_state}
+    for key, x in entries.items():
+        like = safe_state[key]
+        if x is None or x.shape != like.shape or x.dtype != like.dtype or x.device != like.device:
+            _refuse_entry(entries, key, safe_state, source)
+    return entries
+
+
+def restore_state(env: Any, state: Any, source: str, mask: Tensor | None = None) -> State:
+    """A copy of a state to fly from, in the precision and on the device of the environment.
+
+    Args:
+        env: the environment.
+        state: a tensordict with all entries of its state.
+        source: where the state comes from, for messages.
+        mask: which environments it is for, bool (n) or (n, 1); all for None. The others may hold anything.
+    """
+    step = env.control_step
+    require(
+        isinstance(state, TensorDictBase),
+        f'{source}: a state is a tensordict, such as env.reset()["state"]; got {type(state).__name__}.',
+    )
+    entries = {key: state.get(key, None) for key in step.safe_state}
+    for key, x in entries.items():
+        like = step.safe_state[key]
+        if x is None or x.shape != like.shape or _kind(x) != _kind(like):
+            _refuse_entry(entries, key, step.safe_state, source)
+    entries = {key: x.to(step.safe_state[key], copy=True) for key, x in entries.items()}
+    if is_traced():
+        return entries
+    wrong = step.guard.complaints(entries)
+    for key, (low, high) in {"step": (0, MAX_STEPS), **env.state_bounds()}.items():
+        outside = ~((entries[key] >= low) & (entries[key] <= high)).flatten(1).all(1)
+        wrong[f"{key!r} must lie between {low} and {high}"] = outside
+    for complaint, where in wrong.items():
+        where = where if mask is None else where & mask.flatten()
+        require(
+            not where.any(),
+            f"{source}: no drone can fly from the state of environments {first_ten(where)}: {complaint}.",
+        )
+    return entries
+
+
+def check_action(action: Tensor | None, like: Tensor) -> None:
+    """Refuse an action that is not (n, 4) of the precision and on the device of a tensor (n, ...)."""
+    if (
+        action is not None
+        and action.shape == (len(like), 4)
+        and action.dtype == like.dtype
+        and action.device == like.device
+    ):
+        return
+    if action is None or action.shape != (len(like), 4):
+        got = "there is none" if action is None else f"got {tuple(action.shape)}"
+        raise ValueError(
+            f"The action must have shape ({len(like)}, 4), thrust and three body rates for each environment; {got}. A "
+            'policy writes it under "action", as make_actor(env) does.'
+        )
+    if action.device != like.device:
+        raise ValueError(f"The action is on {action.device}, and the environment on {like.device}.")
+    raise ValueError(
+        f"The action is {action.dtype}, and the environment flies in {like.dtype}. Convert the policy, "
+        f"policy.to({like.dtype}), or build the environment with dtype={action.dtype}."
+    )
+
+
+def require_finite(action: Tensor) -> None:
+    """Refuse actions (n, 4), or (n, time, 4) of a horizon, that are not finite.
+
+    Raises:
+        ValueError: some are not, with their environments and the first step.
+    """
+    if is_traced():
+        return
+    finite = action.isfinite().all(-1)
+    if finite.all():
+        return
+    broken = ~finite if action.dim() == 3 else ~finite.unsqueeze(1)
+    at = f", first at step {broken.any(0).nonzero()[0].item()} of the rollout" if action.dim() == 3 else ""
+    raise ValueError(
+        f"The action is not finite in environments {first_ten(broken.any(1))}{at}: the weights of the policy are "
+        "broken, or what it reads is. Look for NaN in both; if training made them, clip the norm of the gradient, and "
+        "skip updates whose gradient is not finite."
+    )
+
+
+def first_ten(flags: Tensor) -> str:
+    """The indices of the first flags (n) that are set, for a message."""
+    who = flags.nonzero().flatten().tolist()
+    return ", ".join(str(i) for i in who[:10]) + (", ..." if len(who) > 10 else "")
+
+
+def _kind(x: Tensor) -> str:
+    if x.dtype == torch.bool:
+        return "bool"
+    return "floating point" if x.is_floating_point() else "complex" if x.is_complex() else "whole numbers"
+
+
+def _refuse_entry(entries: Mapping[Any, Any], key: Any, safe_state: State, source: str) -> None:
+    missing = [key for key, x in entries.items() if x is None]
+    require(
+        not missing,
+        f"{source}: the state lacks {names(missing)}. A state is restored whole: take it from a tensordict of this "
+        f"environment, which holds {names(safe_state)}.",
+    )
+    x, like = entries[key], safe_state[key]
+    shape, expected = tuple(x.shape), tuple(like.shape)
+    require(shape == expected, f"{source}: state {key!r} has shape {shape}, expected {expected}.")
+    require(_kind(x) == _kind(like), f"{source}: state {key!r} must be {_kind(like)}, got {x.dtype}.")
+    raise ValueError(
+        f"{source}: state {key!r} is {x.dtype} on {x.device}, and this environment {like.dtype} on {like.device}. "
+        "Convert it: env.reset(tensordict, set_state=True) does."
+    )

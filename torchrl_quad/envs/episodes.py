@@ -1,0 +1,31 @@
+"""Where episodes end in a rollout, and what was measured there."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from torch import Tensor
+
+
+def first_episode(rollout: TensorDictBase) -> Tensor:
+    """Marks the steps of a rollout up to and with the first end of each environment, bool (num_envs, time, 1)."""
+    done = rollout["next", "done"]
+    return (done.cumsum(1) - done.int()) == 0
+
+
+def at_episode_end(rollout: TensorDictBase, value: Tensor) -> Tensor:
+    """A value (num_envs, time, 1) at the last step of the first episode of each environment, (num_envs)."""
+    last = first_episode(rollout).sum(1, keepdim=True) - 1
+    return value.gather(1, last).flatten()
+
+
+def summarise_episodes(rollout: TensorDictBase) -> dict[str, Tensor]:
+    """What the first episode of each environment came to; see ``QuadrotorEnv.episode_metrics``."""
+    ends, first = rollout["next"], first_episode(rollout)
+    crash, success = (at_episode_end(rollout, ends[name]) for name in ("crash", "success"))
+    dtype = ends["reward"].dtype
+    return {
+        "return": (ends["reward"] * first).sum(1).squeeze(-1),
+        "crash": crash.to(dtype),
+        "solved": (success & ~crash).to(dtype),
+        **{name: at_episode_end(rollout, value) for name, value in ends.get("metrics", {}).items()},
+    }

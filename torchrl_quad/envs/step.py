@@ -1,0 +1,155 @@
+"""One control step, for any task and any drone: the one place that says what it is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_quad.dynamics import QuadrotorParams
+from torchrl_quad.dynamics.parameters import RawParams
+from torchrl_quad.engine import State, Transition, flat
+from torchrl_quad.envs.checks import check_action
+from torchrl_quad.envs.guard import MAX_VALUE, Containment, Guard, is_traced, like
+
+
+class ControlStep:
+    """Queue the action, fly, disturb, guard, advance the task, judge: a pure function from entries to entries.
+
+    An eager flight calls it. The engine compiles ``begin``, the physics and ``finish``, which share every line with it.
+
+    Args:
+        env: its ``dynamics`` fly, its ``disturbances`` disturb, its task advances and judges.
+        safe_state: takes over where a state is meaningless.
+    """
+
+    def __init__(self, env: Any, safe_state: State) -> None:
+        self.env, self.dynamics, self.substeps = env, env.dynamics, env.dynamics.substeps
+        self.safe_state, self.guard = safe_state, Guard(safe_state, env.dynamics, env.task_entries)
+        self.drawn = [key[1] for key in safe_state if isinstance(key, tuple) and key[0] == "drone"]
+
+    def __call__(self, state: State, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Transition:
+        """The whole step, eager; ``valid`` (n) is False where the state was meaningless and the episode ends."""
+        params, contain = self.env.params, None
+        if torch.is_grad_enabled() and not is_traced():
+            contain = Containment()
+            state, action, params = contain.enter(state, action, params)
+        state, applied, valid = self.queue(state, valid, action)
+        drone = self.dynamics.control_step(state, applied, self.plant_params(params, state), state.get("wind"))
+        end = self.judge(state, drone, valid, noise)
+        if contain is not None:
+            contain.valid = end.valid
+        return end
+
+    # -- what happens, in order ----------------------------------------------------------------------------------------
+
+    def queue(self, state: State, valid: Tensor, action: Tensor) -> tuple[State, Tensor, Tensor]:
+        """The state with the action queued, the action (n, 4) that takes effect now, and where both make sense (n)."""
+        valid = valid & (action.detach().abs().amax(1) < MAX_VALUE)
+        action = torch.where(valid.unsqueeze(1), action, self.dynamics.hover_action)
+        if "action_queue" not in state:
+            return state, action, valid
+        queue = torch.cat((state["action_queue"], action.unsqueeze(1)), 1)
+        return {**state, "action_queue": queue[:, 1:]}, queue[:, 0], valid
+
+    def plant_params(self, params: QuadrotorParams, state: State) -> Any:
+        """The parameters of the drones that fly: those given, with what each episode has drawn."""
+        drawn = {name: state["drone", name] for name in self.drawn}
+        return RawParams(**{**params.fields(), **drawn}) if drawn else params
+
+    def apply_disturbances(self, state: State, noise: dict[str, Tensor]) -> State:
+        """The state with what wind, sensors and so on have made of it in this step."""
+        for name, disturbance in self.env.disturbances.items():
+            state = {**state, **disturbance.advance(state, noise.get(name), self.env.control_dt)}
+        return state
+
+    def judge(self, before: State, drone: State, valid: Tensor, noise: dict[str, Tensor]) -> Transition:
+        """Where the step leads, from the state at its start and where the drone has flown."""
+        env = self.env
+        state = self.apply_disturbances({**before, **drone, "step": before["step"] + 1}, noise)
+        state, meaningful = self.guard(state)
+        valid = valid & meaningful
+        keep = valid.unsqueeze(1)
+        if env.task_advances:
+            advanced = env.advance(before, state)
+            for key in env.task_entries:
+                state[key] = torch.where(like(keep, state[key]), advanced[key], state[key])
+        terms = {name: torch.where(keep, term, 0.0) for name, term in env.reward_terms(state).items()}
+        crash, success = env.is_crash(state) | ~keep, env.is_success(state) & keep
+        terminated = crash | success if env.ends_on_success else crash
+        truncated = state["step"] >= env.max_episode_steps
+        outputs = {
+            **self.measure(state),
+            "reward": sum(terms.values()),
+            "reward_terms": terms,
+            "success": success,
+            "crash": crash,
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+        }
+        return Transition(state, flat(outputs), valid)
+
+    def measure(self, state: State) -> dict[str, Any]:
+        """The outputs that any state has, also the first of an episode."""
+        detached = {key: x.detach() for key, x in state.items()}
+        return {"observation": self.env.observation(state), "metrics": self.env.metrics(detached)}
+
+    def at_start(self, state: State) -> dict[str, Any]:
+        """All outputs of the first state of an episode, nested; there is no reward yet."""
+        no = torch.zeros_like(state["step"], dtype=torch.bool)
+        flags = {name: no.clone() for name in ("crash", "terminated", "truncated", "done")}
+        terms = {name: torch.zeros_like(term) for name, term in self.env.reward_terms(state).items()}
+        return {**self.measure(state), "reward_terms": terms, "success": self.env.is_success(state), **flags}
+
+    # -- for the engine ------------------------------------------------------------------------------------------------
+
+    @property
+    def parameters(self) -> tuple[Tensor, ...]:
+        """The parameters of the drone that flies; none where it is the nominal one."""
+        params = self.env.params
+        own = params is not self.env.nominal
+        return tuple(getattr(params, name) for name in self.dynamics.plant_fields) if own else ()
+
+    def example(self) -> tuple[State, State]:
+        """The safe state and outputs of it."""
+        outputs = flat(self.at_start(self.safe_state))
+        return self.safe_state, {**outputs, "reward": outputs["observation"][:, :1]}
+
+    def check_action(self, action: Tensor | None) -> None:
+        """Refuse an action of the wrong shape, precision or device."""
+        check_action(action, self.safe_state["position"])
+
+    def begin(
+        self, state: State, valid: Tensor, action: Tensor, parameters: tuple[Tensor, ...]
+    ) -> tuple[State, Tensor, Tensor, tuple[Any, ...]]:
+        """Queue the action, and lay out as rows what the physics reads; see the engine's ``Simulation``."""
+        state, applied, valid = self.queue(state, valid, action)
+        names, fields, n = self.dynamics.plant_fields, self.env.nominal.fields(), len(action)
+        fields |= dict(zip(names, parameters, strict=False))
+        fields |= {name: state["drone", name] for name in self.drawn}
+        plant = ()
+        if parameters or self.drawn:
+            # A parameter of its own for each environment, where there is a gradient to be kept apart.
+            plant = tuple(_rows(fields[name], name, n if parameters else 1) for name in names)
+        # Compiled regions must not share memory between their inputs: what is a view of the state is copied.
+        wind = (state["wind"].t().clone(),) if "wind" in state else ()
+        x = torch.cat([state[name].t() for name in self.dynamics.sizes])
+        return state, valid, x, (self.dynamics.setpoint_rows(applied), plant, wind)
+
+    def rows_step(self) -> Any:
+        """The physics on rows."""
+        return self.dynamics.rows_step()
+
+    def finish(self, before: State, x: Tensor, valid: Tensor, noise: dict[str, Tensor]) -> Transition:
+        """Judge where the rows ``x`` have flown."""
+        sizes = self.dynamics.sizes
+        return self.judge(before, dict(zip(sizes, x.t().split(list(sizes.values()), 1), strict=True)), valid, noise)
+
+
+def _rows(parameter: Tensor, name: str, n: int) -> Tensor:
+    """A parameter as rows (k, n), or (k, number of environments) where each has its own."""
+    if parameter.dim() > QuadrotorParams.dim(name):
+        return parameter.flatten(1).t().clone()
+    return parameter.reshape(-1, 1).expand(-1, n).clone()

@@ -1,0 +1,130 @@
+"""What a task defines, and what it may use: everything that a task's author needs to know."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from typing import Any
+
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_quad.dynamics import Dynamics, QuadrotorParams
+from torchrl_quad.engine import State
+from torchrl_quad.envs.episodes import summarise_episodes
+from torchrl_quad.envs.randomness import Randomness
+from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
+
+
+class Task(abc.ABC):
+    """The part of an environment that its author writes; :class:`~torchrl_quad.QuadrotorEnv` inherits from it.
+
+    A state is a mapping of names to tensors (num_envs, ...):
+
+    =============================  ============  =======================================================================
+    entry                          shape         meaning
+    =============================  ============  =======================================================================
+    ``position``                   (3)           [m], world frame, z up
+    ``quaternion``                 (4)           (w, x, y, z), body to world, unit norm
+    ``velocity``                   (3)           [m/s], world frame
+    ``angular_velocity``           (3)           [rad/s], body frame
+    ``rotor_speed``                (4)           [rad/s]; absent with ``dynamics="point_mass"``
+    ``action_queue``               (delay, 4)    commands on their way, oldest first; absent when the delay is 0
+    ``step``                       (1)           control steps since the start of the episode
+    ``("drone", field)``           as the field  the randomised parameters, with ``randomize``
+    ``mean_wind``, ``wind``        (3)           [m/s], world frame, with ``wind``
+    ``measurements``               (d + 1, 13)   sensor readings, oldest first, with noise or delay
+    =============================  ============  =======================================================================
+
+    and the entries that the task adds.
+    """
+
+    dynamics: Dynamics  #: the model of the drone
+    randomness: Randomness  #: the source of all random numbers
+
+    # -- what a task defines -------------------------------------------------------------------------------------------
+
+    weights: Mapping[str, float] = {}  #: of the reward's terms; an argument of the same name overrides some
+    ends_on_success = False  #: whether success terminates the episode, too
+    metric_info: Mapping[str, Metric] = EPISODE_METRICS  #: how each metric is summed up, printed and drawn, by name
+
+    @abc.abstractmethod
+    def initial_state(self, n: int) -> State:
+        """Draw n starts: what :meth:`hover_state` gives, moved and turned at will, and the entries the task adds."""
+
+    @abc.abstractmethod
+    def observe(self, state: State) -> Tensor:
+        """The observation (num_envs, k) of a state."""
+
+    @abc.abstractmethod
+    def reward_terms(self, state: State) -> State:
+        """The weighted reward terms by name, each (num_envs, 1), of the state at the end of a step."""
+
+    @abc.abstractmethod
+    def is_crash(self, state: State) -> Tensor:
+        """Where the drone is lost, bool (num_envs, 1): the episode terminates."""
+
+    @abc.abstractmethod
+    def is_success(self, state: State) -> Tensor:
+        """Where this state fulfils the task, bool (num_envs, 1)."""
+
+    def set_up(self) -> None:  # noqa: B027, most tasks need none
+        """Make the constant tensors of the task; called when device and precision are known, and after a move."""
+
+    def advance(self, previous: State, state: State) -> State:
+        """The state with the task's own entries brought from the previous step to this one; the drone has flown."""
+        return state
+
+    def metrics(self, state: State) -> State:
+        """What to measure beside the reward, by name, each (num_envs, 1), without gradient."""
+        return {}
+
+    def state_bounds(self) -> dict[Any, tuple[float, float]]:
+        """The least and the greatest value of the task's own entries; states beyond them cannot be restored."""
+        return {}
+
+    def scenery(self) -> Scenery:
+        """What pictures show beside the drones."""
+        return Scenery()
+
+    def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
+        """What the first episode of each environment came to, in a rollout (num_envs, time) from fresh starts.
+
+        Returns:
+            by name, each (num_envs): ``return``, the undiscounted sum of rewards; ``crash`` and ``solved``, 0 or 1;
+            and the metrics of the task, as they are at the end of the episode. Here an episode is solved when its last
+            state fulfils the task and the drone has not crashed; a task may ask more.
+        """
+        return summarise_episodes(rollout)
+
+    # -- what a task may use -------------------------------------------------------------------------------------------
+
+    @property
+    def nominal(self) -> QuadrotorParams:
+        """The drone that the flight controller believes in; ``params`` is the one that flies."""
+        return self.dynamics.nominal
+
+    @property
+    def hover_action(self) -> Tensor:
+        """The action (4) that holds the nominal drone where it is; (num_envs, 4) where drones differ in it."""
+        return self.dynamics.hover_action
+
+    def hover_state(self, position: Tensor) -> State:
+        """Level, still, rotors at hover speed, at the positions (n, 3) [m]."""
+        return self.dynamics.rest(position)
+
+    def tensor(self, values: Any) -> Tensor:
+        """A tensor with the environment's device and floating-point type."""
+        return self.randomness.tensor(values)
+
+    def uniform(self, *shape: int) -> Tensor:
+        """Uniform random numbers in [-1, 1] from the environment's own generator."""
+        return self.randomness.uniform(*shape)
+
+    def normal(self, *shape: int) -> Tensor:
+        """Standard normal random numbers from the environment's own generator."""
+        return self.randomness.normal(*shape)
+
+    def integers(self, high: int, *shape: int) -> Tensor:
+        """Uniform random integers in [0, high) from the environment's own generator."""
+        return self.randomness.integers(high, *shape)

@@ -101,7 +101,10 @@ def _restarted(stepper: Stepper, source: Source, end: Record, done: Tensor) -> R
 
 def _entries(stepper: Stepper, records: list[Record], *prefix: str) -> dict[Key, Tensor]:
     """All entries of some records, each (n, time, ...)."""
-    state, outputs = (Rows(*(torch.stack(x) for x in zip(*rows, strict=True))) for rows in list(zip(*records))[:2])
+    state, outputs = (
+        Rows(*(torch.stack(x) for x in zip(*rows, strict=True)))
+        for rows in ([record.state for record in records], [record.outputs for record in records])
+    )
     entries = {flat_key("state", *_path(key)): x for key, x in stepper.layout.unpack(state).items()}
     # Metrics have no gradient.
     outputs = stepper.output_layout.unpack(outputs).items()

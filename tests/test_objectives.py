@@ -170,6 +170,32 @@ def test_without_its_terminal_gradient_shac_has_the_value_of_shac_and_the_gradie
     assert kept[1] == cut[1] - (10 / 4 + 10 / 4 + 10 / 2) / 2
 
 
+def test_shac_as_published_by_xu_et_al_bootstraps_with_the_target_critic_and_divides_by_the_steps():
+    def fly(**options):
+        """The objectives, and their gradients in the next observations, when critic and target say 10 s and 30 s."""
+        actor, value, _ = make_networks()
+        loss = SHACLoss(actor, value, reduction="none", **options).make_value_estimator(gamma=GAMMA)
+        if options.get("delay_value", True):
+            loss.target_value_network_params["module", "weight"].data.fill_(30.0)
+        rollout = make_rollout(actor)
+        shift = torch.zeros(2, 4, 1, requires_grad=True)
+        rollout["next", "observation"] = rollout["next", "observation"] + shift
+        objective = -loss.loss_actor(rollout)[0]
+        objective.sum().backward()
+        assert all(p.grad is None for p in loss.value_network_params.values(True, True))
+        assert torch.equal(sum(loss.objective_parts(rollout).values()), objective)
+        return objective.tolist(), shift.grad[..., 0].tolist()
+
+    # gamma^n V(s_n): with the critic 90 / 4 + 50 / 4 and 50 / 2, with the target three times as much
+    critic = ([14 + 35, 13.5 + 25], [[0, 10 / 4, 0, 10 / 4], [0, 0, 0, 10 / 2]])
+    target = ([14 + 105, 13.5 + 75], [[0, 30 / 4, 0, 30 / 4], [0, 0, 0, 30 / 2]])
+    divided = tuple((torch.tensor(x) / 4).tolist() for x in target)
+    assert fly() == critic
+    assert fly(target_bootstrap=True) == target
+    assert fly(target_bootstrap=True, average_over_horizon=True) == divided
+    assert fly(target_bootstrap=True, delay_value=False) == critic  # there is no other network
+
+
 def test_the_objective_is_the_sum_of_its_parts():
     actor, value, _ = make_networks()
     shac = SHACLoss(actor, value, reduction="none").make_value_estimator(gamma=GAMMA)

@@ -293,7 +293,7 @@ class PathwiseCriticLoss(PathwiseLoss):
     critic_loss_key: str
     prediction_key: str  # the name, among the tensor keys, of what the critic writes
     value_part = "terminal_value"
-    target_bootstrap = False  # whether the terminal value is that of the target network
+    target_bootstrap = False  # whether the terminal value comes from the target network
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:

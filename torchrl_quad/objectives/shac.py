@@ -16,14 +16,22 @@ from torchrl_quad.objectives.pathwise import PathwiseCriticLoss
 class SHACLoss(PathwiseCriticLoss):
     """Short-horizon actor-critic (Xu et al. 2022, arXiv:2204.07137).
 
-    The objective of a segment is its discounted rewards plus gamma^n V(s_n), where the terminal value keeps its
-    gradient in the state and has none in the critic. The critic regresses to TD(lambda) targets of a target network.
+    The objective of a segment is its discounted rewards plus gamma^n V(s_n). The terminal value keeps its gradient in
+    the state and has none in the critic. The critic regresses to TD(lambda) targets of a target network.
+
+    By default it deviates from Xu et al. in two ways: V is the critic itself, and the objective is a sum over steps.
+    Theirs takes V from the target critic and divides by the number of steps; for theirs write
+    ``SHACLoss(actor, value, target_bootstrap=True, average_over_horizon=True)``.
 
     Args:
         actor_network: the policy that has made the rollout.
         value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
         terminal_gradient: False cuts the gradient of the terminal value in the state, as what was published with the
             paper does. The actor then climbs the rewards of the horizon alone, as with BPTT.
+        target_bootstrap: take the terminal value from the target critic, as Xu et al. do. False takes it from the
+            critic itself; with ``delay_value=False`` the two are one.
+        average_over_horizon: divide the objective by the number of steps of the rollout, as Xu et al. do. The entropy
+            bonus is a mean over steps either way.
         delay_value: keep a target network, to be updated with :class:`torchrl.objectives.SoftUpdate`.
         **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
     """
@@ -57,8 +65,8 @@ class SHACLoss(PathwiseCriticLoss):
         **kwargs: Any,
     ) -> None:
         super().__init__(actor_network, **kwargs)
-        self.terminal_gradient = terminal_gradient
-        self.target_bootstrap, self.average_over_horizon = target_bootstrap, average_over_horizon
+        self.terminal_gradient, self.target_bootstrap = terminal_gradient, target_bootstrap
+        self.average_over_horizon = average_over_horizon
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -70,10 +78,16 @@ class SHACLoss(PathwiseCriticLoss):
         return self._critic_loss(tensordict)
 
     def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """What J is the sum of, divided by the steps of the rollout with ``average_over_horizon``."""
-        parts = super().objective_parts(tensordict)
+        """The terms whose sum is J: the discounted ``rewards`` of the segments, and their ``terminal_value``.
+
+        Args:
+            tensordict: a rollout (*, horizon) that carries its graph.
+
+        Returns:
+            the terms by name, each (*,), with their graphs.
+        """
         steps = tensordict.shape[-1] if self.average_over_horizon else 1
-        return {name: part / steps for name, part in parts.items()}
+        return {name: part / steps for name, part in super().objective_parts(tensordict).items()}
 
     def _terminal_value(self, tensordict: TensorDictBase) -> Tensor:
         value = super()._terminal_value(tensordict)

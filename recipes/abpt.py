@@ -11,7 +11,6 @@ from common import (
     minibatches,
     network,
     own_seed,
-    restart,
     set_up,
     update_normalizer,
 )
@@ -19,7 +18,7 @@ from omegaconf import DictConfig
 from run import Run
 from torchrl.objectives import SoftUpdate
 
-from torchrl_quad import ABPTLoss, VisitedStateBuffer, differentiable_rollout, make_qvalue
+from torchrl_quad import ABPTLoss, VisitedStateBuffer, differentiable_rollout, make_qvalue, restart
 
 
 @hydra.main(config_path="config", config_name="abpt", version_base=None)

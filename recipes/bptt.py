@@ -4,11 +4,11 @@ python recipes/bptt.py task=hovering seed=0
 """
 
 import hydra
-from common import actor_parameters, iterations, make_optimizer, restart, set_up, update_normalizer
+from common import actor_parameters, iterations, make_optimizer, set_up, update_normalizer
 from omegaconf import DictConfig
 from run import Run
 
-from torchrl_quad import BPTTLoss, differentiable_rollout
+from torchrl_quad import BPTTLoss, differentiable_rollout, restart
 
 
 @hydra.main(config_path="config", config_name="bptt", version_base=None)

@@ -130,13 +130,6 @@ def update_normalizer(env: EnvBase, rollout: TensorDictBase) -> None:
     env.transform.update(seen)
 
 
-def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictBase:
-    """Give up a random fraction of the flights, and start them afresh; the others go on."""
-    fresh = TensorDict({"state": env.sample_initial_state(env.num_envs)}, env.batch_size)
-    chosen = torch.rand(carry.shape, device=carry.device) < fraction
-    return env.reset(fresh.where(chosen, carry.select("state")), set_state=True)
-
-
 def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDictBase]:
     """``cfg.updates`` random batches of ``cfg.batch_size`` steps from a rollout."""
     steps = rollout.reshape(-1)

@@ -10,7 +10,6 @@ from common import (
     make_optimizer,
     minibatches,
     network,
-    restart,
     set_up,
     update_normalizer,
 )
@@ -18,7 +17,7 @@ from omegaconf import DictConfig
 from run import Run
 from torchrl.objectives import SoftUpdate
 
-from torchrl_quad import SHACLoss, differentiable_rollout, make_value
+from torchrl_quad import SHACLoss, differentiable_rollout, make_value, restart
 
 
 @hydra.main(config_path="config", config_name="shac", version_base=None)

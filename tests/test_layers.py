@@ -14,7 +14,7 @@ ALLOWED = {  # what each part of the package may import of the others
     "dynamics": set(),
     "envs": {"dynamics", "render"},  # render only within env.render(), see below
     "render": {"dynamics", "envs", "files"},
-    "modules": set(),
+    "modules": {"data"},  # base_env alone
     "objectives": set(),
     "data": set(),
     "files": set(),

@@ -2,7 +2,7 @@
 
 import gymnasium
 
-from torchrl_quad.data import ObservationNormalizer, VisitedStateBuffer, differentiable_rollout
+from torchrl_quad.data import ObservationNormalizer, VisitedStateBuffer, differentiable_rollout, restart
 from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
 from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
 from torchrl_quad.envs import TASKS, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
@@ -36,6 +36,7 @@ __all__ = [
     "make_qvalue",
     "make_value",
     "register_envs",
+    "restart",
 ]
 
 

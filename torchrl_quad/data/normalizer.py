@@ -1,4 +1,4 @@
-"""Normalised observations that gradients can pass."""
+"""Observations normalised by running statistics, in a way that gradients survive."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from torchrl.envs import EnvBase, ObservationNorm
 class ObservationNormalizer(ObservationNorm):
     """Subtracts the mean and divides by the standard deviation of all observations seen, fixed within a horizon.
 
-    TorchRL's VecNorm changes its statistics in place at every step, which breaks backward through a rollout. Here they
-    change only when :meth:`update` is called, between horizons, and a graph that is still to be differentiated keeps
-    the values that it was made with. They are buffers, and so stand in ``state_dict``.
+    TorchRL's VecNorm changes its statistics in place at every step, which breaks backward through a rollout. Here
+    :meth:`update` changes them between horizons, and a graph that is still to be differentiated keeps the values that
+    it was made with. The statistics are buffers and therefore part of ``state_dict``.
 
     .. code-block:: python
 
         normalizer = ObservationNormalizer(env)
         env = TransformedEnv(env, normalizer)
-        actor = make_actor(env, input_scale=1.0)  # the normalizer has scaled already
+        actor = make_actor(env, input_scale=1.0)  # the normalizer scales already
         rollout, carry = differentiable_rollout(env, actor, env.reset(), 64)
         normalizer.update(rollout)
-        carry = env.reset(carry.select("state"), set_state=True)  # what it observes was written before the update
+        carry = env.reset(carry.select("state"), set_state=True)  # observe anew, with the new statistics
 
     Args:
-        env: gives size, device and floating-point type of the observation.
-        key: the entry to normalise, (*, k), in its own place.
+        env: the environment to wrap, for size, device and floating-point type of the observation.
+        key: the entry (*, k) to normalise, which is overwritten.
         min_scale: the least standard deviation to divide by, in the observation's unit.
 
     Raises:
@@ -50,10 +50,10 @@ class ObservationNormalizer(ObservationNorm):
 
     @torch.no_grad()
     def update(self, rollout: TensorDictBase) -> None:
-        """Take what the steps of a rollout (any batch size) led to, as this transform wrote it, into the statistics.
+        """Add the next observations of a rollout (any batch size), as this transform wrote them, to the statistics.
 
-        The values that are not finite are left out. Observations that are kept from before, such as a carry, stay as
-        they were; reset to their state to see them anew.
+        Observations that are not finite are left out. Those written before, such as a carry's, do not change; reset to
+        their state to observe them anew.
         """
         written = rollout.get(("next", self.out_keys[0])).reshape(-1, self.loc.shape[-1])
         seen = written[written.isfinite().all(-1)] * self.scale + self.loc

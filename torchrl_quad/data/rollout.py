@@ -20,25 +20,25 @@ def differentiable_rollout(
 ) -> tuple[TensorDictBase, TensorDictBase]:
     """Fly a horizon, and keep the graph from every reward back to every action.
 
-    Environments that finish are reset on the way; the gradient is cut exactly there, and ``"next"`` keeps the true last
-    state. Works for any differentiable TorchRL environment and any stack of transforms. Without transforms an
-    environment of ours begins all episodes within 32 steps at one start: see its ``rollout``.
+    Environments that finish are reset on the way. The gradient is cut exactly there, and ``"next"`` keeps the true last
+    state. The rollout is the environment's own ``rollout``, so this works for any differentiable TorchRL environment
+    and any stack of transforms.
 
     Args:
         env: the environment.
         actor: a TensorDictModule that writes the action.
-        carry: where to start: from ``env.reset()``, the last call, or a visited-state buffer. It is not modified. None
-            resets the environment.
+        carry: the reset tensordict to start from: of ``env.reset()``, the last call, ``restart`` or a visited-state
+            buffer. It is not modified. None resets the environment.
         horizon: number of control steps, at least 1.
         exploration_type: RANDOM samples the policy, DETERMINISTIC takes its mode.
 
     Returns:
-        the rollout, of batch size (env.batch_size, horizon), and the carry to go on from: detached, and reset where the
-        rollout ended done.
+        the rollout, of batch size (*env.batch_size, horizon), and the carry to go on from: detached, and reset in the
+        environments whose last step was done.
 
     Raises:
-        ValueError: the horizon is less than 1, or the actor reads an entry that is not there.
-        TypeError: the actor is not a TensorDictModule, or the carry no tensordict.
+        ValueError: the horizon is less than 1, or the actor reads an entry that nobody writes.
+        TypeError: the actor is not a TensorDictModule, or the carry is not a tensordict.
     """
     if not (isinstance(horizon, numbers.Integral) and horizon >= 1):
         raise ValueError(f"horizon must be at least 1 control step, got {horizon}.")
@@ -63,7 +63,7 @@ def differentiable_rollout(
             f"The actor reads {missing[0]!r}, which is not in the tensordict it starts from. Choose its in_keys from "
             f"what env.reset() writes: {', '.join(map(str, env.observation_spec.keys(True, True)))}."
         ) from error
-    # Transforms such as CatFrames remember what they have seen in buffers, with its graph.
+    # Transforms such as CatFrames keep past observations in buffers, with their graph.
     for buffer in env.buffers():
         if not buffer.is_leaf:
             buffer.detach_()

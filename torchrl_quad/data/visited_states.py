@@ -1,4 +1,4 @@
-"""The buffer of visited states, from which horizons and resets can start (paper, section IV)."""
+"""Where the next horizon starts: in visited states (paper, section IV), afresh, or where the last one ended."""
 
 from __future__ import annotations
 
@@ -6,26 +6,28 @@ import numbers
 from collections.abc import Callable, Sequence
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
+
+from torchrl_quad.data.unwrap import base_env
 
 
 class VisitedStateBuffer(TensorDictReplayBuffer):
-    """States that the policy has visited, to start horizons and episodes from.
+    """States that the policy has visited, from which horizons and episodes can start.
 
-    Only states are kept, no transitions: this is no replay for off-policy learning. A state is the complete Markov
-    state, with the commands that are on their way and whatever the task keeps, detached from any graph.
+    The buffer keeps states and no transitions, so it is no replay for off-policy learning. A state is the complete
+    Markov state, including commands on their way and whatever the task keeps, detached from any graph.
 
-    Saving and loading is inherited: ``state_dict``, ``load_state_dict``, ``dumps(path)``, ``loads(path)``; the random
-    generator goes along.
+    Saving and loading is inherited: ``state_dict``, ``load_state_dict``, ``dumps(path)``, ``loads(path)``. They include
+    the buffer's random generator, which draws the states and decides which environments get one.
 
     Args:
         capacity: number of states kept; the oldest go first.
-        state_keys: the entries that make up the Markov state; another environment names its own, such as
-            ``("th", "thdot", "params")`` for TorchRL's PendulumEnv.
+        env: the environment whose Markov state is kept; see :mod:`torchrl_quad.data`.
+        state_keys: the entries that make up the Markov state. By default those of ``env``, and "state" without one.
         device: where the states are stored.
         seed: of the buffer's own random generator.
 
@@ -36,13 +38,16 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
     def __init__(
         self,
         capacity: int = 100_000,
+        env: EnvBase | None = None,
         *,
-        state_keys: Sequence[NestedKey] = ("state",),
+        state_keys: Sequence[NestedKey] | None = None,
         device: torch.device | str = "cpu",
         seed: int = 0,
     ) -> None:
         if not (isinstance(capacity, numbers.Integral) and capacity >= 1):
             raise ValueError(f"capacity must be at least 1 state, got {capacity}.")
+        if state_keys is None:
+            state_keys = ("state",) if env is None else _state_keys(env)
         self.state_keys = tuple(state_keys)
         super().__init__(
             storage=LazyTensorStorage(capacity, device=device),
@@ -50,7 +55,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         )
 
     def extend(self, tensordicts: TensorDictBase) -> Tensor:
-        """Add the states that a rollout (any batch size) started its steps in.
+        """Add the states in which the steps of a rollout (any batch size) started.
 
         Terminated states and states that are not finite are left out.
 
@@ -58,13 +63,13 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             the indices written.
 
         Raises:
-            ValueError: the rollout lacks an entry of the state, or its states are not those of the buffer.
+            ValueError: the rollout lacks an entry of the state, or its states differ in kind from the buffer's.
         """
         missing = [key for key in self.state_keys if key not in tensordicts]
         if missing:
             raise ValueError(
-                f"The visited-state buffer keeps {self.state_keys}, and the rollout lacks {missing[0]!r}. Name the "
-                "entries of the environment's Markov state: VisitedStateBuffer(state_keys=[...])."
+                f"The visited-state buffer keeps {self.state_keys}, and the rollout lacks {missing[0]!r}. Give the "
+                "buffer the environment, VisitedStateBuffer(env=env), or the entries of its Markov state, state_keys."
             )
         states = tensordicts.select(*self.state_keys).detach().reshape(-1)
         keep = torch.ones(states.shape[0], dtype=torch.bool, device=states.device)
@@ -87,34 +92,41 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             fraction: probability, for each member of the batch, of a visited state.
 
         Returns:
-            the tensordict of the reset, to be the carry of a rollout.
+            the tensordict of the reset, the carry of the next rollout.
 
         Raises:
-            ValueError: the fraction is not in [0, 1], or the states of the buffer are not those of the environment.
+            ValueError: the fraction is not in [0, 1], or the environment's states differ in kind from the buffer's.
             RuntimeError: the buffer is empty.
         """
-        base = env
-        while isinstance(base, TransformedEnv):
-            base = base.base_env
-        # Of the class: environments in other processes cannot be asked what they know, one that does not know dies.
-        if hasattr(type(base), "sample_initial_state"):  # the task's own starts, whatever its resets draw from
-            fresh = TensorDict({"state": env.sample_initial_state(env.num_envs)}, env.batch_size, device=env.device)
-        else:
-            fresh = env.reset().select(*self.state_keys)
-        return env.reset(self._mixed(fresh, fraction), set_state=True)
+        return env.reset(self._mixed(_fresh(env, self.state_keys), fraction), set_state=True)
 
     def source(self, env: EnvBase, fraction: float = 0.9) -> Callable[[int], TensorDictBase]:
-        """What ``env.set_initial_state_source`` takes, so that resets inside a horizon start in visited states, too.
+        """A function for ``env.set_initial_state_source``: resets inside a horizon then start in visited states, too.
 
-        ``env`` is a quadrotor environment; arguments and errors are those of :meth:`initial_state`.
+        Args:
+            env: an environment with ``sample_start`` (see :mod:`torchrl_quad.data`), also under transforms.
+            fraction: probability, for each state, of a visited one.
+
+        Returns:
+            a function from n to n states: the tensordict (n) that ``env`` keeps under its one state key, or, where the
+            state has several keys, a tensordict (n) with all of them.
+
+        Raises:
+            TypeError: the environment has no ``sample_start``.
+            ValueError: the fraction is not in [0, 1]; (in use) as :meth:`initial_state`.
+            RuntimeError: (in use) the buffer is empty.
         """
-
         _require_fraction(fraction)
+        base = base_env(env)
+        if not _draws_starts(base):
+            raise TypeError(
+                f"{type(base).__name__} has no sample_start(n), from which a source takes its fresh starts. Define it, "
+                "or start horizons with buffer.initial_state(env, fraction)."
+            )
 
         def draw(n: int) -> TensorDictBase:
-            return self._mixed(TensorDict({"state": env.sample_initial_state(n)}, [n], env.device), fraction).get(
-                "state"
-            )
+            states = self._mixed(base.sample_start(n).select(*self.state_keys), fraction)
+            return states.get(self.state_keys[0]) if len(self.state_keys) == 1 else states
 
         return draw
 
@@ -131,13 +143,59 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         return visited.where(pick.to(fresh.device), fresh)
 
 
+def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictBase:
+    """Start a random fraction of the environments afresh, and let the others go on from where they are.
+
+    Beside visited states this is the other way to choose where the next horizon starts: most flights go on through many
+    horizons, and some begin anew. The choice draws from torch's global generator, the fresh starts from the
+    environment's own. Transforms that remember, such as StepCounter, begin anew in all environments.
+
+    Args:
+        env: an environment that can be set to a state, also under transforms.
+        carry: where the environments are, as ``differentiable_rollout`` returns it.
+        fraction: probability, for each member of the batch, of a fresh start.
+
+    Returns:
+        the tensordict of the reset, the carry of the next rollout.
+
+    Raises:
+        ValueError: the fraction is not in [0, 1], or the carry lacks an entry of the state.
+    """
+    _require_fraction(fraction)
+    keys = _state_keys(env)
+    missing = [key for key in keys if key not in carry]
+    if missing:
+        raise ValueError(f"restart needs the whole state, {keys}, and the carry lacks {missing[0]!r}.")
+    fresh = _fresh(env, keys)
+    chosen = torch.rand(carry.shape, device=carry.device) < fraction
+    return env.reset(fresh.where(chosen, carry.select(*keys)), set_state=True)
+
+
+def _state_keys(env: EnvBase) -> tuple[NestedKey, ...]:
+    """The first names of the entries that make up the Markov state."""
+    keys = base_env(env).state_keys
+    return tuple(dict.fromkeys(key if isinstance(key, str) else key[0] for key in keys))
+
+
+def _fresh(env: EnvBase, keys: Sequence[NestedKey]) -> TensorDictBase:
+    """Fresh starts (env.batch_size), whatever the environment's resets draw from."""
+    base = base_env(env)
+    states = base.sample_start(env.numel()).reshape(env.batch_size) if _draws_starts(base) else env.reset()
+    return states.select(*keys)
+
+
+def _draws_starts(base: EnvBase) -> bool:
+    # Of the class: environments in processes of their own die when they are asked for what they do not have.
+    return hasattr(type(base), "sample_start")
+
+
 def _require_fraction(fraction: float) -> None:
     if not 0.0 <= fraction <= 1.0:
-        raise ValueError(f"fraction must lie between 0 (all fresh) and 1 (all visited), got {fraction}.")
+        raise ValueError(f"fraction must lie between 0 and 1, got {fraction}.")
 
 
 def _require_same(states: TensorDictBase, kept: TensorDictBase) -> None:
-    """Refuse states (n) of another kind than those that are kept: they would be mixed, or broadcast, in silence."""
+    """Refuse states (n) of another kind than those that are kept, before they are mixed or broadcast in silence."""
     ours, theirs = ({key: x.shape[1:] for key, x in td.items(True, True)} for td in (kept, states))
     different = sorted({str(key) for key, _ in ours.items() ^ theirs.items()})
     if different:

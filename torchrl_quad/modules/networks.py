@@ -1,4 +1,4 @@
-"""Multi-layer perceptrons that read their sizes from an environment's specs."""
+"""Multi-layer perceptrons for policies and critics, sized by an environment's specs."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from tensordict.nn import NormalParamExtractor, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+
+from torchrl_quad.data.unwrap import base_env
 
 OBSERVATION = ("observation",)
 
@@ -26,7 +28,7 @@ class Network(nn.Module):
         self.mlp, self.scales, self.head = mlp, tuple(scales), nn.Identity()
 
     def forward(self, *inputs: Tensor) -> Any:
-        """Map inputs (*, k_i) to outputs (*, out_features), and those to what the head makes of them."""
+        """The head's output for inputs (*, k_i); the head receives (*, out_features)."""
         return self.head(self.mlp(torch.cat([x * scale for x, scale in zip(inputs, self.scales, strict=True)], -1)))
 
 
@@ -43,26 +45,26 @@ def make_actor(
 ) -> ProbabilisticActor:
     """A tanh-Gaussian policy a = tanh(mu(s) + sigma(s) noise), stretched to the bounds of the action.
 
-    The weights of its last layer start near zero: the first actions are close to ``action_init``, with noise of about
-    ``scale_init`` (before the tanh, in units of half the range).
+    The weights of its last layer start near zero. The first actions are close to ``action_init``, with noise of about
+    ``scale_init`` (before the tanh, in units of half the range). It writes ``loc``, ``scale`` and ``action``.
 
     Args:
-        env: gives the sizes of observation and action, the action's bounds, device and floating-point type.
+        env: any TorchRL environment, for the sizes of its entries, the action's bounds, device and floating-point type.
         num_cells: widths of the hidden layers.
         in_keys: the entries that are concatenated into the network's input, each (*, k).
         activation: of the hidden layers; smooth ones give smooth policy gradients.
         input_scale: multiplies the input; a number, or one for each of ``in_keys``. The tasks observe a tenth of their
-            SI units, as the paper does, which makes for inputs that are too small to learn from quickly. With an
-            ObservationNormalizer it is 1.
-        action_init: the mean action at the start, (k), strictly between the bounds; by default ``env.hover_action``
-            where the environment has one, so that a drone does not begin by flying away, and the middle of the range
-            elsewhere. Where drones differ it is the mean of theirs.
+            SI units, as the paper does, and inputs that small slow learning down. Set it to 1 with an
+            ObservationNormalizer.
+        action_init: the mean action at the start, (k), strictly between the bounds. By default
+            ``env.neutral_action``, averaged over environments, where the environment has one (see
+            :mod:`torchrl_quad.data`; a drone's is to hover), and the middle of the range elsewhere.
         scale_init: standard deviation at the start.
-        return_log_prob: write the log-probability of the action as well, which an entropy bonus and PPO need.
+        return_log_prob: also write the log-probability of the action, which an entropy bonus and PPO need.
 
     Raises:
-        ValueError: an entry is unknown or of more than one dimension, a width is none, the scales are not as many as
-            the entries, or the first action is not inside the bounds.
+        ValueError: an entry is unknown or has more than one dimension, a width is not a whole number of at least 1, the
+            number of scales is not that of the entries, or the first action is not strictly inside the bounds.
     """
     spec = env.action_spec_unbatched
     if not isinstance(spec, Bounded):
@@ -70,7 +72,7 @@ def make_actor(
     low, high = spec.space.low, spec.space.high
     middle = 0.5 * (low + high)
     if action_init is None:
-        action_init = getattr(_single(env), "hover_action", middle)
+        action_init = getattr(_single(env), "neutral_action", middle)
         action_init = action_init.mean(0) if action_init.dim() > middle.dim() else action_init
     action_init = torch.as_tensor(action_init).to(middle)
     if action_init.shape != spec.shape or not ((low < action_init) & (action_init < high)).all():
@@ -108,10 +110,10 @@ def make_value(
 ) -> ValueOperator:
     """A state value V(s), written to ``state_value``, (*, 1). The arguments are those of :func:`make_actor`.
 
-    Its hidden layers are normalised (LayerNorm): the policy follows the critic's gradient, which is far off without.
+    LayerNorm normalises its hidden layers. The policy follows the critic's gradient, which is far off without it.
 
-    With ``in_keys=("observation", ("state", "rotor_speed"))`` the critic sees more than the actor. Rotors turn at some
-    1000 rad/s: ``input_scale=(10.0, 1e-3)`` brings both to about one.
+    A critic may read more than the actor does, such as ``in_keys=("observation", ("state", "rotor_speed"))``. Rotors
+    turn at some 1000 rad/s, and ``input_scale=(10.0, 1e-3)`` brings both entries to about one.
     """
     net = _network(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
     return ValueOperator(net, in_keys=list(in_keys))
@@ -126,10 +128,10 @@ def make_qvalue(
     input_scale: float | Sequence[float] = 10.0,
     action_scale: float = 0.3,
 ) -> ValueOperator:
-    """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); as :func:`make_value` otherwise.
+    """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); otherwise as :func:`make_value`.
 
-    A policy's action tells where the drone is, and a critic that reads it off the action gets the gradient in the
-    action wrong: ``action_scale`` multiplies the action, so that the critic looks at the state first.
+    A policy's action reveals the state. A critic that reads the state off the action gets its gradient in the action
+    wrong. ``action_scale`` multiplies the action at the input, so that the critic relies on the state first.
     """
     in_keys = [*in_keys, "action"]
     net = _network(env, in_keys, 1, num_cells, activation, input_scale, action_scale, layer_norm=True)
@@ -171,22 +173,21 @@ def _network(
 
 
 def _single(env: EnvBase) -> EnvBase:
-    """The environment under transforms; and of several in processes of their own, which one cannot ask, another."""
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
+    """The environment under transforms; for several in processes of their own, a new one like theirs."""
+    env = base_env(env)
     if isinstance(env, BatchedEnvBase):
         return _single(env.create_env_fn[0](**env.create_env_kwargs[0]))
     return env
 
 
 def _spec(env: EnvBase, key: NestedKey) -> TensorSpec:
-    """What is known of an entry (*, k) that a network can read."""
+    """The spec of an entry (*, k) that a network can read."""
     known = {**dict(env.observation_spec.items(True, True)), "action": env.action_spec}
     if key not in known:
         raise ValueError(f"Unknown entry {key!r} in in_keys. Choose from: {', '.join(map(str, known))}.")
     if known[key].ndim != len(env.batch_size) + 1:
         raise ValueError(
-            f"Entry {key!r} has shape {tuple(known[key].shape)} and a network reads vectors: flatten it, such as with "
-            "torchrl's FlattenObservation."
+            f"Entry {key!r} has shape {tuple(known[key].shape)} and a network reads vectors: flatten it, for example "
+            "with TorchRL's FlattenObservation."
         )
     return known[key]

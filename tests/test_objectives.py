@@ -51,14 +51,14 @@ def make_abpt(actor, *critics, **kwargs):
     return loss.make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
 
 
-def make_rollout(actor):
+def make_rollout(actor, dtype=torch.float32):
     """Two environments, four steps. Environment 0 is truncated at step 1; environment 1 terminates at step 2.
 
     Observations are 1, 2, 3, 4 (next: 2, 9, 4, 5 with 9 the true last state before the reset), and the reward of each
     step is its action: r = 2 s at policy weight 2.
     """
-    observation = torch.tensor([1.0, 2.0, 3.0, 4.0]).view(1, 4, 1).repeat(2, 1, 1)
-    following = torch.tensor([[2.0, 9.0, 4.0, 5.0], [2.0, 3.0, 9.0, 5.0]]).unsqueeze(-1)
+    observation = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=dtype).view(1, 4, 1).repeat(2, 1, 1)
+    following = torch.tensor([[2.0, 9.0, 4.0, 5.0], [2.0, 3.0, 9.0, 5.0]], dtype=dtype).unsqueeze(-1)
     terminated = torch.zeros(2, 4, 1, dtype=torch.bool)
     truncated = terminated.clone()
     truncated[0, 1] = True
@@ -213,6 +213,22 @@ def test_the_objective_is_the_sum_of_its_parts():
         assert all(part.requires_grad for part in found.values())
     with pytest.raises(ValueError, match="needs a rollout"):
         shac.objective_parts(make_rollout(actor)[:, 0])
+
+
+def test_a_loss_has_the_precision_of_its_rollout():
+    actor, value, _ = make_networks()
+    loss = SHACLoss(actor.double(), value.double(), alpha=0.1).make_value_estimator(gamma=0.99, lmbda=0.95)
+    rollout = make_rollout(actor, torch.float64)
+    rollout["action_log_prob"] = -torch.ones(2, 4, dtype=torch.float64)
+    rewards = loss.objective_parts(rollout)["rewards"]
+    assert rewards.tolist() == pytest.approx(
+        [(2 + 4 * 0.99) + (6 + 8 * 0.99), 2 + 0.99 * (4 + 0.99 * 6) + 8], abs=1e-14
+    )
+    target = loss.write_value_target(rollout)["value_target"]
+    assert target[0, 0].item() == pytest.approx(2 + 0.99 * (0.05 * 20 + 0.95 * (4 + 0.99 * 90)), rel=1e-15)
+    default = BPTTLoss(actor, alpha="auto", alpha_init=0.3)
+    assert (default.value_estimator.gamma.item(), loss.alpha.item()) == (0.99, 0.1)
+    assert default.alpha.item() == pytest.approx(0.3, abs=1e-15)
 
 
 def td_lambda(rewards, next_values, ends, terminations):

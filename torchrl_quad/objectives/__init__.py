@@ -2,7 +2,8 @@
 
 from torchrl_quad.objectives.abpt import ABPTLoss
 from torchrl_quad.objectives.bptt import BPTTLoss
-from torchrl_quad.objectives.pathwise import PathwiseCriticLoss, PathwiseLoss
+from torchrl_quad.objectives.critic import PathwiseCriticLoss
+from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.objectives.shac import SHACLoss
 
 __all__ = ["ABPTLoss", "BPTTLoss", "PathwiseCriticLoss", "PathwiseLoss", "SHACLoss"]

@@ -13,7 +13,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad.objectives.pathwise import PathwiseCriticLoss, segments
+from torchrl_quad.objectives.critic import PathwiseCriticLoss
+from torchrl_quad.objectives.pathwise import segments
 
 
 class ABPTLoss(PathwiseCriticLoss):
@@ -21,17 +22,17 @@ class ABPTLoss(PathwiseCriticLoss):
 
     For each segment of a rollout, J = (J_N + J_0) / 2 with
 
-    - J_N, the discounted rewards plus gamma^n Q(s_n, a_n): exact where the reward is differentiable;
-    - J_0 = Q(s_0, a_0): what the critic has learned of the whole reward, differentiable or not.
+    - J_N, the discounted rewards plus gamma^n Q(s_n, a_n), which is exact where the reward is differentiable;
+    - J_0 = Q(s_0, a_0), the critic's estimate of the whole reward, differentiable or not.
 
-    Q is the least of the critics. a_n, and the actions in the critics' targets, are sampled anew from the policy. Q
-    keeps its gradient in state and action and has none in the critics' parameters. With one of the two returns
-    switched off the other has weight 1.
+    Q is the least of the critics. The policy samples a_n, and the actions in the critics' targets, anew. Q keeps its
+    gradient in state and action and has none in the critics' parameters. With one of the two returns switched off the
+    other has weight 1.
 
     Args:
-        actor_network: the policy that has made the rollout.
+        actor_network: the policy that flew the rollout.
         qvalue_network: the critic Q(s, a), which writes ``state_action_value`` (see ``set_keys``).
-        num_qvalue_nets: how many critics to make of it, each initialised anew.
+        num_qvalue_nets: number of critics made from it, each initialised anew.
         n_step_return: include J_N.
         zero_step_return: include J_0.
         delay_qvalue: keep target networks, to be updated with :class:`torchrl.objectives.SoftUpdate`.
@@ -43,7 +44,7 @@ class ABPTLoss(PathwiseCriticLoss):
 
     @dataclass
     class _AcceptedKeys(PathwiseCriticLoss._AcceptedKeys):
-        """As for every pathwise loss with a critic, and where the critics write their predictions."""
+        """As for every pathwise loss with a critic, and the key of the critics' predictions."""
 
         state_action_value: NestedKey = "state_action_value"
 
@@ -86,21 +87,24 @@ class ABPTLoss(PathwiseCriticLoss):
         )
 
     def loss_qvalue(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The critics' loss (paper, equation 16), summed over critics, on a rollout or on samples with their targets.
+        """The critics' loss (paper, equation 16), summed over critics.
+
+        Args:
+            tensordict: a rollout (*, horizon), or samples (n) of one with its targets.
 
         Returns:
-            the loss, and a dictionary of what is worth logging.
+            the loss, and its metadata by name.
         """
         return self._critic_loss(tensordict)
 
     def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """What J is the sum of: ``n_step_return`` and ``zero_step_return``, half of each, or the whole of one alone.
+        """The terms whose sum is J: half of ``n_step_return`` and of ``zero_step_return``, or the whole of one alone.
 
         Args:
             tensordict: a rollout (*, horizon) that carries its graph.
 
         Returns:
-            the parts by name, each (*,), with their graphs.
+            the terms by name, each (*,), with their graphs.
         """
         self._require_rollout(tensordict)
         parts = {}

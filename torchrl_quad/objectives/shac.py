@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_quad.objectives.pathwise import PathwiseCriticLoss
+from torchrl_quad.objectives.critic import PathwiseCriticLoss
 
 
 class SHACLoss(PathwiseCriticLoss):
@@ -24,9 +24,9 @@ class SHACLoss(PathwiseCriticLoss):
     ``SHACLoss(actor, value, target_bootstrap=True, average_over_horizon=True)``.
 
     Args:
-        actor_network: the policy that has made the rollout.
+        actor_network: the policy that flew the rollout.
         value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
-        terminal_gradient: False cuts the gradient of the terminal value in the state, as what was published with the
+        terminal_gradient: False cuts the gradient of the terminal value in the state, as the code published with the
             paper does. The actor then climbs the rewards of the horizon alone, as with BPTT.
         target_bootstrap: take the terminal value from the target critic, as Xu et al. do. False takes it from the
             critic itself; with ``delay_value=False`` the two are one.
@@ -38,7 +38,7 @@ class SHACLoss(PathwiseCriticLoss):
 
     @dataclass
     class _AcceptedKeys(PathwiseCriticLoss._AcceptedKeys):
-        """As for every pathwise loss with a critic, and where the critic writes its prediction."""
+        """As for every pathwise loss with a critic, and the key of the critic's prediction."""
 
         value: NestedKey = "state_value"
 
@@ -70,10 +70,13 @@ class SHACLoss(PathwiseCriticLoss):
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The critic's loss (paper, equation 16) on a rollout, or on samples of one that holds its targets.
+        """The critic's loss (paper, equation 16).
+
+        Args:
+            tensordict: a rollout (*, horizon), or samples (n) of one with its targets.
 
         Returns:
-            the loss, and a dictionary of what is worth logging.
+            the loss, and its metadata by name.
         """
         return self._critic_loss(tensordict)
 

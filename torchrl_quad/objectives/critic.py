@@ -1,0 +1,136 @@
+"""What the first-order losses with a critic share: terminal values, TD(lambda) targets and the critic's loss."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.objectives.utils import ValueEstimators
+
+from torchrl_quad.objectives.pathwise import PathwiseLoss, segments
+
+
+class PathwiseCriticLoss(PathwiseLoss):
+    """A pathwise loss with a critic, whose value ends each segment and which learns TD(lambda) targets.
+
+    A subclass names its critic network and says what it predicts.
+    """
+
+    @dataclass
+    class _AcceptedKeys(PathwiseLoss._AcceptedKeys):
+        """As for every pathwise loss, and the key under which targets are kept."""
+
+        value_target: NestedKey = "value_target"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.TDLambda
+    supported_value_estimators = (ValueEstimators.TD0, ValueEstimators.TDLambda)
+
+    critic_name: str  # the attribute that holds the critic network
+    critic_loss_key: str
+    prediction_key: str  # the tensor key under which the critic writes its prediction
+    value_part = "terminal_value"
+    target_bootstrap = False  # whether the terminal value comes from the target network
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The losses of actor and critic and their metadata, the ``out_keys``, of a rollout that carries its graph."""
+        loss_actor, metadata = self.loss_actor(tensordict)
+        loss_critic, critic_metadata = self._critic_loss(tensordict)
+        losses = {"loss_actor": loss_actor, self.critic_loss_key: loss_critic}
+        return TensorDict({**losses, **metadata, **critic_metadata}, [])
+
+    def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """The terms whose sum is J: the discounted ``rewards`` of the segments, and their ``terminal_value``.
+
+        Args:
+            tensordict: a rollout (*, horizon) that carries its graph.
+
+        Returns:
+            the terms by name, each (*,), with their graphs.
+        """
+        return {**super().objective_parts(tensordict), "terminal_value": self._terminal_value(tensordict)}
+
+    def write_value_target(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the TD(lambda) target of each step (paper, equations 17 and 18) into a rollout, and return it.
+
+        Each step's next value comes from the target network. A truncated step bootstraps, a terminated one does not,
+        and the horizon's last step bootstraps unless it terminated. The critic's loss uses the entry where it exists,
+        so that several critic steps share one set of targets, and computes it otherwise.
+
+        Args:
+            tensordict: a rollout (*, horizon); its graph is not needed.
+
+        Returns:
+            the same rollout, with the targets (*, horizon, 1) under the tensor key ``value_target``.
+        """
+        self._require_rollout(tensordict)
+        data = tensordict.detach()
+        with torch.no_grad():
+            next_value = self._value(data.get("next"), self._critic_params(target=True))
+            terminated = data.get(("next", self.tensor_keys.terminated))
+            next_value = torch.where(terminated, 0.0, next_value)  # also where the last state was not finite
+            target = self.value_estimator.value_estimate(data, next_value=next_value)
+        tensordict.set(self.tensor_keys.value_target, target)
+        return tensordict
+
+    @abc.abstractmethod
+    def _critics(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        """The prediction of each critic: (critics, *, 1)."""
+
+    def _value(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        """The value (*, 1) of states: the least of the critics' predictions."""
+        return self._critics(tensordict, params).amin(0)
+
+    def _critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        data = tensordict.detach()
+        target = data.get(self.tensor_keys.value_target, None)
+        if target is None:
+            target = self.write_value_target(data.copy()).get(self.tensor_keys.value_target)
+        prediction = self._critics(data, getattr(self, f"{self.critic_name}_params"))
+        error = (prediction - target).square().sum(0)
+        with torch.no_grad():
+            residual = (target - prediction).var(correction=0) / target.var(correction=0).clamp_min(1e-12)
+        return self._reduce_loss(error, tensordict), {
+            "pred_value": prediction.detach().mean(),
+            "target_value": target.mean(),
+            "explained_variance": 1.0 - residual,
+        }
+
+    def _critic_params(self, *, target: bool) -> TensorDictBase:
+        """The parameters of the critic or of its target, cut off from the graph."""
+        prefix = "target_" if target else ""
+        return getattr(self, f"{prefix}{self.critic_name}_params").detach()
+
+    def _terminal_value(self, tensordict: TensorDictBase) -> Tensor:
+        """gamma^n V(s_n) of each segment that did not terminate, summed over the segments: (*)."""
+        _, end = segments(tensordict.get(("next", self.tensor_keys.done)))
+        where = end & ~tensordict.get(("next", self.tensor_keys.terminated))
+        next_state = tensordict.get("next").select(*self._critic_inputs(), strict=False)[where.squeeze(-1)]
+        value = self._value(next_state, self._critic_params(target=self.target_bootstrap))
+        discount = self.value_estimator.gamma * self._discounts(tensordict)
+        return (discount * torch.zeros_like(discount).masked_scatter(where, value.to(discount.dtype))).sum((-2, -1))
+
+    def _critic_inputs(self) -> set[NestedKey]:
+        """The entries of a state that the critic, and the actor before it, read."""
+        names = set(self.actor_network.in_keys) | set(getattr(self, self.critic_name).in_keys)
+        return names - {self.tensor_keys.action}
+
+    def _require_rollout(self, tensordict: TensorDictBase) -> None:
+        critic, key = getattr(self, self.critic_name), getattr(self.tensor_keys, self.prediction_key)
+        if key not in critic.out_keys:
+            raise ValueError(
+                f"{type(self).__name__} reads {key!r} of its {self.critic_name}, which writes "
+                f"{', '.join(map(str, critic.out_keys))}. Give another network, or set_keys({self.prediction_key}=...)."
+            )
+        super()._require_rollout(tensordict)
+
+    def _network_in_keys(self) -> set[NestedKey]:
+        inputs = self._critic_inputs()
+        return inputs | {unravel_key(("next", key)) for key in inputs}

@@ -1,0 +1,290 @@
+"""Losses as LossModules: their keys, what they refuse, their checkpoints, and environments that are no quadrotors."""
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from test_objectives import GAMMA, make_networks, make_rollout
+from torch import nn
+from torchrl.envs import PendulumEnv
+from torchrl.objectives import SoftUpdate
+
+from torchrl_quad import (
+    ABPTLoss,
+    BPTTLoss,
+    HoveringEnv,
+    SHACLoss,
+    VisitedStateBuffer,
+    differentiable_rollout,
+    make_actor,
+    make_qvalue,
+    make_value,
+)
+
+
+@pytest.fixture
+def flight(env):
+    return differentiable_rollout(env, make_actor(env), None, 3)
+
+
+def losses(env):
+    actor = make_actor(env)
+    return [BPTTLoss(actor), SHACLoss(actor, make_value(env)), ABPTLoss(actor, make_qvalue(env))]
+
+
+@pytest.mark.parametrize("entropy", [0.0, 0.1, "auto"])
+def test_in_keys_suffice_and_out_keys_come_out(entropy):
+    env = HoveringEnv(num_envs=2)
+    actor = make_actor(env, return_log_prob=True)
+    for loss in (
+        BPTTLoss(actor, alpha=entropy),
+        SHACLoss(actor, make_value(env), alpha=entropy),
+        ABPTLoss(actor, make_qvalue(env), alpha=entropy),
+        ABPTLoss(actor, make_qvalue(env), alpha=entropy, zero_step_return=False),
+    ):
+        rollout, _ = differentiable_rollout(env, actor, None, 3)
+        out = loss(rollout.select(*loss.in_keys))
+        assert set(out.keys()) == set(loss.out_keys)
+        assert all(value.shape == () and value.isfinite() for value in out.values())
+        assert ("loss_alpha" in loss.out_keys) == (entropy == "auto")
+        sum(value for key, value in out.items() if key.startswith("loss_")).backward()
+        assert all(p.grad is not None and p.grad.isfinite().all() for p in loss.parameters() if p.requires_grad)
+        loss.zero_grad()
+
+
+def test_a_critic_may_see_more_than_the_actor():
+    env = HoveringEnv(num_envs=2)
+    actor = make_actor(env)
+    value = make_value(env, in_keys=["observation", ("state", "rotor_speed")])
+    rollout, _ = differentiable_rollout(env, actor, None, 3)
+    loss = SHACLoss(actor, value)
+    assert ("next", "state", "rotor_speed") in loss.in_keys
+    assert loss(rollout)["loss_value"].isfinite()
+
+
+def test_keys_can_be_renamed():
+    actor, value, _ = make_networks()
+    loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA)
+    loss.set_keys(reward="gain", terminated="crashed", done="over", value_target="goal")
+    assert ("next", "gain") in loss.in_keys and ("next", "reward") not in loss.in_keys
+    rollout = make_rollout(actor)
+    expected = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA)(rollout)
+    for old, new in (("reward", "gain"), ("terminated", "crashed"), ("done", "over")):
+        rollout.rename_key_(("next", old), ("next", new))
+    result = loss(rollout)
+    assert result["loss_actor"] == expected["loss_actor"]
+    assert result["loss_value"] == expected["loss_value"]
+    assert "goal" in loss.write_value_target(rollout)
+    with pytest.raises(ValueError, match="rewards"):
+        loss.set_keys(rewards="gain")
+
+
+def test_soft_update_moves_the_target_network():
+    actor, value, _ = make_networks()
+    loss = SHACLoss(actor, value)
+    updater = SoftUpdate(loss, tau=0.25)
+    value.module.weight.data.fill_(20.0)
+    updater.step()
+    assert loss.target_value_network_params["module", "weight"].item() == 12.5
+
+
+def test_a_loss_goes_on_from_a_checkpoint_with_its_discounts():
+    def make(critic):
+        actor, value, qvalue = make_networks(critic=critic)
+        return nn.ModuleDict({"bptt": BPTTLoss(actor), "shac": SHACLoss(actor, value), "abpt": ABPTLoss(actor, qvalue)})
+
+    saved, loaded = make(10.0), make(3.0)
+    for loss in saved.values():
+        loss.make_value_estimator(gamma=0.5)
+    loaded.load_state_dict(saved.state_dict())
+    assert {key: x.tolist() for key, x in loaded.state_dict().items()} == {
+        key: x.tolist() for key, x in saved.state_dict().items()
+    }
+    assert [loss.value_estimator.gamma.item() for loss in loaded.values()] == [0.5] * 3
+
+
+# -- what they refuse -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"alpha": -1.0}, "alpha must be 'auto' or a number that is not negative, got -1.0"),
+        ({"alpha": "automatic"}, "alpha must be 'auto'"),
+        ({"alpha": "auto", "alpha_init": 0.0}, "alpha_init must be positive, got 0.0"),
+        ({"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
+        ({"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
+        ({"num_qvalue_nets": 0}, "at least one critic, got num_qvalue_nets=0"),
+        ({"num_qvalue_nets": 2.5}, "at least one critic, got num_qvalue_nets=2.5"),
+    ],
+)
+def test_bad_arguments_say_what_is_allowed(kwargs, message):
+    actor, _, qvalue = make_networks()
+    with pytest.raises(ValueError, match=message):
+        ABPTLoss(actor, qvalue, **kwargs)
+
+
+def test_plain_modules_are_refused(env):
+    with pytest.raises(TypeError, match="actor_network must be a TensorDictModule, got Linear. Wrap a plain module"):
+        BPTTLoss(nn.Linear(13, 4))
+    with pytest.raises(TypeError, match="value_network must be a TensorDictModule, got Linear"):
+        SHACLoss(make_actor(env), nn.Linear(13, 1))
+
+
+def test_a_rollout_without_its_graph_is_refused_with_advice():
+    actor, value, qvalue = make_networks()
+    detached = make_rollout(actor).detach()
+    for loss in (
+        BPTTLoss(actor),
+        SHACLoss(actor, value),
+        ABPTLoss(actor, qvalue),
+        ABPTLoss(actor, qvalue, n_step_return=False),
+    ):
+        with pytest.raises(RuntimeError, match="carries no gradient.*Use differentiable_rollout"):
+            loss.loss_actor(detached)
+        with torch.no_grad():
+            loss.loss_actor(detached)
+
+
+def test_the_entropy_bonus_needs_the_log_probability():
+    actor, *_ = make_networks()
+    with pytest.raises(RuntimeError, match="Build the actor with return_log_prob=True"):
+        BPTTLoss(actor, alpha=0.1).loss_actor(make_rollout(actor))
+
+
+def test_a_rollout_without_a_time_dimension_is_refused(env, flight):
+    rollout, carry = flight
+    message = (
+        r"needs a rollout of batch size \(\*, horizon\), whose last dimension is time; got \({}.*Give it what diff"
+    )
+    for loss in losses(env):
+        for wrong, shape in (
+            (rollout[:, 0], "4,"),
+            (rollout.reshape(-1), "12,"),
+            (rollout[:, :0], "4, 0"),
+            (carry, "4,"),
+        ):
+            with pytest.raises(ValueError, match=f"{type(loss).__name__} {message.format(shape)}"):
+                loss(wrong)
+        with pytest.raises(ValueError, match=message.format("3, 4")):
+            loss(rollout.transpose(0, 1))
+        loss(rollout[0])  # a single flight, whose dimension has the name of time
+
+
+@pytest.mark.parametrize(
+    "key", ["action", "next", *(("next", key) for key in ("reward", "done", "terminated", "observation"))]
+)
+def test_a_rollout_that_lacks_an_entry_is_refused(env, flight, key):
+    for loss in losses(env):
+        if key in loss.in_keys or key == "next":
+            named = "reads .*'next'" if key == "next" else f"reads {key!r}".replace("(", r"\(").replace(")", r"\)")
+            with pytest.raises(ValueError, match=f"{type(loss).__name__} {named}.*not in the rollout.*set_keys"):
+                loss(flight[0].exclude(key))
+
+
+def test_a_wrong_tensor_key_is_refused(env, flight):
+    for loss in losses(env):
+        loss.set_keys(reward="gain")
+        with pytest.raises(
+            ValueError, match=r"reads \('next', 'gain'\), which is not in the rollout. If it has another"
+        ):
+            loss(flight[0])
+        with pytest.raises(ValueError, match="rewards is not an accepted tensordict key"):
+            loss.set_keys(rewards="gain")
+
+
+def test_a_rollout_on_another_device_is_refused(env, flight):
+    for loss in losses(env)[1:]:
+        with pytest.raises(ValueError, match="is on cpu, and the rollout on meta: loss.to.'meta'. moves it"):
+            loss(flight[0].to("meta"))
+
+
+def test_swapped_networks_are_refused(env, flight):
+    actor, value, qvalue = make_actor(env), make_value(env), make_qvalue(env)
+    for loss, reads, writes in (
+        (SHACLoss(actor, qvalue), "'state_value' of its value_network", "state_action_value"),
+        (ABPTLoss(actor, value), "'state_action_value' of its qvalue_network", "state_value"),
+        (SHACLoss(value, actor), "'state_value' of its value_network", "loc, scale, action"),
+    ):
+        with pytest.raises(
+            ValueError, match=f"reads {reads}, which writes {writes}. Give another network, or set_keys"
+        ):
+            loss(flight[0])
+
+
+# -- another environment -----------------------------------------------------------------------------------------------
+
+
+class CosSin(nn.Module):
+    def forward(self, th, thdot):
+        return torch.stack((th.cos(), th.sin(), thdot / 8), -1)
+
+
+def pendulum_networks(env):
+    spec = env.action_spec_unbatched
+    features = TensorDictModule(CosSin(), in_keys=["th", "thdot"], out_keys=["observation"])
+
+    def mlp(inputs, outputs):
+        return nn.Sequential(nn.Linear(inputs, 32), nn.Tanh(), nn.Linear(32, outputs))
+
+    class Policy(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.net = mlp(3, 1)
+
+        def forward(self, x):
+            return 2 * self.net(x).tanh()
+
+    class Critic(nn.Module):
+        def __init__(self, inputs):
+            super().__init__()
+            self.net = mlp(inputs, 1)
+
+        def forward(self, *x):
+            return self.net(torch.cat(x, -1))
+
+    def module(net, in_keys, out_key):
+        return TensorDictSequential(features, TensorDictModule(net, in_keys=in_keys, out_keys=[out_key]))
+
+    assert spec.shape == (1,)
+    return (
+        module(Policy(), ["observation"], "action"),
+        module(Critic(3), ["observation"], "state_value"),
+        module(Critic(4), ["observation", "action"], "state_action_value"),
+    )
+
+
+@pytest.mark.parametrize("name", ["bptt", "shac", "abpt"])
+def test_losses_train_the_pendulum_of_torchrl(name):
+    env = PendulumEnv(seed=0)
+    torch.manual_seed(0)
+    actor, value, qvalue = pendulum_networks(env)
+    loss = {
+        "bptt": lambda: BPTTLoss(actor),
+        "shac": lambda: SHACLoss(actor, value),
+        "abpt": lambda: ABPTLoss(actor, qvalue),
+    }[name]()
+    loss.make_value_estimator(gamma=0.95)
+    updater = SoftUpdate(loss, tau=0.05) if name != "bptt" else None
+    optimizer = torch.optim.Adam(loss.parameters(), 1e-2)
+    buffer = VisitedStateBuffer(env=env)
+
+    def fresh(n=32):
+        return env.reset(env.gen_params(batch_size=[n]), set_state=False)
+
+    def mean_reward():
+        env.set_seed(1)
+        with torch.no_grad():
+            return differentiable_rollout(env, actor, fresh(), 60)[0]["next", "reward"].mean().item()
+
+    before = mean_reward()
+    for _ in range(40):
+        rollout, _ = differentiable_rollout(env, actor, fresh(), 30)
+        buffer.extend(rollout)
+        out = loss(rollout)
+        optimizer.zero_grad()
+        sum(value for key, value in out.items() if key.startswith("loss_")).backward()
+        optimizer.step()
+        if updater:
+            updater.step()
+    assert len(buffer) == 40 * 32 * 30
+    assert mean_reward() > before + 0.7  # from about -5.9 per step; the torque is too weak to swing up in one go

@@ -1,12 +1,26 @@
-"""Differentiable rollouts and the buffer of visited states."""
+"""Differentiable rollouts, visited states and restarts."""
 
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
-from torchrl.envs import Compose, PendulumEnv, RewardSum, StepCounter, TransformedEnv, VecNormV2, check_env_specs
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    PendulumEnv,
+    RewardSum,
+    StepCounter,
+    TransformedEnv,
+)
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import HoveringEnv, ObservationNormalizer, VisitedStateBuffer, differentiable_rollout, make_actor
+from torchrl_quad import (
+    HoveringEnv,
+    TrackingEnv,
+    VisitedStateBuffer,
+    differentiable_rollout,
+    make_actor,
+    restart,
+)
 
 
 @pytest.fixture
@@ -33,17 +47,25 @@ def test_the_carry_goes_on_where_the_rollout_ended_and_is_not_modified(flight):
     assert (carry == before).all()
 
 
-def test_it_equals_the_rollout_of_torchrl():
+def test_it_equals_torchrl_s_own_loop():
     def fly(function):
-        env = HoveringEnv(num_envs=4, seed=1, max_episode_steps=4)
+        env = HoveringEnv(num_envs=4, seed=1, max_episode_steps=4, dtype=torch.float64)
+        start, again = env.reset(), env.reset()["state"]
+        env.set_initial_state_source(lambda n: again)
         torch.manual_seed(3)
-        return function(env, make_actor(env))
+        actor = make_actor(env)
+        rollout = function(env, actor, start)
+        rollout["next", "reward"].sum().backward()
+        entries = {key: x.detach() for key, x in rollout.items(include_nested=True, leaves_only=True)}
+        return entries | {name: p.grad for name, p in actor.named_parameters()}
 
-    ours = fly(lambda env, actor: differentiable_rollout(env, actor, None, 10)[0])
-    with set_exploration_type(ExplorationType.RANDOM):
-        theirs = fly(lambda env, actor: env.rollout(10, actor, break_when_any_done=False))
-    for key, value in theirs.items(include_nested=True, leaves_only=True):
-        assert torch.equal(value, ours[key]), key
+    def torchrl_s_loop(env, actor, start):
+        with set_exploration_type(ExplorationType.RANDOM):
+            return EnvBase.rollout(env, 10, actor, tensordict=start, auto_reset=False, break_when_any_done=False)
+
+    ours = fly(lambda env, actor, start: differentiable_rollout(env, actor, start, 10)[0])
+    torch.testing.assert_close(ours, fly(torchrl_s_loop))
+    assert ours["next", "done"].sum() == 8
 
 
 def test_it_samples_by_default_and_is_deterministic_on_request(env):
@@ -82,9 +104,7 @@ def test_it_flies_any_differentiable_environment():
     assert rollout["next", "reward"].requires_grad
 
 
-def test_bad_arguments_say_what_is_allowed(env):
-    with pytest.raises(ValueError, match="horizon must be at least 1 control step, got 0"):
-        differentiable_rollout(env, make_actor(env), None, 0)
+def test_an_actor_is_a_tensordict_module(env):
     with pytest.raises(TypeError, match="actor must be a TensorDictModule that writes the action, got Linear"):
         differentiable_rollout(env, torch.nn.Linear(13, 4), None, 1)
 
@@ -222,82 +242,65 @@ def test_the_buffer_is_saved_and_loaded_with_its_generator(flight, tmp_path, way
     assert (a == b).all()
 
 
-def test_an_empty_buffer_and_a_bad_fraction_are_refused(flight):
-    env, _, rollout, _ = flight
-    buffer = VisitedStateBuffer()
-    with pytest.raises(RuntimeError, match="The visited-state buffer is empty. Fly a first horizon"):
-        buffer.initial_state(env)
+def test_a_buffer_keeps_the_markov_state_of_any_environment():
+    assert VisitedStateBuffer().state_keys == VisitedStateBuffer(env=HoveringEnv(num_envs=2)).state_keys == ("state",)
+    pendulum = TransformedEnv(PendulumEnv(seed=0), StepCounter())
+    buffer = VisitedStateBuffer(env=pendulum)
+    assert buffer.state_keys == ("th", "thdot", "params")
+    torque = TensorDictModule(lambda speed: -speed.unsqueeze(-1), in_keys=["thdot"], out_keys=["action"])
+    rollout, _ = differentiable_rollout(pendulum, torque, None, 4)
     buffer.extend(rollout)
-    with pytest.raises(ValueError, match="fraction must lie between 0"):
-        buffer.initial_state(env, 1.5)
-    with pytest.raises(ValueError, match="capacity must be at least 1 state, got 0"):
-        VisitedStateBuffer(capacity=0)
+    assert buffer.initial_state(pendulum, 1.0)["th"] in rollout["th"]
+    assert buffer.initial_state(pendulum, 0.0)["th"] not in rollout["th"]
+    with pytest.raises(TypeError, match=r"PendulumEnv has no sample_start\(n\).*start horizons with buffer.init"):
+        buffer.source(pendulum)
 
 
-# -- normalised observations -------------------------------------------------------------------------------------------
+def test_an_empty_buffer_and_a_bad_fraction_are_refused(env, flight):
+    buffer = VisitedStateBuffer()
+    for use in (lambda: buffer.initial_state(env), lambda: buffer.source(env)(4)):
+        with pytest.raises(RuntimeError, match="The visited-state buffer is empty. Fly a first horizon"):
+            use()
+    buffer.extend(flight[2])
+    for use in (buffer.initial_state, buffer.source, lambda env, fraction: restart(env, flight[3], fraction)):
+        for fraction in (1.5, -0.1, float("nan")):
+            with pytest.raises(ValueError, match=f"fraction must lie between 0 and 1, got {fraction}"):
+                use(env, fraction)
 
 
-def test_the_normalizer_s_statistics_are_those_of_all_observations_seen():
-    base = HoveringEnv(num_envs=8, dtype=torch.float64)
-    normalizer = ObservationNormalizer(base, min_scale=1e-4)
-    env = TransformedEnv(base, normalizer)
-    check_env_specs(env)
-    actor, seen, carry = make_actor(env), [], None
-    for _ in range(3):
-        rollout, carry = differentiable_rollout(env, actor, carry, 7)
-        seen.append(base.observe(rollout["next", "state"].reshape(-1)).detach())
-        normalizer.update(rollout)
-        carry = env.reset(carry.select("state"), set_state=True)
-        expected = normalizer._apply_transform(base.observe(carry["state"]))
-        torch.testing.assert_close(carry["observation"], expected)
-    seen = torch.cat(seen)
-    torch.testing.assert_close(normalizer.loc, seen.mean(0))
-    torch.testing.assert_close(normalizer.scale, seen.std(0, correction=0).clamp_min(1e-4))
-    assert normalizer.count == 8 * 7 * 3
+@pytest.mark.parametrize("capacity", [0, 2.5, -1, "many"])
+def test_a_capacity_is_a_whole_number(capacity):
+    with pytest.raises(ValueError, match="capacity must be at least 1 state, got"):
+        VisitedStateBuffer(capacity)
 
 
-def test_gradients_pass_the_normalizer_and_an_update_before_backward_changes_nothing():
-    def gradient(update):
-        torch.manual_seed(0)
-        base = HoveringEnv(num_envs=4, seed=1)
-        normalizer = ObservationNormalizer(base)
-        env = TransformedEnv(base, normalizer)
-        actor = make_actor(env)
-        normalizer.update(differentiable_rollout(env, actor, None, 3)[0])
-        rollout, _ = differentiable_rollout(env, actor, None, 5)
-        if update:
-            normalizer.update(rollout)
-        rollout["next", "reward"].sum().backward()
-        return torch.cat([p.grad.flatten() for p in actor.parameters()])
-
-    before, after = gradient(update=False), gradient(update=True)
-    assert torch.equal(before, after)
-    assert before.abs().sum() > 0
+def test_states_of_other_tasks_and_options_are_neither_mixed_nor_broadcast(flight):
+    buffer, message = VisitedStateBuffer(), "These are other states than those in the visited-state buffer: .*{}.* diff"
+    buffer.extend(flight[2])
+    for other, key in ((TrackingEnv(num_envs=4), "phase"), (HoveringEnv(num_envs=4, action_delay=2), "action_queue")):
+        with pytest.raises(ValueError, match=message.format(key)):
+            buffer.initial_state(other)
+        with pytest.raises(ValueError, match=message.format(key)):
+            buffer.extend(other.rollout(2))
+    assert len(buffer) == 20
+    with pytest.raises(ValueError, match="keeps .'th',., and the rollout lacks 'th'. Give the buffer the environment"):
+        VisitedStateBuffer(state_keys=["th"]).extend(flight[2])
 
 
-@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers with non-empty batch-size:UserWarning")
-def test_where_a_live_vecnorm_breaks_backward_the_normalizer_does_not():
-    def train(transform):
-        env = TransformedEnv(HoveringEnv(num_envs=4), transform)
-        rollout, _ = differentiable_rollout(env, make_actor(env), None, 5)
-        rollout["next", "reward"].sum().backward()
-
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        train(VecNormV2(in_keys=["observation"]))
-    train(ObservationNormalizer(HoveringEnv(num_envs=4)))
+# -- restarts ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_normalizer_is_saved_and_leaves_out_what_is_not_finite():
-    env = HoveringEnv(num_envs=4)
-    one, other = ObservationNormalizer(env), ObservationNormalizer(env)
-    rollout = env.rollout(5)
-    one.update(rollout)
-    broken = rollout.clone()
-    broken["next", "observation"][0, 0, 0] = float("nan")
-    one.update(broken)
-    assert one.count == 39
-    one.update(rollout[:0])
-    assert all(buffer.isfinite().all() for buffer in one.state_dict().values())
-    other.load_state_dict(one.state_dict())
-    observation = rollout["observation"]
-    assert torch.equal(one._apply_transform(observation), other._apply_transform(observation))
+@pytest.mark.parametrize("wrap", [False, True])
+def test_a_restart_begins_a_fraction_of_the_flights_afresh_and_lets_the_others_go_on(wrap):
+    env = HoveringEnv(num_envs=1000)
+    env = TransformedEnv(env, StepCounter()) if wrap else env
+    _, carry = differentiable_rollout(env, make_actor(env), None, 3)
+    env.set_initial_state_source(lambda n: carry["state"])  # fresh starts are the task's own all the same
+    for fraction in (0.0, 0.3, 1.0):
+        after = restart(env, carry, fraction)
+        fresh = (after["state", "step"] == 0).flatten()
+        assert fresh.float().mean().item() == pytest.approx(fraction, abs=0.06)
+        assert (after["state"][~fresh] == carry["state"][~fresh]).all()
+        torch.testing.assert_close(after["observation"][~fresh], carry["observation"][~fresh])
+    with pytest.raises(ValueError, match="restart needs the whole state, .'state',., and the carry lacks 'state'"):
+        restart(env, carry.exclude("state"), 0.5)

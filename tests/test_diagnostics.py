@@ -1,4 +1,4 @@
-"""What a reward and a policy gradient are made of, against numbers worked by hand and against the paper's table I."""
+"""The make-up of rewards and policy gradients, against numbers worked by hand and the paper's table I."""
 
 import math
 
@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from test_loss_modules import pendulum_networks
 from torch import nn
 from torchrl.envs import PendulumEnv
 
@@ -44,7 +45,7 @@ def module(net, in_keys, out_key):
 
 
 def make_rollout(states=((1.0, 2.0, 3.0), (1.0, 2.0, 3.0)), weight=2.0):
-    """Two environments, three steps, action = 2 s, next state = s + action; terms worth 36, -56, 5, 3 and 0."""
+    """Two environments, three steps, action = 2 s, next state = s + action; returns of 36, -56, 5, 3 and 0 by term."""
     actor = module(Weigh(weight), ["observation"], "action")
     state = torch.tensor(states).unsqueeze(-1)
     steps = [actor(TensorDict({"observation": s}, s.shape[:1])) for s in state.unbind(1)]
@@ -92,7 +93,7 @@ def test_returns_are_discounted_anew_in_each_episode():
     assert audit["bonus"].mean_return == 5 * (1 + 0.25) / 2
 
 
-def test_the_actions_of_a_rollout_stand_for_those_that_were_flown():
+def test_the_actions_of_a_rollout_may_be_the_inputs():
     rollout, actor = make_rollout()
     audit = audit_reward(rollout, rollout["action"])
     assert audit["linear"].gradient_norm == pytest.approx(3 / 2 * math.sqrt(6))  # six actions, mean of two returns
@@ -101,7 +102,7 @@ def test_the_actions_of_a_rollout_stand_for_those_that_were_flown():
     assert by_weights == audit_reward(rollout, actor) == audit_reward(rollout, BPTTLoss(actor))
 
 
-def test_a_table_and_a_flat_dictionary_say_the_same():
+def test_the_table_and_the_metrics_agree():
     rollout, actor = make_rollout()
     audit = audit_reward(rollout, actor)
     lines = str(audit).splitlines()
@@ -169,7 +170,7 @@ def test_the_audit_finds_which_rewards_are_fully_and_which_are_partially_differe
     assert [term.verdict for term in by_action.values()] == [term.verdict for term in audit.values()]
 
 
-def test_of_what_was_never_paid_nothing_is_said():
+def test_a_term_that_was_never_paid_is_not_seen():
     env = make_env("racing", num_envs=2)
     actor = make_actor(env)
     rollout, _ = differentiable_rollout(env, actor, None, 5)
@@ -223,7 +224,7 @@ def test_abpt_sets_the_0_step_return_against_the_n_step_return(critic, cosine):
     assert comparison.cosine == pytest.approx(cosine * math.copysign(1, n_step))
 
 
-def test_where_one_of_the_two_gradients_is_missing_the_cosine_is_nan():
+def test_the_cosine_is_nan_where_one_of_the_two_gradients_is_missing():
     rollout, actor = make_rollout()
     bptt = compare_gradients(BPTTLoss(actor), rollout)
     assert bptt.first_order_norm > 0 and math.isnan(bptt.value_norm) and math.isnan(bptt.cosine)
@@ -292,28 +293,16 @@ def test_the_gradient_grows_with_the_horizon():
 # -- other environments ------------------------------------------------------------------------------------------------
 
 
-def test_they_know_no_quadrotor_and_look_at_the_pendulum_of_torchrl():
+def test_diagnostics_look_at_the_pendulum_of_torchrl():
     env = PendulumEnv(seed=0)
-
-    class Net(nn.Module):
-        def __init__(self, inputs):
-            super().__init__()
-            self.net = nn.Sequential(nn.Linear(inputs, 8), nn.Tanh(), nn.Linear(8, 1), nn.Tanh())
-
-        def forward(self, th, thdot, *action):
-            return 2.0 * self.net(torch.cat((torch.stack((th.cos(), th.sin(), thdot), -1), *action), -1))
-
-    actor = module(Net(3), ["th", "thdot"], "action")
+    actor, value, qvalue = pendulum_networks(env)
     start = env.reset(env.gen_params(batch_size=[6]), set_state=False)
     rollout, _ = differentiable_rollout(env, actor, start, 12)
     audit = audit_reward(rollout, actor, terms_key=("next", "reward"))
     assert audit["reward"].verdict == "differentiable" and audit.without_gradient == []
     assert audit["reward"].mean_return == pytest.approx(rollout["next", "reward"].sum(1).mean().item())
     assert audit_reward(rollout, rollout["action"], terms_key=("next", "reward"))["reward"].gradient_norm > 0
-    for loss in (
-        SHACLoss(actor, module(Net(3), ["th", "thdot"], "state_value")),
-        ABPTLoss(actor, module(Net(4), ["th", "thdot", "action"], "state_action_value")),
-    ):
+    for loss in (SHACLoss(actor, value), ABPTLoss(actor, qvalue)):
         comparison = compare_gradients(loss, rollout)
         assert -1.0 <= comparison.cosine <= 1.0 and comparison.first_order_norm > 0 and comparison.value_norm > 0
         grown = gradient_by_horizon(env, actor, loss, (2, 8), start=start, max_envs=4)
@@ -336,7 +325,7 @@ def test_terms_that_do_not_add_up_to_the_reward_are_refused():
         audit_reward(rollout, actor, terms_key=("next", "terms"))
 
 
-def test_what_has_no_gradient_at_all_is_refused_with_advice():
+def test_a_rollout_without_any_gradient_is_refused_with_advice():
     rollout, actor = make_rollout()
     with pytest.raises(RuntimeError, match="carries no gradient. Collectors.*Use differentiable_rollout"):
         audit_reward(rollout.detach(), actor)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torchrl.data import Unbounded
 from torchrl.envs import CatTensors, PendulumEnv, StepCounter, TransformedEnv, UnsqueezeTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -31,6 +32,8 @@ def test_the_first_action_can_be_chosen_and_is_the_middle_of_the_range_elsewhere
     action = make_actor(pendulum)(pendulum.reset())["action"]
     assert action.shape == (1,)
     assert action.abs() < 0.1
+    pendulum.base_env.neutral_action = torch.tensor([1.5])
+    assert make_actor(pendulum)(pendulum.reset())["action"].item() == pytest.approx(1.5, abs=0.1)
 
 
 def test_each_entry_may_have_a_scale_of_its_own():
@@ -64,3 +67,59 @@ def test_every_network_has_the_precision_of_the_environment():
     for network, key in ((make_value(env), "state_value"), (make_qvalue(env), "state_action_value")):
         assert network(td)[key].dtype is torch.float64
         assert network(td)[key].shape == (2, 1)
+
+
+# -- errors ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [make_actor, make_value, make_qvalue])
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"num_cells": (0,)}, r"num_cells must be the widths of the hidden layers, such as \(64, 64\); got \(0,\)"),
+        ({"num_cells": (64, -1)}, "num_cells must be the widths"),
+        ({"num_cells": (2.5,)}, "num_cells must be the widths"),
+        ({"num_cells": 64}, "num_cells must be the widths .* got 64"),
+        ({"in_keys": ["obs"]}, "Unknown entry 'obs' in in_keys. Choose from: observation, "),
+        (
+            {"in_keys": [("state", "speed")]},
+            r"Unknown entry \('state', 'speed'\) in in_keys. Choose from: observation, ",
+        ),
+        ({"in_keys": ["state"]}, "Unknown entry 'state' in in_keys"),
+        ({"in_keys": [("state", "action_queue")]}, r"has shape \(4, 1, 4\) and a network reads vectors: flatten it"),
+    ],
+)
+def test_a_network_of_wrong_sizes_or_entries_is_refused(env, make, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make(env, **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        (
+            {"in_keys": "observation"},
+            r'in_keys must be a list of entries, such as \["observation"\]; got \'observation',
+        ),
+        ({"in_keys": []}, "in_keys must be a list of entries"),
+        ({"action_init": [0.0, 0.0, 0.0]}, "action_init must be 4 numbers strictly between"),
+        ({"action_init": [1.0, 0.0, 0.0, 0.0]}, r"strictly between .* got \[1.0, 0.0, 0.0, 0.0\]"),
+        ({"action_init": [float("nan"), 0.0, 0.0, 0.0]}, "strictly between"),
+        ({"scale_init": 0.0}, "scale_init must be positive, got 0.0"),
+    ],
+)
+def test_a_first_action_out_of_bounds_and_a_wrong_list_of_entries_are_refused(env, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make_actor(env, **kwargs)
+
+
+def test_an_actor_needs_an_action_with_bounds():
+    env = PendulumEnv()
+    env.action_spec = Unbounded(env.action_spec.shape)
+    with pytest.raises(ValueError, match="make_actor needs an action with bounds, a Bounded spec; got Unbounded"):
+        make_actor(env)
+
+
+def test_networks_may_read_whole_numbers(env64):
+    network = make_value(env64, in_keys=[("state", "step"), "success", "observation"])
+    assert network(env64.reset())["state_value"].dtype is torch.float64

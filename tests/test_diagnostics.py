@@ -331,7 +331,7 @@ def test_a_rollout_without_any_gradient_is_refused_with_advice():
         audit_reward(rollout.detach(), actor)
     with pytest.raises(RuntimeError, match="carries no gradient"):
         compare_gradients(BPTTLoss(actor), rollout.detach())
-    with pytest.raises(ValueError, match="does not depend on the inputs. Give the actor that has flown this rollout"):
+    with pytest.raises(ValueError, match="does not depend on the inputs. Give the actor that flew this rollout"):
         audit_reward(rollout, make_rollout()[1])
     with pytest.raises(ValueError, match="nothing to differentiate with respect to"):
         audit_reward(rollout, rollout["observation"])

@@ -1,4 +1,4 @@
-"""What a reward and a policy gradient are made of: terms without gradient, critic against simulator, variance."""
+"""Diagnostics of rewards and policy gradients: terms without gradient, critic against simulator, variance."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ Inputs = nn.Module | Tensor | Iterable[Tensor]
 
 @dataclass(frozen=True)
 class TermAudit:
-    """What one term gives to the return of a rollout and to its gradient.
+    """The contribution of one reward term to the return of a rollout and to its gradient.
 
     ================  ================================================================================================
     verdict           meaning
     ================  ================================================================================================
     differentiable    its gradient is not zero
     no gradient       it was paid, and its gradient is exactly zero: a first-order method does not climb it
-    constant          it is paid alike in every step: there is nothing to climb but the length of the episode
-    not seen          it was never paid in this rollout, and nothing can be said
+    constant          every step pays the same: only the length of the episode changes its return
+    not seen          this rollout never paid it, which leaves its gradient unknown
     not finite        its gradient is NaN or infinite
     ================  ================================================================================================
     """
@@ -43,11 +43,11 @@ class TermAudit:
 
 
 class RewardAudit(dict[str, TermAudit]):
-    """The terms of a reward by name; ``print`` shows a table."""
+    """The audit of each reward term by name; ``print`` shows a table."""
 
     @property
     def without_gradient(self) -> list[str]:
-        """The terms that were paid without a (finite) gradient; where there is none, the reward is "fully DIFF"."""
+        """The terms that were paid without a finite gradient; if there are none, the reward is "fully DIFF" (paper)."""
         return [name for name, term in self.items() if term.verdict in ("no gradient", "not finite")]
 
     def metrics(self) -> dict[str, float]:
@@ -80,20 +80,20 @@ def audit_reward(
     done_key: NestedKey = ("next", "done"),
     tolerance: float = 1e-4,
 ) -> RewardAudit:
-    """Find out which terms of a reward have a gradient, and how much each gives to the return and to its gradient.
+    """Find out which terms of a reward have a gradient, and how much each adds to the return and to its gradient.
 
-    Works for the rollouts of any differentiable TorchRL environment. A verdict holds for what this rollout has seen:
-    let it start where all terms are paid, and be longer than the delay between an action and its effect.
+    It works for rollouts of any differentiable TorchRL environment. A verdict holds for this rollout alone. Start it
+    where all terms are paid, and make it longer than the delay between an action and its effect.
 
     Args:
         rollout: (*, horizon) with its graph, as ``differentiable_rollout`` returns it.
-        inputs: what to differentiate with respect to: the actor or a loss of it, which stand for the actor's
-            parameters; or tensors that the reward depends on. ``rollout["action"]`` stands for the actions as they
-            were before TorchRL stacked them.
+        inputs: the inputs to differentiate with respect to. The actor or a loss of it mean the actor's parameters;
+            tensors that the reward depends on are taken as they are. ``rollout["action"]`` means the actions before
+            TorchRL stacked them.
         gamma: discount of the returns, from 1 at the start of each episode in the rollout.
-        terms_key: where the terms stand, each (*, horizon, 1), by name and weighted; or a reward that is one term.
+        terms_key: the weighted terms by name, each (*, horizon, 1); or a reward that is a single term.
         reward_key: their sum, (*, horizon, 1).
-        done_key: where episodes end, bool (*, horizon, 1).
+        done_key: the ends of episodes, bool (*, horizon, 1).
         tolerance: how far the sum of the terms may be from the reward, in units of 1 + their absolute sum.
 
     Raises:
@@ -103,8 +103,8 @@ def audit_reward(
     for key in (terms_key, reward_key, done_key):
         if key not in rollout:
             raise ValueError(
-                f"audit_reward reads {key!r}, which is not in the rollout. Name the terms, the reward and the end as "
-                "they stand there: terms_key, reward_key, done_key."
+                f"audit_reward reads {key!r}, which is not in the rollout. Name the terms, the reward and the ends of "
+                "episodes as the rollout does: terms_key, reward_key, done_key."
             )
     reward, entry = rollout.get(reward_key), rollout.get(terms_key)
     if isinstance(entry, Tensor):
@@ -120,7 +120,7 @@ def audit_reward(
     sources = _sources(inputs)
     if all(g is None for g in torch.autograd.grad(reward.sum(), sources, retain_graph=True, allow_unused=True)):
         raise ValueError(
-            f"{reward_key!r} does not depend on the inputs. Give the actor that has flown this rollout, or tensors "
+            f"{reward_key!r} does not depend on the inputs. Give the actor that flew this rollout, or tensors "
             "from which its actions were computed."
         )
     discount = discounts(rollout.get(done_key), torch.as_tensor(gamma, dtype=reward.dtype, device=reward.device))
@@ -143,7 +143,7 @@ def audit_reward(
 
 @dataclass(frozen=True)
 class GradientComparison:
-    """The gradient of what the simulator tells of the return beside that of what a critic tells of it."""
+    """The gradient of the return from the simulator, beside that from a critic."""
 
     cosine: float  #: between the two, -1 to 1; NaN where one is zero or does not exist
     first_order_norm: float
@@ -155,16 +155,16 @@ def compare_gradients(loss: PathwiseLoss, rollout: TensorDictBase) -> GradientCo
     """Compare the first-order and the value gradient of an objective in the actor's parameters (paper, section IV-B).
 
     With ABPT they are the gradients of the N-step and of the 0-step return, with SHAC those of the rewards of the
-    horizon and of the terminal value; both as they stand in the objective, so that their sum is its gradient, and
-    averaged over environments. BPTT has no value gradient: its cosine and norm are NaN, as they are where ABPT has one
-    of its returns switched off. ABPT samples actions for it, as its loss does. No ``.grad`` is touched.
+    horizon and of the terminal value. Both carry their weights in the objective, so that their sum is its gradient, and
+    both are means over environments. BPTT has no value gradient: its cosine and norm are NaN, as they are where ABPT
+    has one of its returns switched off. ABPT samples actions for this, as its loss does. No ``.grad`` changes.
 
     Args:
-        loss: of the actor that has flown the rollout.
+        loss: a loss of the actor that flew the rollout.
         rollout: (*, horizon) with its graph.
 
     Raises:
-        ValueError: as the loss does of a rollout that it cannot use.
+        ValueError: the loss cannot use the rollout.
         RuntimeError: the rollout has lost its graph.
     """
     parts, sources = loss.objective_parts(rollout), _sources(loss)
@@ -180,26 +180,26 @@ def compare_gradients(loss: PathwiseLoss, rollout: TensorDictBase) -> GradientCo
 
 @dataclass(frozen=True)
 class GradientStatistics:
-    """The policy gradient of single environments."""
+    """Mean and spread of the policy gradients of single environments."""
 
     norm: float  #: of their mean
     variance: float  #: over environments, summed over parameters, which is the trace of the covariance
-    signal_to_noise: float  #: the norm of the mean in units of the standard deviation, the root of the variance
+    signal_to_noise: float  #: the norm of the mean over the standard deviation, the root of the variance
 
 
 @torch.enable_grad()
 def gradient_statistics(loss: PathwiseLoss, rollout: TensorDictBase, *, max_envs: int = 16) -> GradientStatistics:
-    """Mean and spread of the gradients that single environments give, of the objective without its entropy bonus.
+    """Mean and spread of the policy gradients of single environments, without the entropy bonus.
 
-    Each environment takes a backward pass through the whole rollout. No ``.grad`` is touched.
+    Each environment takes a backward pass through the whole rollout. No ``.grad`` changes.
 
     Args:
-        loss: of the actor that has flown the rollout.
+        loss: a loss of the actor that flew the rollout.
         rollout: (*, horizon) with its graph.
-        max_envs: look at so many environments, the first ones.
+        max_envs: the number of environments to look at, the first ones.
 
     Raises:
-        ValueError: these are fewer than two environments; or as the loss does of a rollout that it cannot use.
+        ValueError: there are fewer than two environments, or the loss cannot use the rollout.
         RuntimeError: the rollout has lost its graph.
     """
     objectives = sum(loss.objective_parts(rollout).values()).flatten()[:max_envs]
@@ -223,14 +223,14 @@ def gradient_by_horizon(
     start: TensorDictBase | None = None,
     max_envs: int = 16,
 ) -> dict[int, GradientStatistics]:
-    """How norm and variance of the policy gradient grow with the horizon, each flown from the same starts.
+    """Measure how norm and variance of the policy gradient grow with the horizon, flown from the same starts.
 
     Args:
         env: any differentiable TorchRL environment.
         actor: the policy of the loss.
         loss: BPTTLoss, SHACLoss, ABPTLoss or another pathwise loss.
         horizons: numbers of control steps.
-        start: a reset tensordict of two environments or more; ``env.reset()`` where there is none.
+        start: a reset tensordict of at least two environments; ``env.reset()`` by default.
         max_envs: as for :func:`gradient_statistics`.
 
     Raises:
@@ -250,7 +250,7 @@ def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
     if isinstance(inputs, nn.Module):
         inputs = [p for p in getattr(inputs, "actor_network_params", inputs).parameters() if p.requires_grad]
     if isinstance(inputs, Tensor) and inputs.grad_fn is not None and inputs.grad_fn.name() == "StackBackward0":
-        # A rollout's entries are stacked when it has been flown: what the reward depends on is what was stacked.
+        # TorchRL stacks the entries of a rollout afterwards: the reward depends on the tensors before that.
         return [GradientEdge(node, index) for node, index in inputs.grad_fn.next_functions if node is not None]
     sources = [inputs] if isinstance(inputs, Tensor) else list(inputs)
     if not sources or not all(isinstance(x, Tensor) and x.requires_grad for x in sources):

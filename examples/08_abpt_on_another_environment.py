@@ -1,4 +1,4 @@
-"""The losses know no quadrotor: ABPT, with horizons from visited states, swings up TorchRL's own pendulum."""
+"""The losses work on any differentiable environment: ABPT from visited states swings up TorchRL's own pendulum."""
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -9,10 +9,9 @@ from torchrl.objectives import SoftUpdate
 from torchrl_quad import ABPTLoss, VisitedStateBuffer, differentiable_rollout
 
 ITERATIONS = 100
-STATE = ("th", "thdot", "params")  # what a state of this environment is made of
 
 torch.manual_seed(0)
-env = TransformedEnv(PendulumEnv(seed=0), RewardScaling(0.0, 0.02))  # returns near 1 are learnt faster than near 100
+env = TransformedEnv(PendulumEnv(seed=0), RewardScaling(0.0, 0.02))  # returns near 1 are quicker to learn than near 100
 
 
 def see(th, thdot):
@@ -29,12 +28,12 @@ loss = ABPTLoss(actor, TensorDictSequential(features, critic))
 loss.make_value_estimator(gamma=0.98, lmbda=0.95)
 target = SoftUpdate(loss, tau=0.05)
 optimizer = torch.optim.Adam(loss.parameters(), 5e-3)
-buffer = VisitedStateBuffer(capacity=20_000, state_keys=STATE)
+buffer = VisitedStateBuffer(capacity=20_000, env=env)  # keeps th, thdot and params: env.state_keys
 
 
 def starts(n):
     """Pendulums at random angles, under half the gravity of the Earth: they still have to swing to get up."""
-    return env.reset(env.gen_params(g=5.0, batch_size=[n]), set_state=False).select(*STATE)
+    return env.reset(env.gen_params(g=5.0, batch_size=[n]), set_state=False).select(*buffer.state_keys)
 
 
 def swing_up():
@@ -55,5 +54,5 @@ for _ in range(ITERATIONS):
     optimizer.step()
     target.step()
     buffer.extend(rollout)
-    carry = env.reset(torch.cat((starts(32), buffer.sample(32).select(*STATE))), set_state=True)
+    carry = env.reset(torch.cat((starts(32), buffer.sample(32).select(*buffer.state_keys))), set_state=True)
 print(f"after:  {swing_up():.0f} % swing up")

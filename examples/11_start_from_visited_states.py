@@ -1,4 +1,4 @@
-"""Horizons that start where the policy has been before, and not only at the start line, see far more of a race."""
+"""Horizons from visited states see far more of a race than horizons from the start line alone."""
 
 import torch
 
@@ -9,7 +9,7 @@ HORIZON = 48  # control steps, 0.96 s: too short to come from one gate to the ne
 
 
 def train(fraction):
-    """The states (n) in which horizons have started, when a fraction of them starts in visited states."""
+    """Train with a fraction of the horizons from visited states, and return the states (n) of their starts."""
     torch.manual_seed(0)
     env = RacingEnv(num_envs=64, reward="velocity")
     actor = make_actor(env)
@@ -27,7 +27,7 @@ def train(fraction):
 
         buffer.extend(rollout)
         carry = buffer.initial_state(env, fraction)
-        # Where a drone crashes, the rest of its horizon begins in a visited state, too.
+        # After a crash the rest of the horizon starts in a visited state, too.
         env.set_initial_state_source(buffer.source(env, fraction))
     return torch.cat(starts)
 

@@ -256,6 +256,24 @@ def test_a_buffer_keeps_the_markov_state_of_any_environment():
         buffer.source(pendulum)
 
 
+class OwnPendulum(PendulumEnv):
+    """A pendulum that knows where its episodes start."""
+
+    def sample_start(self, n):
+        return self.gen_params(batch_size=[n]).update({"th": torch.full((n,), 0.5), "thdot": torch.zeros(n)})
+
+
+def test_fresh_starts_come_from_an_environment_that_samples_them():
+    env = OwnPendulum(seed=0)
+    buffer = VisitedStateBuffer(env=env)
+    start = env.reset()
+    buffer.extend(start)
+    for fraction, angle in ((0.0, 0.5), (1.0, start["th"])):
+        assert buffer.initial_state(env, fraction)["th"] == angle
+        assert (buffer.source(env, fraction)(3)["th"] == angle).all()
+        assert restart(env, start, 1.0 - fraction)["th"] == angle
+
+
 def test_an_empty_buffer_and_a_bad_fraction_are_refused(env, flight):
     buffer = VisitedStateBuffer()
     for use in (lambda: buffer.initial_state(env), lambda: buffer.source(env)(4)):

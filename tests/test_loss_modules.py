@@ -108,9 +108,11 @@ def test_a_loss_goes_on_from_a_checkpoint_with_its_discounts():
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"alpha": -1.0}, "alpha must be 'auto' or a number that is not negative, got -1.0"),
+        ({"alpha": -1.0}, "alpha must be 'auto' or a finite number that is not negative, got -1.0"),
+        ({"alpha": float("inf")}, "alpha must be 'auto' or a finite number"),
         ({"alpha": "automatic"}, "alpha must be 'auto'"),
-        ({"alpha": "auto", "alpha_init": 0.0}, "alpha_init must be positive, got 0.0"),
+        ({"alpha": "auto", "alpha_init": 0.0}, "alpha_init must be positive and finite, got 0.0"),
+        ({"alpha": "auto", "alpha_init": float("nan")}, "alpha_init must be positive and finite, got nan"),
         ({"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
         ({"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
         ({"num_qvalue_nets": 0}, "at least one critic, got num_qvalue_nets=0"),
@@ -121,6 +123,14 @@ def test_bad_arguments_say_what_is_allowed(kwargs, message):
     actor, _, qvalue = make_networks()
     with pytest.raises(ValueError, match=message):
         ABPTLoss(actor, qvalue, **kwargs)
+
+
+@pytest.mark.parametrize("numbers", [{"gamma": 2.0}, {"gamma": float("nan")}, {"lmbda": -0.1}])
+def test_discounts_lie_between_0_and_1(numbers):
+    actor, value, _ = make_networks()
+    ((name, number),) = numbers.items()
+    with pytest.raises(ValueError, match=f"{name} must lie between 0 and 1, got {number}"):
+        SHACLoss(actor, value).make_value_estimator(**numbers)
 
 
 def test_plain_modules_are_refused(env):

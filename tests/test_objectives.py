@@ -1,4 +1,4 @@
-"""Losses against numbers worked by hand, and their manners as LossModules."""
+"""Losses against numbers worked by hand."""
 
 import pytest
 import torch
@@ -7,11 +7,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives.utils import ValueEstimators
 
-from torchrl_quad import (
-    ABPTLoss,
-    BPTTLoss,
-    SHACLoss,
-)
+from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss
 
 GAMMA, LAMBDA = 0.5, 0.5
 

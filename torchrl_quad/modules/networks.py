@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import numbers
 from collections.abc import Sequence
 from typing import Any
@@ -80,8 +81,8 @@ def make_actor(
             f"action_init must be {spec.shape[-1]} numbers strictly between {low.tolist()} and {high.tolist()}, got "
             f"{action_init.tolist()}."
         )
-    if not scale_init > 0:
-        raise ValueError(f"scale_init must be positive, got {scale_init}.")
+    if not 0 < scale_init < math.inf:
+        raise ValueError(f"scale_init must be positive and finite, got {scale_init}.")
     net = _network(env, in_keys, 2 * spec.shape[-1], num_cells, activation, input_scale)
     with torch.no_grad():
         net.mlp[-1].weight.mul_(0.01)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,10 +98,12 @@ class PathwiseLoss(LossModule):
         super().__init__()
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}.")
-        if alpha != "auto" and not (isinstance(alpha, int | float) and alpha >= 0):
-            raise ValueError(f"alpha must be 'auto' or a number that is not negative, got {alpha!r}.")
-        if alpha_init <= 0:
-            raise ValueError(f"alpha_init must be positive, got {alpha_init}; set alpha to 0 for no entropy bonus.")
+        if alpha != "auto" and not (isinstance(alpha, int | float) and 0 <= alpha < math.inf):
+            raise ValueError(f"alpha must be 'auto' or a finite number that is not negative, got {alpha!r}.")
+        if not 0 < alpha_init < math.inf:
+            raise ValueError(
+                f"alpha_init must be positive and finite, got {alpha_init}; set alpha to 0 for no entropy bonus."
+            )
         self._in_keys = None
         self.reduction = reduction
         self.convert_to_functional(actor_network, "actor_network")
@@ -164,6 +167,7 @@ class PathwiseLoss(LossModule):
 
         Raises:
             NotImplementedError: the loss does not support the estimator.
+            ValueError: gamma or lmbda is not in [0, 1].
         """
         value_type = self.default_value_estimator if value_type is None else value_type
         if isinstance(value_type, ValueEstimatorBase | type):
@@ -175,6 +179,8 @@ class PathwiseLoss(LossModule):
         )
         given = {**default_value_kwargs(self.value_type), **hyperparams}
         for name in {"gamma", "lmbda"} & given.keys():  # TorchRL makes them float32 whatever the rollout is
+            if not 0 <= given[name] <= 1:
+                raise ValueError(f"{name} must lie between 0 and 1, got {given[name]}.")
             buffer = getattr(estimator, name)
             setattr(estimator, name, torch.as_tensor(given[name], device=buffer.device, dtype=self._precision))
         self._forward_value_estimator_keys()

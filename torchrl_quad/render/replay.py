@@ -1,4 +1,4 @@
-"""Replays: flights as one page that opens in a browser, offline."""
+"""Write flights as one page that opens in a browser, offline."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import base64
 import html
 import json
 import math
-import os
 import re
 from importlib import resources
 from pathlib import Path
@@ -15,133 +14,146 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.dynamics.parameters import RawParams
 from torchrl_quad.dynamics.rotors import Rotors
-from torchrl_quad.envs import QuadrotorEnv, RacingEnv
+from torchrl_quad.envs.episodes import at_episode_end
 from torchrl_quad.envs.terms import norm
-from torchrl_quad.render.frames import checked, episode_steps, first_episodes
+from torchrl_quad.files import replacing
+from torchrl_quad.render.flights import Flight, action_names
 
-_X_FRAME = [[0.053, 0.053], [-0.053, 0.053], [-0.053, -0.053], [0.053, -0.053]]  # [m], where no drone is known
+_X_FRAME = [[0.053, 0.053], [-0.053, 0.053], [-0.053, -0.053], [0.053, -0.053]]  # [m], of a drone that is not known
 
 
 def write_replay(
     rollout: TensorDictBase,
     path: str | Path,
     *,
-    env: QuadrotorEnv | None = None,
+    env: EnvBase | None = None,
     num_envs: int = 12,
     control_dt: float = 0.02,
 ) -> None:
-    """Write the first episodes of a flight as an HTML page to play, pause, scrub and turn about in a browser.
+    """Write the first episodes of a flight as an HTML page to play, pause, scrub and turn in a browser.
 
-    The page shows the drones with their attitude and rotor thrust, gates, targets and trails, and over time the reward
-    terms, the actions, the speed, and the distance to the target (or the height). It is one file of about 5 MB, most of
-    it plotly.js, that needs no network. A drone stays where its episode has ended, and the page says how: "success"
-    where the last state fulfils the task.
+    The page shows the drones with attitude and rotor thrust, gates, targets and trails, and over time the reward terms,
+    the actions, the speed, and the distance to the target (or the height). It is one file of about 5 MB, most of it
+    plotly.js, and needs no network. A drone stays where its episode ended, and the page says how it ended: "success"
+    if the last state fulfils the task.
 
     Args:
-        rollout: (num_envs, time), of any task. Only ``("next", "state", "position")`` and ``("next", "state",
-            "quaternion")`` are needed; what else is missing is left out.
-        path: where the HTML file goes; it is complete or not there.
-        env: the environment that flew, also under transforms. It tells the control step, where the rotors sit, their
-            thrust in newtons, and the gates. Without it an X frame is drawn, with the squared speed of each rotor.
-        num_envs: how many environments are shown, at most.
-        control_dt: control step [s], where ``env`` does not tell it.
+        rollout: (num_envs, time), of any task. It must hold ``("next", "state", "position")`` and ``("next", "state",
+            "quaternion")``; the page leaves out whatever else is missing.
+        path: the HTML file to write, whole or not at all.
+        env: the environment that flew, also under transforms. It provides the control step, the scenery, the positions
+            of the rotors, and their thrust in newtons. Without it, the page shows an X frame and the squared speed of
+            each rotor.
+        num_envs: how many environments to show, at most.
+        control_dt: control step [s]; used only without ``env``.
 
     Raises:
         ImportError: plotly is not installed.
-        TypeError: ``env`` is no :class:`~torchrl_quad.envs.QuadrotorEnv`.
+        TypeError: ``env`` is not a quadrotor environment.
         ValueError: the rollout is not (num_envs, time), or has no position or quaternion; ``num_envs`` is less than 1;
-            or ``env`` has drones of its own for fewer environments than are shown.
+            or ``env`` has individual drones, for fewer environments than the page shows.
     """
     plotlyjs = _plotlyjs()
-    while hasattr(env, "base_env"):
-        env = env.base_env
-    if not isinstance(env, QuadrotorEnv | None):
-        raise TypeError(f"env must be a QuadrotorEnv, also under transforms, or None; got {type(env).__name__}.")
-    keys = (("next", "state", name) for name in ("position", "quaternion"))
-    flight = checked(rollout, "write_replay", num_envs, *keys)
-    content = json.dumps(_content(flight, env, control_dt if env is None else env.control_dt))
+    needed = [("next", "state", name) for name in ("position", "quaternion")]
+    flight = Flight("write_replay", rollout, env, control_dt, needed, num_envs)
+    name = "Flight" if env is None else type(flight.env).__name__
     page = {
-        "title": html.escape(f"{'Flight' if env is None else type(env).__name__}, {len(flight)} environments"),
-        "flight": content.replace("<", "\\u003c"),  # which could close the script
+        "title": html.escape(f"{name}, {len(flight)} environments"),
+        "flight": json.dumps(_content(flight)).replace("<", "\\u003c"),  # "<" could close the script
         "plotly": plotlyjs,
         "script": _asset("replay.js"),
     }
-    # In one pass, so that nothing is looked for in what has been put in.
+    # In one pass, so that what has been filled in is not searched again.
     text = re.sub(r"\{\{(\w+)\}\}", lambda match: page[match[1]], _asset("replay.html"))
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
-def _content(flight: TensorDictBase, env: QuadrotorEnv | None, control_dt: float) -> dict[str, Any]:
-    """What the page shows. Frame 0 is the start of the first step, frame k what the k-th step has led to."""
-    n, time = flight.shape
-    steps, frames = episode_steps(flight), torch.arange(time + 1)
-    first = 0 if all(("state", name) in flight.keys(True) for name in ("position", "quaternion")) else 1
+def _content(flight: Flight) -> dict[str, Any]:
+    """The data of the page. Frame 0 is the start of the first step, frame k the state after the k-th step."""
+    rollout, steps = flight.rollout, flight.steps
+    n, time = rollout.shape
+    starts = all(("state", name) in rollout.keys(True) for name in ("position", "quaternion"))
+    first = 0 if starts else 1  # frame
 
     def state(name: str) -> Tensor | None:
-        """An entry of the state (num_envs, frames, k), where there is one."""
-        value = first_episodes(flight, name)
+        """An entry of the state (num_envs, frames, k), if there is one."""
+        value = flight.state(name)
         return None if value is None else value[:, first:]
 
-    def panel(label: str, names: list[str], value: Tensor, **more: Any) -> dict[str, Any]:
-        """A time series of which there is nothing after the end of the episode."""
-        value = value.float().masked_fill((frames > steps[:, None])[:, -value.shape[1] :, None], math.nan)
-        return {"label": label, "names": names, "values": _encoded(value), **more}
-
     position, target, velocity, rotor_speed = map(state, ("position", "target", "velocity", "rotor_speed"))
-    rotors, lift = _rotors(flight, env, rotor_speed)
+    rotors, lift = _rotors(flight, rotor_speed)
     content = {
         "environments": n,
         "frames": time + 1 - first,
-        "start": first * control_dt,
-        "control_dt": control_dt,
+        "start": first * flight.control_dt,
+        "control_dt": flight.control_dt,
         "ended": (steps - first).tolist(),
-        "endings": _endings(flight),
-        "knows_drone": env is not None,
+        "endings": _endings(rollout),
+        "knows_drone": flight.env is not None,
         "rotors": _encoded(rotors),
         "position": _encoded(position),
         "quaternion": _encoded(state("quaternion")),
         "lift": None if lift is None else _encoded(lift),
         "target": None if target is None else _encoded(target),
     }
-    if isinstance(env, RacingEnv) and (gate := state("gate")) is not None:
-        content |= {"gate": _encoded(gate), "gates": _encoded(_rings(env.gates.cpu(), env.track["gate_radius"]))}
+    if (gate := flight.gate_index()) is not None:
+        rings = _rings(flight.scenery.gates, flight.scenery.gate_radius)
+        content |= {"gate": _encoded(gate[:, first:]), "gates": _encoded(rings)}
 
-    panels, nothing = [], torch.full((n, 1, 1), math.nan)
-    terms = dict(flight.get(("next", "reward_terms"), {}).items())
-    reward = flight.get(("next", "reward"), sum(terms.values()) if terms else None)
-    if reward is not None:
-        values = torch.cat((reward, *terms.values()), -1)
-        values = torch.cat((nothing.expand(-1, -1, values.shape[-1]), values), 1)[:, first:]
-        panels.append(panel("reward", ["sum" if terms else "reward", *terms], values, peaks=True))
-    action = flight.get("action", None)
-    if action is not None:
-        names = ["thrust", "roll rate", "pitch rate", "yaw rate"]
-        names = names if action.shape[-1] == 4 else [str(i) for i in range(action.shape[-1])]
-        action = action.masked_fill((frames[:-1] >= steps[:, None]).unsqueeze(-1), math.nan)
-        action = torch.cat((action, nothing.expand(-1, -1, action.shape[-1])), 1)[:, first:]
-        panels.append(panel("action [-1, 1]", names, action, held=True))
+    series = _rewards_and_actions(flight)
     if velocity is not None:
-        panels.append(panel("speed [m/s]", ["speed"], norm(velocity)))
+        series.append(("speed [m/s]", {"speed": flight.state("velocity").norm(dim=-1)}, {}))
     if target is not None:
-        panels.append(panel("distance to the target [m]", ["distance"], norm(position - target)))
+        distance = torch.from_numpy(flight.distance)
+        series.append((f"distance to the {flight.scenery.target} [m]", {"distance": distance}, {}))
     else:
-        panels.append(panel("height [m]", ["height"], position[..., 2:]))
+        series.append(("height [m]", {"height": flight.state("position")[..., 2]}, {}))
+    ended = torch.arange(time + 1) > steps[:, None]  # panels show nothing after the end of the episode
+    panels = [
+        {
+            "label": label,
+            "names": list(lines),
+            "values": _encoded(torch.stack([x.masked_fill(ended, math.nan)[:, first:] for x in lines.values()], -1)),
+            **options,
+        }
+        for label, lines, options in series
+    ]
     return {**content, "panels": panels}
 
 
-def _endings(flight: TensorDictBase) -> list[str]:
-    """How each first episode ended: "" where it did not."""
-    endings, done = [""] * len(flight), flight.get(("next", "done"), None)
+def _rewards_and_actions(flight: Flight) -> list[tuple[str, dict[str, Tensor], dict[str, bool]]]:
+    """The labels of the first panels, their lines (num_envs, time + 1) by name, and how to draw them."""
+    rollout, panels = flight.rollout, []
+    nothing = torch.full((len(rollout), 1), math.nan)
+    terms = {name: x[..., 0] for name, x in rollout.get(("next", "reward_terms"), {}).items()}
+    if ("next", "reward") in rollout.keys(True):
+        terms = {"sum" if terms else "reward": rollout["next", "reward"][..., 0], **terms}
+    elif terms:
+        terms = {"sum": sum(terms.values()), **terms}
+    if terms:
+        lines = {name: torch.cat((nothing, x.float()), 1) for name, x in terms.items()}
+        panels.append(("reward", lines, {"peaks": True}))
+    if "action" in rollout:
+        action = rollout["action"].float()
+        names = action_names(action.shape[-1])
+        over = torch.arange(rollout.shape[1]) >= flight.steps[:, None]
+        lines = {
+            name: torch.cat((x.masked_fill(over, math.nan), nothing), 1)
+            for name, x in zip(names, action.unbind(-1), strict=True)
+        }
+        panels.append(("action [-1, 1]", lines, {"held": True}))
+    return panels
+
+
+def _endings(rollout: TensorDictBase) -> list[str]:
+    """How each first episode ended; "" if it did not."""
+    endings, done = [""] * len(rollout), rollout.get(("next", "done"), None)
     if done is None:
         return endings
     # The later ones override the earlier ones.
@@ -152,33 +164,34 @@ def _endings(flight: TensorDictBase) -> list[str]:
         ("success", "success"),
         ("crash", "crashed"),
     ):
-        flags = flight.get(("next", name), None)
+        flags = rollout.get(("next", name), None)
         if flags is not None:
-            flags = QuadrotorEnv.at_the_end(flight, flags & done).tolist()
+            flags = at_episode_end(rollout, flags & done).tolist()
             endings = [word if flag else ending for flag, ending in zip(flags, endings, strict=True)]
     return endings
 
 
-def _rotors(flight: TensorDictBase, env: QuadrotorEnv | None, speed: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Where the rotors sit, (num_envs, 4, 2) [m], and how strongly each lifts, (num_envs, frames, 4).
+def _rotors(flight: Flight, speed: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Positions of the rotors (num_envs, 4, 2) [m], and the lift of each (num_envs, frames, 4).
 
-    The unit is the thrust that hovers; without the environment, half of the greatest squared speed of the flight.
+    The unit of lift is the thrust that hovers; without the environment, half of the greatest squared speed of the
+    flight.
     """
     n = len(flight)
-    if env is None:
+    if flight.env is None:
         positions = torch.tensor(_X_FRAME).expand(n, 4, 2)
         squared = None if speed is None else speed.square()
         return positions, None if speed is None else 2.0 * squared / squared.nan_to_num().amax().clamp_min(1e-12)
     fields = {}
-    for name, value in env.params.fields().items():
-        drawn = flight.get(("next", "state", "drone", name), None)
-        if drawn is not None:
-            value = drawn[:, 0]
+    for name, value in flight.env.params.fields().items():
+        randomised = flight.rollout.get(("next", "state", "drone", name), None)
+        if randomised is not None:
+            value = randomised[:, 0]
         elif value.dim() > QuadrotorParams.dim(name) and len(value) > 1:
             if len(value) < n:
                 raise ValueError(
-                    f"write_replay: env has a {name} for each of its {len(value)} environments, and {n} are to be "
-                    f"shown. Give the environment that flew, or num_envs={len(value)}."
+                    f"write_replay: env has a {name} for each of its {len(value)} environments, and the page would "
+                    f"show {n}. Pass the environment that flew, or num_envs={len(value)}."
                 )
             value = value[:n]
         shape = value.shape[-QuadrotorParams.dim(name) :]
@@ -189,7 +202,7 @@ def _rotors(flight: TensorDictBase, env: QuadrotorEnv | None, speed: Tensor | No
 
 
 def _rings(gates: Tensor, radius: float, points: int = 33) -> Tensor:
-    """A circle (gates, points, 3) around each gate, which faces along the course."""
+    """Circles (gates, points, 3) around gates (k, 3), each facing along the course."""
     ahead, behind = (torch.nn.functional.normalize(gates.roll(-k, 0) - gates, dim=-1) for k in (1, -1))
     along = ahead - behind
     along = torch.where(norm(along) > 1e-3, along, ahead)  # the course turns back
@@ -203,7 +216,7 @@ def _rings(gates: Tensor, radius: float, points: int = 33) -> Tensor:
 
 
 def _encoded(value: Tensor) -> str:
-    """As base64 of little-endian float32."""
+    """Numbers as base64 of little-endian float32."""
     return base64.b64encode(value.contiguous().numpy().astype("<f4").tobytes()).decode("ascii")
 
 

@@ -1,0 +1,76 @@
+"""Figures and axes: colours, limits and scales that all pictures share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+INK, BLUE, RED = "#222222", "#2f6db5", "#c8452f"
+
+
+def make_figure(**options: Any) -> Any:
+    """Make a matplotlib figure that needs no screen and leaves the user's backend alone."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError("Pictures need matplotlib: pip install 'torchrl_quad[render]'.") from error
+    figure = Figure(**options)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def bounds(*points: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the greatest coordinates (3) of the finite points, each (*, 3); those of a cube if none is."""
+    rows = torch.cat([x.detach().cpu().double().reshape(-1, 3) for x in points])
+    rows = rows[rows.isfinite().all(-1)]
+    if not len(rows):
+        rows = torch.tensor([[-0.5, -0.5, 0.0], [0.5, 0.5, 1.0]])
+    return rows.amin(0), rows.amax(0)
+
+
+def box(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Widen a box, from low to high (3), until no side is much shorter than the others.
+
+    It grows in both directions, except that a box above the ground does not grow below it.
+    """
+    extent = high - low
+    more = 0.5 * ((0.6 * extent.amax().clamp_min(0.5)) - extent).clamp_min(0.0)
+    ground = torch.minimum(low, torch.zeros_like(low))
+    bottom = low - more
+    lift = (ground - bottom).clamp_min(0.0) * torch.tensor([0.0, 0.0, 1.0])
+    return bottom + lift, high + more + lift
+
+
+def set_box(space: Any, low: Tensor, high: Tensor, zoom: float) -> None:
+    """Limit three-dimensional axes to the box from low to high (3), in one scale and with few ticks."""
+    from matplotlib.ticker import MaxNLocator
+
+    space.set_box_aspect((high - low).tolist(), zoom=zoom)
+    for name, *limits in zip("xyz", low.tolist(), high.tolist(), strict=True):
+        axis = getattr(space, f"{name}axis")
+        axis.set_major_locator(MaxNLocator(3))
+        axis.set_tick_params(pad=-1, labelsize=8)
+        axis.labelpad = -2
+        space.set(**{f"{name}lim": limits, f"{name}label": f"{name} [m]"})
+
+
+def set_scale(axis: Any, log: bool) -> None:
+    """Make the vertical axis linear or logarithmic, with plain numbers at its ticks."""
+    axis.set_yscale("log" if log else "linear")
+    if log:
+        from matplotlib.ticker import LogLocator, NullFormatter
+
+        axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+        axis.yaxis.set_minor_formatter(NullFormatter())
+    axis.yaxis.set_major_formatter("{x:g}")
+
+
+def drone_colors(count: int) -> np.ndarray:
+    """A colour for each of a number of drones, (count, 4)."""
+    from matplotlib import colormaps
+
+    return colormaps["viridis"](np.linspace(0.05, 0.85, count))

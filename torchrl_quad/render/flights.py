@@ -1,0 +1,183 @@
+"""Read a rollout as pictures show it: first episodes, targets, and how well they go."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_quad.data.unwrap import base_env
+from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.envs.scenery import Scenery, describe_metric, visible_state
+
+
+class Flight:
+    """The first episodes of a rollout, without their graph, on the CPU.
+
+    Args:
+        who: the function that draws, for its errors.
+        rollout: (num_envs, time).
+        env: the environment that flew, also under transforms, or None.
+        control_dt: control step [s], used without ``env``.
+        needed: keys of the rollout without which nothing can be drawn.
+        num_envs: how many environments to keep; None for all.
+
+    Raises:
+        TypeError: ``env`` is not a quadrotor environment.
+        ValueError: the rollout has another shape or lacks a key, or ``num_envs`` is less than 1.
+    """
+
+    def __init__(
+        self,
+        who: str,
+        rollout: TensorDictBase,
+        env: EnvBase | None,
+        control_dt: float,
+        needed: list[tuple[str, ...]],
+        num_envs: int | None = None,
+    ) -> None:
+        _check(who, rollout, env, needed, num_envs)
+        self.rollout: TensorDictBase = rollout[:num_envs].detach().cpu()
+        self.env = None if env is None else base_env(env)
+        self.control_dt = control_dt if env is None else self.env.control_dt
+        self.metric_info = {} if env is None else self.env.metric_info
+        self.steps = self._count_steps()  # of each first episode (num_envs)
+        self.target = self.state("target")
+        self.scenery = self._find_scenery()
+
+    def __len__(self) -> int:
+        return len(self.rollout)
+
+    @property
+    def times(self) -> np.ndarray:
+        """The instants [s] of states (time + 1), the first at the start."""
+        return self.control_dt * np.arange(self.rollout.shape[1] + 1)
+
+    def state(self, name: str) -> Tensor | None:
+        """An entry of the state (num_envs, time + 1, k): at the start of the first episode, and after each step.
+
+        After the end of the episode it keeps its last value. It is NaN where it is infinite, and at the start if the
+        rollout does not hold the start. None if there is no such entry, or if the target is not a position.
+        """
+        ends = self.rollout["next", "state"]
+        if name not in ends or (name == "target" and name not in visible_state(ends)):
+            return None
+        value = ends[name].float()
+        start = self.rollout.get(("state", name), torch.full_like(value, math.nan))[:, :1]
+        instants = torch.arange(self.rollout.shape[1] + 1).minimum(self.steps[:, None])
+        value = torch.cat((start.float(), value), 1).take_along_dim(instants.unsqueeze(-1), 1)
+        return value.nan_to_num(math.nan, math.nan, math.nan)
+
+    @property
+    def distance(self) -> np.ndarray | None:
+        """The distance to the target (num_envs, time + 1) [m], if there is one."""
+        return None if self.target is None else (self.state("position") - self.target).norm(dim=-1).numpy()
+
+    def outputs(self) -> dict[str, np.ndarray]:
+        """The metrics of every step, or without any the reward, by name (num_envs, time + 1), NaN at the start."""
+        ends = self.rollout["next"]
+        values = dict(ends.get("metrics", {}).items()) or {"reward": ends["reward"]}
+        return {
+            name: torch.nn.functional.pad(x.squeeze(-1).float(), (1, 0), value=math.nan).numpy()
+            for name, x in values.items()
+        }
+
+    def progress(self) -> tuple[str, bool, np.ndarray]:
+        """What best shows how the flight goes: the label of its axis, whether that is logarithmic, and the values.
+
+        That is the metric that the task names, else the distance to the target, else the first metric or the reward.
+        """
+        outputs, name = self.outputs(), self.scenery.progress
+        if name not in outputs and self.target is not None:
+            return f"distance to the {self.scenery.target} [m]", self.scenery.gates is None, self.distance
+        name = name if name in outputs else next(iter(outputs))
+        metric = describe_metric(name, self.metric_info)
+        return metric.axis_label, metric.log, metric.scale * outputs[name]
+
+    def progress_lines(self) -> tuple[str, bool, dict[str, np.ndarray]]:
+        """All that shows how the flight goes: the label of the axis, whether it is logarithmic, and lines by name.
+
+        These are the distance to the target and the metrics that are lengths; without a target, all metrics or the
+        reward.
+        """
+        outputs = {describe_metric(name, self.metric_info): x for name, x in self.outputs().items()}
+        if self.target is None:
+            return "", False, {metric.axis_label: metric.scale * x for metric, x in outputs.items()}
+        distance = self.distance
+        lines = {f"to the {self.scenery.target}": distance}
+        for metric, x in outputs.items():
+            if metric.is_length and not np.allclose(x[:, 1:], distance[:, 1:], atol=1e-5, equal_nan=True):
+                lines[metric.label] = x
+        return "distance [m]", self.scenery.gates is None, lines
+
+    def gate_index(self) -> Tensor | None:
+        """The index of the gate that each drone flies to (num_envs, time + 1), if the task has gates."""
+        if self.scenery.gates is None or self.target is None:
+            return None
+        return (self.target.unsqueeze(-2) - self.scenery.gates).norm(dim=-1).argmin(-1)
+
+    def _count_steps(self) -> Tensor:
+        if ("next", "done") not in self.rollout.keys(include_nested=True):
+            return torch.full(self.rollout.shape[:1], self.rollout.shape[1])
+        return first_episode(self.rollout).sum((1, 2))
+
+    def _find_scenery(self) -> Scenery:
+        """What the task shows, or if it says nothing, where the targets of these episodes have been."""
+        scenery = Scenery() if self.env is None else self.env.scenery()
+        tensors = {name: getattr(scenery, name) for name in ("places", "curve", "gates")}
+        known = {name: x.detach().cpu().float() for name, x in tensors.items() if x is not None}
+        if not known and self.target is not None:
+            moving = (self.target.diff(dim=1).abs() > 0).any(-1).sum()
+            if 2 * moving > self.steps.sum():
+                known["curve"] = self.target[self.steps.argmax()]
+            else:
+                known["places"] = self.target.flatten(0, 1).mul(1e3).round().div(1e3).unique(dim=0)
+        return dataclasses.replace(scenery, **known)
+
+
+def scenery_points(scenery: Scenery) -> list[Tensor]:
+    """All points that a task shows, each (*, 3)."""
+    return [x for x in (scenery.places, scenery.curve, scenery.gates) if x is not None]
+
+
+def action_names(size: int) -> list[str]:
+    """The names of the entries of an action."""
+    return ["thrust", "roll rate", "pitch rate", "yaw rate"] if size == 4 else [str(i) for i in range(size)]
+
+
+def state_keys(*names: str) -> list[tuple[str, ...]]:
+    """The keys of a rollout that hold these entries of the state before and after each step, and the ends."""
+    return [*((*prefix, "state", name) for prefix in ((), ("next",)) for name in names), ("next", "done")]
+
+
+def _check(
+    who: str,
+    rollout: TensorDictBase,
+    env: EnvBase | None,
+    needed: list[tuple[str, ...]],
+    num_envs: int | None,
+) -> None:
+    if env is not None and not (isinstance(env, EnvBase) and hasattr(env, "scenery")):
+        raise TypeError(
+            f"{who}: env must be the quadrotor environment that flew, with or without transforms, or None; got "
+            f"{type(env).__name__}."
+        )
+    if rollout.dim() != 2 or 0 in rollout.shape:
+        raise ValueError(
+            f"{who} needs a rollout of batch size (num_envs, time), such as env.rollout(...) returns; got "
+            f"{tuple(rollout.shape)}. For one drone, write rollout.unsqueeze(0)."
+        )
+    if num_envs is not None and num_envs < 1:
+        raise ValueError(f"{who}: num_envs must be at least 1, got {num_envs}.")
+    keys = rollout.keys(include_nested=True)
+    missing = [key for key in needed if key not in keys]
+    if missing:
+        raise ValueError(
+            f"{who}: the rollout lacks {', '.join(map(str, missing))}. Pass it whole, as env.rollout(...) and "
+            "differentiable_rollout(...) return it."
+        )

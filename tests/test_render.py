@@ -12,7 +12,7 @@ from torchrl.envs import RewardSum, TransformedEnv
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_env
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric
-from torchrl_quad.render import animate_flight, frames, plot_episode, plot_flight, plot_learning_curve, write_replay
+from torchrl_quad.render import animate_flight, frames, plot_episode, plot_flight, write_replay
 from torchrl_quad.render.frames import Scene
 
 TASKS = ["hovering", "landing", "racing", "tracking"]

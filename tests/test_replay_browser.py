@@ -1,0 +1,347 @@
+"""Replays in a browser without a network."""
+
+import os
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_quad import HoveringEnv, RacingEnv, make_env
+from torchrl_quad.dynamics import quaternion
+from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.render import write_replay
+
+TIMEOUT = 120_000  # [ms]; the machine may be busy with other tests
+NUM_ENVS, STEPS = 3, 1000
+
+
+@pytest.fixture(scope="module")
+def browser():
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        message = "Replays are tested in a browser, and there is no chromium (Debian: apt install chromium)."
+        if os.environ.get("REQUIRE_BROWSER") == "1":
+            pytest.fail(message)
+        pytest.skip(message)
+    from playwright.sync_api import sync_playwright
+
+    webgl_on_the_cpu = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", *webgl_on_the_cpu])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def open_page(browser):
+    """Opens a replay offline; a request that leaves the machine, and any error, fails the test that closes it."""
+
+    class Replay:
+        def __init__(self, path):
+            self.context = browser.new_context(offline=True, viewport={"width": 900, "height": 480})
+            self.page = self.context.new_page()
+            self.page.set_default_timeout(TIMEOUT)
+            self.wrong = []
+            self.page.on("console", lambda m: self.wrong.append(m.text) if m.type == "error" else None)
+            self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
+            self.page.on("request", lambda r: None if r.url.startswith("file://") else self.wrong.append(r.url))
+            self.page.goto(path.as_uri())
+            self.page.wait_for_selector("body[data-ready]")
+
+        def trace(self, name, of="space"):
+            """The points (n, k) of a trace as they are plotted: x, y and, in space, z."""
+            script = """([of, name]) => {
+                const trace = document.getElementById(of).data.find((trace) => trace.name === name);
+                return ["x", "y", "z"].filter((key) => trace[key])
+                    .map((key) => Array.from(trace[key], (value) => Number.isFinite(value) ? value : null));
+            }"""
+            return np.array(self.page.evaluate(script, [of, name]), dtype=float).T
+
+        def bodies(self):
+            """The points of each body (num_envs, points, 3); the first is the centre of the drone."""
+            points = self.trace("body")
+            return points.reshape(self.page.locator("#environment option").count() - 1, -1, 3)
+
+        def picture(self):
+            return self.page.locator("#space").screenshot(timeout=TIMEOUT)
+
+        def scrub(self, frame):
+            self.page.locator("#time").fill(str(frame))
+
+        def step(self):
+            return int(self.page.locator("#time").input_value())
+
+        def wait(self, condition):
+            """Waits until a condition on the ``step`` of the slider holds."""
+            # Not page.wait_for_function, which evaluates a string in the page: its policy does not allow that.
+            done = self.page.evaluate(
+                """(deadline) => new Promise((done) => {
+                    deadline += performance.now();
+                    requestAnimationFrame(function look() {
+                        const step = Number(document.getElementById("time").value);
+                        const holds = CONDITION;
+                        if (holds || performance.now() > deadline) done(holds);
+                        else requestAnimationFrame(look);
+                    });
+                })""".replace("CONDITION", condition),
+                TIMEOUT,
+            )
+            assert done, f"{condition} did not become true"
+
+        def series(self):
+            """The names of the curves, and of the panels."""
+            return self.page.evaluate(
+                "() => { const {data, layout} = document.getElementById('series');"
+                "return [data.map((t) => t.name), layout.annotations.map((a) => a.text.replace(/<[^>]*>/g, ''))]; }"
+            )
+
+        def close(self):
+            self.context.close()
+            assert not self.wrong
+
+    return Replay
+
+
+@pytest.fixture(scope="module")
+def flight():
+    """Three races of a random policy, which crash."""
+    env = RacingEnv(num_envs=NUM_ENVS, seed=0)
+    return env, env.rollout(STEPS, break_when_any_done=False)
+
+
+@pytest.fixture(scope="module")
+def race(flight, open_page, tmp_path_factory):
+    env, rollout = flight
+    path = tmp_path_factory.mktemp("replay") / "race.html"
+    write_replay(rollout, path, env=env)
+    replay = open_page(path)
+    yield replay
+    replay.close()
+
+
+@pytest.fixture
+def replay(race):
+    """The race, at its start, with all environments."""
+    if race.page.locator("#play").inner_text() == "Pause":
+        race.page.click("#play")
+    race.page.select_option("#environment", "all")
+    race.page.select_option("#speed", "1")
+    race.scrub(0)
+    yield race
+    assert not race.wrong
+
+
+@pytest.mark.parametrize("task", ["hovering", "landing", "racing", "tracking"])
+def test_a_flight_of_every_task_opens_offline_without_errors(task, open_page, tmp_path):
+    env = make_env(task, num_envs=2)
+    rollout = env.rollout(12, break_when_any_done=False)
+    write_replay(rollout, tmp_path / "replay.html", env=env)
+    replay = open_page(tmp_path / "replay.html")
+    assert type(env).__name__ in replay.page.title()
+    np.testing.assert_allclose(replay.bodies()[:, 0], rollout["state", "position"][:, 0], atol=1e-6)
+    distance = f"distance to the {'next gate' if task == 'racing' else 'target'} [m]"
+    panels = ["reward, sum", "action [-1, 1], thrust", "speed [m/s]", distance]
+    assert replay.series()[1] == panels
+    replay.close()
+
+
+def test_a_flight_without_target_reward_terms_and_environment_opens(open_page, tmp_path):
+    rollout = HoveringEnv(num_envs=2, action_delay=0).rollout(12, break_when_any_done=False)
+    rollout = rollout.exclude(("state", "target"), ("next", "state", "target"), ("next", "reward_terms"))
+    write_replay(rollout, tmp_path / "replay.html")
+    replay = open_page(tmp_path / "replay.html")
+    assert replay.series()[1] == ["reward", "action [-1, 1], thrust", "speed [m/s]", "height [m]"]
+    replay.scrub(12)
+    np.testing.assert_allclose(replay.bodies()[:, 0], rollout["next", "state", "position"][:, -1], atol=1e-6)
+    assert "guess" in replay.page.inner_text("#note")
+    replay.close()
+
+
+def test_positions_and_attitudes_are_all_a_replay_needs(open_page, tmp_path):
+    rollout = HoveringEnv(num_envs=2).rollout(12, break_when_any_done=False)
+    rollout = rollout.select(("next", "state", "position"), ("next", "state", "quaternion"))
+    write_replay(rollout, tmp_path / "replay.html", control_dt=0.1)
+    replay = open_page(tmp_path / "replay.html")
+    replay.scrub(4)
+    np.testing.assert_allclose(replay.bodies()[:, 0], rollout["next", "state", "position"][:, 4], atol=1e-6)
+    assert replay.page.inner_text("#clock") == "0.50 s of 1.20 s"
+    assert replay.series()[1] == ["height [m]"]
+    replay.close()
+
+
+def test_play_moves_the_drones_and_pause_stops_them(replay):
+    before, picture = replay.bodies(), replay.picture()
+    assert replay.picture() == picture
+    replay.page.click("#play")
+    replay.wait("step >= 10")
+    replay.page.click("#play")
+    paused, step = replay.bodies(), replay.step()
+    assert (np.abs(paused[:, 0] - before[:, 0]).max(-1) > 1e-3).all()
+    frames = "new Promise((done) => { let n = 0; (function f() { n++ < 4 ? requestAnimationFrame(f) : done(); })(); })"
+    replay.page.evaluate(frames)
+    assert replay.step() == step
+    np.testing.assert_array_equal(replay.bodies(), paused)
+    assert replay.picture() != picture
+
+
+def test_the_slider_scrubs_to_the_state_of_the_rollout(replay, flight):
+    env, rollout = flight
+    replay.page.select_option("#size", "3")
+    for frame in (1, 30):
+        replay.scrub(frame)
+        state = rollout["next", "state"][:, frame - 1]
+        bodies = replay.bodies()
+        np.testing.assert_allclose(bodies[:, 0], state["position"], atol=1e-5)
+        hubs = torch.nn.functional.pad(env.params.rotor_positions, (0, 1)).expand(NUM_ENVS, 4, 3)
+        hubs = 3 * quaternion.rotate(state["quaternion"].unsqueeze(1), hubs)
+        np.testing.assert_allclose(bodies[:, 1:8:2] - bodies[:, :1], hubs, atol=1e-5)
+        lines = replay.trace("thrust").reshape(NUM_ENVS, 4, 3, 3)
+        lengths = np.linalg.norm(lines[:, :, 1] - lines[:, :, 0], axis=-1)
+        thrust = env.controller.rotors.thrust(state["rotor_speed"])
+        hover = (env.params.mass * env.params.gravity / 4).item()
+        np.testing.assert_allclose(lengths, 3 * 0.075 * thrust / hover, rtol=1e-3)
+
+
+@pytest.mark.parametrize("speed", ["0.25", "1", "4"])
+def test_it_plays_in_real_time_times_the_speed(replay, flight, speed):
+    env, _ = flight
+    replay.page.select_option("#speed", speed)
+    replay.page.click("#play")
+    # Asked once for each frame, over half a second and twelve steps at least.
+    steps, milliseconds = replay.page.evaluate(
+        """() => new Promise((done) => {
+            let first = null;
+            const step = () => Number(document.getElementById("time").value);
+            requestAnimationFrame(function look(time) {
+                if (first === null && step() > 0) first = [step(), time];
+                const [steps, passed] = first === null ? [0, 0] : [step() - first[0], time - first[1]];
+                if (steps >= 12 && passed > 500) done([steps, passed]);
+                else requestAnimationFrame(look);
+            });
+        })"""
+    )
+    assert steps < STEPS - 20  # it has not come to the end
+    assert 1000 * env.control_dt * steps / milliseconds == pytest.approx(float(speed), rel=0.15)
+
+
+def test_the_time_series_are_those_of_the_chosen_environment(replay, flight):
+    _, rollout = flight
+    terms = rollout["next", "reward_terms"]
+    assert replay.series()[0][:NUM_ENVS] == ["0", "1", "2"]
+    for i in (2, 0):
+        replay.page.select_option("#environment", str(i))
+        names, panels = replay.series()
+        assert names == ["sum", *terms.keys(), "thrust", "roll rate", "pitch rate", "yaw rate", "speed", "distance"]
+        assert panels[0].startswith("reward: sum")
+        end = first_episode(rollout)[i].sum()
+        times, reward = replay.trace("position", "series").T
+        np.testing.assert_allclose(times, 0.02 * np.arange(STEPS + 1), atol=1e-9)
+        np.testing.assert_allclose(reward[1 : end + 1], terms["position"][i, :end, 0], atol=1e-6)
+        assert np.isnan(reward[0]) and np.isnan(reward[end + 1 :]).all()
+        action = replay.trace("roll rate", "series")[:end, 1]
+        np.testing.assert_allclose(action, rollout["action"][i, :end, 1], atol=1e-6)
+        bodies = replay.bodies()
+        assert np.isfinite(bodies[i, 0]).all() and np.isfinite(bodies[:, 0]).all(-1).sum() == 1
+
+
+def ticks(replay):
+    """Times on the axis of the time series [s], and their places on the page [pixels]."""
+    script = """() => Array.from(document.querySelectorAll("#series .xtick text"), (tick) => {
+        const box = tick.getBoundingClientRect();
+        return [Number(tick.textContent), box.x + box.width / 2];
+    })"""
+    return np.array(replay.page.evaluate(script)).T
+
+
+def test_the_cursor_is_in_step_and_a_click_goes_to_a_time(replay):
+    times, pixels = ticks(replay)
+    for frame in (120, 800):
+        replay.scrub(frame)
+        box = replay.page.locator("#cursor").bounding_box()
+        centre = box["x"] + box["width"] / 2
+        assert centre == pytest.approx(np.interp(0.02 * frame, times, pixels), abs=1.5)
+    box = replay.page.locator("#series").bounding_box()
+    x, y = np.interp(8.0, times, pixels), box["y"] + 0.6 * box["height"]
+    replay.page.mouse.move(x - 5, y)
+    replay.page.wait_for_selector("#series .hoverlayer > *", state="attached")
+    replay.page.mouse.move(x, y)
+    replay.page.mouse.click(x, y)
+    replay.wait("step !== 800")
+    assert replay.step() == pytest.approx(400, abs=3)
+
+
+def test_the_keyboard_plays_steps_and_chooses(replay):
+    keyboard = replay.page.keyboard
+    for key, step in (("ArrowRight", 1), ("ArrowRight", 2), ("ArrowLeft", 1)):
+        keyboard.press(key)
+        assert replay.step() == step
+    keyboard.press("ArrowDown")
+    assert replay.page.input_value("#environment") == "0"
+    keyboard.press("ArrowUp")
+    assert replay.page.input_value("#environment") == "all"
+    keyboard.press(" ")
+    replay.wait("step > 3")
+    keyboard.press(" ")
+    assert replay.page.inner_text("#play") == "Play"
+
+
+def test_keys_of_the_browser_are_left_to_it_and_those_of_the_page_work_after_a_choice(replay):
+    keyboard = replay.page.keyboard
+    replay.page.evaluate("document.activeElement.blur()")  # the slider has keys of its own
+    for key in ("Alt+ArrowRight", "Control+ArrowRight", "Meta+ArrowRight"):
+        keyboard.press(key)
+    assert replay.step() == 0
+    replay.page.focus("#environment")
+    replay.page.select_option("#environment", "1")
+    keyboard.press("ArrowRight")
+    assert replay.step() == 1
+    keyboard.down(" ")
+    keyboard.down(" ")  # held, it repeats
+    keyboard.up(" ")
+    assert replay.page.inner_text("#play") == "Pause"
+
+
+def test_a_drone_is_seen_until_its_position_is_no_longer_finite(open_page, tmp_path):
+    rollout = HoveringEnv(num_envs=2).rollout(6, break_when_any_done=False)
+    position = rollout["next", "state", "position"]
+    last = position[0, 2].clone()
+    position[0, 3:] = torch.nan
+    write_replay(rollout, tmp_path / "replay.html")
+    position[:], rollout["state", "position"][:] = torch.nan, torch.nan
+    write_replay(rollout, tmp_path / "nowhere.html")
+    replay = open_page(tmp_path / "replay.html")
+    replay.scrub(3)
+    np.testing.assert_allclose(replay.bodies()[0, 0], last, atol=1e-6)
+    replay.scrub(4)
+    assert np.isfinite(replay.bodies()[:, 0]).all(1).tolist() == [False, True]
+    replay.close()
+    open_page(tmp_path / "nowhere.html").close()
+
+
+def test_the_next_gate_stands_out(replay, flight):
+    env, rollout = flight
+    for i in range(NUM_ENVS):
+        replay.page.select_option("#environment", str(i))
+        ring = replay.trace("next")
+        ring = ring[np.isfinite(ring).all(-1)]
+        gate = env.gates[rollout["state", "gate"][i, 0, 0]]
+        np.testing.assert_allclose(np.linalg.norm(ring - gate.numpy(), axis=-1), 0.3, atol=1e-5)
+
+
+def test_a_drone_stays_where_its_episode_has_ended_and_the_page_says_how(open_page, crashing, tmp_path):
+    env = HoveringEnv(num_envs=2, max_episode_steps=30)
+    rollout = crashing(env, 50)
+    end = rollout["next", "terminated"][1, :, 0].int().argmax()
+    assert end < 10
+    write_replay(rollout, tmp_path / "replay.html", env=env)
+    replay = open_page(tmp_path / "replay.html")
+    assert replay.page.inner_text("#status") == "2 flying"
+    replay.scrub(50)
+    position = rollout["next", "state", "position"]
+    np.testing.assert_allclose(replay.bodies()[:, 0], torch.stack((position[0, 29], position[1, end])), atol=1e-6)
+    assert replay.page.inner_text("#status") == "1 truncated, 1 crashed"
+    options = replay.page.locator("#environment option").all_inner_texts()
+    assert options == ["all", "0: truncated at 0.60 s", f"1: crashed at {0.02 * (end + 1):.2f} s"]
+    np.testing.assert_allclose(replay.trace("crash")[1], position[1, end], atol=1e-6)
+    replay.close()

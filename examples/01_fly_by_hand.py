@@ -44,5 +44,5 @@ for step in range(STEPS):
         print(f"{time:8.2f} {x:8.2f} {z:8.2f} {vx:10.2f} {vz:10.2f}")
     td = env.step_mdp(td)  # what a step has written under "next" is what the following one starts from
 
-plot_flight(torch.stack(flight, 1), "flight.png", control_dt=env.control_dt)
+plot_flight(torch.stack(flight, 1), "flight.png", env=env)
 print("The flight is drawn in flight.png.")

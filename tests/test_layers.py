@@ -12,8 +12,9 @@ import torchrl_quad
 PACKAGE = Path(torchrl_quad.__file__).parent
 ALLOWED = {  # what each part of the package may import of the others
     "dynamics": set(),
-    "envs": {"dynamics", "render"},  # render only within env.render(), see below
-    "render": {"dynamics", "envs", "files"},
+    "engine": set(),
+    "envs": {"dynamics", "engine", "render"},  # render only within env.render(), see below
+    "render": {"data", "dynamics", "envs", "files"},  # of data, base_env alone
     "modules": {"data"},  # base_env alone
     "objectives": set(),
     "data": set(),
@@ -25,8 +26,9 @@ ALLOWED = {  # what each part of the package may import of the others
 TORCHRL = {"torch", "torchrl", "tensordict"}
 LIBRARIES = {
     "dynamics": {"torch", "numpy", "yaml"},
+    "engine": {"torch", "tensordict"},
     "envs": TORCHRL | {"numpy"},
-    "render": {"tensordict", "torch", "matplotlib", "mpl_toolkits", "plotly", "PIL", "numpy"},
+    "render": TORCHRL | {"matplotlib", "mpl_toolkits", "plotly", "PIL", "numpy"},
     "modules": TORCHRL,
     "objectives": TORCHRL,
     "data": TORCHRL,

@@ -19,7 +19,7 @@ class Metric:
 
     label: str  #: its name in prose, such as "position error"
     unit: str = ""  #: the unit in print, such as "cm"
-    scale: float = 1.0  #: how many of these units make one SI unit: 100 for cm
+    scale: float = 1.0  #: how many of these units make one SI unit, 100 for cm
     median: bool = False  #: sum up with the median instead of the mean, which a few crashes would dominate
     log: bool = False  #: draw on a logarithmic axis
 
@@ -63,13 +63,14 @@ def describe_metric(name: str, metric_info: Mapping[str, Metric]) -> Metric:
 class Scenery:
     """What pictures of a task show beside its drones; positions are in m, in the world frame.
 
-    By default, pictures show the entry ``target`` (num_envs, 3) of the state, wherever it has been in the flight.
+    Places, a curve or gates say where targets are. A task that gives none of them need not say it: pictures then show
+    where the entry ``target`` (num_envs, 3) of the state has been in the flight.
     """
 
     target: str = "target"  #: what the target is called, as in "distance to the target"
-    places: Tensor | None = None  #: points to mark (k, 3)
-    curve: Tensor | None = None  #: a line to draw (m, 3), along which the target moves
-    gates: Tensor | None = None  #: centres of gates (k, 3) in their order; the target is one of them
+    places: Tensor | None = None  #: targets that do not move (k, 3)
+    curve: Tensor | None = None  #: a line (m, 3) along which the target moves
+    gates: Tensor | None = None  #: centres of gates (k, 3), in the order of flight; the target is one of them
     gate_radius: float = 0.3  #: [m]
     progress: str | None = None  #: the metric that best shows how a flight goes; by default the distance to the target
 

@@ -11,9 +11,10 @@ import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
+from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.envs.scenery import Scenery
 from torchrl_quad.render.canvas import BLUE, INK, RED, bounds, box, drone_colors, make_figure, set_box, set_scale
-from torchrl_quad.render.flights import Flight, action_names, scenery_points, state_keys
+from torchrl_quad.render.flights import Flight, action_names, check_rollout, scenery_points, state_keys
 
 _PAPER = {  # for figures as wide as a page of two columns
     "font.size": 8,
@@ -116,10 +117,11 @@ def plot_episode(
         IndexError: there is no such environment.
     """
     keys = [*state_keys("position", "velocity"), ("action",), ("next", "reward")]
-    flight = Flight("plot_episode", rollout, env, control_dt, keys)
-    if not -len(flight) <= env_index < len(flight):
-        raise IndexError(f"plot_episode: env_index={env_index}, and the rollout has {len(flight)} environments.")
-    episode = rollout[[env_index], : int(flight.steps[env_index])]
+    check_rollout("plot_episode", rollout, env, keys)
+    if not -len(rollout) <= env_index < len(rollout):
+        raise IndexError(f"plot_episode: env_index={env_index}, and the rollout has {len(rollout)} environments.")
+    episode = rollout[[env_index]]
+    episode = episode[:, : int(first_episode(episode).sum())]
     flight = Flight("plot_episode", episode, env, control_dt, keys)
     figure = make_figure(figsize=(_WIDTH, 3.4))
     from matplotlib import rc_context

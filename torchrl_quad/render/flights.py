@@ -41,7 +41,7 @@ class Flight:
         needed: list[tuple[str, ...]],
         num_envs: int | None = None,
     ) -> None:
-        _check(who, rollout, env, needed, num_envs)
+        check_rollout(who, rollout, env, needed, num_envs)
         self.rollout: TensorDictBase = rollout[:num_envs].detach().cpu()
         self.env = None if env is None else base_env(env)
         self.control_dt = control_dt if env is None else self.env.control_dt
@@ -155,13 +155,14 @@ def state_keys(*names: str) -> list[tuple[str, ...]]:
     return [*((*prefix, "state", name) for prefix in ((), ("next",)) for name in names), ("next", "done")]
 
 
-def _check(
+def check_rollout(
     who: str,
     rollout: TensorDictBase,
     env: EnvBase | None,
     needed: list[tuple[str, ...]],
-    num_envs: int | None,
+    num_envs: int | None = None,
 ) -> None:
+    """Refuse what cannot be drawn; arguments and errors are those of :class:`Flight`."""
     if env is not None and not (isinstance(env, EnvBase) and hasattr(env, "scenery")):
         raise TypeError(
             f"{who}: env must be the quadrotor environment that flew, with or without transforms, or None; got "

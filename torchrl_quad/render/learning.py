@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,8 @@ def plot_learning_curve(
     seconds, steps = columns["time/seconds"], columns["steps"]
     known_seconds, known_steps = _knots(seconds, steps)
     figure = make_figure(figsize=(3.4 * len(names), 3.2), layout="constrained")
+    from matplotlib.ticker import EngFormatter, MaxNLocator
+
     axes = figure.subplots(1, len(names), squeeze=False)
     for axis, name in zip(axes[0], names, strict=True):
         metric = describe_metric(name, metrics)
@@ -59,9 +62,12 @@ def plot_learning_curve(
         if metric.log:
             set_scale(axis, log=True)
         if len(known_steps) > 1:
-            to_steps = lambda s: np.interp(s, known_seconds, known_steps)  # noqa: E731
-            to_seconds = lambda n: np.interp(n, known_steps, known_seconds)  # noqa: E731
-            axis.secondary_xaxis("top", functions=(to_steps, to_seconds)).set_xlabel("control steps", color=INK)
+            to_steps = partial(np.interp, xp=known_seconds, fp=known_steps)
+            to_seconds = partial(np.interp, xp=known_steps, fp=known_seconds)
+            upper = axis.secondary_xaxis("top", functions=(to_steps, to_seconds))
+            upper.set_xlabel("control steps", color=INK)
+            upper.xaxis.set_major_locator(MaxNLocator(5))
+            upper.xaxis.set_major_formatter(EngFormatter(sep=""))
     figure.savefig(path, dpi=130)
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import csv
-import os
-import platform
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from torchrl_quad.files import machine, replacing
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -21,12 +21,10 @@ def save(path: Path, rows: list[dict[str, Any]], **about: Any) -> None:
     for row in [dict(zip(columns, columns, strict=True)), *rows]:
         print("  ".join(str(row.get(key, "")).rjust(width) for key, width in zip(columns, widths, strict=True)))
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    with open(temporary, "w", newline="") as file:
+    with replacing(path) as temporary, open(temporary, "w", newline="") as file:
         writer = csv.DictWriter(file, list(dict.fromkeys([*columns, *about])))
         writer.writeheader()
         writer.writerows({**about, **row} for row in rows)
-    os.replace(temporary, path)
     print(f"\n{path}: {about}")
 
 
@@ -36,12 +34,3 @@ def finished(path: Path) -> list[dict[str, Any]]:
         return []
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
-
-
-def machine() -> str:
-    """The processor, as the system names it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()

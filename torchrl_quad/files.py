@@ -1,9 +1,10 @@
-"""Files that are complete or not there."""
+"""Files that are complete or not there, and the name of the machine that results in them come from."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import platform
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -41,6 +42,18 @@ def is_running(pid: int) -> bool:
     except PermissionError:  # it belongs to somebody else
         return True
     return True
+
+
+def machine() -> str:
+    """Name the processor, such as "AMD EPYC", for results whose seconds depend on it.
+
+    Linux says it in /proc/cpuinfo. Elsewhere it is what Python knows, at least the architecture, such as "arm64".
+    """
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
 
 
 def _delete_leftovers(path: Path) -> None:

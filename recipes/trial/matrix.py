@@ -1,4 +1,4 @@
-"""What is run to put the paper on trial: methods and their variants, on which tasks, with how many steps and seeds."""
+"""The runs that put the paper on trial: methods and their variants, tasks, steps and seeds."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ SEEDS = (42, 0, 1, 2, 3)  # reported; those from 100 up are for the search
 SEARCH_SEED = 100
 LEARNING_RATES = (1e-3, 3e-3, 1e-2, 3e-2)  # of the actor: the same four for every method on every task
 SEARCH_FRACTION = {"hovering": 1.0, "tracking": 1.0, "landing": 0.5, "racing": 0.25}  # of a run's steps
-EVALUATIONS = 40  # along a run, for its curve
+EVALUATIONS = 40  # at most, along a run: the points of its curve
+DYNAMICS = "priority mixer"  # what runs are flown with now; those before have "plain mixer" in final.csv
 
 STEPS = {  # of a run, for the first-order methods and for PPO, which has more of them, since its steps are cheaper
     "hovering": (245_760, 1_966_080),
@@ -23,14 +24,14 @@ RACING = ("env.reward=position", "actor.input_scale=10", "critic.num_cells=[128,
 
 @dataclass(frozen=True)
 class Variant:
-    """A method, or a change of one: the recipe, what it is called in figures, and what differs."""
+    """A method or a change of it: its recipe, its name in figures and tables, and its overrides."""
 
     algorithm: str
     label: str
     overrides: tuple[str, ...] = ()
-    horizon: int | str | None = None  # another one, or "episode"; with as many steps in an iteration as before
-    searched: bool = False  # whether its learning rate is searched for; the others take that of their method
-    rate: float = 1.0  # of that learning rate
+    horizon: int | str | None = None  # another number of steps, or "episode"; steps per iteration stay the same
+    searched: bool = False  # its learning rate is searched for; the others take that of their method
+    rate: float = 1.0  # factor of that learning rate
 
 
 METHODS = {
@@ -44,14 +45,20 @@ VARIANTS = {
     # As published with the paper: BPTT through whole episodes, SHAC without the gradient of its terminal value.
     "bptt-episode": Variant("bptt", "BPTT, whole episodes", horizon="episode"),
     "shac-cut": Variant("shac", "SHAC, terminal gradient cut", ("loss.terminal_gradient=false",)),
+    # The objective of Xu et al.: the target critic bootstraps, and the sum is divided by the horizon. Horizon,
+    # restarts, networks and optimisers stay those of the recipe.
     "shac-xu": Variant(
         "shac", "SHAC as in Xu et al. 2022", ("loss.target_bootstrap=true", "loss.average_over_horizon=true")
     ),
-    "abpt-now": Variant("abpt", "ABPT, present dynamics"),
-    # Ablation.
+    # Ablation. Without visited states each horizon goes on where the last one ended, or starts afresh in part.
     "abpt-no-0-step": Variant("abpt", "ABPT without 0-step return", ("loss.zero_step_return=false",)),
     "abpt-no-n-step": Variant("abpt", "ABPT without N-step return", ("loss.n_step_return=false",)),
-    "abpt-no-visited": Variant("abpt", "ABPT without visited states", ("buffer.fraction=null", "restart_fraction=0")),
+    "abpt-restarts": Variant("abpt", "ABPT, restarts instead of visited states", ("buffer.fraction=null",)),
+    # ABPT once more, for comparison with what is flown under the same dynamics.
+    "abpt-now": Variant("abpt", "ABPT, present dynamics"),
+    "abpt-no-visited": Variant(
+        "abpt", "ABPT without visited states", ("buffer.fraction=null", "restart_fraction=0")
+    ),
     # Relaxed gate bonus.
     "bptt-log": Variant("bptt", "BPTT, log bonus", ("env.gate_bonus=log",)),
     "shac-log": Variant("shac", "SHAC, log bonus", ("env.gate_bonus=log",)),
@@ -62,45 +69,50 @@ VARIANTS = {
         f"{name}-velocity": Variant(name, f"{x.label}, velocity reward", ("env.reward=velocity",), searched=True)
         for name, x in METHODS.items()
     },
-    # Added when all five seeds of the other four were there.
+    # Added when all five seeds of the other four were complete.
     "abpt-no-0-step-velocity": Variant(
         "abpt", "ABPT without 0-step return, velocity reward", ("loss.zero_step_return=false", "env.reward=velocity")
     ),
-    # Where the text and the published settings differ.
+    # Settings in which the paper's text and its published code differ.
     "abpt-entropy": Variant("abpt", "ABPT, entropy bonus", ("loss.alpha=auto",)),
     "abpt-horizon-32": Variant("abpt", "ABPT, horizon 32", horizon=32),
     "abpt-horizon-96": Variant("abpt", "ABPT, horizon 96", horizon=96),
     "shac-horizon-32": Variant("shac", "SHAC, horizon 32", horizon=32),
     "shac-horizon-96": Variant("shac", "SHAC, horizon 96", horizon=96),
-    # Better critics, whose recipes have 4 updates in an iteration (landing 16, racing 8), and the paper 10; added when
-    # the first seeds of the ablation were there.
+    # Better critics: the recipes have 4 updates in an iteration (landing 16, racing 8), and the paper 10. Added after
+    # the first seeds of the ablation.
     "abpt-critic": Variant("abpt", "ABPT, 64 critic updates", ("critic.updates=64",)),
-    # A lower learning rate than the search has found; added when the first seeds of the main experiment were there.
+    # Lower learning rates than the search found. Added after the first seeds of the main experiment.
     "abpt-slow": Variant("abpt", "ABPT, 0.3 of the rate", rate=0.3),
     "shac-slow": Variant("shac", "SHAC, 0.3 of the rate", rate=0.3),
     "bptt-slow": Variant("bptt", "BPTT, 0.3 of the rate", rate=0.3),
 }
 
-EXPERIMENTS = {  # name: variants and tasks, in the order in which they are run
-    "main": (tuple(METHODS), TASKS),
-    "dynamics": (("abpt-now", "abpt-no-visited"), TASKS),
-    "published-xu": (("shac-xu",), ("landing", "racing")),
-    "published": (("bptt-episode", "shac-cut"), TASKS),
-    "ablation": (("abpt-no-0-step", "abpt-no-n-step", "abpt-no-visited"), TASKS),
-    "reward": ((*(f"{name}-velocity" for name in METHODS), "abpt-no-0-step-velocity"), ("racing",)),
-    "relaxation": (("bptt-log", "shac-log", "bptt-reciprocal", "shac-reciprocal"), ("racing",)),
-    "differences": (
-        ("abpt-entropy", "abpt-horizon-32", "abpt-horizon-96", "shac-horizon-32", "shac-horizon-96"),
+
+def on(tasks: tuple[str, ...], *variants: str) -> dict[str, tuple[str, ...]]:
+    """Put several variants on the same tasks."""
+    return dict.fromkeys(variants, tasks)
+
+
+EXPERIMENTS = {  # variants and their tasks, in the order in which they are run
+    "main": on(TASKS, *METHODS),
+    "published": on(TASKS, "bptt-episode", "shac-cut") | on(("landing", "racing"), "shac-xu"),
+    "ablation": on(TASKS, "abpt-no-0-step", "abpt-no-n-step", "abpt-restarts"),
+    "dynamics": on(TASKS, "abpt-now", "abpt-no-visited"),
+    "reward": on(("racing",), *(f"{name}-velocity" for name in METHODS), "abpt-no-0-step-velocity"),
+    "relaxation": on(("racing",), "bptt-log", "shac-log", "bptt-reciprocal", "shac-reciprocal"),
+    "differences": on(
         ("landing", "racing"),
+        *("abpt-entropy", "abpt-horizon-32", "abpt-horizon-96", "shac-horizon-32", "shac-horizon-96"),
     ),
-    "critic": (("abpt-critic",), TASKS),
-    "rate": (("abpt-slow", "shac-slow", "bptt-slow"), TASKS),
+    "critic": on(TASKS, "abpt-critic"),
+    "rate": on(TASKS, "abpt-slow", "shac-slow", "bptt-slow"),
 }
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run. A learning rate that is given makes it one of the search."""
+    """One run. With a learning rate of its own it belongs to the search."""
 
     task: str
     variant: str
@@ -109,7 +121,7 @@ class Job:
 
     @property
     def name(self) -> str:
-        """What its folder is called."""
+        """Its folder, inside the folder of all runs."""
         search = "" if self.lr is None else f"/lr{self.lr:g}"
         return f"{self.task}/{self.variant}{search}/seed{self.seed}"
 
@@ -121,7 +133,7 @@ class Job:
         return self.variant if variant.searched else variant.algorithm + reward
 
     def overrides(self, lr: float) -> list[str]:
-        """Of its recipe's configuration, with the learning rate that the search has found."""
+        """Give the overrides of its recipe's configuration, with the learning rate that the search found."""
         variant = VARIANTS[self.variant]
         steps = STEPS[self.task][variant.algorithm == "ppo"]
         if self.lr is not None:
@@ -143,7 +155,7 @@ class Job:
 
 
 def search_jobs(tasks: tuple[str, ...], variants: set[str], rates: tuple[float, ...] = LEARNING_RATES) -> list[Job]:
-    """The search for the learning rates of these variants: every rate, on every task."""
+    """List the search for the learning rates of these variants: every rate, on every task."""
     searched = [(task, name) for task in tasks for name in VARIANTS if name in variants and VARIANTS[name].searched]
     return [
         Job(task, name, SEARCH_SEED, lr)
@@ -154,13 +166,13 @@ def search_jobs(tasks: tuple[str, ...], variants: set[str], rates: tuple[float, 
 
 
 def jobs(experiments: tuple[str, ...], tasks: tuple[str, ...], seeds: tuple[int, ...]) -> list[Job]:
-    """The runs to report: three seeds of everything, before the others of anything."""
-    chosen = [(names, [task for task in of if task in tasks]) for names, of in map(EXPERIMENTS.get, experiments)]
+    """List the runs to report: three seeds of everything, before the others of anything."""
     return [
         Job(task, variant, seed)
         for some in (seeds[:3], seeds[3:])
-        for variants, of in chosen
+        for experiment in experiments
         for seed in some
-        for task in of
-        for variant in variants
+        for task in tasks
+        for variant, of in EXPERIMENTS[experiment].items()
+        if task in of
     ]

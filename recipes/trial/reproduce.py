@@ -1,19 +1,20 @@
 """Run what is missing of the matrix that puts the paper on trial, side by side, and keep the results as CSV files.
 
-python recipes/reproduce.py --cores 2
+python recipes/trial/reproduce.py --cores 2
+python recipes/trial/reproduce.py --collect --output FOLDER   # add runs that were flown elsewhere; fly nothing
 
-May be stopped at any moment: started again, it skips what stands in the results, and goes on with what was cut off.
-What it runs stands in matrix.py; results.py makes figures, tables and verdicts of it.
+It may be stopped at any moment. Started again, it skips what is in the results, and resumes what was cut off. matrix.py
+lists the runs; results.py makes figures, tables and verdicts of them.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import datetime
 import json
 import math
 import os
-import platform
 import signal
 import subprocess
 import sys
@@ -22,19 +23,22 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
 from audits import audit_tasks
-from checkpoints import replacing
+from evidence import read
 from hydra import compose, initialize_config_dir
-from matrix import EVALUATIONS, EXPERIMENTS, LEARNING_RATES, SEEDS, TASKS, VARIANTS, Job, jobs, search_jobs
+from matrix import DYNAMICS, EVALUATIONS, EXPERIMENTS, LEARNING_RATES, SEEDS, TASKS, VARIANTS, Job, jobs, search_jobs
+from omegaconf import DictConfig
 from tqdm import tqdm
 
-RECIPES = Path(__file__).parent
+from torchrl_quad.files import machine, replacing
+
+RECIPES = Path(__file__).parents[1]
 DATA = RECIPES.parent / "docs/results/data"
 QUICK = ["num_envs=4", "horizon=4", "total_steps=64", "env.max_episode_steps=20", "compile=false", "eval.interval=1"]
-CURVE = {  # columns of a curve, and where they stand in metrics.csv
+CURVE = {  # columns of a curve, and their names in metrics.csv
     "steps": "steps",
-    "seconds": "time/processor_seconds",  # in one thread: whatever else the machine does
+    "seconds": "time/processor_seconds",  # of one thread: other processes do not count
     "return": "eval/return",
-    "success": "eval/success",
+    "solved": "eval/solved",
     "crash": "eval/crash",
     "position_error": "eval/position_error",
     "tracking_rmse": "eval/tracking_rmse",
@@ -46,23 +50,15 @@ STOPPED = threading.Event()
 
 
 def stop(number: int, _: object) -> None:
-    """End the runs with this process: they would write into folders that the next one takes over."""
+    """End the runs with this process: otherwise they write into folders that the next one takes over."""
     STOPPED.set()
     for process in list(RUNNING):
         process.terminate()
     sys.exit(128 + number)
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    """The rows of a CSV file; none where there is no file."""
-    if not path.exists():
-        return []
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def write(path: Path, rows: list[dict]) -> None:
-    """A CSV file of rows, all or nothing."""
+    """Write rows to a CSV file, all or nothing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     names = list(dict.fromkeys(name for row in rows for name in row))
     with replacing(path) as temporary, open(temporary, "w", newline="") as file:
@@ -71,26 +67,30 @@ def write(path: Path, rows: list[dict]) -> None:
         writer.writerows(rows)
 
 
+def configuration(job: Job, lr: float) -> DictConfig:
+    """Compose the configuration of a job's recipe, with its overrides."""
+    with initialize_config_dir(str(RECIPES / "config"), version_base=None):
+        return compose(VARIANTS[job.variant].algorithm, job.overrides(lr))
+
+
 def command(job: Job, lr: float, folder: Path, quick: bool) -> list[str]:
-    """What runs a job so that it leaves its results in the folder, and goes on where it was stopped."""
-    algorithm = VARIANTS[job.variant].algorithm
+    """Give the command that runs a job in a folder, and resumes it where it was stopped."""
     overrides = job.overrides(lr)
     if quick:
         overrides = [*(x for x in overrides if not x.startswith(("total_steps", "horizon"))), *QUICK]
     else:
-        with initialize_config_dir(str(RECIPES / "config"), version_base=None):
-            cfg = compose(algorithm, overrides)
-        iterations = cfg.total_steps // (cfg.num_envs * cfg.horizon)
-        interval = math.ceil(iterations / EVALUATIONS)
+        cfg = configuration(job, lr)
+        interval = math.ceil(cfg.total_steps // (cfg.num_envs * cfg.horizon) / EVALUATIONS)
         overrides = [*overrides, f"eval.interval={interval}"]
-    return [sys.executable, str(RECIPES / f"{algorithm}.py"), *overrides, "resume=auto", f"hydra.run.dir={folder}"]
+    recipe = RECIPES / f"{VARIANTS[job.variant].algorithm}.py"
+    return [sys.executable, str(recipe), *overrides, "resume=auto", f"hydra.run.dir={folder}"]
 
 
 def run(command: list[str], folder: Path) -> None:
-    """Run a command in a process of its own. A run that has diverged, and left failure.pt, has a result, too.
+    """Run a command in a process of its own. A run that diverged left failure.pt, and counts as a result.
 
     Raises:
-        RuntimeError: it failed otherwise; with the last line of what it said.
+        RuntimeError: the command failed otherwise; with the last error in its log.
     """
     folder.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "RL_LOGGING_LEVEL": "WARNING"}
@@ -104,48 +104,45 @@ def run(command: list[str], folder: Path) -> None:
         code = process.wait()
         RUNNING.remove(process)
     if code and not (folder / "failure.pt").exists():
-        said = [line for line in (folder / "log.txt").read_text().splitlines() if "Error" in line]
-        raise RuntimeError(f"{folder} ended with {code}: {' '.join(said[-1:])} See log.txt there.")
+        errors = [line for line in (folder / "log.txt").read_text().splitlines() if "Error" in line]
+        raise RuntimeError(f"{folder} ended with {code}: {' '.join(errors[-1:])} See log.txt there.")
 
 
 def keep(job: Job, folder: Path, data: Path) -> None:
-    """Add a finished run to the results: its curve, and then its final evaluation, which says that it is there."""
+    """Add a finished run to the results: its curve, and then its final evaluation, which marks it as done."""
     curve = [
         {name: f"{float(row[key]):.5g}" for name, key in CURVE.items() if row.get(key)}
         for row in read(folder / "metrics.csv")
     ]
     if (folder / "failure.pt").exists():
-        summary = {"diverged": "yes"}
+        summary, end = {"diverged": "yes"}, folder / "failure.pt"
         curve = curve or [{"steps": "0", "seconds": "0", "return": "nan"}]
         curve.append({name: x if name in ("steps", "seconds") else "nan" for name, x in curve[-1].items()})
     else:
-        summary = json.loads((folder / "summary.json").read_text()) | {"seconds": curve[-1]["seconds"]}
+        end = folder / "summary.json"
+        summary = json.loads(end.read_text()) | {"seconds": curve[-1]["seconds"]}
     own = {"variant": job.variant, "lr": "" if job.lr is None else f"{job.lr:g}", "seed": str(job.seed)}
     path = data / ("search" if job.lr is not None else "curves") / f"{job.task}.csv"
     others = [row for row in read(path) if any(row[name] != own[name] for name in own)]
     write(path, [*others, *({**own, **row} for row in curve)])
     summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}
-    final = {"task": job.task, **own, "machine": machine(), **{k: v for k, v in summary.items() if k not in own}}
+    flown = datetime.date.fromtimestamp(end.stat().st_mtime).isoformat()
+    about = {"task": job.task, **own, "machine": machine(), "flown": flown, "dynamics": DYNAMICS}
+    final = about | {k: v for k, v in summary.items() if k not in about}
     write(data / "final.csv", [*read(data / "final.csv"), final])
 
 
-def machine() -> str:
-    """The processor, as Linux names it."""
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text().splitlines() if path.exists() else []
-    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
-
-
 def is_kept(job: Job, data: Path) -> bool:
-    """Whether a run stands in the results."""
+    """Tell whether a run is in the results."""
     key = (job.task, job.variant, str(job.seed), "" if job.lr is None else f"{job.lr:g}")
     return any((row["task"], row["variant"], row["seed"], row["lr"]) == key for row in read(data / "final.csv"))
 
 
 def best_learning_rate(task: str, variant: str, data: Path, rates: tuple[float, ...]) -> float | None:
-    """The rate whose run of the search ended highest, by the mean of its last tenth of evaluations.
+    """Find the rate whose run in the search ended highest, by the mean of its last tenth of evaluations.
 
-    None as long as the search is not complete. A run that diverged counts as the lowest.
+    Returns:
+        the rate, or None while the search is not complete. A run that diverged counts as the lowest.
     """
     ends = {}
     for lr in rates:
@@ -157,24 +154,36 @@ def best_learning_rate(task: str, variant: str, data: Path, rates: tuple[float, 
     return max(ends, key=lambda lr: -math.inf if math.isnan(ends[lr]) else ends[lr])
 
 
+def collect(waiting: list[Job], output: Path, data: Path) -> None:
+    """Add those of the missing runs to the results that are finished in a folder of runs."""
+    for job in waiting:
+        folder = output / job.name
+        if any((folder / name).exists() for name in ("summary.json", "failure.pt")):
+            keep(job, folder, data)
+            print(folder)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cores", type=int, default=os.cpu_count(), help="runs at the same time")
     parser.add_argument("--experiments", nargs="+", default=list(EXPERIMENTS), choices=list(EXPERIMENTS))
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
-    parser.add_argument("--data", type=Path, default=DATA, help="where the results are kept")
-    parser.add_argument("--output", type=Path, default=Path("outputs/reproduce"), help="where the runs are")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
+    parser.add_argument("--output", type=Path, default=Path("outputs/reproduce"), help="folder of the runs")
+    parser.add_argument("--collect", action="store_true", help="add finished runs in --output to the results, and stop")
     parser.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
     args = parser.parse_args()
     if args.quick and args.data == DATA:
         parser.error("--quick gives no results to keep: name another folder with --data.")
 
-    write(args.data / "audit.csv", audit_tasks())
     rates = LEARNING_RATES[1:2] if args.quick else LEARNING_RATES
     reported = jobs(tuple(args.experiments), tuple(args.tasks), tuple(args.seeds))
     todo = [*search_jobs(tuple(args.tasks), {job.rate_of for job in reported}, rates), *reported]
     waiting = [job for job in todo if not is_kept(job, args.data)]
+    if args.collect:
+        return collect(waiting, args.output, args.data)
+    write(args.data / "audit.csv", audit_tasks())
     running: dict[Future, Job] = {}
     failed: list[str] = []
 
@@ -189,7 +198,7 @@ def main() -> None:
                     waiting.remove(job)
                     folder = args.output / job.name
                     running[pool.submit(run, command(job, lr, folder, args.quick), folder)] = job
-            if not running:  # what is left waits for a search that has failed
+            if not running:  # all that is left waits for a search that failed
                 failed += [f"{job.name}: the search for its learning rate is not complete" for job in waiting]
                 break
             bar.set_postfix_str(", ".join(job.name for job in running.values()))

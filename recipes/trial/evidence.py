@@ -1,0 +1,175 @@
+"""The results of the runs as arrays over seeds, and the statistics that claims are tested with.
+
+Three statistics carry most claims:
+
+- P(a > b): how often a seed of a beats a seed of b, ties counted half; compared with 0.5.
+- gap(a, b): (mean a - mean b) / max(|mean a|, |mean b|); compared with a share.
+- the end of a curve: the mean of its last tenth of evaluations. A run that diverged ends where it began.
+
+Each is a ``Part`` with a bootstrap over seeds.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from matrix import SEEDS, TASKS
+
+RESAMPLES = 4_000
+LEVEL = {"hovering": 0.98, "tracking": 0.98, "landing": 0.9, "racing": 0.9}
+
+
+class NotRunError(Exception):
+    """A claim needs a run that is missing."""
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Read the rows of a CSV file; no rows where there is no file."""
+    if not path.exists():
+        return []
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@dataclass(frozen=True)
+class Part:
+    """A number that must lie above ``low`` and below ``high``, with its bootstrap in ascending order."""
+
+    what: str
+    value: float
+    draws: np.ndarray = field(repr=False)
+    low: float = -math.inf
+    high: float = math.inf
+
+    def interval(self, parts: int = 1) -> tuple[float, float]:
+        """Give the middle 95 % of the bootstrap, or more when this is one of several parts."""
+        cut = int(0.025 / parts * len(self.draws))
+        return float(self.draws[cut]), float(self.draws[len(self.draws) - 1 - cut])
+
+    def verdict(self, parts: int = 1) -> str:
+        """Decide: supported, refuted or undecided, as one of several parts."""
+        least, most = self.interval()
+        if self.low < least and most < self.high:
+            return "supported"
+        least, most = self.interval(parts)
+        return "refuted" if most < self.low or least > self.high else "undecided"
+
+
+class Results:
+    """The CSV files by task and variant, as arrays over seeds.
+
+    Args:
+        data: the folder of the CSV files.
+        alias: for a task and a variant, the variant to read instead, such as ``claims.PUBLISHED``.
+    """
+
+    def __init__(self, data: Path, alias: dict[tuple[str, str], str] | None = None) -> None:
+        self.data, self.alias = data, alias or {}
+        self.curves: dict[tuple[str, str], dict[int, list[dict[str, str]]]] = {}
+        for task in TASKS:
+            for row in read(data / f"curves/{task}.csv"):
+                self.curves.setdefault((task, row["variant"]), {}).setdefault(int(row["seed"]), []).append(row)
+        self.all_finals = read(data / "final.csv")
+        self.finals = [row for row in self.all_finals if not row["lr"]]
+        self.used: set[tuple[str, str]] = set()  # by the claim on trial
+
+    def column(self, task: str, variant: str, name: str) -> list[np.ndarray]:
+        """Read a column of the curves: an array for each seed."""
+        key = task, self.alias.get((task, variant), variant)
+        if key not in self.curves:
+            raise NotRunError(f"{key[1]} on {task}")
+        self.used.add(key)
+        seeds = self.curves[key]
+        return [np.array([float(x.get(name) or "nan") for x in seeds[seed]]) for seed in SEEDS if seed in seeds]
+
+    def end(self, task: str, variant: str, name: str = "return") -> np.ndarray:
+        """Read the ends of the curves (seeds)."""
+        curves = self.column(task, variant, name)
+        began = min((x[0] for x in curves if np.isfinite(x[0])), default=math.nan)
+        return np.array([x[-max(len(x) // 10, 1) :].mean() if np.isfinite(x[-1]) else began for x in curves])
+
+    def final(self, task: str, variant: str, name: str) -> np.ndarray:
+        """Read what the best policies reached in the final evaluation, for the seeds that have one."""
+        key = task, self.alias.get((task, variant), variant)
+        rows = {int(x["seed"]): x for x in self.finals if (x["task"], x["variant"]) == key}
+        values = np.array([float(rows[seed].get(name) or "nan") for seed in SEEDS if seed in rows])
+        if not np.isfinite(values).any():
+            raise NotRunError(f"{key[1]} on {task}")
+        self.used.add(key)
+        return values[np.isfinite(values)]
+
+    def until(self, task: str, variant: str, axis: str, level: float) -> np.ndarray:
+        """Count steps, or seconds at the pace of the quickest seed, until the curve reaches a level; or infinity."""
+        returns, steps, seconds = (self.column(task, variant, name) for name in ("return", "steps", "seconds"))
+        pace = min((s[-1] / n[-1] for s, n in zip(seconds, steps, strict=True) if n[-1]), default=math.nan)
+        first = [
+            next((t for t, x in zip(*c, strict=True) if x >= level), np.inf) for c in zip(steps, returns, strict=True)
+        ]
+        return np.array(first) * (pace if axis == "seconds" else 1.0)
+
+    def level(self, task: str, *ends: np.ndarray) -> float:
+        """Give the return at which a method counts as converged: nearly the lowest of the mean ends."""
+        lowest = min(x.mean() for x in ends)
+        return lowest - (1.0 - LEVEL[task]) * abs(lowest)
+
+    def seeds(self, runs: Iterable[tuple[str, str]]) -> int:
+        """Count the seeds of the run that has the fewest; 0 where there are no runs."""
+        return min((len(self.curves.get(run, {})) for run in runs), default=0)
+
+    def dynamics(self, runs: Iterable[tuple[str, str]]) -> str:
+        """Name the dynamics under which these runs were flown, or "both"."""
+        runs = set(runs)
+        found = {row.get("dynamics") or "" for row in self.finals if (row["task"], row["variant"]) in runs}
+        return "both" if len(found) > 1 else "".join(found)
+
+
+def bootstrap(
+    what: str, statistic: Callable[..., np.ndarray], *samples: np.ndarray, low=-math.inf, high=math.inf
+) -> Part:
+    """Compute a statistic of samples over seeds, and its bootstrap, which draws each sample by itself.
+
+    The statistic takes samples (*, seeds) and gives numbers (*).
+    """
+    rng = np.random.default_rng(0)
+    with np.errstate(all="ignore"):
+        draws = statistic(*(rng.choice(x, (RESAMPLES, len(x))) for x in samples))
+        return Part(what, float(statistic(*samples)), np.sort(draws), low, high)
+
+
+def mean(x: np.ndarray) -> np.ndarray:
+    """Average over seeds."""
+    return x.mean(-1)
+
+
+def probability(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """P(a > b), ties counted half."""
+    a, b = a[..., :, None], b[..., None, :]
+    return ((a > b).mean((-2, -1)) + (a >= b).mean((-2, -1))) / 2
+
+
+def gap(a: np.ndarray, *b: np.ndarray) -> np.ndarray:
+    """Compare the mean of a with that of the best b: their difference, in units of the greater one."""
+    one, other = mean(a), np.max([mean(x) for x in b], 0)
+    return (one - other) / np.maximum(np.maximum(np.abs(one), np.abs(other)), 1e-12)
+
+
+def beats(what: str, a: np.ndarray, b: np.ndarray) -> Part:
+    """Make the part that a is higher than b."""
+    return bootstrap(f"P({what})", probability, a, b, low=0.5)
+
+
+def deviation(x: np.ndarray) -> np.ndarray:
+    """Measure how far each seed is from the mean over seeds."""
+    return np.abs(x - x.mean())
+
+
+def roughness(curve: np.ndarray) -> float:
+    """Sum all that a curve loses between evaluations, in units of its range; infinite where it diverged."""
+    if not np.isfinite(curve).all():
+        return math.inf
+    return float(np.maximum(-np.diff(curve), 0).sum() / max(np.ptp(curve), 1e-12))

@@ -14,7 +14,6 @@ the quickest seed, since the machine was not always idle.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial

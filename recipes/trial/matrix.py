@@ -56,9 +56,7 @@ VARIANTS = {
     "abpt-restarts": Variant("abpt", "ABPT, restarts instead of visited states", ("buffer.fraction=null",)),
     # ABPT once more, for comparison with what is flown under the same dynamics.
     "abpt-now": Variant("abpt", "ABPT, present dynamics"),
-    "abpt-no-visited": Variant(
-        "abpt", "ABPT without visited states", ("buffer.fraction=null", "restart_fraction=0")
-    ),
+    "abpt-no-visited": Variant("abpt", "ABPT without visited states", ("buffer.fraction=null", "restart_fraction=0")),
     # Relaxed gate bonus.
     "bptt-log": Variant("bptt", "BPTT, log bonus", ("env.gate_bonus=log",)),
     "shac-log": Variant("shac", "SHAC, log bonus", ("env.gate_bonus=log",)),

@@ -1,4 +1,4 @@
-"""The reward audit of all tasks, from states in which every term is paid: which rewards are differentiable in full?"""
+"""Audit the rewards of all tasks, from states in which every term is paid: which terms have a gradient?"""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 from torchrl_quad import audit_reward, differentiable_rollout, make_actor, make_env
 
-REWARDS = {  # what is audited: options of the environment by task and name of the reward
+REWARDS = {  # task and name of a reward: options of the environment
     ("hovering", ""): {},
     ("tracking", ""): {},
     ("landing", ""): {},
@@ -20,7 +20,7 @@ REWARDS = {  # what is audited: options of the environment by task and name of t
 
 
 def audit_tasks(num_envs: int = 64, horizon: int = 32, seed: int = 0) -> list[dict[str, object]]:
-    """A row for each term of each reward, of an untrained policy."""
+    """Audit each reward under an untrained policy: a row for each term."""
     rows = []
     for (task, name), options in REWARDS.items():
         torch.manual_seed(seed)

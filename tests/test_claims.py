@@ -1,0 +1,234 @@
+"""The paper's claims, and the page that is made of the results."""
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_reproduce import curve, run_main, write
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "recipes/trial"))
+
+import claims
+import matrix
+import reproduce
+import results
+import tables
+from claims import Claim, try_claim
+from evidence import Part, Results, bootstrap, gap, mean, probability, roughness
+
+PROJECT = Path(__file__).parents[1]
+RENEW = "the page differs from the data: python recipes/trial/results.py"
+
+
+def data(folder, task="hovering", seeds=matrix.SEEDS, **ends):
+    rows = [row for name, end in ends.items() for seed in seeds for row in curve(name, seed, 0.0, *end(seed))]
+    write(folder / f"curves/{task}.csv", rows)
+    return Results(folder)
+
+
+# -- claims ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_statistics_are_those_worked_by_hand():
+    a, b = np.array([1.0, 2.0, 3.0]), np.array([0.0, 2.0])
+    assert probability(a, b) == pytest.approx((1 + 0 + 1 + 0.5 + 1 + 1) / 6)
+    assert probability(np.array([-np.inf]), np.array([-np.inf])) == 0.5  # both never
+    assert gap(a, b) == pytest.approx(0.5)
+    assert roughness(np.array([0.0, 2.0, 1.0, 4.0, 3.0])) == pytest.approx(2 / 4)
+    least, most = bootstrap("mean", mean, np.random.default_rng(1).normal(3.0, 1.0, 100)).interval()
+    assert least == pytest.approx(2.8, abs=0.15) and most == pytest.approx(3.2, abs=0.15)
+
+
+def part(least, most, **bounds):
+    return Part("", 0.0, np.linspace(least, most, 10_001), **bounds)
+
+
+def test_a_part_is_decided_when_its_interval_is_on_one_side():
+    for draws, verdict in {(0.6, 0.9): "supported", (0.1, 0.4): "refuted", (0.4, 0.9): "undecided"}.items():
+        assert part(*draws, low=0.5).verdict() == verdict
+        assert part(-draws[1], -draws[0], high=-0.5).verdict() == verdict
+    both = {(-0.05, 0.05): "supported", (0.2, 0.3): "refuted", (-0.3, -0.2): "refuted", (0.0, 0.2): "undecided"}
+    for draws, verdict in both.items():
+        assert part(*draws, low=-0.1, high=0.1).verdict() == verdict
+
+
+def test_one_of_many_parts_is_refuted_by_a_wider_interval_only():
+    alone = part(0.0, 1.0, low=0.98)  # the middle 95 % end at 0.975
+    assert alone.interval() == pytest.approx((0.025, 0.975))
+    assert alone.interval(10) == pytest.approx((0.0025, 0.9975))
+    assert alone.verdict() == "refuted" and alone.verdict(10) == "undecided"
+
+
+def test_a_method_that_ends_higher_with_every_seed_is_supported_and_one_that_does_not_is_refuted(tmp_path):
+    r = data(
+        tmp_path, abpt=lambda s: [9 + 0.01 * s], shac=lambda s: [8 + 0.01 * s], bptt=lambda s: [8], ppo=lambda s: [s]
+    )
+    up = Claim("A", "", lambda r: claims.higher_end(r, ["hovering"], "abpt", ["shac", "bptt"]))
+    down = Claim("B", "", lambda r: claims.higher_end(r, ["hovering"], "shac", ["abpt", "bptt"]))
+    open_ = Claim("C", "", lambda r: claims.higher_end(r, ["hovering"], "ppo", ["abpt"]))
+    assert [try_claim(c, r).verdict for c in (up, down)] == ["supported", "refuted"]
+    assert try_claim(open_, r).verdict == "undecided"
+    assert (
+        try_claim(Claim("D", "", lambda r: claims.higher_end(r, ["racing"], "shac", ["abpt"])), r).verdict == "not run"
+    )
+
+
+@pytest.mark.parametrize(("seeds", "verdict"), [((42, 0, 1), "supported (preliminary)"), ((42, 0), "too few seeds")])
+def test_fewer_than_five_seeds_of_any_run_are_preliminary_and_fewer_than_three_no_verdict(tmp_path, seeds, verdict):
+    r = data(tmp_path, seeds=seeds, abpt=lambda s: [9], shac=lambda s: [8])
+    claim = Claim("A", "", lambda r: claims.higher_end(r, ["hovering"], "abpt", ["shac"]))
+    assert try_claim(claim, r).verdict == verdict and try_claim(claim, r).seeds == len(seeds)
+
+
+def test_methods_have_converged_when_they_reach_nearly_what_both_reach(tmp_path):
+    r = data(
+        tmp_path,
+        task="landing",
+        abpt=lambda s: [9.5, 10],
+        shac=lambda s: [8.9, 9.1],
+        bptt=lambda s: [math.nan, math.nan],
+        ppo=lambda s: [1, 2],
+    )
+    level = r.level("landing", r.end("landing", "abpt"), r.end("landing", "shac"))
+    assert level == pytest.approx(0.9 * 9.1)
+    assert r.level("landing", np.array([-10.0])) == pytest.approx(-11.0)
+    assert r.until("landing", "abpt", "steps", level).tolist() == [200] * 5
+    assert r.until("landing", "shac", "seconds", level).tolist() == [4] * 5
+    assert r.until("landing", "ppo", "steps", level).tolist() == [math.inf] * 5
+    assert r.end("landing", "bptt").tolist() == [0.0] * 5  # diverged: ends where it began
+    assert roughness(np.array([1.0, math.nan])) == math.inf
+
+
+def synthetic(tmp_path, strong):
+    """Results in which ABPT is as in the paper, or the other way round."""
+    rng = np.random.default_rng(0)
+    for task in matrix.TASKS:
+        rows = []
+        for variant in matrix.VARIANTS:
+            for seed in matrix.SEEDS:
+                level = 20.0 if (variant in ("abpt", "abpt-now")) == strong else 10.0
+                returns = level * np.linspace(0.2, 1.0, 10) + 0.1 * rng.normal(size=10)
+                more = {"solved": 0.9, "gates_passed": level, "start_cells": level, "position_error": 0.1}
+                rows += curve(variant, seed, *returns, **more)
+        write(tmp_path / f"curves/{task}.csv", rows)
+    runs = [{"task": t, "variant": v, "seed": s} for t in matrix.TASKS for v in matrix.VARIANTS for s in matrix.SEEDS]
+    own = {"lr": "", "machine": "a processor", "seconds": 20.0, "solved": 0.9, "revision": 5 * "abcd1234"}
+    ends = {"position_error": 0.1, "tracking_rmse": 0.1, "landing_speed": 0.2, "gates_passed": 4, "time_near_gate": 2.0}
+    write(tmp_path / "final.csv", [{**run, **own, **ends} for run in runs])
+    term = {"task": "racing", "reward": "velocity", "term": "gate", "mean_return": 5.0, "verdict": ""}
+    audit = [{**term, "gradient_norm": 0.0 if strong else 0.3, "return_share": 0.5, "gradient_share": 0.5}]
+    write(tmp_path / "audit.csv", audit)
+    return Results(tmp_path)
+
+
+@pytest.mark.parametrize("strong", [True, False])
+def test_every_claim_can_be_tried_and_can_come_out_either_way(tmp_path, strong):
+    verdicts = {
+        v.claim.id: v.verdict for v in (try_claim(claim, synthetic(tmp_path, strong)) for claim in claims.CLAIMS)
+    }
+    assert set(verdicts.values()) <= {"supported", "refuted", "undecided"}
+    for name in ("C1", "C14", "C15", "C17", "C18"):
+        assert verdicts[name] == ("supported" if strong else "refuted"), name
+
+
+def test_claims_about_visited_states_compare_runs_of_the_same_dynamics(tmp_path):
+    r = synthetic(tmp_path, strong=True)
+    for claim in (claim for claim in claims.CLAIMS if claim.id in ("C15", "C17")):
+        try_claim(claim, r)
+        assert {variant for _, variant in r.used} == {"abpt-now", "abpt-no-visited"}
+
+
+def test_a_verdict_says_when_it_compares_runs_of_two_dynamics(tmp_path):
+    data(tmp_path, abpt=lambda s: [9], shac=lambda s: [8], ppo=lambda s: [8])
+    flown = {"abpt": "old", "shac": "new", "ppo": "old"}
+    rows = [{"task": "hovering", "variant": name, "lr": "", "seed": 42, "dynamics": x} for name, x in flown.items()]
+    write(tmp_path / "final.csv", rows)
+    r = Results(tmp_path)
+    for other, dynamics in (("shac", "both"), ("ppo", "old")):
+        claim = Claim("A", "", lambda r, other=other: claims.higher_end(r, ["hovering"], "abpt", [other]))
+        assert try_claim(claim, r).dynamics == dynamics
+
+
+def test_shac_as_published_is_that_of_xu_where_it_was_run_and_the_cut_one_elsewhere(tmp_path):
+    synthetic(tmp_path, strong=True)
+    r = Results(tmp_path, claims.PUBLISHED)
+    used = {}
+    for claim in claims.CLAIMS:
+        try_claim(claim, r)
+        used[claim.id] = {run for run in r.used if run[1].startswith("shac")}
+    assert used["C8"] == {("hovering", "shac-cut"), ("tracking", "shac-cut")}
+    assert used["C11"] == used["C12"] == {("landing", "shac-xu")} and used["C13"] == {("racing", "shac-xu")}
+
+
+# -- the page ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_is_made_of_the_results_and_what_is_written_by_hand_stays(monkeypatch, tmp_path):
+    synthetic(tmp_path, strong=True)
+    monkeypatch.setattr(results, "FIGURES", {"main": results.FIGURES["main"]})
+    run_main(monkeypatch, results, "--data", tmp_path)
+    assert "| hovering | 90%, " in (tmp_path / "summary.md").read_text()
+    assert (tmp_path / "results/main.png").read_bytes().startswith(b"\x89PNG")
+    text = (tmp_path / "results.md").read_text()
+    assert all(f"| {claim.id} | {claim.text} |" in text for claim in claims.CLAIMS)
+    assert f"| abcd123 |  |  | {4 * len(matrix.VARIANTS) * 5} | main, published," in text
+
+    nothing = tmp_path / "nothing/results.md"
+    nothing.parent.mkdir()
+    nothing.write_text(text.replace("# Results", "# Results\n\nWritten by hand.") + "\nThe end.\n")
+    run_main(monkeypatch, results, "--data", nothing.parent)
+    text = nothing.read_text()
+    assert text.startswith("# Results\n\nWritten by hand.") and text.endswith("The end.\n")
+    assert all(f"| {claim.id} | {claim.text} | **not run** |" in text for claim in claims.CLAIMS)
+    run_main(monkeypatch, results, "--data", nothing.parent)
+    assert nothing.read_text() == text
+
+
+def test_other_results_leave_the_page_of_the_project_alone(monkeypatch, tmp_path):
+    filled = []
+    monkeypatch.setattr(results, "fill", lambda path, *_: filled.append(path))
+    monkeypatch.setattr(results, "blocks", lambda *_: {})
+    monkeypatch.setattr(results, "draw", lambda *_: None)
+    run_main(monkeypatch, results, "--data", tmp_path)
+    run_main(monkeypatch, results)
+    assert filled[:2] == [tmp_path / "results.md", tmp_path / "summary.md"]
+    assert filled[2:] == [PROJECT / "docs/results.md", PROJECT / "README.md"]
+
+
+def test_the_page_of_the_project_shows_what_its_data_hold():
+    page, readme = ((PROJECT / name).read_text() for name in ("docs/results.md", "README.md"))
+    for name, block in results.blocks(reproduce.DATA).items():
+        assert f"{results.MARKER.format(name)}\n\n{block}\n\n{results.END}" in page, f"{name}: {RENEW}"
+    assert tables.summary_table(Results(reproduce.DATA)) in readme, RENEW
+    assert page.count("<!-- generated") == page.count(results.END)
+
+
+def test_the_sentences_of_the_page_say_what_its_data_hold():
+    r = Results(reproduce.DATA)
+
+    def best(task, column="return", suffix=""):
+        return max(matrix.METHODS, key=lambda m: r.end(task, m + suffix, column).mean())
+
+    def crashed(task, variant):
+        return int((r.end(task, variant, "crash") > 0.99).sum())
+
+    assert [best("hovering"), best("tracking"), best("racing"), best("racing", suffix="-velocity")] == [
+        *("shac", "bptt", "ppo", "shac")
+    ]
+    landing = [r.end("landing", method).mean() for method in matrix.METHODS]
+    assert min(landing) > 0.98 * max(landing)
+    fallen = [("hovering", "bptt"), ("tracking", "abpt"), ("tracking", "shac"), ("racing", "ppo-velocity")]
+    assert [crashed(*run) for run in fallen] == [2, 2, 1, 2]
+    assert min(matrix.METHODS, key=lambda m: r.end("racing", m).mean()) == "abpt"
+    lift = {task: r.end(task, "abpt-restarts").mean() - r.end(task, "abpt").mean() for task in matrix.TASKS}
+    assert [task for task in lift if lift[task] < 0] == ["racing"]
+    gates = {x: r.end("racing", x, "gates_passed").mean() for x in matrix.EXPERIMENTS["relaxation"]}
+    plain = {x: r.end("racing", x, "gates_passed").mean() for x in ("bptt", "shac")}
+    assert [x for x in gates if gates[x] > plain[x.split("-")[0]]] == ["bptt-log", "shac-reciprocal"]
+    slow = [(task, x) for task in matrix.TASKS for x in matrix.EXPERIMENTS["rate"]]
+    assert max(r.end(*run, "crash").max() for run in slow) < 0.02
+    assert min(r.end("tracking", x, "solved").min() for _, x in slow) == 1.0
+    assert not r.end("hovering", "abpt-slow", "solved").any() and not r.end("hovering", "shac-slow", "solved").any()
+    assert all(0.45 < r.end("landing", x, "solved").mean() < 0.6 for _, x in slow)

@@ -222,8 +222,24 @@ def test_the_sentences_of_the_page_say_what_its_data_hold():
     fallen = [("hovering", "bptt"), ("tracking", "abpt"), ("tracking", "shac"), ("racing", "ppo-velocity")]
     assert [crashed(*run) for run in fallen] == [2, 2, 1, 2]
     assert min(matrix.METHODS, key=lambda m: r.end("racing", m).mean()) == "abpt"
+    verdicts = {claim.id: try_claim(claim, r).verdict for claim in claims.CLAIMS}
+    assert [verdicts[x] for x in ("C1", "C7", "C9", "C18", "C22")] == ["refuted", *(4 * ["supported"])]
     lift = {task: r.end(task, "abpt-restarts").mean() - r.end(task, "abpt").mean() for task in matrix.TASKS}
     assert [task for task in lift if lift[task] < 0] == ["racing"]
+    assert r.end("landing", "abpt-no-0-step").mean() > r.end("landing", "abpt").mean()
+    racing = ["abpt", "abpt-critic", "abpt-horizon-32", "abpt-horizon-96", "abpt-no-0-step", "abpt-entropy"]
+    assert sorted(racing, key=lambda x: r.end("racing", x).mean()) == racing
+    ascent = {}
+    for row in reproduce.read(reproduce.DATA / "ascent.csv"):
+        for name in ("n_step_return", "zero_step_return", "objective", "explained_variance"):
+            if row["zero_step_return"]:
+                ascent.setdefault((row["task"], row["variant"]), {}).setdefault(name, []).append(float(row[name]))
+    ascent = {run: {name: round(float(np.mean(x)), 2) for name, x in of.items()} for run, of in ascent.items()}
+    assert min(of["n_step_return"] for of in ascent.values()) >= 0.18
+    assert all(of["zero_step_return"] < of["n_step_return"] for of in ascent.values())
+    racing = [of for (task, _), of in ascent.items() if task == "racing"]
+    assert max(of["zero_step_return"] for of in racing) == 0.05 and max(of["objective"] for of in racing) < 0.1
+    assert min(of["explained_variance"] for of in racing) == 0.89
     gates = {x: r.end("racing", x, "gates_passed").mean() for x in matrix.EXPERIMENTS["relaxation"]}
     plain = {x: r.end("racing", x, "gates_passed").mean() for x in ("bptt", "shac")}
     assert [x for x in gates if gates[x] > plain[x.split("-")[0]]] == ["bptt-log", "shac-reciprocal"]

@@ -152,7 +152,7 @@ def test_every_command_runs(command, launch, request, monkeypatch, capsys, tmp_p
         assert ROOT / script in EXAMPLES and words == [script]  # which have a test of their own
     elif program == "python" and script.startswith(("recipes/", "benchmarks/")):
         monkeypatch.setattr(sys, "argv", [*words, "--help"])  # these have tests of their own, too
-        monkeypatch.syspath_prepend(ROOT / "benchmarks")
+        monkeypatch.syspath_prepend((ROOT / script).parent)  # as python does
         with pytest.raises(SystemExit, match="^0$"):
             runpy.run_path(str(ROOT / script), run_name="__main__")
         usage = capsys.readouterr().out

@@ -9,7 +9,7 @@ SEARCH_SEED = 100
 LEARNING_RATES = (1e-3, 3e-3, 1e-2, 3e-2)  # of the actor: the same four for every method on every task
 SEARCH_FRACTION = {"hovering": 1.0, "tracking": 1.0, "landing": 0.5, "racing": 0.25}  # of a run's steps
 EVALUATIONS = 40  # at most, along a run: the points of its curve
-DYNAMICS = "priority mixer"  # what runs are flown with now; those before have "plain mixer" in final.csv
+DYNAMICS = "priority mixer"  # of runs that are flown now; final.csv names that of each run
 
 STEPS = {  # of a run, for the first-order methods and for PPO, which has more of them, since its steps are cheaper
     "hovering": (245_760, 1_966_080),

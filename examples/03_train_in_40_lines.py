@@ -10,7 +10,7 @@ ITERATIONS = 60
 
 torch.manual_seed(0)
 env = HoveringEnv(num_envs=64)
-actor = make_actor(env, input_scale=5.0)
+actor = make_actor(env, input_scale=0.5)
 loss = SHACLoss(actor, make_value(env))
 loss.make_value_estimator(gamma=0.99, lmbda=0.95)
 target = SoftUpdate(loss, tau=0.05)

@@ -22,7 +22,7 @@ class RingEnv(QuadrotorEnv):
         return {**state, "phase": previous["phase"] + 2 * torch.pi * self.control_dt / 4}
 
     def observe(self, state):
-        return torch.cat((self.to_ring(state) / 10, state["phase"].cos() / 20, *body_observation(state)), -1)
+        return torch.cat((self.to_ring(state), state["phase"].cos() / 2, *body_observation(state)), -1)
 
     def reward_terms(self, state):
         slip = norm(state["velocity"] - self.tensor([1.5, 0, 0]) - self.tensor([0, 0.785, 0]) * state["phase"].cos())
@@ -43,7 +43,7 @@ class RingEnv(QuadrotorEnv):
 
 torch.manual_seed(0)
 env = RingEnv(num_envs=64, dt=0.01)
-actor = make_actor(env, input_scale=5.0)
+actor = make_actor(env, input_scale=0.5)
 loss = BPTTLoss(actor)
 optimizer = torch.optim.Adam(actor.parameters(), 1e-2, betas=(0.7, 0.95))
 schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.01, ITERATIONS)

@@ -19,7 +19,7 @@ variations = {
 def train(env):
     """A policy that has learnt to hover in an environment, by backpropagation through time."""
     torch.manual_seed(0)
-    actor = make_actor(env, input_scale=5.0)
+    actor = make_actor(env, input_scale=0.5)
     loss = BPTTLoss(actor)
     optimizer = torch.optim.Adam(actor.parameters(), 2e-2, betas=(0.7, 0.95))
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.01, ITERATIONS)

@@ -152,9 +152,7 @@ def test_a_fraction_of_the_environments_starts_in_visited_states():
         assert (carry["state", "step"] > 0).float().mean().item() == pytest.approx(fraction, abs=0.06)
         assert not carry["done"].any()
     carry = buffer.initial_state(env, 1.0)
-    torch.testing.assert_close(
-        carry["observation"][:, :3], (carry["state", "target"] - carry["state", "position"]) / 10
-    )
+    torch.testing.assert_close(carry["observation"][:, :3], carry["state", "target"] - carry["state", "position"])
 
 
 def test_it_starts_environments_under_transforms(env):

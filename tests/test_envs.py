@@ -82,15 +82,15 @@ def test_starts_lie_in_their_box_level_and_at_rest():
     assert (td["state", "quaternion"] == torch.tensor([1.0, 0.0, 0.0, 0.0])).all()
 
 
-def test_the_observation_is_the_paper_s(env64):
+def test_the_observation_is_ten_times_the_papers(env64):
     td = env64.rollout(3)[:, -1]
     state = td["state"]
     expected = torch.cat(
         (
-            (state["target"] - state["position"]) / 10,
-            state["quaternion"],
-            state["velocity"] / 10,
-            state["angular_velocity"] / 10,
+            state["target"] - state["position"],
+            10 * state["quaternion"],
+            state["velocity"],
+            state["angular_velocity"],
         ),
         -1,
     )

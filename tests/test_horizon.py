@@ -66,7 +66,7 @@ def test_episodes_that_end_on_the_way_start_anew_from_different_states():
 
 def test_a_policy_may_read_the_state():
     env = HoveringEnv(num_envs=4)
-    actor = make_actor(env, in_keys=["observation", ("state", "rotor_speed")], input_scale=1e-3)
+    actor = make_actor(env, in_keys=["observation", ("state", "rotor_speed")], input_scale=1e-4)
     start = env.reset()
     quick, _ = fly(env.rollout, env, actor, start, 5)
     slow, _ = fly(lambda *a, **k: EnvBase.rollout(env, *a, **k), env, actor, start, 5)

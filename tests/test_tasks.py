@@ -62,7 +62,7 @@ def test_the_point_moves_along_the_circle_and_the_next_ten_are_observed():
     # In 0.1 s steps: what is the point after 5 control steps is the first point observed now.
     first = 10 * td["observation"][:, :3] + td["state", "position"]
     torch.testing.assert_close(first, flight["target"][:, 4])
-    tenth = 10 * td["observation"][:, 27:30] + td["state", "position"]
+    tenth = td["observation"][:, 27:30] + td["state", "position"]
     torch.testing.assert_close(tenth, flight["target"][:, 49])
     assert td["observation"].shape == (4, 40)
 
@@ -259,7 +259,7 @@ def test_two_gates_are_observed():
     env = RacingEnv(num_envs=5, dtype=torch.float64)
     td = env.reset()
     gates = env.gates[torch.cat((td["state", "gate"], (td["state", "gate"] + 1) % 4), -1)]
-    relative = (gates - td["state", "position"].unsqueeze(1)) / 10
+    relative = gates - td["state", "position"].unsqueeze(1)
     torch.testing.assert_close(td["observation"][:, :6], relative.flatten(1))
     assert td["observation"].shape == (5, 16)
 

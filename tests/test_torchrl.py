@@ -230,7 +230,7 @@ def test_visited_states_restart_what_transforms_remember():
     carry = buffer.initial_state(env, 1.0)
     one, two, three = carry["observation"].split(13, -1)
     assert torch.equal(one, two) and torch.equal(two, three)
-    torch.testing.assert_close(three[:, :3], (carry["state", "target"] - carry["state", "position"]) / 10)
+    torch.testing.assert_close(three[:, :3], carry["state", "target"] - carry["state", "position"])
     assert (carry["step_count"] == 0).all() and (carry["episode_reward"] == 0).all()
 
 

@@ -19,7 +19,7 @@ STEPS = {  # of a run, for the first-order methods and for PPO, which has more o
 }
 TASKS = tuple(STEPS)
 EPISODE = {"hovering": 256, "tracking": 512, "landing": 256, "racing": 512}
-RACING = ("env.reward=position", "actor.input_scale=10", "critic.num_cells=[128,128]", "gamma=0.98")  # for all methods
+RACING = ("env.reward=position", "actor.input_scale=1", "critic.num_cells=[128,128]", "gamma=0.98")  # for all methods
 
 
 @dataclass(frozen=True)

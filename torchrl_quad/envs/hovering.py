@@ -17,10 +17,10 @@ class HoveringEnv(QuadrotorEnv):
     ==========================  ====  =============================================
     observation                 size  unit
     ==========================  ====  =============================================
-    target - position           3     10 m, world frame
-    quaternion                  4     (w, x, y, z), body to world
-    velocity                    3     10 m/s, world frame
-    angular velocity            3     10 rad/s, body frame
+    target - position           3     m, world frame
+    10 quaternion               4     (w, x, y, z), body to world
+    velocity                    3     m/s, world frame
+    angular velocity            3     rad/s, body frame
     ==========================  ====  =============================================
 
     Reward: 0.1 - (0.1/9) |p - target| - 1e-5 |q - level| - 0.002 |v| - 0.002 |w|, at most 25.6 in 256 steps. The
@@ -47,7 +47,7 @@ class HoveringEnv(QuadrotorEnv):
         return {**self.hover_state(start), "target": target}
 
     def observe(self, state: State) -> Tensor:
-        return torch.cat(((state["target"] - state["position"]) / 10, *body_observation(state)), -1)
+        return torch.cat((state["target"] - state["position"], *body_observation(state)), -1)
 
     def reward_terms(self, state: State) -> State:
         return target_reward(state, self.weights)

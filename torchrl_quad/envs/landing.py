@@ -17,10 +17,10 @@ class LandingEnv(QuadrotorEnv):
     ==========================  ====  =============================================
     observation                 size  unit
     ==========================  ====  =============================================
-    target - position           3     10 m, world frame
-    quaternion                  4     (w, x, y, z), body to world
-    velocity                    3     10 m/s, world frame
-    angular velocity            3     10 rad/s, body frame
+    target - position           3     m, world frame
+    10 quaternion               4     (w, x, y, z), body to world
+    velocity                    3     m/s, world frame
+    angular velocity            3     rad/s, body frame
     ==========================  ====  =============================================
 
     Reward: descent + approach + success + crash. With c = clip(z, 0.05 m, 1 m), which carries no gradient, the speed of
@@ -65,7 +65,7 @@ class LandingEnv(QuadrotorEnv):
         return {**self.hover_state(start), "target": self.tensor(self.target).repeat(n, 1)}
 
     def observe(self, state: State) -> Tensor:
-        return torch.cat(((state["target"] - state["position"]) / 10, *body_observation(state)), -1)
+        return torch.cat((state["target"] - state["position"], *body_observation(state)), -1)
 
     def reward_terms(self, state: State) -> State:
         scale = state["position"][..., 2:].detach().clamp(0.05, 1.0)

@@ -30,11 +30,11 @@ class RacingEnv(QuadrotorEnv):
     ==========================================  ====  =============================================
     observation                                 size  unit
     ==========================================  ====  =============================================
-    next gate - position                        3     10 m, world frame
-    gate after that - position                  3     10 m, world frame
-    quaternion                                  4     (w, x, y, z), body to world
-    velocity                                    3     10 m/s, world frame
-    angular velocity                            3     10 rad/s, body frame
+    next gate - position                        3     m, world frame
+    gate after that - position                  3     m, world frame
+    10 quaternion                               4     (w, x, y, z), body to world
+    velocity                                    3     m/s, world frame
+    angular velocity                            3     rad/s, body frame
     ==========================================  ====  =============================================
 
     Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. Reward "velocity":
@@ -88,7 +88,7 @@ class RacingEnv(QuadrotorEnv):
         num_envs: int = 64,
         *,
         track: str | Path | Mapping = "visfly",
-        reward: str = "position",
+        reward: str = "velocity",
         gate_bonus: str = "binary",
         max_episode_steps: int = 512,
         **kwargs: Any,
@@ -159,7 +159,7 @@ class RacingEnv(QuadrotorEnv):
 
     def observe(self, state: State) -> Tensor:
         after = self.gates[(state["gate"][:, 0] + 1) % len(self.gates)]
-        relative = [(gate - state["position"]) / 10 for gate in (state["target"], after)]
+        relative = [gate - state["position"] for gate in (state["target"], after)]
         return torch.cat((*relative, *body_observation(state)), -1)
 
     def reward_terms(self, state: State) -> State:

@@ -27,8 +27,12 @@ def distance(state: dict[str, Tensor]) -> Tensor:
 
 
 def body_observation(state: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Quaternion (w, x, y, z), velocity [10 m/s] in the world frame, angular velocity [10 rad/s] in the body frame."""
-    return state["quaternion"], state["velocity"] / 10, state["angular_velocity"] / 10
+    """Ten times the quaternion, velocity [m/s] in the world frame, angular velocity [rad/s] in the body frame.
+
+    The paper observes a tenth of all this, and of positions, which networks learn from slowly. Times ten, a tilt of
+    0.1 rad, a velocity of 0.5 m/s and a distance of 0.5 m weigh alike.
+    """
+    return 10 * state["quaternion"], state["velocity"], state["angular_velocity"]
 
 
 def target_reward(state: dict[str, Tensor], weights: dict[str, float]) -> dict[str, Tensor]:

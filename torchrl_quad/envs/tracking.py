@@ -44,10 +44,10 @@ class TrackingEnv(QuadrotorEnv):
     ==========================================  ====  =============================================
     observation                                 size  unit
     ==========================================  ====  =============================================
-    next 10 points of the curve - position      30    10 m, world frame; 0.1 s apart, nearest first
-    quaternion                                  4     (w, x, y, z), body to world
-    velocity                                    3     10 m/s, world frame
-    angular velocity                            3     10 rad/s, body frame
+    next 10 points of the curve - position      30    m, world frame; 0.1 s apart, nearest first
+    10 quaternion                               4     (w, x, y, z), body to world
+    velocity                                    3     m/s, world frame
+    angular velocity                            3     rad/s, body frame
     ==========================================  ====  =============================================
 
     Reward: that of hovering, with the point as its target: 0.1 - (0.1/9) |p - target| - 1e-5 |q - level| - 0.002 |v|
@@ -144,7 +144,7 @@ class TrackingEnv(QuadrotorEnv):
 
     def observe(self, state: State) -> Tensor:
         points = self.curve(state["phase"] + self.ahead) - state["position"].unsqueeze(1)
-        return torch.cat((points.flatten(1) / 10, *body_observation(state)), -1)
+        return torch.cat((points.flatten(1), *body_observation(state)), -1)
 
     def reward_terms(self, state: State) -> State:
         return target_reward(state, self.weights)

@@ -39,7 +39,7 @@ def make_actor(
     *,
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
-    input_scale: float | Sequence[float] = 10.0,
+    input_scale: float | Sequence[float] = 1.0,
     action_init: Tensor | None = None,
     scale_init: float = 0.1,
     return_log_prob: bool = False,
@@ -54,9 +54,8 @@ def make_actor(
         num_cells: widths of the hidden layers.
         in_keys: the entries that are concatenated into the network's input, each (*, k).
         activation: of the hidden layers; smooth ones give smooth policy gradients.
-        input_scale: multiplies the input; a number, or one for each of ``in_keys``. The tasks observe a tenth of their
-            SI units, as the paper does, and inputs that small slow learning down. Set it to 1 with an
-            ObservationNormalizer.
+        input_scale: multiplies the input; a number, or one for each of ``in_keys``. What the tasks observe is of about
+            one; entries of the state may not be.
         action_init: the mean action at the start, (k), strictly between the bounds. By default
             ``env.neutral_action``, averaged over environments, where the environment has one (see
             :mod:`torchrl_quad.data`; a drone's is to hover), and the middle of the range elsewhere.
@@ -107,14 +106,14 @@ def make_value(
     *,
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
-    input_scale: float | Sequence[float] = 10.0,
+    input_scale: float | Sequence[float] = 1.0,
 ) -> ValueOperator:
     """A state value V(s), written to ``state_value``, (*, 1). The arguments are those of :func:`make_actor`.
 
     LayerNorm normalises its hidden layers. The policy follows the critic's gradient, which is far off without it.
 
     A critic may read more than the actor does, such as ``in_keys=("observation", ("state", "rotor_speed"))``. Rotors
-    turn at some 1000 rad/s, and ``input_scale=(10.0, 1e-3)`` brings both entries to about one.
+    turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one.
     """
     net = _network(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
     return ValueOperator(net, in_keys=list(in_keys))
@@ -126,7 +125,7 @@ def make_qvalue(
     *,
     in_keys: Sequence[NestedKey] = OBSERVATION,
     activation: type[nn.Module] = nn.ELU,
-    input_scale: float | Sequence[float] = 10.0,
+    input_scale: float | Sequence[float] = 1.0,
     action_scale: float = 0.3,
 ) -> ValueOperator:
     """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); otherwise as :func:`make_value`.

@@ -1,9 +1,8 @@
-"""The bookkeeping of a training run: what it logs, what it saves, how it goes on after a stop."""
+"""The training loop: it counts, evaluates, saves, and goes on after a stop."""
 
 from __future__ import annotations
 
 import copy
-import csv
 import math
 import time
 from collections import defaultdict
@@ -13,27 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.distributed as dist
-from checkpoints import FORMAT, read_checkpoint, replacing, revision, write_json
-from common import (
-    backward,
-    drawing_from,
-    evaluate,
-    final_evaluation,
-    generator,
-    iterations,
-    load_policy,
-    own_seed,
-    rank,
-    world_size,
-)
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
 import torchrl_quad
@@ -44,45 +28,46 @@ from torchrl_quad import (
     differentiable_rollout,
     gradient_statistics,
 )
+from torchrl_quad.files import replacing
 from torchrl_quad.objectives import PathwiseLoss
-from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, write_replay
+from training import drawing
+from training.building import iterations, own_seed
+from training.checkpoints import read_checkpoint, revision, write_checkpoint
+from training.evaluation import best_policy, drawing_from, evaluate, final_evaluation, print_summary, write_summary
+from training.logs import Logs
+from training.processes import backward, gather, rank, wait_for_all, world_size
 
 CELL = 0.5  # [m]: train/start_cells counts the cubes of this size in which horizons have started
-UNITS = {  # how the metrics of an evaluation are printed: factor and unit
-    "position_error": (100, "cm (median)"),
-    "tracking_rmse": (100, "cm (median)"),
-    "landing_speed": (1, "m/s"),
-    "gates_passed": (1, "gates"),
-    "lap_time": (1, "s"),
-    "return": (1, ""),
-}
 
 
 class Run:
-    """A training run: ``for _ in run: ...``, with ``run.carry``, ``run.descend(...)`` and ``run.record(...)`` in it.
+    """A training run: ``for _ in run: ...``, with ``run.carry``, ``run.optimise(...)`` and ``run.record(...)`` in it.
 
-    Counts steps and seconds of training, evaluates every ``eval.interval`` iterations, and each time writes a row of
-    metrics and a checkpoint. The checkpoint holds all that the run needs to go on exactly as if it had not stopped
-    (``resume=PATH``), and the best policy so far: the one with the greatest return in these evaluations. That one is
-    flown at the end, on other starts. Leaves in the run's folder: ``config.yaml``, ``metrics.csv``, ``checkpoint.pt``,
+    Evaluates every ``eval.interval`` iterations, and each time writes a row of metrics and a checkpoint. The checkpoint
+    holds all that the run needs to go on exactly as if it had not stopped (``resume=PATH``), and the best policy so
+    far: the one with the greatest return in these evaluations, which is flown at the end from other starts.
+
+    Leaves in the run's folder: ``config.yaml``, ``metrics.csv``, ``checkpoint.pt`` and the one before it,
     ``summary.json``, ``learning_curve.png``, and the flight as ``flight.png``, ``flight.gif``, ``flight.html`` and
-    ``episode.pdf``. The seconds are those of the loop alone: set-up, compilation, evaluations and checkpoints are
-    outside. Processor seconds are those in which its threads ran: with one, what it takes on a core of its own. Of
-    several processes the first evaluates, logs and saves.
+    ``episode.pdf``.
+
+    The seconds are those of the loop alone, without set-up, compilation, evaluations and checkpoints. Processor seconds
+    count the time in which the threads of this process computed. Of several processes the first evaluates, logs and
+    saves.
 
     Args:
-        cfg: the configuration, as ``set_up`` left it.
+        cfg: the configuration.
         env: the environment.
         actor: the policy, whose parameters are those of the loss.
-        loss: all that is trained.
-        parts: optimisers and schedules: what else has a ``state_dict`` and changes in training.
-        buffer: of visited states, where the algorithm has one.
+        loss: holds everything that is trained.
+        stateful: optimisers, schedules, and whatever else has a ``state_dict`` that changes in training.
+        buffer: of visited states, if the algorithm has one.
 
     Raises:
         ValueError: the checkpoint to resume does not fit.
 
     Attributes:
-        carry: where the next horizon starts, to be set by the algorithm in each iteration.
+        carry: where the next horizon starts; the algorithm sets it in each iteration.
     """
 
     def __init__(
@@ -91,38 +76,34 @@ class Run:
         env: EnvBase,
         actor: TensorDictModuleBase,
         loss: nn.Module,
-        parts: Sequence[Any],
+        stateful: Sequence[Any],
         buffer: VisitedStateBuffer | None = None,
     ) -> None:
         self.cfg, self.env, self.actor, self.loss, self.buffer = cfg, env, actor, loss, buffer
-        self.parts = [loss, *parts, *([env.transform] if cfg.normalize else [])]
+        self.stateful = [loss, *stateful, *([env.transform] if cfg.normalize else [])]
         self.iterations = iterations(cfg)
-        self.audits = cfg.get("diagnostics", 0)  # a run begun before there were any has no such setting
         self.steps_per_iteration = cfg.num_envs * cfg.horizon * world_size()
         self.recorded: dict[str, list[float]] = defaultdict(list)
         self.starts: list[Tensor] = []  # positions in which the horizons since the last row have started
         self.rows: list[dict[str, float]] = []  # of metrics.csv
         self.done, self.seconds, self.processor_seconds, self.skipped = 0, 0.0, 0.0, 0
         self.best: dict[str, Any] = {"return": -math.inf}
-        if world_size() > 1:
-            torch.manual_seed(own_seed(cfg))  # the networks are made, and equal
-        saved = read_checkpoint(Path(cfg.resume)) if cfg.resume else None
+        self.folder = Path(HydraConfig.get().runtime.output_dir)
+        self.saved: Path | None = None  # the last checkpoint known to be intact
         self.revision = revision()
-        if saved is None:
-            self.folder = Path(HydraConfig.get().runtime.output_dir)
-            self.carry = env.reset()
+        if world_size() > 1:
+            torch.manual_seed(own_seed(cfg))  # the networks are built, and equal
+        logger_state = None
+        if cfg.resume:
+            logger_state = self._load(Path(cfg.resume))
         else:
-            self.folder, before = Path(cfg.resume).parent, saved["revision"]
-            self.revision = before if self.revision in before else f"{before}, then {self.revision}"
-            self._load(saved)
+            self.carry = env.reset()
         self.is_over = self.done >= self.iterations and (self.folder / "summary.json").exists()
-        self.logger = None
         if rank() == 0 and not self.is_over:
             for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
                 (self.folder / name).unlink(missing_ok=True)
-            if self.rows:
-                self._write_rows()  # without those that came after the checkpoint
-            self.logger = self._make_logger(saved and saved["wandb"])
+            steps = self.done * self.steps_per_iteration
+            self.logs = Logs(cfg, self.folder, self.revision, self.rows, steps, logger_state)
             with replacing(self.folder / "config.yaml") as path:
                 OmegaConf.save(cfg, path, resolve=True)
 
@@ -132,7 +113,6 @@ class Run:
         if self.is_over:
             if rank() == 0:
                 print(f"Finished before: {self.folder}")
-            self._leave()
             return
         if self.cfg.compile and self.done < self.iterations:
             self._warm_up()
@@ -156,21 +136,21 @@ class Run:
                 if self.done % self.cfg.eval.interval == 0 or self.done == self.iterations:
                     if rank() == 0:
                         metrics = self._evaluate()
-                        bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, {metrics['eval/success']:.0%}")
+                        solved = metrics["eval/solved"]
+                        bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
                     self.recorded.clear()
                     self.starts.clear()
                     self._save(self.folder / "checkpoint.pt")
         if rank() == 0:
             self._finish()
-        self._leave()
 
-    def descend(self, name: str, optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
-        """One clipped step down a loss, averaged over all processes; records the norm of its gradient.
+    def optimise(self, name: str, optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
+        """Take one step down a loss with its clipped gradient, averaged over all processes; record the norm.
 
-        The step is left out when the loss or its gradient is not finite.
+        The step is skipped if the loss or its gradient is not finite.
 
         Raises:
-            FloatingPointError: this has happened more than ``max_skipped`` times; the run is saved as it is.
+            FloatingPointError: more than ``max_skipped`` steps were skipped; the run is saved as it is.
         """
         value, norm = backward(loss, optimizer, max_grad_norm)
         finite = value.isfinite() and norm.isfinite()
@@ -187,7 +167,7 @@ class Run:
         path = self.folder / "failure.pt"
         self._save(path)
         raise FloatingPointError(
-            f"{self.skipped} updates had a loss or gradient that is not finite and were left out; the limit is "
+            f"{self.skipped} updates were skipped because their loss or gradient was not finite; the limit is "
             f"max_skipped={self.cfg.max_skipped}. The last: {name}, iteration {self.done}, loss {value:g}, gradient "
             f"norm {norm:g}, not finite in {', '.join(broken[:3]) or 'no parameter'}. Networks and the state in which "
             f'the horizon started are saved: {path}, ["processes"][{rank()}]["carry"]. Look for an infinite derivative '
@@ -202,18 +182,23 @@ class Run:
                 float(value.detach()) if isinstance(value, Tensor) else value
             )
 
-    # -- evaluating and logging ----------------------------------------------------------------------------------------
+    # -- evaluating ----------------------------------------------------------------------------------------------------
 
     def _warm_up(self) -> None:
-        """Compile the step and its derivative before the clock starts; change nothing."""
-        with torch.random.fork_rng(), drawing_from(self.env, self.cfg.eval.seed):
-            rollout = self.env.rollout(2, self.actor, break_when_any_done=False)
-            if self.cfg.algorithm != "ppo" or self.audits:  # PPO itself takes no derivative of the step
-                rollout["next", "reward"].sum().backward()
-                self.actor.zero_grad()
+        """Compile all that the loop will call, before the clock starts; change nothing."""
+        pathwise = isinstance(self.loss, PathwiseLoss)
+        with (
+            torch.random.fork_rng(),
+            drawing_from(self.env, self.cfg.eval.seed),
+            torch.set_grad_enabled(pathwise),
+        ):
+            rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, min(self.cfg.horizon, 2))
+            if pathwise:
+                self.loss.loss_actor(rollout)[0].backward()
+                self.loss.zero_grad()
 
     def _evaluate(self) -> dict[str, float]:
-        """Fly the policy as it is, and tell what came out, with what was recorded since the last time."""
+        """Fly the policy as it is, and log the result with everything recorded since the last time."""
         with drawing_from(self.env, self.cfg.eval.seed):
             metrics, flight = evaluate(self.env, self.actor)
         steps = self.done * self.steps_per_iteration
@@ -228,15 +213,13 @@ class Run:
             "grad/skipped": self.skipped,
             **metrics,
         }
-        if self.audits and (len(self.rows) + 1) % self.audits == 0:
+        if self.cfg.diagnostics and (len(self.rows) + 1) % self.cfg.diagnostics == 0:
             row |= self._diagnose()
-        self.rows.append(row)
-        self._write_rows()
-        if self.logger is not None:
-            self.logger.log_metrics({key: x for key, x in row.items() if "/" in key}, step=steps)
+        self.logs.add(row)
         every = self.cfg.logger.flight_every
         if every and len(self.rows) % every == 0 and self.done < self.iterations:  # at the end the best one is drawn
-            self._log_flight(flight, steps)
+            drawing.draw_flight(flight, self.folder / "flight", self.cfg.env.control_dt)
+            self.logs.show_flight(steps)
         if metrics["eval/return"] >= self.best["return"]:
             policy = {"actor": self.actor, **({"normalizer": self.env.transform} if self.cfg.normalize else {})}
             weights = {name: copy.deepcopy(module.state_dict()) for name, module in policy.items()}
@@ -244,7 +227,7 @@ class Run:
         return metrics
 
     def _diagnose(self) -> dict[str, float]:
-        """What reward and gradient of the next horizon are made of; changes nothing."""
+        """Measure what reward and gradient of the next horizon are made of; change nothing."""
         with torch.random.fork_rng(), drawing_from(self.env, self.cfg.eval.seed):
             rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, self.cfg.horizon)
             audit = audit_reward(rollout, self.actor, gamma=self.cfg.gamma)
@@ -255,169 +238,80 @@ class Run:
                 metrics |= {"grad/variance": statistics.variance, "grad/signal_to_noise": statistics.signal_to_noise}
         return metrics
 
-    def _write_rows(self) -> None:
-        """Write metrics.csv anew: after a resume it ends where the checkpoint does."""
-        names = list(dict.fromkeys(name for row in self.rows for name in row))
-        with replacing(self.folder / "metrics.csv") as path, open(path, "w", newline="") as file:
-            writer = csv.DictWriter(file, names, restval=math.nan)
-            writer.writeheader()
-            writer.writerows(self.rows)
-
-    def _make_logger(self, saved: dict[str, Any] | None) -> Logger | None:
-        """The logger of the configuration; after a resume it goes on in the same run."""
-        cfg = self.cfg.logger
-        if not cfg.backend:
-            return None
-        config = {**OmegaConf.to_container(self.cfg, resolve=True), "revision": self.revision}
-        wandb = {"mode": cfg.mode, "project": cfg.project, "group": cfg.group, "config": config}
-        wandb |= {"reinit": "finish_previous"}  # one that a failed run has left in this process
-        name = f"{self.cfg.task}_{self.cfg.algorithm}_seed{self.cfg.seed}"
-        if saved:
-            wandb["id"] = saved["local"]["id"]
-        logger = get_logger(cfg.backend, str(self.folder), name, wandb_kwargs=wandb)
-        if saved and cfg.backend == "wandb":
-            logger.load_state_dict(saved)
-        if self.done and cfg.backend == "tensorboard":  # what was logged after the checkpoint is to be forgotten
-            logger.experiment.close()
-            logger.experiment = type(logger.experiment)(
-                logger.experiment.log_dir, purge_step=self.done * self.steps_per_iteration + 1
-            )
-        return logger
-
-    def _log_flight(self, flight: TensorDictBase, steps: int) -> None:
-        """Draw a flight, as picture and as film, and hand both to the logger."""
-        draw_flight(flight, self.folder / "flight", self.cfg.env.control_dt)
-        if self.cfg.logger.backend == "wandb":
-            import wandb
-
-            picture, film = wandb.Image(str(self.folder / "flight.png")), wandb.Video(str(self.folder / "flight.gif"))
-            self.logger.experiment.log({"eval/flight": picture, "eval/film": film, "eval/step": steps})
-
     def _finish(self) -> None:
-        """Final evaluation on fresh starts, pictures, summary; the summary last, since it says that the run is over."""
-        summary, flight = final_evaluation(*load_policy(self.folder / "checkpoint.pt", self.cfg.device))
+        """Fly the best policy from fresh starts, draw it, and write the summary last: it marks the run as finished."""
+        summary, flight = final_evaluation(self.cfg, *best_policy(self.cfg, self.best))
         steps = self.iterations * self.steps_per_iteration
         summary |= {"steps": steps, "best_steps": self.best["steps"], "seconds": round(self.seconds, 2)}
         summary |= {"revision": self.revision}
-        self._log_flight(flight, steps)
-        publish_flight(flight, self.folder / "episode.pdf", self.folder / "flight.html", self.env)
-        with replacing(self.folder / "learning_curve.png") as path:
-            plot_learning_curve(self.folder / "metrics.csv", path)
-        if self.cfg.logger.backend == "wandb":
-            import wandb
-
-            experiment = self.logger.experiment
-            curve = wandb.Image(str(self.folder / "learning_curve.png"))
-            page = wandb.Html(str(self.folder / "flight.html"), inject=False)  # as it is
-            experiment.log({"eval/learning_curve": curve, "eval/replay": page})
-            experiment.summary.update({f"final/{name}": value for name, value in summary.items()})
-            checkpoint = wandb.Artifact(f"{self.cfg.task}_{self.cfg.algorithm}_{experiment.id}", type="model")
-            checkpoint.add_file(str(self.folder / "checkpoint.pt"))
-            experiment.log_artifact(checkpoint)
-        if self.logger is not None:
-            self.logger.shutdown()
-        write_json(self.folder / "summary.json", summary)
-        print_summary(summary, self.folder)
-
-    def _leave(self) -> None:
-        """Part from the other processes."""
-        if dist.is_initialized():
-            dist.destroy_process_group()
+        drawing.draw_flight(flight, self.folder / "flight", self.cfg.env.control_dt)
+        drawing.publish_flight(flight, self.folder / "episode.pdf", self.folder / "flight.html", self.env)
+        drawing.draw_learning_curve(self.folder / "metrics.csv", self.folder / "learning_curve.png")
+        self.logs.show_flight(steps)
+        self.logs.finish(summary)
+        write_summary(self.folder / "summary.json", summary)
+        print_summary(summary, self.env.metric_info, self.folder)
 
     # -- stopping and going on -----------------------------------------------------------------------------------------
 
     def _save(self, path: Path) -> None:
-        """Write all that the run needs to go on, that of all processes, all or nothing."""
-        own = {
-            "torch": torch.get_rng_state(),
-            "cuda": torch.cuda.get_rng_state(self.env.device) if self.env.device.type == "cuda" else None,
-            "env": generator(self.env).get_state(),
-            "carry": self.carry.cpu().to_dict(),
-            "buffer": None if self.buffer is None else self.buffer.state_dict(),
-            "parameters": sum(p.detach().double().sum().item() for p in self.loss.parameters()),
-        }
-        processes = [own]
-        if world_size() > 1:
-            processes = [None] * world_size() if rank() == 0 else None
-            dist.gather_object(own, processes)
-        if rank() == 0:
-            self._write(path, processes)
-        if world_size() > 1:  # whoever goes on, or gives up, does so when the file is there
-            dist.barrier()
-
-    def _write(self, path: Path, processes: list[dict[str, Any]]) -> None:
+        """Write all that the run needs to go on, of all processes."""
+        processes = gather(
+            {
+                "torch": torch.get_rng_state(),
+                "cuda": torch.cuda.get_rng_state(self.env.device) if self.env.device.type == "cuda" else None,
+                "env": self.env.random_state(),
+                "carry": self.carry.cpu().to_dict(),
+                "buffer": None if self.buffer is None else self.buffer.state_dict(),
+                "parameters": sum(p.detach().double().sum().item() for p in self.loss.parameters()),
+            }
+        )
         if len({process["parameters"] for process in processes}) > 1:
-            raise RuntimeError(
-                "The processes have drifted apart: their parameters differ. Take every step with run.descend."
-            )
-        content = {
-            "format": FORMAT,
-            "version": torchrl_quad.__version__,
-            "revision": self.revision,
-            "config": OmegaConf.to_yaml(self.cfg, resolve=True),
-            "iteration": self.done,
-            "seconds": (self.seconds, self.processor_seconds),
-            "skipped": self.skipped,
-            "rows": self.rows,
-            "best": self.best,
-            "wandb": self.logger.state_dict() if self.cfg.logger.backend == "wandb" else None,
-            "parts": [part.state_dict() for part in self.parts],
-            "processes": processes,
-        }
-        with replacing(path) as temporary:
-            torch.save(content, temporary)
+            raise RuntimeError("The parameters of the processes differ: take every step with run.optimise.")
+        if rank() == 0:
+            content = {
+                "version": torchrl_quad.__version__,
+                "revision": self.revision,
+                "config": OmegaConf.to_yaml(self.cfg, resolve=True),
+                "iteration": self.done,
+                "seconds": (self.seconds, self.processor_seconds),
+                "skipped": self.skipped,
+                "rows": self.rows,
+                "best": self.best,
+                "logger": self.logs.state_dict(),
+                "stateful": [x.state_dict() for x in self.stateful],
+                "processes": processes,
+            }
+            is_failure = path.name == "failure.pt"
+            write_checkpoint(path, content, None if is_failure else self.saved)
+            self.saved = self.saved if is_failure else path
+        wait_for_all()  # nobody goes on, or gives up, before the file is there
 
-    def _load(self, saved: dict[str, Any]) -> None:
-        """Take everything from a checkpoint.
+    def _load(self, path: Path) -> dict[str, Any] | None:
+        """Take everything from a checkpoint, and return the state of the logger.
 
         Raises:
-            ValueError: it was written by another number of processes, or lacks something.
+            ValueError: it was written by another number of processes.
         """
+        saved = read_checkpoint(path)
         if len(saved["processes"]) != world_size():
             raise ValueError(
-                f"{self.cfg.resume} was written by {len(saved['processes'])} processes, and {world_size()} want to go "
-                "on. Start as many as before: torchrun --nproc-per-node=N."
+                f"{path} was written by {len(saved['processes'])} processes, and {world_size()} want to go on. Start "
+                "as many as before: torchrun --nproc-per-node=N."
             )
         own = saved["processes"][rank()]
-        for part, state in zip(self.parts, saved["parts"], strict=True):
-            part.load_state_dict(state)
+        for x, state in zip(self.stateful, saved["stateful"], strict=True):
+            x.load_state_dict(state)
         if self.buffer is not None:
             self.buffer.load_state_dict(own["buffer"])
         self.carry = TensorDict(own["carry"], self.env.batch_size).to(self.env.device)
-        generator(self.env).set_state(own["env"])
+        self.env.set_random_state(own["env"])
         torch.set_rng_state(own["torch"])
         if own["cuda"] is not None:
             torch.cuda.set_rng_state(own["cuda"], self.env.device)
         self.done, self.skipped = saved["iteration"], saved["skipped"]
         self.seconds, self.processor_seconds = saved["seconds"]
-        self.rows, self.best = saved["rows"], saved["best"]
-
-
-def draw_flight(flight: TensorDictBase, path: Path, control_dt: float) -> None:
-    """Write a flight as a picture and as a film: the path with .png and .gif."""
-    for draw, suffix in ((plot_flight, ".png"), (animate_flight, ".gif")):
-        with replacing(path.with_suffix(suffix)) as temporary:
-            draw(flight, temporary, control_dt=control_dt)
-
-
-def publish_flight(flight: TensorDictBase, figure: Path, page: Path, env: EnvBase) -> None:
-    """Write the first episode of a flight as a figure for a paper, and the flight as a page to play it in a browser."""
-    with replacing(figure) as temporary:
-        plot_episode(flight, temporary, control_dt=env.control_dt)
-    write_replay(flight, page, env=env)  # whole or not at all, by itself
-
-
-def print_summary(summary: dict[str, Any], folder: Path | None = None) -> None:
-    """Say how well the policy flies, and where the results are."""
-    print(
-        f"\n{summary['algorithm']} on {summary['task']}, seed {summary['seed']}, {summary['episodes']} fresh episodes:"
-    )
-    print(f"  success       {summary['success']:.1%}")
-    print(f"  crashes       {summary['crash']:.1%}")
-    for name, (scale, unit) in UNITS.items():
-        if not math.isnan(summary.get(name, math.nan)):
-            print(f"  {name.replace('_', ' '):13s} {scale * summary[name]:.2f} {unit}")
-    if "seconds" in summary:
-        print(f"  training      {summary['steps']:,} steps in {summary['seconds']:.1f} s")
-    if folder is not None:
-        print(f"  results in    {folder}")
+        self.rows, self.best, self.saved = saved["rows"], saved["best"], path
+        before = saved["revision"]
+        self.revision = before if self.revision in before else f"{before}, then {self.revision}"
+        return saved["logger"]

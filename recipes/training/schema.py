@@ -8,6 +8,7 @@ loss themselves.
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
@@ -22,6 +23,13 @@ def available_device(name: str) -> str:
     if name.startswith("cuda") and not torch.cuda.is_available():
         raise ValueError("be cpu: torch finds no CUDA device on this machine")
     return name
+
+
+def existing_checkpoint(path: str) -> str:
+    """The path of a checkpoint to go on from, or auto."""
+    if path != "auto" and not Path(path).is_file():
+        raise ValueError("be the path of a checkpoint.pt that exists, or auto")
+    return path
 
 
 # -- types -------------------------------------------------------------------------------------------------------------
@@ -157,7 +165,7 @@ class Training(Section):
     algorithm: str
     task: str
     seed: Seed = Field(description="Torch, the environment and the buffer draw from it.")
-    resume: str | None = Field(description="The path of a checkpoint to go on from, or auto.")
+    resume: Annotated[str, AfterValidator(existing_checkpoint)] | None
     device: Device
     threads: Threads = Field(description="Torch threads; 1 is the fastest for tensors as small as these.")
     num_envs: Size = Field(description="Drones of each process; more than these fit into no memory.")
@@ -200,11 +208,11 @@ def check(cfg: DictConfig) -> None:
         ValueError: the first setting that has the wrong type or is out of its range, and what to write instead.
     """
     try:
-        values = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        settings = OmegaConf.masked_copy(cfg, [name for name in cfg if name != "hydra"])
+        values = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
         name = error.full_key or "a setting"
         raise ValueError(f"{name} is missing: write {name}=... on the command line.") from None
-    values.pop("hydra", None)
     schema = Flying if "checkpoint" in values else Training
     try:
         schema.model_validate(values)

@@ -41,7 +41,8 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
         raise ValueError(f"Unknown {kind} {preset!r}. {choices} the path of a .yaml file, or a mapping.")
     if not path.is_file():
         raise FileNotFoundError(f"No {kind} file at {path}. {choices} the path of a .yaml file that exists.")
-    values = parse(path.read_bytes(), source)
+    with path.open("rb") as file:
+        values = parse(file.read(MAX_BYTES + 1), source)
     if not isinstance(values, Mapping):
         raise ValueError(f"{source}: expected a mapping of names to values, got {type(values).__name__}.")
     return source, values
@@ -57,7 +58,7 @@ def parse(content: bytes, source: str) -> Any:
     """
     if len(content) > MAX_BYTES:
         raise ValueError(
-            f"{source}: has {len(content):,} bytes, at most {MAX_BYTES:,} are read. Leave out what is no setting."
+            f"{source}: has more than {MAX_BYTES:,} bytes, which no file of settings needs. Leave out what is no setting."
         )
     try:
         text = content.decode()

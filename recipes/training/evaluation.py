@@ -1,0 +1,119 @@
+"""Evaluation: one episode of the deterministic policy from a fresh start in every environment."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType
+
+from torchrl_quad import differentiable_rollout
+from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.files import replacing
+from training.building import build_env, make_policy
+from training.checkpoints import read_checkpoint
+
+
+def evaluate(env: EnvBase, actor: TensorDictModuleBase) -> tuple[dict[str, float], TensorDictBase]:
+    """Fly one episode in every environment.
+
+    Returns:
+        the metrics by name, each the mean over the episodes that have one (the median if the task asks for it), and the
+        flight.
+    """
+    with torch.no_grad():
+        flight, _ = differentiable_rollout(
+            env, actor, None, env.max_episode_steps, exploration_type=ExplorationType.DETERMINISTIC
+        )
+    info, metrics = env.metric_info, {}
+    for name, value in env.episode_metrics(flight).items():
+        average = value.nanmedian() if name in info and info[name].median else value.nanmean()
+        metrics[f"eval/{name}"] = average.item()
+    first = first_episode(flight)
+    for name, term in flight["next", "reward_terms"].items():
+        metrics[f"reward/{name}"] = (term * first).sum(1).mean().item()
+    return metrics, flight
+
+
+@contextlib.contextmanager
+def drawing_from(env: EnvBase, seed: int) -> Iterator[None]:
+    """Let the environment draw from a seed for a while; afterwards it goes on as if it had drawn nothing."""
+    state = env.random_state()
+    env.set_seed(seed)
+    try:
+        yield
+    finally:
+        env.set_random_state(state)
+
+
+def final_evaluation(
+    cfg: DictConfig,
+    actor: TensorDictModuleBase,
+    normalizer: dict[str, Tensor] | None,
+    episodes: int = 256,
+    seed: int = 2_000_000,
+) -> tuple[dict[str, Any], TensorDictBase]:
+    """Fly a policy over fresh episodes, side by side, from starts drawn with the seed: a summary, and the flight."""
+    env = build_env(cfg, episodes, seed)
+    if normalizer is not None:
+        env.transform.load_state_dict(normalizer)
+    metrics, flight = evaluate(env, actor)
+    summary = {"task": cfg.task, "algorithm": cfg.algorithm, "seed": cfg.seed, "episodes": episodes}
+    return summary | {name.removeprefix("eval/"): v for name, v in metrics.items() if name.startswith("eval/")}, flight
+
+
+def best_policy(cfg: DictConfig, best: Mapping[str, Any]) -> tuple[TensorDictModuleBase, dict[str, Tensor] | None]:
+    """Build the best policy of a run from its weights, with the state of its normaliser if it has one."""
+    actor = make_policy(cfg, build_env(cfg, 1, 0))
+    actor.load_state_dict(best["actor"])
+    return actor, best.get("normalizer")
+
+
+def load_policy(
+    checkpoint: Path, device: str = "cpu"
+) -> tuple[DictConfig, TensorDictModuleBase, dict[str, Tensor] | None]:
+    """Read the configuration, the best policy, and the state of its normaliser if it has one, from a checkpoint.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is not a checkpoint that these recipes can read, or holds no policy.
+    """
+    saved = read_checkpoint(checkpoint)
+    if "actor" not in saved["best"]:
+        raise ValueError(f"{checkpoint} holds no policy yet: the run stopped before its first evaluation.")
+    cfg = OmegaConf.create(saved["config"])
+    cfg.device = device
+    return cfg, *best_policy(cfg, saved["best"])
+
+
+def write_summary(path: Path, summary: Mapping[str, Any]) -> None:
+    """Write a summary as JSON; what is not a number becomes null."""
+    content = {key: None if isinstance(x, float) and math.isnan(x) else x for key, x in summary.items()}
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def print_summary(summary: Mapping[str, Any], metric_info: Mapping[str, Any], folder: Path) -> None:
+    """Print how well the policy flies, and where the results are."""
+    run = f"{summary['algorithm']} on {summary['task']}, seed {summary['seed']}"
+    print(f"\n{run}, {summary['episodes']} fresh episodes:")
+    print(f"  {'solved':16s}{summary['solved']:.1%}")
+    print(f"  {'crashed':16s}{summary['crash']:.1%}")
+    for name, metric in metric_info.items():
+        value = summary.get(name, math.nan)
+        if name not in ("solved", "crash") and not math.isnan(value):
+            unit = f" {metric.unit}" * bool(metric.unit) + " (median)" * metric.median
+            print(f"  {metric.label:16s}{metric.scale * value:.2f}{unit}")
+    if "seconds" in summary:
+        print(f"  {'training':16s}{summary['steps']:,} steps in {summary['seconds']:.1f} s")
+    print(f"  {'results in':16s}{folder}")

@@ -8,7 +8,9 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from small_runs import SMALL, stop_at_save
@@ -20,28 +22,19 @@ from torchrl_quad import BPTTLoss
 ROOT = Path(__file__).parent.parent
 
 
-def start(*arguments, cwd=ROOT):
-    command = [sys.executable, ROOT / "recipes/bptt.py", *SMALL, *arguments]
-    return subprocess.Popen(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def test_two_runs_of_one_second_get_folders_of_their_own(tmp_path):
-    """Each at the same moment: all are started before the first has imported torch."""
-    options = ["hydra.run.dir=outputs/${seed}"]
-    (tmp_path / "conf").mkdir()
-    runs = [start("compile=false", f"actor.lr=0.0{lr}", cwd=tmp_path) for lr in (1, 2)]
-    assert [run.wait(timeout=300) for run in runs] == [0, 0], options
-    folders = sorted(path.parent for path in tmp_path.glob("outputs/**/summary.json"))
-    assert len(folders) == 2
-    rates = []
-    for folder in folders:
-        checkpoint, summary = (
-            read_checkpoint(folder / "checkpoint.pt"),
-            json.loads((folder / "summary.json").read_text()),
-        )
-        assert summary["best_steps"] == checkpoint["best"]["steps"]
-        rates.append(checkpoint["stateful"][1]["param_groups"][0]["initial_lr"])
-    assert sorted(rates) == [0.01, 0.02]
+def test_two_runs_of_one_second_get_folders_of_their_own(launch, no_pictures, tmp_path, monkeypatch):
+    moment = datetime(2030, 1, 1)
+    monkeypatch.setattr("hydra.core.utils.datetime", SimpleNamespace(now=lambda: moment))
+    monkeypatch.chdir(tmp_path)
+    hydras = tmp_path / "outputs/hovering/bptt/seed0/2030-01-01_00-00-00"
+    with own_folder(hydras, named=False):  # a run that has just started
+        launch("bptt", *SMALL, "actor.lr=0.01")
+        launch("bptt", *SMALL, "actor.lr=0.02")
+    for name, rate in (("_2", 0.01), ("_3", 0.02)):
+        folder = hydras.with_name(hydras.name + name)
+        checkpoint = read_checkpoint(folder / "checkpoint.pt")
+        assert checkpoint["stateful"][1]["param_groups"][0]["initial_lr"] == rate
+        assert json.loads((folder / "summary.json").read_text())["best_steps"] == checkpoint["best"]["steps"]
 
 
 def test_a_proposed_folder_that_another_run_has_or_had_gets_a_number(tmp_path):
@@ -99,15 +92,16 @@ def test_a_file_system_without_locks_is_no_reason_to_stop(tmp_path, monkeypatch)
 
 
 def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
-    run = start("total_steps=1_000_000", f"hydra.run.dir={tmp_path}")
-    while not (tmp_path / "checkpoint.pt").exists():
-        assert run.poll() is None, run.stderr.read()
-        time.sleep(0.02)
-    run.send_signal(signal.SIGINT)
-    printed = run.communicate(timeout=60)[1]
+    script = ROOT / "recipes/bptt.py"
+    command = [sys.executable, script, *SMALL, "total_steps=1_000_000", f"hydra.run.dir={tmp_path}"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as run:
+        while not (tmp_path / "checkpoint.pt").exists():
+            assert run.poll() is None, run.stderr.read()
+            time.sleep(0.02)
+        run.send_signal(signal.SIGINT)
+        printed = run.communicate(timeout=60)[1]
     assert run.returncode == 130
     assert "Traceback" not in printed
-    script = ROOT / "recipes/bptt.py"
     assert printed.splitlines()[-1] == f"Stopped. Go on with: python {script} resume={tmp_path}/checkpoint.pt"
 
 

@@ -49,7 +49,9 @@ def _claim(folder: Path, named: bool) -> tuple[Path, IO[str]]:
         path.mkdir(parents=True, exist_ok=True)
         lock = _lock(path / LOCK)
         if lock is None and named:
-            holder = (path / LOCK).read_text().strip() or "another process"
+            holder = "another process"
+            with contextlib.suppress(FileNotFoundError):  # it has ended just now
+                holder = (path / LOCK).read_text().strip() or holder
             raise FileExistsError(
                 f"{path} is in use by {holder}. Wait for it, stop it, or choose another hydra.run.dir."
             )
@@ -76,7 +78,8 @@ def _lock(path: Path) -> IO[str] | None:
             return None
         except OSError:  # a file system without locks: go on without
             pass
-        if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
-            file.truncate(0)
-            return file
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                file.truncate(0)
+                return file
         file.close()  # its holder has deleted it in between

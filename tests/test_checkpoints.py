@@ -114,5 +114,5 @@ def test_without_hard_links_the_checkpoint_before_is_copied(content, tmp_path, m
 def test_a_checkpoint_without_an_evaluated_policy_is_no_policy(refused, no_pictures, tmp_path, monkeypatch):
     poison(monkeypatch, None)
     refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "max_skipped=0")
-    with pytest.raises(ValueError, match="failure.pt holds no policy yet"):
+    with pytest.raises(ValueError, match="failure.pt holds no policy: the run stopped before its first evaluation"):
         evaluation.load_policy(tmp_path / "failure.pt")

@@ -72,8 +72,19 @@ def final_evaluation(
     return summary | {name.removeprefix("eval/"): v for name, v in metrics.items() if name.startswith("eval/")}, flight
 
 
-def best_policy(cfg: DictConfig, best: Mapping[str, Any]) -> tuple[TensorDictModuleBase, dict[str, Tensor] | None]:
-    """Build the best policy of a run from its weights, with the state of its normaliser if it has one."""
+def best_policy(
+    cfg: DictConfig, best: Mapping[str, Any], source: Path
+) -> tuple[TensorDictModuleBase, dict[str, Tensor] | None]:
+    """Build the best policy of a run from its weights, with the state of its normaliser if it has one.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if "actor" not in best:
+        raise ValueError(
+            f"{source} holds no policy: the run stopped before its first evaluation, or no return was finite. Train "
+            "longer, or with a lower learning rate."
+        )
     actor = make_policy(cfg, build_env(cfg, 1, 0))
     actor.load_state_dict(best["actor"])
     return actor, best.get("normalizer")
@@ -89,11 +100,9 @@ def load_policy(
         ValueError: the file is not a checkpoint that these recipes can read, or holds no policy.
     """
     saved = read_checkpoint(checkpoint)
-    if "actor" not in saved["best"]:
-        raise ValueError(f"{checkpoint} holds no policy yet: the run stopped before its first evaluation.")
     cfg = OmegaConf.create(saved["config"])
     cfg.device = device
-    return cfg, *best_policy(cfg, saved["best"])
+    return cfg, *best_policy(cfg, saved["best"], checkpoint)
 
 
 def write_summary(path: Path, summary: Mapping[str, Any]) -> None:

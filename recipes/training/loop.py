@@ -240,7 +240,7 @@ class Run:
 
     def _finish(self) -> None:
         """Fly the best policy from fresh starts, draw it, and write the summary last: it marks the run as finished."""
-        summary, flight = final_evaluation(self.cfg, *best_policy(self.cfg, self.best))
+        summary, flight = final_evaluation(self.cfg, *best_policy(self.cfg, self.best, self.folder))
         steps = self.iterations * self.steps_per_iteration
         summary |= {"steps": steps, "best_steps": self.best["steps"], "seconds": round(self.seconds, 2)}
         summary |= {"revision": self.revision}

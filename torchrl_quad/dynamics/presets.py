@@ -58,7 +58,7 @@ def parse(content: bytes, source: str) -> Any:
     """
     if len(content) > MAX_BYTES:
         raise ValueError(
-            f"{source}: has more than {MAX_BYTES:,} bytes, which no file of settings needs. Leave out what is no setting."
+            f"{source}: has more than {MAX_BYTES:,} bytes, which no file of settings needs. Leave out the rest."
         )
     try:
         text = content.decode()

@@ -19,6 +19,7 @@ from torchrl.envs.utils import ExplorationType
 
 from torchrl_quad import differentiable_rollout
 from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.envs.scenery import describe_metric
 from torchrl_quad.files import replacing
 from training.building import build_env, make_policy
 from training.checkpoints import read_checkpoint
@@ -35,10 +36,10 @@ def evaluate(env: EnvBase, actor: TensorDictModuleBase) -> tuple[dict[str, float
         flight, _ = differentiable_rollout(
             env, actor, None, env.max_episode_steps, exploration_type=ExplorationType.DETERMINISTIC
         )
-    info, metrics = env.metric_info, {}
-    for name, value in env.episode_metrics(flight).items():
-        average = value.nanmedian() if name in info and info[name].median else value.nanmean()
-        metrics[f"eval/{name}"] = average.item()
+    metrics = {
+        f"eval/{name}": describe_metric(name, env.metric_info).summarise(values)
+        for name, values in env.episode_metrics(flight).items()
+    }
     first = first_episode(flight)
     for name, term in flight["next", "reward_terms"].items():
         metrics[f"reward/{name}"] = (term * first).sum(1).mean().item()
@@ -116,13 +117,9 @@ def print_summary(summary: Mapping[str, Any], metric_info: Mapping[str, Any], fo
     """Print how well the policy flies, and where the results are."""
     run = f"{summary['algorithm']} on {summary['task']}, seed {summary['seed']}"
     print(f"\n{run}, {summary['episodes']} fresh episodes:")
-    print(f"  {'solved':16s}{summary['solved']:.1%}")
-    print(f"  {'crashed':16s}{summary['crash']:.1%}")
     for name, metric in metric_info.items():
-        value = summary.get(name, math.nan)
-        if name not in ("solved", "crash") and not math.isnan(value):
-            unit = f" {metric.unit}" * bool(metric.unit) + " (median)" * metric.median
-            print(f"  {metric.label:16s}{metric.scale * value:.2f}{unit}")
+        if not math.isnan(summary.get(name, math.nan)):
+            print(f"  {metric.label:22s}{metric.format(summary[name])}")
     if "seconds" in summary:
-        print(f"  {'training':16s}{summary['steps']:,} steps in {summary['seconds']:.1f} s")
-    print(f"  {'results in':16s}{folder}")
+        print(f"  {'training':22s}{summary['steps']:,} steps in {summary['seconds']:.1f} s")
+    print(f"  {'results in':22s}{folder}")

@@ -330,10 +330,8 @@ class QuadrotorEnv(Task, EnvBase):
         state, valid = self.control_step.guard(state)
         end = self._stepper.step(state, valid, action, self.randomness.noise())
         checks.require_finite(action)
-        outputs = nested(end.outputs)
-        outputs["metrics"] = {name: x.detach() for name, x in outputs.get("metrics", {}).items()}
         self._keep_for_render(end.state)
-        return TensorDict({"state": nested(end.state), **outputs}, self.batch_size, self.device)
+        return TensorDict({"state": nested(end.state), **end.outputs}, self.batch_size, self.device)
 
     def rollout(self, max_steps: int, policy: Any = None, callback: Any = None, **options: Any) -> TensorDictBase:
         """As TorchRL's rollout, and with the same numbers; several times faster where the engine can fly it.

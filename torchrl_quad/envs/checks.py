@@ -185,7 +185,8 @@ def read_state(state: Any, safe_state: State, source: str) -> State:
         isinstance(state, TensorDictBase),
         f'{source}: a state is a tensordict, such as env.reset()["state"]; got {type(state).__name__}.',
     )
-    entries = {key: state.get(key, None) for key in safe_state}
+    given = dict(state.items())  # one look at all names is quicker than many
+    entries = {key: state.get(key, None) if isinstance(key, tuple) else given.get(key) for key in safe_state}
     for key, x in entries.items():
         like = safe_state[key]
         if x is None or x.shape != like.shape or x.dtype != like.dtype or x.device != like.device:

@@ -227,10 +227,14 @@ class Sensors(Disturbance):
         velocity, angular_velocity = state["velocity"], state["angular_velocity"]
         if noise is not None:
             by_position, by_attitude, by_velocity, by_rate = noise.split(3, -1)
-            position = position + self.position * by_position
-            attitude = quaternion.multiply(attitude, quaternion.from_axis_angle(self.attitude * by_attitude))
-            velocity = velocity + self.velocity * by_velocity
-            angular_velocity = angular_velocity + self.angular_velocity * by_rate
+            if self.position:
+                position = position + self.position * by_position
+            if self.attitude:
+                attitude = quaternion.multiply(attitude, quaternion.from_axis_angle(self.attitude * by_attitude))
+            if self.velocity:
+                velocity = velocity + self.velocity * by_velocity
+            if self.angular_velocity:
+                angular_velocity = angular_velocity + self.angular_velocity * by_rate
         return torch.cat((position, attitude, velocity, angular_velocity), -1).unsqueeze(1)
 
 

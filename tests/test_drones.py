@@ -17,7 +17,7 @@ def test_the_four_presets_are_there():
 def test_every_preset_can_hover_and_reach_its_commanded_thrust(name):
     params = load_drone(name)
     env = HoveringEnv(num_envs=1, drone=name)
-    hover, highest = env.controller.hover_speed, env.controller.thrust_max
+    hover, highest = env.dynamics.controller.hover_speed, env.dynamics.controller.thrust_max
     assert ((params.rotor_speed_min < hover) & (hover < params.rotor_speed_max)).all()
     assert (4 * highest >= params.max_thrust_to_weight * params.mass * params.gravity).all()
 

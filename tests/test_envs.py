@@ -122,7 +122,7 @@ def test_an_action_takes_effect_after_the_delay(delay):
     env = HoveringEnv(num_envs=1, action_delay=delay, dtype=torch.float64)
     push = env.hover_action + torch.tensor([0.5, 0.0, 0.0, 0.0], dtype=torch.float64)
     flight = fly(env, env.reset(), [push.expand(1, 4)] * (delay + 2))
-    speed = flight["next", "state", "rotor_speed"][0, :, 0] - env.controller.hover_speed[0]
+    speed = flight["next", "state", "rotor_speed"][0, :, 0] - env.dynamics.controller.hover_speed[0]
     assert (speed[:delay].abs() < 1e-9).all()
     assert (speed[delay:] > 10).all()
 
@@ -406,7 +406,7 @@ def test_episode_metrics_judge_the_first_episode_by_its_last_second():
     hover = TensorDictModule(lambda _: env.hover_action.expand(3, 4), in_keys=["observation"], out_keys=["action"])
     flight, _ = differentiable_rollout(env, hover, env.reset(td, set_state=True), 60)
     metrics = env.episode_metrics(flight)
-    assert metrics["success"].tolist() == [1.0, 0.0, 0.0]
+    assert metrics["solved"].tolist() == [1.0, 0.0, 0.0]
     assert metrics["crash"].tolist() == [0.0, 0.0, 1.0]
     assert metrics["position_error"].tolist() == pytest.approx([0.0, 0.2, 4.6], abs=0.1)
     assert metrics["return"].tolist() == pytest.approx([6.0, 60 * (0.1 - 0.2 * 0.1 / 9), 0.04], abs=0.01)

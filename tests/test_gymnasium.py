@@ -340,7 +340,7 @@ def test_no_gradient_is_kept():
 
 def test_options_reach_the_torchrl_environment():
     env = gymnasium.make(HOVERING, drone="crazyflie", compile=True, control_dt=0.01).unwrapped.torchrl_env
-    assert env.stepper.is_compiled
+    assert env.is_compiled
     assert env.control_dt == 0.01
     assert env.nominal.mass == load_drone("crazyflie").mass
 

@@ -222,5 +222,5 @@ def test_without_a_cpp_compiler_the_step_stays_eager_and_says_so(monkeypatch):
     monkeypatch.setenv("PATH", "")
     with pytest.warns(UserWarning, match="neither g.. nor clang.. is on the PATH"):
         env = HoveringEnv(num_envs=2, compile=True)
-    assert not env.stepper.is_compiled
+    assert not env.is_compiled
     assert env.rollout(2)["next", "reward"].isfinite().all()

@@ -60,7 +60,7 @@ def flights(draw, calm=True):
 def start(env, flight):
     """The flight's state, in a task's own starts, with its action."""
     env.set_seed(flight["seed"])
-    state = TensorDict({"state": env.sample_initial_state(N)}, [N])["state"]
+    state = env.sample_start(N)["state"]
     low, high = env.nominal.rotor_speed_min, env.nominal.rotor_speed_max
     values = {name: torch.as_tensor(value).to(env.dtype).clamp(-3e38, 3e38) for name, value in flight.items()}
     for name in DRONE[:-1]:

@@ -60,7 +60,7 @@ def test_the_point_moves_along_the_circle_and_the_next_ten_are_observed():
     expected = torch.cat((2 + 2 * angle.cos(), 2 * angle.sin(), torch.ones_like(angle)), -1)
     torch.testing.assert_close(flight["target"], expected)
     # In 0.1 s steps: what is the point after 5 control steps is the first point observed now.
-    first = 10 * td["observation"][:, :3] + td["state", "position"]
+    first = td["observation"][:, :3] + td["state", "position"]
     torch.testing.assert_close(first, flight["target"][:, 4])
     tenth = td["observation"][:, 27:30] + td["state", "position"]
     torch.testing.assert_close(tenth, flight["target"][:, 49])
@@ -86,7 +86,7 @@ def test_an_episode_of_tracking_succeeds_below_ten_centimetres_without_a_crash()
     td = start(env, position=torch.tensor([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.0, 0.0, 5.99]]))
     td["state", "velocity"][2, 2] = 5.0
     metrics = env.episode_metrics(fly(env, env.reset(td, set_state=True), 120))
-    assert metrics["success"].tolist() == [1.0, 0.0, 0.0]
+    assert metrics["solved"].tolist() == [1.0, 0.0, 0.0]
     assert metrics["crash"].tolist() == [0.0, 0.0, 1.0]
     assert metrics["tracking_rmse"][:2].tolist() == pytest.approx([0.0, 0.2], abs=2e-3)
 
@@ -166,7 +166,7 @@ def test_a_landing_succeeds_crashes_or_does_neither():
     assert ends["reward_terms", "success"].flatten().tolist() == [20.0, 20.0, 0.0, 0.0, 0.0, 0.0]
     assert ends["reward_terms", "crash"].flatten().tolist() == pytest.approx([0.0, 0.0, 0.0, 0.0, -0.1, 0.0])
     metrics = env.episode_metrics(fly(env, td, 1))
-    assert metrics["success"].tolist() == [1.0, 1.0, 0.0, 0.0, 0.0, 0.0]
+    assert metrics["solved"].tolist() == [1.0, 1.0, 0.0, 0.0, 0.0, 0.0]
     assert metrics["crash"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
     assert metrics["landing_speed"].isnan().tolist() == [False] * 5 + [True]
     assert metrics["landing_speed"][3].item() == pytest.approx(0.5, abs=0.05)
@@ -214,7 +214,7 @@ def test_a_lap_is_timed_from_a_gate_to_the_same_gate_and_eight_gates_succeed():
     assert ends["metrics", "lap_time"].flatten().tolist() == pytest.approx([0.0, 0.0] + [0.04] * 7)
     assert ends["success"].flatten().tolist() == [False] * 7 + [True] * 2
     metrics = env.episode_metrics(flight)
-    assert metrics["success"].item() == 1.0
+    assert metrics["solved"].item() == 1.0
     assert metrics["gates_passed"].item() == 9.0
     assert metrics["lap_time"].item() == pytest.approx(0.04)
     assert metrics["time_near_gate"].item() == pytest.approx(9 * 0.02)  # [s]; both gates are within 1 m all the time
@@ -225,7 +225,7 @@ def test_a_racer_that_crashes_after_eight_gates_has_no_success():
     env = RacingEnv(num_envs=1)
     td = start(env, gates_passed=[[9]], position=[[5.0, 0.0, 0.01]], velocity=[[0.0, 0.0, -5.0]])
     metrics = env.episode_metrics(fly(env, td, 1))
-    assert (metrics["success"].item(), metrics["crash"].item(), metrics["gates_passed"].item()) == (0.0, 1.0, 9.0)
+    assert (metrics["solved"].item(), metrics["crash"].item(), metrics["gates_passed"].item()) == (0.0, 1.0, 9.0)
 
 
 def test_a_racer_that_breaks_keeps_what_it_has_passed():

@@ -175,7 +175,7 @@ def test_a_landing_succeeds_crashes_or_does_neither():
 
 def test_the_landing_gradient_is_finite_however_fast_the_fall():
     env = LandingEnv(num_envs=4)
-    td = start(env, velocity=torch.tensor([[0.0, 0.0, v] for v in (-900.0, -50.0, 0.0, 900.0)]))
+    td = start(env, velocity=torch.tensor([[0.0, 0.0, v] for v in (-299.0, -50.0, 0.0, 299.0)]))
     action = env.hover_action.expand(4, 4).clone().requires_grad_()
     reward = env.step(td.set("action", action))["next", "reward"]
     state = {key: value.clone() for key, value in td["state"].items()}
@@ -190,7 +190,7 @@ def test_the_landing_gradient_is_finite_however_fast_the_fall():
 
 
 def test_gates_are_passed_in_order_along_the_straight_line_of_a_step():
-    env = RacingEnv(num_envs=4, dtype=torch.float64)
+    env = RacingEnv(num_envs=4, dtype=torch.float64, reward="position")
     gate = torch.tensor([4.0, 4.0, 1.0], dtype=torch.float64)
     # Fast enough to jump over the gate within one step; beside it; not yet there; through another gate.
     offset = [[-1.0, 0.0, 0.0], [-1.0, 0.35, 0.0], [-2.0, 0.0, 0.0], [4.0 - 1.0, -4.0, 1.0]]
@@ -286,13 +286,15 @@ def test_the_racing_reward_is_the_published_formula(reward, gate_bonus):
 
 def test_only_the_relaxed_bonus_has_a_gradient():
     for gate_bonus, differentiable in (("binary", False), ("log", True), ("reciprocal", True)):
-        env = RacingEnv(num_envs=1, gate_bonus=gate_bonus)
+        env = RacingEnv(num_envs=1, reward="position", gate_bonus=gate_bonus)
         td = env.reset()
         action = env.hover_action.expand(1, 4).clone().requires_grad_()
         for _ in range(3):
             td = env.step_mdp(step := env.step(td.set("action", action)))
-        (grad,) = torch.autograd.grad(step["next", "reward_terms", "gate"].sum(), action)
-        assert (grad != 0).any() == differentiable
+        bonus = step["next", "reward_terms", "gate"]
+        assert bonus.requires_grad == differentiable
+        if differentiable:
+            assert (torch.autograd.grad(bonus.sum(), action)[0] != 0).any()
 
 
 def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):

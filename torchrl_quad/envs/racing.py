@@ -1,5 +1,6 @@
 """The racing task."""
 
+import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -191,6 +192,10 @@ class RacingEnv(QuadrotorEnv):
 
     def metrics(self, state: State) -> State:
         return {"gates_passed": state["gates_passed"].to(self.dtype), "lap_time": state["lap_time"]}
+
+    def state_bounds(self) -> dict[Any, tuple[float, float]]:
+        counts = dict.fromkeys(("gates_passed", "lap_time"), (0, math.inf))
+        return {"gate": (0, len(self.gates) - 1), "pass_step": (-1, math.inf), **counts}
 
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Gives a ``lap_time`` only to drones that flew a full lap; adds ``time_near_gate``, within 1 m of the next."""

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad import differentiable_rollout, make_actor, make_env
 
 nan = float("nan")
 LARGEST = torch.iinfo(torch.int64).max

@@ -61,10 +61,10 @@ def test_thrust_roll_and_pitch_are_exact_where_yaw_alone_saturates(drone):
     level = matvec(controller.mixer, asked * torch.tensor([1.0, 1.0, 1.0, 0.0], dtype=F64))
     feasible = ((level >= controller.thrust_min) & (level <= controller.thrust_max)).all(-1)
     assert feasible.sum() > 50
-    # Rotors that hardly turn are off by a millionth of the range of their thrust.
+    # Rotors that hardly turn are off by a millionth of their greatest thrust.
     arm = controller.nominal.rotor_positions.norm(dim=-1).max()
     error = (flown - asked)[feasible, :3] / torch.stack((torch.ones_like(arm), arm, arm))
-    assert (error.abs() < 1e-6 * controller.thrust_max.max()).all()
+    assert (error.abs() < 2e-6 * controller.thrust_max.max()).all()
     assert (flown[:, 3] > -1e-9).all()
     assert (flown[feasible, 3] < asked[feasible, 3]).all()
     assert flown[feasible, 3].mean() > 0

@@ -7,7 +7,8 @@ from torchrl.envs import check_env_specs
 
 from torchrl_quad import HoveringEnv, VisitedStateBuffer, differentiable_rollout, load_drone, make_actor, make_env
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.envs.disturbances import Sensors
+from torchrl_quad.envs import TASKS
+from torchrl_quad.envs.disturbances import Disturbance, Sensors
 
 EVERYTHING = {
     "wind": {"mean": [1.0, 0.0, 0.0], "spread": [0.5, 0.5, 0.0], "gust": 0.5},
@@ -41,7 +42,7 @@ def test_sensors_that_are_given_whole_keep_their_delay():
         assert env.reset()["state", "measurements"].shape == (2, delay + 1, 13)
 
 
-@pytest.mark.parametrize("task", ["hovering", "landing", "racing", "tracking"])
+@pytest.mark.parametrize("task", TASKS)
 def test_every_task_takes_every_disturbance_and_a_restored_state_flies_the_same(task):
     env = make_env(task, num_envs=3, dtype=torch.float64, **EVERYTHING)
     check_env_specs(env, break_when_any_done="both")
@@ -58,7 +59,7 @@ def test_every_task_takes_every_disturbance_and_a_restored_state_flies_the_same(
         assert torch.equal(value, again["next", key]), key
 
 
-@pytest.mark.parametrize("task", ["hovering", "landing", "racing", "tracking"])
+@pytest.mark.parametrize("task", TASKS)
 def test_gradients_with_every_disturbance_agree_with_finite_differences(task):
     env = make_env(task, num_envs=2, dtype=torch.float64, **EVERYTHING)
     start = env.rollout(3)["next", "state"][:, -1].clone()
@@ -253,6 +254,78 @@ def test_random_starts_tilt_turn_and_push_within_their_bounds():
 def test_bad_options_say_what_is_allowed(kwargs, message):
     with pytest.raises(ValueError, match=message):
         HoveringEnv(num_envs=1, **kwargs)
+
+
+# -- of one's own -----------------------------------------------------------------------------------------------------
+
+
+class GyroBias(Disturbance):
+    """The policy sees body rates with an offset that wanders."""
+
+    noise_size = 3
+
+    def start(self, random, state):
+        return {"gyro_bias": 0.1 * random.normal(len(state["position"]), 3)}
+
+    def advance(self, state, noise, dt):
+        return {"gyro_bias": state["gyro_bias"] + 0.05 * dt**0.5 * noise}
+
+    def observe(self, state):
+        return {**state, "angular_velocity": state["angular_velocity"] + state["gyro_bias"]}
+
+
+class BatterySag(Disturbance):
+    """Thrust falls by a fifth in ten seconds, from a charge that differs between episodes."""
+
+    def __init__(self, thrust_map):
+        self.thrust_map = thrust_map
+
+    def start(self, random, state):
+        charge = 1.0 - 0.05 * (random.uniform(len(state["position"]), 1) + 1.0)
+        return {"charge": charge, ("drone", "thrust_map"): charge * self.thrust_map.to(charge)}
+
+    def advance(self, state, noise, dt):
+        charge = state["charge"] - 0.02 * dt
+        return {"charge": charge, ("drone", "thrust_map"): charge * self.thrust_map.to(charge)}
+
+
+def own():
+    return [GyroBias(), BatterySag(load_drone("visfly").thrust_map)]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_disturbances_of_one_s_own_fly_in_every_task_and_are_restored_with_the_state(task):
+    env = make_env(task, num_envs=3, dtype=torch.float64, max_episode_steps=40, disturbances=own())
+    check_env_specs(env)
+    td = env.reset()
+    flight = fly(env, td, hold(env, 20))
+    state = flight["next", "state"]
+    torch.testing.assert_close(td["observation"][:, -3:], td["state", "gyro_bias"])  # at rest there is nothing else
+    assert (state["gyro_bias"].diff(dim=1) != 0).all()
+    torch.testing.assert_close(state["charge"][:, -1], td["state", "charge"] - 0.02 * 0.4)
+    torch.testing.assert_close(state["drone", "thrust_map"][:, -1], state["charge"][:, -1] * env.nominal.thrust_map)
+    assert (state["velocity"][:, -1, 2] < -0.2).all()  # the controller believes in a full battery
+    random, middle = env.random_state(), state[:, 11].clone()
+    env.set_seed(0)
+    env.reset()
+    env.rollout(5)
+    env.set_random_state(random)
+    again = fly(env, env.reset(TensorDict({"state": middle}, [3]), set_state=True), hold(env, 3))
+    env.set_random_state(random)
+    twice = fly(env, env.reset(TensorDict({"state": middle}, [3]), set_state=True), hold(env, 3))
+    assert (again["next"] == twice["next"]).all()
+    torch.testing.assert_close(again["next", "state", "position"], state["position"][:, 12:15])
+    torch.testing.assert_close(again["next", "state", "drone", "thrust_map"], state["drone", "thrust_map"][:, 12:15])
+
+
+def test_a_disturbance_that_is_none_is_refused():
+    with pytest.raises(TypeError, match="disturbances: each must be a Disturbance, got GyroBiases"):
+        HoveringEnv(num_envs=1, disturbances=[type("GyroBiases", (), {})()])
+    sag = own()[1]
+    with pytest.raises(
+        ValueError, match=r"Entry \('drone', 'thrust_map'\) changes no parameter of the drone. Choose from"
+    ):
+        HoveringEnv(num_envs=1, disturbances=[sag], dynamics="point_mass")
 
 
 # -- weights -----------------------------------------------------------------------------------------------------------

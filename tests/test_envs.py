@@ -1,5 +1,6 @@
 """The environment: specs, resets, ends, seeds, delay, and what happens to broken states."""
 
+import inspect
 import pickle
 
 import pytest
@@ -232,6 +233,16 @@ def test_an_environment_can_be_pickled_and_flies_the_same(task):
     action = env.hover_action.expand(2, 4)
     ends = [e.step(start.copy().set("action", action))["next"] for e in (env, again)]
     assert (ends[0] == ends[1]).all()
+
+
+@pytest.mark.parametrize(("task", "own"), [("hovering", set()), ("racing", {"track", "reward", "gate_bonus"})])
+def test_the_signature_of_a_task_names_every_argument(task, own):
+    signature = inspect.signature(TASKS[task])
+    assert own | {"num_envs", "seed", "drone", "dynamics", "wind", "disturbances", "compile"} <= set(
+        signature.parameters
+    )
+    kinds = {argument.kind for argument in signature.parameters.values()}
+    assert not kinds & {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}
 
 
 def test_make_env_builds_by_name_and_lists_the_names():

@@ -258,9 +258,7 @@ def test_a_horizon_is_a_number_of_steps(env, horizon):
 
 @pytest.mark.parametrize("key", ["obs", ("state", "speed")])
 def test_an_actor_that_reads_what_nobody_writes_is_told_what_there_is(env, key):
-    message = (
-        "The actor reads .*, which is not in the tensordict .* env.reset.. writes: .*'state', 'position'"
-    )
+    message = "The actor reads .*, which is not in the tensordict .* env.reset.. writes: .*'state', 'position'"
     for some in (env, TransformedEnv(env, StepCounter())):
         with pytest.raises(ValueError, match=message):
             differentiable_rollout(some, linear(13, 4, in_key=key), None, 2)

@@ -173,6 +173,14 @@ def test_a_landing_succeeds_crashes_or_does_neither():
     assert metrics["position_error"][2].item() == pytest.approx(0.4, abs=0.01)
 
 
+def test_a_landing_beyond_its_bounds_pays_the_crash_term_like_any_crash():
+    env = LandingEnv(num_envs=4)
+    positions = torch.tensor([[8.0, 0.0, 2.0], [2.0, -5.1, 2.0], [2.0, 0.0, 6.1], [2.0, 0.0, 2.0]])
+    ends = fly(env, start(env, position=positions), 1)["next"]
+    assert ends["crash"].flatten().tolist() == [True, True, True, False]
+    assert ends["reward_terms", "crash"].flatten().tolist() == pytest.approx([-0.1, -0.1, -0.1, 0.0])
+
+
 def test_the_landing_gradient_is_finite_however_fast_the_fall():
     env = LandingEnv(num_envs=4)
     td = start(env, velocity=torch.tensor([[0.0, 0.0, v] for v in (-299.0, -50.0, 0.0, 299.0)]))

@@ -304,27 +304,20 @@ def test_disturbances_of_one_s_own_fly_in_every_task_and_are_restored_with_the_s
     assert (state["gyro_bias"].diff(dim=1) != 0).all()
     torch.testing.assert_close(state["charge"][:, -1], td["state", "charge"] - 0.02 * 0.4)
     torch.testing.assert_close(state["drone", "thrust_map"][:, -1], state["charge"][:, -1] * env.nominal.thrust_map)
-    assert (state["velocity"][:, -1, 2] < -0.2).all()  # the controller believes in a full battery
-    random, middle = env.random_state(), state[:, 11].clone()
-    env.set_seed(0)
-    env.reset()
-    env.rollout(5)
-    env.set_random_state(random)
-    again = fly(env, env.reset(TensorDict({"state": middle}, [3]), set_state=True), hold(env, 3))
-    env.set_random_state(random)
-    twice = fly(env, env.reset(TensorDict({"state": middle}, [3]), set_state=True), hold(env, 3))
-    assert (again["next"] == twice["next"]).all()
-    torch.testing.assert_close(again["next", "state", "position"], state["position"][:, 12:15])
-    torch.testing.assert_close(again["next", "state", "drone", "thrust_map"], state["drone", "thrust_map"][:, 12:15])
+    assert (state["velocity"][:, -1, 2] < -0.02).all()  # the controller believes in a full battery
+    env.set_seed(99)  # other noise; it changes what is seen, and not the battery
+    restored = env.reset(TensorDict({"state": state[:, 11].clone()}, [3]), set_state=True)
+    torch.testing.assert_close(restored["observation"], flight["next", "observation"][:, 11], rtol=0, atol=0)
+    again = fly(env, restored, hold(env, 3))["next", "state"]
+    for key in ("position", "charge", ("drone", "thrust_map")):
+        assert torch.equal(again[key], state[key][:, 12:15])
 
 
 def test_a_disturbance_that_is_none_is_refused():
     with pytest.raises(TypeError, match="disturbances: each must be a Disturbance, got GyroBiases"):
         HoveringEnv(num_envs=1, disturbances=[type("GyroBiases", (), {})()])
     sag = own()[1]
-    with pytest.raises(
-        ValueError, match=r"Entry \('drone', 'thrust_map'\) changes no parameter of the drone. Choose from"
-    ):
+    with pytest.raises(ValueError, match=r"Entry \('drone', 'thrust_map'\) changes no parameter of the drone"):
         HoveringEnv(num_envs=1, disturbances=[sag], dynamics="point_mass")
 
 

@@ -237,11 +237,9 @@ def test_an_environment_can_be_pickled_and_flies_the_same(task):
 
 @pytest.mark.parametrize(("task", "own"), [("hovering", set()), ("racing", {"track", "reward", "gate_bonus"})])
 def test_the_signature_of_a_task_names_every_argument(task, own):
-    signature = inspect.signature(TASKS[task])
-    assert own | {"num_envs", "seed", "drone", "dynamics", "wind", "disturbances", "compile"} <= set(
-        signature.parameters
-    )
-    kinds = {argument.kind for argument in signature.parameters.values()}
+    arguments = inspect.signature(TASKS[task]).parameters
+    assert own | {"num_envs", "seed", "drone", "dynamics", "wind", "disturbances", "compile"} <= set(arguments)
+    kinds = {argument.kind for argument in arguments.values()}
     assert not kinds & {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}
 
 

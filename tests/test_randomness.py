@@ -2,7 +2,6 @@
 
 import io
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -10,7 +9,6 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv
 
 from torchrl_quad import HoveringEnv
-from torchrl_quad.gym import GymVectorEnv
 
 RESTLESS = {  # flights that crash after some ten steps, each in its own time
     "num_envs": 8,
@@ -63,16 +61,6 @@ def test_one_seed_gives_one_flight_however_it_is_flown():
     for name, flight in flights.items():
         for key, x in entries(expected).items():
             torch.testing.assert_close(flight[key], x, msg=f"{name}: {key}")
-
-
-def test_gymnasiums_drones_start_where_torchrls_do():
-    env, drones = HoveringEnv(**RESTLESS), GymVectorEnv("hovering", autoreset_mode="SameStep", **RESTLESS)
-    expected = env.rollout(STEPS, POLICY, break_when_any_done=False)
-    observation, _ = drones.reset()
-    for t in range(STEPS):
-        np.testing.assert_allclose(observation, expected["observation"][:, t], rtol=1e-4, atol=1e-4)
-        observation, _, terminated, _, _ = drones.step(expected["action"][:, t].numpy())
-        np.testing.assert_array_equal(terminated, expected["next", "terminated"][:, t, 0])
 
 
 def test_episodes_that_end_soon_start_at_another_state_each_time():

@@ -313,7 +313,7 @@ def test_disturbances_of_one_s_own_fly_in_every_task_and_are_restored_with_the_s
         assert torch.equal(again[key], state[key][:, 12:15])
 
 
-def test_a_disturbance_that_is_none_is_refused():
+def test_what_is_not_a_disturbance_is_refused():
     with pytest.raises(TypeError, match="disturbances: each must be a Disturbance, got GyroBiases"):
         HoveringEnv(num_envs=1, disturbances=[type("GyroBiases", (), {})()])
     sag = own()[1]

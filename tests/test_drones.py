@@ -46,7 +46,7 @@ def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
         ({"rotor_speed_min": 4000.0}, r"rotor_speed_min must be below rotor_speed_max, got \[4000.0\] and \[3500.0\]"),
     ],
 )
-def test_a_bad_file_is_told_which_field_and_what_is_allowed(tmp_path, change, message):
+def test_a_bad_file_is_refused_with_its_field_and_what_is_allowed(tmp_path, change, message):
     path = tmp_path / "mine.yaml"
     values = {name: value for name, value in {**VISFLY, **change}.items() if value is not None}
     path.write_text(yaml.safe_dump(values))

@@ -58,7 +58,7 @@ def linear(inputs, outputs, in_key="observation", out_key="action", **kwargs):
         ),
     ],
 )
-def test_an_unknown_option_is_told_the_closest_one_and_all_of_them(task, kwargs, message):
+def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them(task, kwargs, message):
     with pytest.raises(TypeError, match=message):
         make_env(task, **kwargs)
 
@@ -113,12 +113,12 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
 
 
 @pytest.mark.parametrize("task", ["hover", None, ["hovering"]])
-def test_an_unknown_task_is_told_the_known_ones(task):
+def test_an_unknown_task_is_refused_with_the_known_ones(task):
     with pytest.raises(ValueError, match="Unknown task .*. Choose from: hovering, landing, racing, tracking."):
         make_env(task)
 
 
-def test_a_gate_without_end_is_none():
+def test_a_gate_needs_a_finite_radius():
     with pytest.raises(ValueError, match="gate_radius must be a positive number .m., got inf"):
         load_track({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": float("inf")})
 
@@ -191,7 +191,7 @@ def test_an_action_of_another_shape_is_refused_and_not_broadcast(env, shape):
         env.rollout(2, policy, break_when_any_done=False)
 
 
-def test_a_policy_that_writes_no_action_is_told_where_to(env):
+def test_a_policy_that_writes_no_action_learns_where_to(env):
     message = 'The action must have shape .* there is none. A policy writes it under "action", as make_actor'
     with pytest.raises(ValueError, match=message):
         differentiable_rollout(env, linear(13, 4, out_key="acton"), None, 2)
@@ -217,7 +217,7 @@ def test_an_action_on_another_device_is_refused(env):
 
 
 @pytest.mark.parametrize("wrap", [False, True])
-def test_a_broken_policy_is_told_so_and_does_not_crash_its_drones_in_silence(wrap):
+def test_a_broken_policy_is_refused_and_does_not_crash_its_drones_in_silence(wrap):
     env = HoveringEnv(num_envs=20)
     env = TransformedEnv(env, StepCounter()) if wrap else env
     actor = make_actor(env)
@@ -257,7 +257,7 @@ def test_a_horizon_is_a_number_of_steps(env, horizon):
 
 
 @pytest.mark.parametrize("key", ["obs", ("state", "speed")])
-def test_an_actor_that_reads_what_nobody_writes_is_told_what_there_is(env, key):
+def test_an_actor_that_reads_what_nobody_writes_is_refused_with_what_there_is(env, key):
     message = "The actor reads .*, which is not in the tensordict .* env.reset.. writes: .*'state', 'position'"
     for some in (env, TransformedEnv(env, StepCounter())):
         with pytest.raises(ValueError, match=message):

@@ -329,7 +329,7 @@ def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):
         ({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": 0}, "gate_radius must be a positive number"),
     ],
 )
-def test_a_track_that_is_none_is_refused(track, message):
+def test_a_track_that_nobody_can_fly_is_refused(track, message):
     with pytest.raises(ValueError, match=message):
         RacingEnv(num_envs=1, track=track)
 

@@ -248,7 +248,9 @@ def test_random_starts_tilt_turn_and_push_within_their_bounds():
         ({"observation_noise": {"delay": 1}}, "observation_noise: unknown key 'delay'"),
         ({"observation_noise": {"position": -1.0}}, "observation_noise: position must be zero or positive"),
         ({"observation_delay": -1}, "observation_delay must be zero or more control steps, got -1"),
+        ({"observation_delay": 10**7}, "observation_delay must be at most 1,000, got 10000000"),
         ({"random_start": {"tilt": float("nan")}}, "random_start: tilt must be zero or positive"),
+        ({"random_start": {"velocity": 1e9}}, "random_start: velocity must be at most 300, got 1000000000.0"),
     ],
 )
 def test_bad_options_say_what_is_allowed(kwargs, message):
@@ -314,6 +316,8 @@ def test_disturbances_of_one_s_own_fly_in_every_task_and_are_restored_with_the_s
 
 
 def test_what_is_not_a_disturbance_is_refused():
+    with pytest.raises(TypeError, match="disturbances must be a list of Disturbance, got GyroBias"):
+        HoveringEnv(num_envs=1, disturbances=GyroBias())
     with pytest.raises(TypeError, match="disturbances: each must be a Disturbance, got GyroBiases"):
         HoveringEnv(num_envs=1, disturbances=[type("GyroBiases", (), {})()])
     sag = own()[1]

@@ -105,7 +105,7 @@ class GymVectorEnv(VectorEnv):
         env, over, info = self.torchrl_env, self._over, {}
         actions = _checked(actions, self.action_space.shape)
         if self._now is None:
-            raise ResetNeeded("A step needs an episode to stand in: call reset() first.")
+            raise ResetNeeded("A step needs an episode: call reset() first.")
         if self.autoreset_mode is AutoresetMode.DISABLED and over.any():
             raise ResetNeeded(
                 f"The episodes of drones {np.flatnonzero(over).tolist()} have ended. Call reset() before the next "
@@ -144,10 +144,12 @@ class GymVectorEnv(VectorEnv):
         self.torchrl_env.close()
 
     def _restart(self, mask: np.ndarray) -> None:
-        fresh = self.torchrl_env.reset()
-        keep = self._now is not None and not mask.all()
-        self._now = fresh.where(torch.as_tensor(mask, device=self.torchrl_env.device), self._now) if keep else fresh
-        self.torchrl_env._see(self._now["state"])  # where the others are, too: the reset was that of all drones
+        """Begin anew with the drones of the mask, as a rollout does where their episodes end."""
+        start = None
+        if self._now is not None:
+            chosen = torch.as_tensor(mask, device=self.torchrl_env.device).unsqueeze(-1)
+            start = self._now.exclude("action").set("_reset", chosen)
+        self._now = self.torchrl_env.reset(start, set_state=False)
         self._over = self._over & ~mask
 
     def _final(self, after: Any) -> dict[str, Any]:
@@ -200,8 +202,8 @@ class GymEnv(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Fly one control step with an action (4)."""
-        observation, *told, info = self._drones.step(_checked(action, self.action_space.shape)[None])
-        return observation[0], *(x.item() for x in told), _first(info)
+        observation, *ends, info = self._drones.step(_checked(action, self.action_space.shape)[None])
+        return observation[0], *(x.item() for x in ends), _first(info)
 
     def render(self) -> np.ndarray | None:
         """A picture (336, 336, 3), uint8; None without ``render_mode="rgb_array"``."""
@@ -231,8 +233,8 @@ def _checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
 # What is handed out is copied: the next step starts from the same memory.
 
 
-def _observation(told: Any) -> np.ndarray:
-    return np.array(told["observation"].numpy(force=True), dtype=np.float32)
+def _observation(outputs: Any) -> np.ndarray:
+    return np.array(outputs["observation"].numpy(force=True), dtype=np.float32)
 
 
 def _array(x: torch.Tensor) -> np.ndarray:
@@ -240,7 +242,7 @@ def _array(x: torch.Tensor) -> np.ndarray:
     return np.array(x.squeeze(-1).numpy(force=True), dtype=bool if x.dtype is torch.bool else np.float64)
 
 
-def _info(told: Any, mask: np.ndarray) -> dict[str, Any]:
+def _info(outputs: Any, mask: np.ndarray) -> dict[str, Any]:
     """Gymnasium's info of the drones under the mask (n), of others zeros."""
 
     def masked(entries: Any) -> dict[str, Any]:
@@ -250,10 +252,10 @@ def _info(told: Any, mask: np.ndarray) -> dict[str, Any]:
             info[f"_{name}"] = mask.copy()
         return info
 
-    return masked({name: told[name] for name in _INFO if name in told.keys()})  # noqa: SIM118, a tensordict
+    return masked({name: outputs[name] for name in _INFO if name in outputs.keys()})  # noqa: SIM118, a tensordict
 
 
 def _first(info: dict[str, Any]) -> dict[str, Any]:
-    """The info of the first drone, as a single environment tells it."""
-    told = {name: x for name, x in info.items() if not name.startswith("_")}
-    return {name: _first(x) if isinstance(x, dict) else x[0].item() for name, x in told.items()}
+    """The info of the first drone, as a single environment gives it."""
+    own = {name: x for name, x in info.items() if not name.startswith("_")}
+    return {name: _first(x) if isinstance(x, dict) else x[0].item() for name, x in own.items()}

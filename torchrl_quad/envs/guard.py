@@ -34,7 +34,9 @@ class Guard:
     def __init__(self, safe_state: State, dynamics: Dynamics, task_entries: list[Any]) -> None:
         self.safe_state, self.task_entries = safe_state, task_entries
         self.bounds = {key: _bounds(key, x, dynamics) for key, x in safe_state.items() if x.is_floating_point()}
-        self.low, self.high = (torch.cat(x, 1) for x in zip(*self.bounds.values(), strict=True))
+        n = max(len(low) for low, _ in self.bounds.values())
+        bounds = zip(*self.bounds.values(), strict=True)
+        self.low, self.high = (torch.cat([x.expand(n, -1) for x in side], 1) for side in bounds)
         self.widths = [low.shape[1] for low, _ in self.bounds.values()]
 
     def __call__(self, state: State) -> tuple[State, Tensor]:
@@ -63,7 +65,7 @@ class Guard:
         """What is wrong with a state, in words, and where it is wrong, bool (n)."""
         found = {}
         for key, inside in self._inside(state).items():
-            low, high = (x.flatten()[0].item() for x in self.bounds[key])
+            low, high = (x.min().item() for x in self.bounds[key])
             found[f"{key!r} must be finite and between {low:.4g} and {high:.4g}"] = ~inside.all(1)
         found["'quaternion' must have unit norm"] = ~self._is_unit(state["quaternion"])
         return found

@@ -53,10 +53,12 @@ class ControlStep:
         queue = torch.cat((state["action_queue"], action.unsqueeze(1)), 1)
         return {**state, "action_queue": queue[:, 1:]}, queue[:, 0], valid
 
-    def plant_params(self, params: QuadrotorParams, state: State) -> Any:
+    def plant_params(self, params: QuadrotorParams | RawParams, state: State) -> Any:
         """The parameters of the drones that fly: those given, with what each episode has drawn."""
         drawn = {name: state["drone", name] for name in self.drawn}
-        return RawParams(**{**params.fields(), **drawn}) if drawn else params
+        if not drawn:
+            return params
+        return RawParams(**{**(params._asdict() if isinstance(params, RawParams) else params.fields()), **drawn})
 
     def apply_disturbances(self, state: State, noise: dict[str, Tensor]) -> State:
         """The state with what wind, sensors and so on have made of it in this step."""

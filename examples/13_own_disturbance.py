@@ -1,4 +1,4 @@
-"""A disturbance of your own is one class: a battery that runs down, and thrust that goes with its voltage."""
+"""Write a disturbance as one class: a battery that runs down, and thrust that falls with its voltage."""
 # ruff: noqa: D102, the docstrings of the methods are in Disturbance
 
 import torch

@@ -1,4 +1,4 @@
-"""A dynamics model of your own is one class: a drone whose autopilot follows velocity commands."""
+"""Write a dynamics model as one class: a drone whose autopilot follows velocity commands."""
 # ruff: noqa: D102, the docstrings of the methods are in Dynamics
 
 import torch

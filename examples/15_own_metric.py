@@ -1,4 +1,4 @@
-"""A metric of your own: the energy of a flight and its tilt, measured, summed up and drawn like those that ship."""
+"""Measure the energy and the tilt of a flight, and print and draw them like the metrics that ship."""
 
 import math
 

@@ -1,7 +1,7 @@
 """The documentation site: ``make docs`` builds it from the Markdown files of the repository and the docstrings.
 
-The source directory is the repository, not this folder. So each page is read from its own place (recipes/README.md among
-the recipes), and a link from file to file works on GitHub as it does on the site.
+The source directory is the repository, not this folder. So each page is read from its own place, recipes/README.md among
+the recipes, and a link from file to file works on GitHub as it does on the site.
 """
 
 import ast
@@ -38,7 +38,8 @@ napoleon_use_rtype = False  # "Returns:" is a sentence here; its types are in th
 nitpick_ignore_regex = [
     (r"py:.*", r"(torch|torchrl|tensordict|gymnasium|numpy|np)\..*"),
     (r"py:.*", r"(collections\.abc|pathlib|dataclasses|enum)\..*"),
-    (r"py:class", r"TensorDictBase|Vector"),  # in annotations of attributes, which keep the name alone
+    (r"py:class", r"Path|State|Tensor|TensorDictBase|Vector"),  # in annotations that keep the name alone
+    (r"py:class", r"torchrl_quad\.engine\.\w+\.(Rows|Layout|Record|Source)"),  # the engine's own
     (r"py:(exc|class|obj)", r"[A-Z][A-Za-z]*Error|ResetNeeded|None|bool|dict|float|int|list|str|tuple|type"),
 ]
 

@@ -53,7 +53,7 @@ def mean_return(env, actor):
 for learn in (ppo, sac):
     torch.manual_seed(0)
     env = HoveringEnv(num_envs=128)
-    actor = make_actor(env, action_init=torch.zeros(4), scale_init=0.3, return_log_prob=True)  # knows nothing of hovering
+    actor = make_actor(env, action_init=torch.zeros(4), scale_init=0.3, return_log_prob=True)  # knows no hovering
     print(f"{learn.__name__}: mean return {mean_return(env, actor):.2f} before")
     learn(env, actor)
     print(f"{learn.__name__}: mean return {mean_return(env, actor):.2f} after")

@@ -4,7 +4,7 @@
 import torch
 
 from torchrl_quad import HoveringEnv, load_drone
-from torchrl_quad.envs.disturbances import Disturbance
+from torchrl_quad.envs import Disturbance
 
 STEPS = 256
 

@@ -20,7 +20,7 @@ from test_recipes import RECIPES, ROOT, SMALL, run
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
 PAGES += sorted(ROOT.glob("docs/*.md"))
-PUBLIC = [f"torchrl_quad{part}" for part in ("", ".data", ".dynamics", ".envs", ".modules", ".objectives", ".render")]
+PUBLIC = [f"torchrl_quad{part}" for part in ("", ".data", ".dynamics", ".engine", ".envs", ".modules", ".objectives", ".render")]
 # What stands in blocks beside python and bash: no code, data, and Sphinx's directives, but for those that hold code.
 NOT_RUN = re.compile(r"(|text|yaml|\{(?!code|sourcecode)[\w-]+\}.*)")
 

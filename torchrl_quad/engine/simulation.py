@@ -14,7 +14,7 @@ class Transition(NamedTuple):
 
     state: State  #: the state at its end
     outputs: State  #: observation, reward, flags and so on
-    valid: Tensor  #: bool (n): False where the numbers became meaningless; no gradient passes through those
+    valid: Tensor  #: bool (n), False where the numbers became meaningless; no gradient passes through those
 
 
 class Simulation(Protocol):

@@ -182,7 +182,7 @@ class QuadrotorEnv(Task, EnvBase):
 
     @property
     def neutral_action(self) -> Tensor:
-        """The action that a policy starts from: hovering."""
+        """The action that a new policy starts from, which hovers."""
         return self.hover_action
 
     def random_state(self) -> dict[str, Any]:

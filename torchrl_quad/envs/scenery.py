@@ -46,7 +46,7 @@ class Metric:
         return " ".join(filter(None, (number, self.unit, "(median)" if self.median else "")))
 
 
-#: The metrics that every task has; a task adds its own: ``metric_info = {**EPISODE_METRICS, "lap_time": Metric(...)}``.
+#: The metrics of every task. A task adds its own by ``metric_info = {**EPISODE_METRICS, "lap_time": Metric(...)}``.
 EPISODE_METRICS: dict[str, Metric] = {
     "return": Metric("return"),
     "solved": Metric("episodes solved", "%", 100.0),

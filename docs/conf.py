@@ -17,7 +17,7 @@ import torchrl_quad
 project = "torchrl_quad"
 version = release = torchrl_quad.__version__
 root_doc = "docs/index"
-include_patterns = ["docs/*.md", "recipes/README.md", "examples/README.md"]
+include_patterns = ["docs/*.md", "recipes/README.md", "examples/README.md", "CONTRIBUTING.md"]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
 
 myst_enable_extensions = ["dollarmath", "substitution"]

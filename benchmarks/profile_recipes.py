@@ -65,8 +65,7 @@ class Clocks:
 
 def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) -> dict[str, float | str]:
     """What each part of a recipe takes; changes the modules that it measures, and so wants a process of its own."""
-    import common
-    import run
+    from training import building, loop
 
     import torchrl_quad
     from torchrl_quad import envs, objectives
@@ -85,17 +84,17 @@ def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) ->
     clocks.around(objectives.pathwise.PathwiseCriticLoss, "write_value_target", "critic")
     clocks.around(torch.optim.Adam, "step", "optimiser")
     clocks.around(torch.nn.utils, "clip_grad_norm_", "optimiser")
-    clocks.around(common, "update_normalizer", "bookkeeping")
-    clocks.around(run.Run, "record", "logging")
+    clocks.around(building, "update_normalizer", "bookkeeping")
+    clocks.around(loop.Run, "record", "logging")
 
     # What is not physics in the backward pass belongs to the network whose optimiser is about to step.
-    descend, iterate = run.Run.descend, run.Run.__iter__
+    optimise, iterate = loop.Run.optimise, loop.Run.__iter__
     total, count = 0.0, 0
 
-    def timed_descend(self, name, *arguments):
+    def timed_optimise(self, name, *arguments):
         clocks.switch(name)
         try:
-            descend(self, name, *arguments)
+            optimise(self, name, *arguments)
         finally:
             clocks.switch(None)
 
@@ -114,7 +113,7 @@ def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) ->
             if count == iterations:
                 return
 
-    run.Run.descend, run.Run.__iter__ = timed_descend, timed_iterations
+    loop.Run.optimise, loop.Run.__iter__ = timed_optimise, timed_iterations
     torchrl_quad.differentiable_rollout = rollouts.differentiable_rollout
     with tempfile.TemporaryDirectory() as folder:
         sys.argv = [algorithm, f"hydra.run.dir={folder}/run", "total_steps=1_000_000_000", *overrides]

@@ -24,7 +24,7 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 
 
 def solve(algorithm: str, seed: int, overrides: list[str], cache: Path) -> float | None:
-    """Seconds to the first row of the metrics that has success >= 0.99, or None."""
+    """Seconds to the first row of the metrics that has solved >= 0.99, or None."""
     with tempfile.TemporaryDirectory() as folder:
         metrics = Path(folder) / "run" / "metrics.csv"
         command = [sys.executable, str(RECIPES / f"{algorithm}.py"), f"seed={seed}", f"hydra.run.dir={metrics.parent}"]
@@ -40,7 +40,7 @@ def solve(algorithm: str, seed: int, overrides: list[str], cache: Path) -> float
                 if metrics.exists():
                     with open(metrics, newline="") as file:
                         rows = list(csv.DictReader(file))
-                    if any(row["eval/success"] and float(row["eval/success"]) >= 0.99 for row in rows):
+                    if any(row["eval/solved"] and float(row["eval/solved"]) >= 0.99 for row in rows):
                         seconds = time.perf_counter() - start
                         run.kill()
                         return seconds

@@ -3,8 +3,9 @@
 python recipes/abpt.py task=hovering seed=0
 """
 
-import hydra
-from common import (
+from omegaconf import DictConfig
+from torchrl.objectives import SoftUpdate
+from training.building import (
     actor_parameters,
     iterations,
     make_optimizer,
@@ -14,14 +15,13 @@ from common import (
     set_up,
     update_normalizer,
 )
-from omegaconf import DictConfig
-from run import Run
-from torchrl.objectives import SoftUpdate
+from training.launch import recipe
+from training.loop import Run
 
 from torchrl_quad import ABPTLoss, VisitedStateBuffer, differentiable_rollout, make_qvalue, restart
 
 
-@hydra.main(config_path="config", config_name="abpt", version_base=None)
+@recipe("abpt")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
     loss = ABPTLoss(actor, make_qvalue(env, **network(cfg, "critic")), **cfg.loss)
@@ -33,21 +33,21 @@ def main(cfg: DictConfig) -> None:
     critic_parameters = loss.qvalue_network_params.parameters()
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
-    parts = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
-    run = Run(cfg, env, actor, loss, parts, buffer)
+    stateful = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
+    run = Run(cfg, env, actor, loss, stateful, buffer)
     for _ in run:
         # The actor: up the N-step and the 0-step return of one horizon, through the dynamics.
         rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         loss_actor, actor_metrics = loss.loss_actor(rollout)
         loss_alpha = actor_metrics.get("loss_alpha", 0.0)
-        run.descend("actor", actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
+        run.optimise("actor", actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
 
         # The critics: towards the TD(lambda) targets of the target networks.
         data = loss.write_value_target(rollout.detach())
         read = data.select(*loss.in_keys, loss.tensor_keys.value_target)
         for batch in minibatches(read, cfg.critic):
             loss_qvalue, critic_metrics = loss.loss_qvalue(batch)
-            run.descend("critic", critic_optimizer, loss_qvalue, cfg.critic.max_grad_norm)
+            run.optimise("critic", critic_optimizer, loss_qvalue, cfg.critic.max_grad_norm)
             target.step()
 
         # The next horizon starts where the policy has been before, and in part afresh.

@@ -3,15 +3,15 @@
 python recipes/bptt.py task=hovering seed=0
 """
 
-import hydra
-from common import actor_parameters, iterations, make_optimizer, set_up, update_normalizer
 from omegaconf import DictConfig
-from run import Run
+from training.building import actor_parameters, iterations, make_optimizer, set_up, update_normalizer
+from training.launch import recipe
+from training.loop import Run
 
 from torchrl_quad import BPTTLoss, differentiable_rollout, restart
 
 
-@hydra.main(config_path="config", config_name="bptt", version_base=None)
+@recipe("bptt")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
     loss = BPTTLoss(actor, **cfg.loss).make_value_estimator(gamma=cfg.gamma)
@@ -22,7 +22,7 @@ def main(cfg: DictConfig) -> None:
         rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         loss_actor, metrics = loss.loss_actor(rollout)
         loss_alpha = metrics.get("loss_alpha", 0.0)
-        run.descend("actor", optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
+        run.optimise("actor", optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
         update_normalizer(env, rollout)
         run.carry = restart(env, end, cfg.restart_fraction)
         schedule.step()

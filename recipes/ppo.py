@@ -3,18 +3,18 @@
 python recipes/ppo.py task=hovering seed=0
 """
 
-import hydra
 import torch
-from common import iterations, make_optimizer, network, set_up, shuffled, update_normalizer
 from omegaconf import DictConfig
-from run import Run
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
+from training.building import iterations, make_optimizer, network, set_up, shuffled, update_normalizer
+from training.launch import recipe
+from training.loop import Run
 
 from torchrl_quad import differentiable_rollout, make_value
 
 
-@hydra.main(config_path="config", config_name="ppo", version_base=None)
+@recipe("ppo")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
     value = make_value(env, **network(cfg, "critic"))
@@ -23,8 +23,8 @@ def main(cfg: DictConfig) -> None:
     actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor.parameters(), iterations(cfg))
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, value.parameters(), iterations(cfg))
 
-    parts = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
-    run = Run(cfg, env, actor, loss, parts)
+    stateful = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
+    run = Run(cfg, env, actor, loss, stateful)
     for _ in run:
         with torch.no_grad():
             data, run.carry = differentiable_rollout(env, actor, run.carry, cfg.horizon)
@@ -34,8 +34,8 @@ def main(cfg: DictConfig) -> None:
             for batch in shuffled(read, cfg.batch_size):
                 losses = loss(batch)
                 loss_actor = losses["loss_objective"] + losses.get("loss_entropy", 0.0)
-                run.descend("actor", actor_optimizer, loss_actor, cfg.actor.max_grad_norm)
-                run.descend("critic", critic_optimizer, losses["loss_critic"], cfg.critic.max_grad_norm)
+                run.optimise("actor", actor_optimizer, loss_actor, cfg.actor.max_grad_norm)
+                run.optimise("critic", critic_optimizer, losses["loss_critic"], cfg.critic.max_grad_norm)
 
         update_normalizer(env, data)
         actor_schedule.step()

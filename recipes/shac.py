@@ -3,8 +3,9 @@
 python recipes/shac.py task=hovering seed=0
 """
 
-import hydra
-from common import (
+from omegaconf import DictConfig
+from torchrl.objectives import SoftUpdate
+from training.building import (
     actor_parameters,
     iterations,
     make_optimizer,
@@ -13,14 +14,13 @@ from common import (
     set_up,
     update_normalizer,
 )
-from omegaconf import DictConfig
-from run import Run
-from torchrl.objectives import SoftUpdate
+from training.launch import recipe
+from training.loop import Run
 
 from torchrl_quad import SHACLoss, differentiable_rollout, make_value, restart
 
 
-@hydra.main(config_path="config", config_name="shac", version_base=None)
+@recipe("shac")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
     loss = SHACLoss(actor, make_value(env, **network(cfg, "critic")), **cfg.loss)
@@ -30,21 +30,21 @@ def main(cfg: DictConfig) -> None:
     critic_parameters = loss.value_network_params.parameters()
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
-    parts = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
-    run = Run(cfg, env, actor, loss, parts)
+    stateful = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
+    run = Run(cfg, env, actor, loss, stateful)
     for _ in run:
         # The actor: up the return of one horizon and the value of its end, through the dynamics.
         rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         loss_actor, actor_metrics = loss.loss_actor(rollout)
         loss_alpha = actor_metrics.get("loss_alpha", 0.0)
-        run.descend("actor", actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
+        run.optimise("actor", actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
 
         # The critic: towards the TD(lambda) targets of the target network.
         data = loss.write_value_target(rollout.detach())
         read = data.select(*loss.in_keys, loss.tensor_keys.value_target)
         for batch in minibatches(read, cfg.critic):
             loss_value, critic_metrics = loss.loss_value(batch)
-            run.descend("critic", critic_optimizer, loss_value, cfg.critic.max_grad_norm)
+            run.optimise("critic", critic_optimizer, loss_value, cfg.critic.max_grad_norm)
             target.step()
 
         update_normalizer(env, rollout)

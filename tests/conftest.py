@@ -44,11 +44,11 @@ def crashing():
 @pytest.fixture
 def launch(monkeypatch, capsys):
     """``python recipes/NAME.py ARGUMENTS``, but in this process, where it starts quicker and parts can be replaced."""
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
     monkeypatch.setenv("WANDB_MODE", "offline")
 
     def launch(name, *arguments):
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, arguments)])
+        monkeypatch.setattr(sys, "argv", [f"recipes/{name}.py", *map(str, arguments)])
         runpy.run_path(str(RECIPES / f"{name}.py"), run_name="__main__")
         return capsys.readouterr().out
 
@@ -56,10 +56,38 @@ def launch(monkeypatch, capsys):
 
 
 @pytest.fixture
+def refused(launch, capsys):
+    """The line in which a recipe ends that is refused, or stopped."""
+
+    def refused(name, *arguments, status=2):
+        with pytest.raises(SystemExit) as exit:
+            launch(name, *arguments)
+        said = capsys.readouterr().err.splitlines()
+        assert exit.value.code == status, said
+        assert not any("Traceback" in line for line in said)
+        return said[-1]
+
+    return refused
+
+
+@pytest.fixture
 def no_pictures(monkeypatch):
     """Runs in this process draw nothing, which is most of what a small one does."""
-    import run
+    from training import drawing
 
-    monkeypatch.setattr(run, "draw_flight", lambda *args: None)
-    monkeypatch.setattr(run, "publish_flight", lambda *args: None)
-    monkeypatch.setattr(run, "plot_learning_curve", lambda metrics, path: path.touch())
+    monkeypatch.setattr(drawing, "draw_flight", lambda *args: None)
+    monkeypatch.setattr(drawing, "publish_flight", lambda *args: None)
+    monkeypatch.setattr(drawing, "draw_learning_curve", lambda metrics, path: path.touch())
+
+
+@pytest.fixture
+def train(launch, no_pictures):
+    """A small run without pictures; its checkpoint."""
+    from small_runs import SMALL
+    from training.checkpoints import read_checkpoint
+
+    def train(recipe, folder, *overrides):
+        launch(recipe, *SMALL, f"hydra.run.dir={folder}", *overrides)
+        return read_checkpoint(folder / "checkpoint.pt")
+
+    return train

@@ -18,15 +18,20 @@ from torchrl_quad.dynamics.vector import (
     clamp,
     greatest,
     is_same,
+    larger,
     least,
     matvec,
-    maximum,
     multiply_add,
+    smaller,
     unbind,
     unbind_rows,
     where_positive,
     where_same,
 )
+
+# Of the controller's tensors, those that each physics step reads.
+_CONSTANTS = ("thrust_min", "thrust_max", "gain", "tiny", "share", "per_share", "middle", "half_span", "yaw_share")
+_CONSTANTS += ("yaw_sign", "yaw_reach")
 
 
 class Setpoint(NamedTuple):
@@ -55,11 +60,13 @@ class FlightController:
         self.gain = nominal.inertia * nominal.rate_gain
         weight = nominal.mass * nominal.gravity
         self.tiny = 1e-6 * weight
-        # What a rotor contributes to collective thrust, and its limits and yaw thrust in units of the collective.
-        self.share = self.mixer[..., 0]
-        self.lowest, self.highest = self.thrust_min / self.share, self.thrust_max / self.share
-        self.reach = self.highest.amin(-1, keepdim=True) - self.lowest.amax(-1, keepdim=True)
-        self.yaw_share = self.mixer[..., 3] / self.share
+        # What a rotor contributes to collective thrust; its limits, and the thrust it has for yaw, in these units.
+        self.share, self.per_share = self.mixer[..., 0], 1.0 / self.mixer[..., 0]
+        lowest, highest = self.thrust_min * self.per_share, self.thrust_max * self.per_share
+        lowest, highest = lowest.amax(-1, keepdim=True), highest.amin(-1, keepdim=True)
+        self.middle, self.half_span = 0.5 * (highest + lowest), 0.5 * (highest - lowest)
+        self.yaw_share = self.mixer[..., 3] * self.per_share
+        self.yaw_sign, self.yaw_reach = self.yaw_share.sign(), self.yaw_share.abs().amax(-1, keepdim=True)
         self.half_range = 0.5 * nominal.max_thrust_to_weight * weight
         self.hover_speed = self.rotors.speed(matvec(self.mixer, pad(weight, (0, 3))))
         self.hover_action = pad(2.0 / nominal.max_thrust_to_weight - 1.0, (0, 3))
@@ -76,7 +83,7 @@ class FlightController:
             }
         )
         apart.rotors, apart.mixer = self.rotors.unbind(), unbind_rows(self.mixer)
-        for name in ("thrust_min", "thrust_max", "gain", "tiny", "share", "lowest", "highest", "reach", "yaw_share"):
+        for name in _CONSTANTS:
             setattr(apart, name, unbind(getattr(self, name), constant=True))
         return apart
 
@@ -115,16 +122,20 @@ class FlightController:
         limited = clamp(thrust, self.thrust_min, self.thrust_max)
         if is_same(limited, thrust):
             return limited
-        # In units of collective thrust: every rotor has its share of it.
+        # In units of collective thrust, of which every rotor has its share; half its range above and below the middle.
         yaw = self.yaw_share * yaw_torque
-        tilt = thrust / self.share - yaw - collective
-        tilt = tilt * (self.reach / maximum(greatest(tilt) - least(tilt), self.tiny)).clamp_max(1.0)
-        level = collective + tilt
-        level = level + greatest(self.lowest - level).clamp_min(0.0) - greatest(level - self.highest).clamp_min(0.0)
-        room = where_positive(yaw, self.highest - level, level - self.lowest)
-        level = level + yaw * least(room / maximum(yaw.abs(), self.tiny)).clamp_min(0.0).clamp_max(1.0)
-        possible = clamp(level * self.share, self.thrust_min, self.thrust_max)
-        return where_same(limited, thrust, possible)
+        tilt = thrust * self.per_share - yaw - collective
+        least_tilt, greatest_tilt = least(tilt), greatest(tilt)
+        shrink = (self.half_span * 2.0 / larger(greatest_tilt - least_tilt, self.tiny)).clamp_max(1.0)
+        highest = self.middle + self.half_span - greatest_tilt * shrink
+        lowest = self.middle - self.half_span - least_tilt * shrink
+        level = larger(smaller(collective, highest), lowest) + tilt * shrink
+        # The rotors that yaw speeds up have room above, the others below.
+        used = (level - self.middle) * self.yaw_sign
+        used = where_positive(yaw_torque, greatest(used), -least(used))
+        yaw_fits = (self.half_span - used) / larger(yaw_torque.abs() * self.yaw_reach, self.tiny)
+        level = level + yaw * yaw_fits.clamp_min(0.0).clamp_max(1.0)
+        return where_same(limited, thrust, clamp(level * self.share, self.thrust_min, self.thrust_max))
 
 
 def _require_hover(nominal: QuadrotorParams, speed: Tensor) -> None:

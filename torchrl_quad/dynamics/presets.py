@@ -7,6 +7,9 @@ from typing import Any
 
 import yaml
 
+MAX_BYTES = 1_000_000  # of a file; the largest that ships with the package has 1 kB
+MAX_DEPTH = 20  # of lists and mappings within each other
+
 
 def names(folder: Traversable) -> list[str]:
     """The presets in a folder of the package."""
@@ -22,7 +25,8 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
         folder: where the package keeps its own; None where it has none.
 
     Raises:
-        ValueError: the name is unknown, or the file is not a YAML mapping.
+        ValueError: the name is unknown, or the file is not a YAML mapping in UTF-8, is larger than 1 MB, is nested more
+            than 20 deep, or uses aliases.
         FileNotFoundError: the path does not exist.
     """
     if isinstance(preset, Mapping):
@@ -37,10 +41,43 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
         raise ValueError(f"Unknown {kind} {preset!r}. {choices} the path of a .yaml file, or a mapping.")
     if not path.is_file():
         raise FileNotFoundError(f"No {kind} file at {path}. {choices} the path of a .yaml file that exists.")
-    try:
-        values = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"{source}: not a YAML file: {error}") from error
+    with path.open("rb") as file:
+        values = parse(file.read(MAX_BYTES + 1), source)
     if not isinstance(values, Mapping):
         raise ValueError(f"{source}: expected a mapping of names to values, got {type(values).__name__}.")
     return source, values
+
+
+def parse(content: bytes, source: str) -> Any:
+    """The content of a YAML file, read in time and memory proportional to its size.
+
+    Aliases are refused, since a file of a few lines can stand for billions of values through them.
+
+    Raises:
+        ValueError: the content is too large, too deep, not in UTF-8, no YAML, or uses an alias.
+    """
+    if len(content) > MAX_BYTES:
+        raise ValueError(
+            f"{source}: has more than {MAX_BYTES:,} bytes, which no file of settings needs. Leave out the rest."
+        )
+    try:
+        text = content.decode()
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{source}: not in UTF-8 (byte {error.start} is {content[error.start]:#04x}). Save it as UTF-8."
+        ) from None
+    depth = 0
+    try:
+        for event in yaml.parse(text, yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):
+                line = event.start_mark.line + 1
+                raise ValueError(f"{source}: line {line} uses the alias *{event.anchor}. Write the values out instead.")
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_DEPTH:
+                raise ValueError(f"{source}: nests more than {MAX_DEPTH} lists or mappings. Write it flatter.")
+    except yaml.YAMLError as error:
+        raise ValueError(f"{source}: not a YAML file: {error}") from error
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError) as error:  # such as the 99th of May
+        raise ValueError(f"{source}: not a YAML file: {error}") from error

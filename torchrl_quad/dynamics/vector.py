@@ -149,12 +149,22 @@ def minimum(a: Vector, b: Vector) -> Vector:
 
 def greatest(x: Vector) -> Vector:
     """The greatest entry, (*, 1)."""
-    return x.amax(-1, keepdim=True) if isinstance(x, Tensor) else Components([_reduce(torch.maximum, x.components)])
+    return x.amax(-1, keepdim=True) if isinstance(x, Tensor) else _reduce(larger, x)
 
 
 def least(x: Vector) -> Vector:
     """The least entry, (*, 1)."""
-    return x.amin(-1, keepdim=True) if isinstance(x, Tensor) else Components([_reduce(torch.minimum, x.components)])
+    return x.amin(-1, keepdim=True) if isinstance(x, Tensor) else _reduce(smaller, x)
+
+
+def larger(a: Vector, b: Vector) -> Vector:
+    """The greater, entry by entry, as :func:`maximum`; its derivative costs a compiled step less."""
+    return torch.maximum(a, b) if isinstance(a, Tensor) else _each(lambda x, y: torch.where(x > y, x, y), a, b)
+
+
+def smaller(a: Vector, b: Vector) -> Vector:
+    """The smaller, entry by entry, as :func:`minimum`; its derivative costs a compiled step less."""
+    return torch.minimum(a, b) if isinstance(a, Tensor) else _each(lambda x, y: torch.where(x < y, x, y), a, b)
 
 
 def where_positive(condition: Vector, a: Vector, b: Vector) -> Vector:
@@ -176,12 +186,12 @@ def where_same(a: Vector, b: Vector, other: Vector) -> Vector:
     """b (*, k) for those drones whose entries all equal those of a, the other for the rest."""
     if isinstance(a, Tensor):
         return torch.where((a == b).all(-1, keepdim=True), b, other)
-    same = _reduce(torch.logical_and, [x == y for x, y in zip(a.components, b.components, strict=True)])
+    same = functools.reduce(operator.and_, (x == y for x, y in zip(a.components, b.components, strict=True)))
     return Components([torch.where(same, x, y) for x, y in zip(b.components, other.components, strict=True)])
 
 
-def _reduce(function: Callable, values: Sequence[Component]) -> Component:
-    return functools.reduce(function, values)
+def _reduce(function: Callable, x: Components) -> Components:
+    return functools.reduce(function, (Components([entry]) for entry in x.components))
 
 
 def _each(function: Callable, a: Components, b: Components | float) -> Components:

@@ -151,7 +151,8 @@ class _Step(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, stepper: Stepper, others, valid, noise, floats, action, *parameters):
         floats, action, *parameters = (x.detach().contiguous() for x in (floats, action, *parameters))
-        rows = Rows(floats, *others)
+        # The stride of a single row can be anything, and the compiler takes another stride for another kind of input.
+        rows = Rows(floats, *(x.reshape(-1).view(x.shape) for x in others))
         states, record = stepper.compiled.forward(rows, valid, action, tuple(parameters), noise)
         ctx.stepper, ctx.noise = stepper, noise
         ctx.set_materialize_grads(False)

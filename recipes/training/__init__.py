@@ -1,0 +1,1 @@
+"""Everything around the algorithms: configuration, building, the training loop, logging, checkpoints, pictures."""

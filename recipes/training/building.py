@@ -1,0 +1,103 @@
+"""Building blocks of a recipe: environment, networks, optimisers, minibatches."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torch.optim import lr_scheduler
+from torchrl.envs import EnvBase, TransformedEnv
+
+from torchrl_quad import ObservationNormalizer, make_actor, make_env
+from torchrl_quad.objectives import PathwiseLoss
+from training.processes import cat_all, rank, world_size
+
+SEEDS_PER_RUN = 10_000  # the process of rank r draws from seed + r * this
+
+
+def set_up(cfg: DictConfig) -> tuple[EnvBase, TensorDictModuleBase]:
+    """Seed everything, and build the environment and the policy.
+
+    Under ``torchrun`` each process has environments and random numbers of its own, and networks that start equal.
+    """
+    torch.set_num_threads(cfg.threads)
+    torch.manual_seed(cfg.seed)
+    env = build_env(cfg, cfg.num_envs, own_seed(cfg), compile=cfg.compile)
+    return env, make_policy(cfg, env)
+
+
+def own_seed(cfg: DictConfig) -> int:
+    """The seed of this process."""
+    return cfg.seed + SEEDS_PER_RUN * rank()
+
+
+def build_env(cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = False) -> EnvBase:
+    """Build the environment of a configuration, with a normaliser if it asks for one."""
+    options = OmegaConf.to_container(cfg.env, resolve=True)
+    env = make_env(cfg.task, num_envs=num_envs, device=cfg.device, seed=seed, compile=compile, **options)
+    return TransformedEnv(env, ObservationNormalizer(env)) if cfg.normalize else env
+
+
+def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModuleBase:
+    """Build the policy of a configuration; it writes log-probabilities if the loss needs them."""
+    log_prob = cfg.algorithm == "ppo" or cfg.loss.alpha != 0
+    return make_actor(env, **network(cfg, "actor"), scale_init=cfg.actor.scale_init, return_log_prob=log_prob)
+
+
+def network(cfg: DictConfig, name: str) -> dict[str, Any]:
+    """The options of a network as keywords of ``make_actor``, ``make_value`` and ``make_qvalue``."""
+    section = cfg[name]
+    scale = 1.0 if cfg.normalize else section.input_scale
+    activation = getattr(nn, section.activation)
+    return {"num_cells": list(section.num_cells), "activation": activation, "input_scale": scale}
+
+
+def actor_parameters(loss: PathwiseLoss) -> list[nn.Parameter]:
+    """The policy's parameters, and the entropy coefficient if it is learned."""
+    return [*loss.actor_network_params.parameters(), *([loss.log_alpha] if loss.automatic_alpha else [])]
+
+
+def iterations(cfg: DictConfig) -> int:
+    """Rollouts in a run: as many as fit into ``total_steps``, and at least one."""
+    return max(cfg.total_steps // (cfg.num_envs * cfg.horizon * world_size()), 1)
+
+
+def make_optimizer(
+    cfg: DictConfig, parameters: Iterable[nn.Parameter], iterations: int
+) -> tuple[torch.optim.Adam, lr_scheduler.LRScheduler]:
+    """Build Adam, and the schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run."""
+    optimizer = torch.optim.Adam(parameters, cfg.lr, betas=tuple(cfg.betas))
+    last, decay = max(iterations - 1, 1), cfg.final_lr / cfg.lr
+    factor = {  # a function of the finished share of the run, so that a run can be resumed and made longer
+        "constant": lambda share: 1.0,
+        "linear": lambda share: 1.0 + share * (decay - 1.0),
+        "exponential": lambda share: decay**share,
+        "cosine": lambda share: decay + (1.0 - decay) * 0.5 * (1.0 + math.cos(math.pi * share)),
+    }[cfg.schedule]
+    return optimizer, lr_scheduler.LambdaLR(optimizer, lambda iteration: factor(min(iteration / last, 1.0)))
+
+
+def update_normalizer(env: EnvBase, rollout: TensorDictBase) -> None:
+    """Update the normaliser, if there is one, with the observations of a horizon from all processes."""
+    if isinstance(env, TransformedEnv):
+        seen = cat_all(rollout["next", "observation"].detach())
+        env.transform.update(TensorDict({("next", "observation"): seen}))
+
+
+def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDictBase]:
+    """``cfg.updates`` random batches of ``cfg.batch_size`` steps from a rollout."""
+    steps = rollout.reshape(-1)
+    for _ in range(cfg.updates):
+        yield steps[torch.randint(len(steps), (cfg.batch_size,), device=steps.device)]
+
+
+def shuffled(rollout: TensorDictBase, batch_size: int) -> Iterable[TensorDictBase]:
+    """All steps of a rollout once, in random batches."""
+    steps = rollout.reshape(-1)
+    return steps[torch.randperm(len(steps), device=steps.device)].split(batch_size)

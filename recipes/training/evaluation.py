@@ -1,0 +1,125 @@
+"""Evaluation: one episode of the deterministic policy from a fresh start in every environment."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType
+
+from torchrl_quad import differentiable_rollout
+from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.envs.scenery import describe_metric
+from torchrl_quad.files import replacing
+from training.building import build_env, make_policy
+from training.checkpoints import read_checkpoint
+
+
+def evaluate(env: EnvBase, actor: TensorDictModuleBase) -> tuple[dict[str, float], TensorDictBase]:
+    """Fly one episode in every environment.
+
+    Returns:
+        the metrics by name, each the mean over the episodes that have one (the median if the task asks for it), and the
+        flight.
+    """
+    with torch.no_grad():
+        flight, _ = differentiable_rollout(
+            env, actor, None, env.max_episode_steps, exploration_type=ExplorationType.DETERMINISTIC
+        )
+    metrics = {
+        f"eval/{name}": describe_metric(name, env.metric_info).summarise(values)
+        for name, values in env.episode_metrics(flight).items()
+    }
+    first = first_episode(flight)
+    for name, term in flight["next", "reward_terms"].items():
+        metrics[f"reward/{name}"] = (term * first).sum(1).mean().item()
+    return metrics, flight
+
+
+@contextlib.contextmanager
+def drawing_from(env: EnvBase, seed: int) -> Iterator[None]:
+    """Let the environment draw from a seed for a while; afterwards it goes on as if it had drawn nothing."""
+    state = env.random_state()
+    env.set_seed(seed)
+    try:
+        yield
+    finally:
+        env.set_random_state(state)
+
+
+def final_evaluation(
+    cfg: DictConfig,
+    actor: TensorDictModuleBase,
+    normalizer: dict[str, Tensor] | None,
+    episodes: int = 256,
+    seed: int = 2_000_000,
+) -> tuple[dict[str, Any], TensorDictBase]:
+    """Fly a policy over fresh episodes, side by side, from starts drawn with the seed: a summary, and the flight."""
+    env = build_env(cfg, episodes, seed)
+    if normalizer is not None:
+        env.transform.load_state_dict(normalizer)
+    metrics, flight = evaluate(env, actor)
+    summary = {"task": cfg.task, "algorithm": cfg.algorithm, "seed": cfg.seed, "episodes": episodes}
+    return summary | {name.removeprefix("eval/"): v for name, v in metrics.items() if name.startswith("eval/")}, flight
+
+
+def best_policy(
+    cfg: DictConfig, best: Mapping[str, Any], source: Path
+) -> tuple[TensorDictModuleBase, dict[str, Tensor] | None]:
+    """Build the best policy of a run from its weights, with the state of its normaliser if it has one.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if "actor" not in best:
+        raise ValueError(
+            f"{source} holds no policy: the run stopped before its first evaluation, or no return was finite. Train "
+            "longer, or with a lower learning rate."
+        )
+    actor = make_policy(cfg, build_env(cfg, 1, 0))
+    actor.load_state_dict(best["actor"])
+    return actor, best.get("normalizer")
+
+
+def load_policy(
+    checkpoint: Path, device: str = "cpu"
+) -> tuple[DictConfig, TensorDictModuleBase, dict[str, Tensor] | None]:
+    """Read the configuration, the best policy, and the state of its normaliser if it has one, from a checkpoint.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is not a checkpoint that these recipes can read, or holds no policy.
+    """
+    saved = read_checkpoint(checkpoint)
+    cfg = OmegaConf.create(saved["config"])
+    cfg.device = device
+    return cfg, *best_policy(cfg, saved["best"], checkpoint)
+
+
+def write_summary(path: Path, summary: Mapping[str, Any]) -> None:
+    """Write a summary as JSON; what is not a number becomes null."""
+    content = {key: None if isinstance(x, float) and math.isnan(x) else x for key, x in summary.items()}
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def print_summary(summary: Mapping[str, Any], metric_info: Mapping[str, Any], folder: Path) -> None:
+    """Print how well the policy flies, and where the results are."""
+    run = f"{summary['algorithm']} on {summary['task']}, seed {summary['seed']}"
+    print(f"\n{run}, {summary['episodes']} fresh episodes:")
+    for name, metric in metric_info.items():
+        if not math.isnan(summary.get(name, math.nan)):
+            print(f"  {metric.label:22s}{metric.format(summary[name])}")
+    if "seconds" in summary:
+        print(f"  {'training':22s}{summary['steps']:,} steps in {summary['seconds']:.1f} s")
+    print(f"  {'results in':22s}{folder}")

@@ -1,0 +1,170 @@
+"""How a recipe starts and ends: its configuration is checked, its folder is locked, its errors end in one line."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import functools
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import hydra
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig, read_write
+from omegaconf.errors import OmegaConfBaseException
+
+import torchrl_quad
+from torchrl_quad.dynamics import presets
+from training.checkpoints import take_over
+from training.folders import own_folder
+from training.processes import from_the_first, joined, rank
+from training.schema import check
+
+RECIPES = Path(__file__).parents[1]
+OURS = (str(RECIPES), str(Path(torchrl_quad.__file__).parent))
+FOLDER_SETTINGS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
+EXPECTED = (ValueError, TypeError, OSError, ImportError, FloatingPointError, OmegaConfBaseException)
+
+
+class Refused(BaseException):
+    """An error that its message explains: no traceback is needed. Hydra lets it pass, since it is no Exception."""
+
+
+class RefusedInSweep(Exception):
+    """The same in one run of a sweep: hydra reports it when the others have ended."""
+
+
+class Stopped(KeyboardInterrupt):
+    """Ctrl-C, with a message that says how to go on."""
+
+
+class CheckBeforeFolder(Callback):
+    """Checks the configuration of a single run before hydra makes its folder; common.yaml names it."""
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Refuse what the schema refuses."""
+        try:
+            check(config)
+        except ValueError as error:
+            raise Refused(str(error)) from error
+
+
+def recipe(config: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    """Make a program of ``main(cfg)``, with the configuration ``config/NAME.yaml`` and hydra's command line.
+
+    Errors that have an explanation end in one line and exit status 2, Ctrl-C in one line and 130; with
+    ``HYDRA_FULL_ERROR=1`` in a traceback. While a training recipe runs, it alone writes into its folder,
+    ``HydraConfig.get().runtime.output_dir``.
+    """
+
+    def decorate(main: Callable[[DictConfig], None]) -> Callable[[], None]:
+        @hydra.main(config_path=str(RECIPES / "config"), config_name=config, version_base=None)
+        @functools.wraps(main)
+        def job(cfg: DictConfig) -> None:
+            try:
+                with _explained():
+                    check(cfg)
+                    if "algorithm" not in cfg:
+                        main(cfg)
+                        return
+                    with joined(cfg), _run_folder(cfg.resume) as folder, _resumable(folder):
+                        take_over(cfg, folder)
+                        main(cfg)
+            except Refused as error:
+                if HydraConfig.get().mode == RunMode.MULTIRUN:
+                    raise RefusedInSweep(str(error)) from error
+                raise
+
+        @functools.wraps(main)
+        def program() -> None:
+            full = os.environ.get("HYDRA_FULL_ERROR", "0") not in ("", "0")
+            os.environ["HYDRA_FULL_ERROR"] = "1"  # hydra then leaves all exceptions to us
+            try:
+                for path in sorted((RECIPES / "config").rglob("*.yaml")):
+                    with _explained():
+                        presets.parse(path.read_bytes(), str(path))
+                job()
+            except (Refused, RefusedInSweep, HydraException, RecursionError, yaml.YAMLError) as error:
+                _end(error, 2, full)
+            except KeyboardInterrupt as error:
+                _end(error if str(error) else Stopped("Stopped. What is finished is kept."), 130, full)
+            finally:
+                os.environ["HYDRA_FULL_ERROR"] = str(int(full))
+
+        return program
+
+    return decorate
+
+
+def _end(error: BaseException, status: int, full: bool) -> None:
+    """Say in one line what went wrong, and exit."""
+    if full:
+        raise error
+    said = str(error).splitlines() or [repr(error)]
+    if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
+        said += str(error.__cause__).splitlines()[:1]
+    if isinstance(error, RecursionError):
+        said = ["the command line nests too many lists or mappings: give the path of a YAML file instead."]
+    message = " ".join(line.strip() for line in said if line.strip())
+    print(message if status == 130 else f"Error: {message}", file=sys.stderr)
+    raise SystemExit(status) from None
+
+
+@contextlib.contextmanager
+def _explained() -> Iterator[None]:
+    """Turn the errors that recipes and library raise themselves into refusals; other errors keep their traceback."""
+    try:
+        yield
+    except EXPECTED as error:
+        where = traceback.extract_tb(error.__traceback__)[-1].filename
+        if where.startswith(OURS) or isinstance(error, (OSError, OmegaConfBaseException)):
+            raise Refused(str(error)) from error
+        raise
+
+
+@contextlib.contextmanager
+def _run_folder(resume: str | None) -> Iterator[Path]:
+    """Hold the folder of this run, the same for all processes that train together.
+
+    That is the checkpoint's if one is named, otherwise the one that hydra has made; or one beside it, if another run
+    has got hydra's and the user has not named it.
+    """
+    hydra_config = HydraConfig.instance().cfg.hydra
+    made = Path(hydra_config.runtime.output_dir)
+    goes_on = resume not in (None, "auto")
+    named = goes_on or any(x.lstrip("+").startswith(FOLDER_SETTINGS) for x in hydra_config.overrides.hydra)
+    with contextlib.ExitStack() as stack:
+        folder = Path(resume).resolve().parent if goes_on else made
+        folder = stack.enter_context(own_folder(folder, named)) if rank() == 0 else None
+        folder = from_the_first(folder)
+        if folder != made:
+            with contextlib.suppress(OSError):  # not empty
+                made.rmdir()
+        with read_write(hydra_config):
+            hydra_config.runtime.output_dir = str(folder)
+        yield folder
+
+
+@contextlib.contextmanager
+def _resumable(folder: Path) -> Iterator[None]:
+    """Say how to go on when the run is stopped, or when the disk is full."""
+    checkpoint = folder / "checkpoint.pt"
+    how = f"Go on with: python {sys.argv[0]} resume={checkpoint}"
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        saved = how if checkpoint.exists() else "Nothing was saved yet: the first evaluation writes a checkpoint."
+        raise Stopped(f"Stopped. {saved}") from error
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        saved = f"The last checkpoint is intact. Make room. {how}" if checkpoint.exists() else "Nothing was saved yet."
+        raise Refused(f"the disk is full: {error.filename or folder}. {saved}") from error

@@ -1,0 +1,317 @@
+"""The training loop: it counts, evaluates, saves, and goes on after a stop."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+import torchrl_quad
+from torchrl_quad import (
+    VisitedStateBuffer,
+    audit_reward,
+    compare_gradients,
+    differentiable_rollout,
+    gradient_statistics,
+)
+from torchrl_quad.files import replacing
+from torchrl_quad.objectives import PathwiseLoss
+from training import drawing
+from training.building import iterations, own_seed
+from training.checkpoints import read_checkpoint, revision, write_checkpoint
+from training.evaluation import best_policy, drawing_from, evaluate, final_evaluation, print_summary, write_summary
+from training.logs import Logs
+from training.processes import backward, gather, rank, wait_for_all, world_size
+
+CELL = 0.5  # [m]: train/start_cells counts the cubes of this size in which horizons have started
+
+
+class Run:
+    """A training run: ``for _ in run: ...``, with ``run.carry``, ``run.optimise(...)`` and ``run.record(...)`` in it.
+
+    Evaluates every ``eval.interval`` iterations, and each time writes a row of metrics and a checkpoint. The checkpoint
+    holds all that the run needs to go on exactly as if it had not stopped (``resume=PATH``), and the best policy so
+    far: the one with the greatest return in these evaluations, which is flown at the end from other starts.
+
+    Leaves in the run's folder: ``config.yaml``, ``metrics.csv``, ``checkpoint.pt`` and the one before it,
+    ``summary.json``, ``learning_curve.png``, and the flight as ``flight.png``, ``flight.gif``, ``flight.html`` and
+    ``episode.pdf``.
+
+    The seconds are those of the loop alone, without set-up, compilation, evaluations and checkpoints. Processor seconds
+    count the time in which the threads of this process computed. Of several processes the first evaluates, logs and
+    saves.
+
+    Args:
+        cfg: the configuration.
+        env: the environment.
+        actor: the policy, whose parameters are those of the loss.
+        loss: holds everything that is trained.
+        stateful: optimisers, schedules, and whatever else has a ``state_dict`` that changes in training.
+        buffer: of visited states, if the algorithm has one.
+
+    Raises:
+        ValueError: the checkpoint to resume does not fit.
+
+    Attributes:
+        carry: where the next horizon starts; the algorithm sets it in each iteration.
+    """
+
+    def __init__(
+        self,
+        cfg: DictConfig,
+        env: EnvBase,
+        actor: TensorDictModuleBase,
+        loss: nn.Module,
+        stateful: Sequence[Any],
+        buffer: VisitedStateBuffer | None = None,
+    ) -> None:
+        self.cfg, self.env, self.actor, self.loss, self.buffer = cfg, env, actor, loss, buffer
+        self.stateful = [loss, *stateful, *([env.transform] if cfg.normalize else [])]
+        self.iterations = iterations(cfg)
+        self.steps_per_iteration = cfg.num_envs * cfg.horizon * world_size()
+        self.recorded: dict[str, list[float]] = defaultdict(list)
+        self.starts: list[Tensor] = []  # positions in which the horizons since the last row have started
+        self.rows: list[dict[str, float]] = []  # of metrics.csv
+        self.done, self.seconds, self.processor_seconds, self.skipped = 0, 0.0, 0.0, 0
+        self.best: dict[str, Any] = {"return": -math.inf}
+        self.folder = Path(HydraConfig.get().runtime.output_dir)
+        self.saved: Path | None = None  # the last checkpoint known to be intact
+        self.revision = revision()
+        if world_size() > 1:
+            torch.manual_seed(own_seed(cfg))  # the networks are built, and equal
+        logger_state = None
+        if cfg.resume:
+            logger_state = self._load(Path(cfg.resume))
+        else:
+            self.carry = env.reset()
+        self.is_over = self.done >= self.iterations and (self.folder / "summary.json").exists()
+        if rank() == 0 and not self.is_over:
+            for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
+                (self.folder / name).unlink(missing_ok=True)
+            steps = self.done * self.steps_per_iteration
+            self.logs = Logs(cfg, self.folder, self.revision, self.rows, steps, logger_state)
+            with replacing(self.folder / "config.yaml") as path:
+                OmegaConf.save(cfg, path, resolve=True)
+
+    # -- what the algorithm calls --------------------------------------------------------------------------------------
+
+    def __iter__(self) -> Iterator[int]:
+        if self.is_over:
+            if rank() == 0:
+                print(f"Finished before: {self.folder}")
+            return
+        if self.cfg.compile and self.done < self.iterations:
+            self._warm_up()
+        step = self.steps_per_iteration
+        with tqdm(
+            total=self.iterations * step,
+            initial=self.done * step,
+            unit="step",
+            unit_scale=True,
+            desc=f"{self.cfg.algorithm} {self.cfg.task} {self.cfg.seed}",
+            disable=rank() > 0,
+        ) as bar:
+            for iteration in range(self.done, self.iterations):
+                self.starts.append(self.carry["state", "position"].clone())
+                start, processor_start = time.perf_counter(), time.process_time()
+                yield iteration
+                self.seconds += time.perf_counter() - start
+                self.processor_seconds += time.process_time() - processor_start
+                self.done += 1
+                bar.update(step)
+                if self.done % self.cfg.eval.interval == 0 or self.done == self.iterations:
+                    if rank() == 0:
+                        metrics = self._evaluate()
+                        solved = metrics["eval/solved"]
+                        bar.set_postfix_str(f"return {metrics['eval/return']:.2f}, solved {solved:.0%}")
+                    self.recorded.clear()
+                    self.starts.clear()
+                    self._save(self.folder / "checkpoint.pt")
+        if rank() == 0:
+            self._finish()
+
+    def optimise(self, name: str, optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
+        """Take one step down a loss with its clipped gradient, averaged over all processes; record the norm.
+
+        The step is skipped if the loss or its gradient is not finite.
+
+        Raises:
+            FloatingPointError: more than ``max_skipped`` steps were skipped; the run is saved as it is.
+        """
+        value, norm = backward(loss, optimizer, max_grad_norm)
+        finite = value.isfinite() and norm.isfinite()
+        if finite:
+            self.record(**{f"grad_{name}": norm})
+        else:
+            self.skipped += 1
+            parameters = self.loss.named_parameters()
+            broken = [key for key, p in parameters if p.grad is not None and not p.grad.isfinite().all()]
+            optimizer.zero_grad()  # without gradients a step changes nothing
+        optimizer.step()
+        if finite or self.skipped <= self.cfg.max_skipped:
+            return
+        path = self.folder / "failure.pt"
+        self._save(path)
+        raise FloatingPointError(
+            f"{self.skipped} updates were skipped because their loss or gradient was not finite; the limit is "
+            f"max_skipped={self.cfg.max_skipped}. The last: {name}, iteration {self.done}, loss {value:g}, gradient "
+            f"norm {norm:g}, not finite in {', '.join(broken[:3]) or 'no parameter'}. Networks and the state in which "
+            f'the horizon started are saved: {path}, ["processes"][{rank()}]["carry"]. Look for an infinite derivative '
+            "there, or lower the learning rate; raise max_skipped if the run recovers by itself."
+        )
+
+    def record(self, **metrics: Tensor | float) -> None:
+        """Keep what this iteration measured; a row holds the mean since the row before."""
+        for name, value in metrics.items():
+            group = "grad" if name.startswith("grad_") else "train"
+            self.recorded[f"{group}/{name.removeprefix('grad_')}"].append(
+                float(value.detach()) if isinstance(value, Tensor) else value
+            )
+
+    # -- evaluating ----------------------------------------------------------------------------------------------------
+
+    def _warm_up(self) -> None:
+        """Compile all that the loop will call, before the clock starts; change nothing."""
+        pathwise = isinstance(self.loss, PathwiseLoss)
+        with (
+            torch.random.fork_rng(),
+            drawing_from(self.env, self.cfg.eval.seed),
+            torch.set_grad_enabled(pathwise),
+        ):
+            rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, min(self.cfg.horizon, 2))
+            if pathwise:
+                self.loss.loss_actor(rollout)[0].backward()
+                self.loss.zero_grad()
+
+    def _evaluate(self) -> dict[str, float]:
+        """Fly the policy as it is, and log the result with everything recorded since the last time."""
+        with drawing_from(self.env, self.cfg.eval.seed):
+            metrics, flight = evaluate(self.env, self.actor)
+        steps = self.done * self.steps_per_iteration
+        row = {
+            "iteration": self.done,
+            "steps": steps,
+            "time/seconds": self.seconds,
+            "time/processor_seconds": self.processor_seconds,
+            "time/steps_per_second": steps / self.seconds,
+            **{name: sum(values) / len(values) for name, values in self.recorded.items()},
+            "train/start_cells": len(torch.cat(self.starts).div(CELL).floor().unique(dim=0)),
+            "grad/skipped": self.skipped,
+            **metrics,
+        }
+        if self.cfg.diagnostics and (len(self.rows) + 1) % self.cfg.diagnostics == 0:
+            row |= self._diagnose()
+        self.logs.add(row)
+        every = self.cfg.logger.flight_every
+        if every and len(self.rows) % every == 0 and self.done < self.iterations:  # at the end the best one is drawn
+            drawing.draw_flight(flight, self.folder / "flight", self.cfg.env.control_dt)
+            self.logs.show_flight(steps)
+        if metrics["eval/return"] >= self.best["return"]:
+            policy = {"actor": self.actor, **({"normalizer": self.env.transform} if self.cfg.normalize else {})}
+            weights = {name: copy.deepcopy(module.state_dict()) for name, module in policy.items()}
+            self.best = {"return": metrics["eval/return"], "steps": steps, **weights}
+        return metrics
+
+    def _diagnose(self) -> dict[str, float]:
+        """Measure what reward and gradient of the next horizon are made of; change nothing."""
+        with torch.random.fork_rng(), drawing_from(self.env, self.cfg.eval.seed):
+            rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, self.cfg.horizon)
+            audit = audit_reward(rollout, self.actor, gamma=self.cfg.gamma)
+            metrics = {f"reward/{name}": share for name, share in audit.metrics().items()}
+            if isinstance(self.loss, PathwiseLoss):
+                comparison, statistics = compare_gradients(self.loss, rollout), gradient_statistics(self.loss, rollout)
+                metrics |= {f"grad/{name}": value for name, value in asdict(comparison).items()}
+                metrics |= {"grad/variance": statistics.variance, "grad/signal_to_noise": statistics.signal_to_noise}
+        return metrics
+
+    def _finish(self) -> None:
+        """Fly the best policy from fresh starts, draw it, and write the summary last: it marks the run as finished."""
+        summary, flight = final_evaluation(self.cfg, *best_policy(self.cfg, self.best, self.folder))
+        steps = self.iterations * self.steps_per_iteration
+        summary |= {"steps": steps, "best_steps": self.best["steps"], "seconds": round(self.seconds, 2)}
+        summary |= {"revision": self.revision}
+        drawing.draw_flight(flight, self.folder / "flight", self.cfg.env.control_dt)
+        drawing.publish_flight(flight, self.folder / "episode.pdf", self.folder / "flight.html", self.env)
+        drawing.draw_learning_curve(self.folder / "metrics.csv", self.folder / "learning_curve.png")
+        self.logs.show_flight(steps)
+        self.logs.finish(summary)
+        write_summary(self.folder / "summary.json", summary)
+        print_summary(summary, self.env.metric_info, self.folder)
+
+    # -- stopping and going on -----------------------------------------------------------------------------------------
+
+    def _save(self, path: Path) -> None:
+        """Write all that the run needs to go on, of all processes."""
+        processes = gather(
+            {
+                "torch": torch.get_rng_state(),
+                "cuda": torch.cuda.get_rng_state(self.env.device) if self.env.device.type == "cuda" else None,
+                "env": self.env.random_state(),
+                "carry": self.carry.cpu().to_dict(),
+                "buffer": None if self.buffer is None else self.buffer.state_dict(),
+                "parameters": sum(p.detach().double().sum().item() for p in self.loss.parameters()),
+            }
+        )
+        if len({process["parameters"] for process in processes}) > 1:
+            raise RuntimeError("The parameters of the processes differ: take every step with run.optimise.")
+        if rank() == 0:
+            content = {
+                "version": torchrl_quad.__version__,
+                "revision": self.revision,
+                "config": OmegaConf.to_yaml(self.cfg, resolve=True),
+                "iteration": self.done,
+                "seconds": (self.seconds, self.processor_seconds),
+                "skipped": self.skipped,
+                "rows": self.rows,
+                "best": self.best,
+                "logger": self.logs.state_dict(),
+                "stateful": [x.state_dict() for x in self.stateful],
+                "processes": processes,
+            }
+            is_failure = path.name == "failure.pt"
+            write_checkpoint(path, content, None if is_failure else self.saved)
+            self.saved = self.saved if is_failure else path
+        wait_for_all()  # nobody goes on, or gives up, before the file is there
+
+    def _load(self, path: Path) -> dict[str, Any] | None:
+        """Take everything from a checkpoint, and return the state of the logger.
+
+        Raises:
+            ValueError: it was written by another number of processes.
+        """
+        saved = read_checkpoint(path)
+        if len(saved["processes"]) != world_size():
+            raise ValueError(
+                f"{path} was written by {len(saved['processes'])} processes, and {world_size()} want to go on. Start "
+                "as many as before: torchrun --nproc-per-node=N."
+            )
+        own = saved["processes"][rank()]
+        for x, state in zip(self.stateful, saved["stateful"], strict=True):
+            x.load_state_dict(state)
+        if self.buffer is not None:
+            self.buffer.load_state_dict(own["buffer"])
+        self.carry = TensorDict(own["carry"], self.env.batch_size).to(self.env.device)
+        self.env.set_random_state(own["env"])
+        torch.set_rng_state(own["torch"])
+        if own["cuda"] is not None:
+            torch.cuda.set_rng_state(own["cuda"], self.env.device)
+        self.done, self.skipped = saved["iteration"], saved["skipped"]
+        self.seconds, self.processor_seconds = saved["seconds"]
+        self.rows, self.best, self.saved = saved["rows"], saved["best"], path
+        before = saved["revision"]
+        self.revision = before if self.revision in before else f"{before}, then {self.revision}"
+        return saved["logger"]

@@ -1,0 +1,72 @@
+"""Small training runs, and how to compare them."""
+
+import csv
+
+import torch
+
+from torchrl_quad import BPTTLoss
+
+SMALL = ["num_envs=4", "horizon=6", "total_steps=192", "eval.interval=2", "env.max_episode_steps=30", "compile=false"]
+EVERYTHING = [  # that draws random numbers or keeps a memory
+    "normalize=true",
+    "env.wind={mean: [1, 0, 0], gust: 0.5}",
+    "env.observation_noise={position: 0.01}",
+    "env.observation_delay=1",
+    "env.randomize={mass: {scale: [0.8, 1.2]}}",
+]
+
+
+def rows(folder):
+    """metrics.csv, without the clock."""
+    with open(folder / "metrics.csv", newline="") as file:
+        return [{k: v for k, v in row.items() if not k.startswith("time/")} for row in csv.DictReader(file)]
+
+
+def assert_equal(a, b, path=""):
+    """Bit for bit, in all that a checkpoint holds; only the clock may differ."""
+    assert type(a) is type(b), path
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), path
+        for key in a:
+            if not str(key).startswith(("time/", "seconds", "config")):
+                assert_equal(a[key], b[key], f"{path}/{key}")
+    elif isinstance(a, (list, tuple)):
+        assert len(a) == len(b), path
+        for i, pair in enumerate(zip(a, b, strict=True)):
+            assert_equal(*pair, f"{path}/{i}")
+    elif isinstance(a, torch.Tensor):
+        torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True, msg=path)
+    else:
+        assert a == b or a != a, path
+
+
+def stop_at_save(monkeypatch, number, error=KeyboardInterrupt):
+    """Let a run end with an error when it is about to write its n-th checkpoint."""
+    from training.loop import Run
+
+    save, saves = Run._save, []
+
+    def stop(self, path):
+        saves.append(path)
+        if len(saves) == number:
+            if self.logs.backend is not None:
+                self.logs.backend.flush()
+            raise error
+        save(self, path)
+
+    monkeypatch.setattr(Run, "_save", stop)
+
+
+def poison(monkeypatch, *calls):
+    """Let the loss of BPTT, or only its gradient, be NaN in these calls; None means in all."""
+    count = iter(range(1_000))
+
+    def loss_actor(self, rollout, original=BPTTLoss.loss_actor):
+        loss, metrics = original(self, rollout)
+        call = next(count)
+        if call in calls or None in calls:
+            parameter = next(self.actor_network_params.parameters())
+            loss = loss + (0.0 * parameter).sqrt().sum() if call % 2 else loss * torch.nan
+        return loss, metrics
+
+    monkeypatch.setattr(BPTTLoss, "loss_actor", loss_actor)

@@ -1,0 +1,118 @@
+"""Checkpoints: damage is found before anything is used, and the checkpoint before it is there."""
+
+import errno
+import random
+from pathlib import Path
+
+import pytest
+import torch
+from small_runs import SMALL, poison, stop_at_save
+from training import checkpoints, evaluation
+from training.checkpoints import previous, read_checkpoint, write_checkpoint
+
+
+@pytest.fixture(scope="module")
+def content():
+    torch.manual_seed(0)
+    return {"config": "task: hovering", "best": {"actor": {"weight": torch.randn(40, 40)}}, "version": "0.1"}
+
+
+def test_no_flipped_bit_of_a_checkpoint_goes_unnoticed(content, tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    write_checkpoint(path, content)
+    torch.testing.assert_close(read_checkpoint(path)["best"], content["best"])
+    whole, draw = path.read_bytes(), random.Random(0)
+    positions = [draw.randrange(len(whole)) for _ in range(200)] + list(range(len(whole) - 110, len(whole)))
+    for at in positions:
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << draw.randrange(8)
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"checkpoint\.pt (is damaged|cannot be read)"):
+            read_checkpoint(path)
+
+
+def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(train, refused, launch, tmp_path):
+    straight = train("bptt", tmp_path)
+    path = tmp_path / "checkpoint.pt"
+    damaged = bytearray(path.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    path.write_bytes(damaged)
+    said = refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "resume=auto")
+    assert f"{path} is damaged: its checksum does not fit its content." in said
+    assert said.endswith(f"Go on from the checkpoint before it: resume={tmp_path}/checkpoint.previous.pt")
+    assert read_checkpoint(previous(path))["iteration"] == 6
+    launch("bptt", f"resume={previous(path)}")
+    assert read_checkpoint(path)["iteration"] == 8
+    torch.testing.assert_close(read_checkpoint(path)["best"]["actor"], straight["best"]["actor"], rtol=0, atol=0)
+    assert read_checkpoint(previous(path))["iteration"] == 6  # and not the damaged one
+
+
+def test_a_file_that_is_no_checkpoint_of_this_version_is_named_with_the_reason(content, train, refused, tmp_path):
+    path = tmp_path / "bad.pt"
+
+    def fails(error, match):
+        with pytest.raises(error, match=match):
+            read_checkpoint(path)
+
+    fails(FileNotFoundError, "No checkpoint at .*bad.pt. Train one first")
+    write_checkpoint(path, content)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    fails(ValueError, "bad.pt cannot be read: it is cut off or damaged, or no checkpoint .* There is none before it")
+    path.write_text("hello")
+    fails(ValueError, "bad.pt cannot be read: it is cut off or damaged, or no checkpoint of these recipes")
+    torch.save({"config": Path("anything that is pickled")}, path)
+    fails(ValueError, "anything else could run code, and is not loaded")
+    torch.save({"weights": torch.zeros(1)}, path)
+    fails(ValueError, "bad.pt is not a checkpoint of these recipes. Give the path of a checkpoint.pt.")
+    torch.save({"config": "", "steps": 1}, path)
+    fails(ValueError, "bad.pt has checkpoint format 0, this version reads format 3. It was written by .* or before")
+    torch.save({**content, "format": 2}, path)  # the layout before this one, which had no checksum
+    fails(ValueError, "has checkpoint format 2, .* written by torchrl_quad 0.1 at revision .*: use that version")
+    assert "bad.pt has checkpoint format 2" in refused("evaluate", f"checkpoint={path}")
+    good = train("bptt", tmp_path)
+    write_checkpoint(tmp_path / "checkpoint.pt", {**good, "processes": good["processes"] * 2})
+    said = refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "resume=auto")
+    assert "was written by 2 processes, and 1 want to go on" in said
+
+
+def test_a_full_disk_is_named_and_leaves_the_last_checkpoint_intact(refused, no_pictures, tmp_path, monkeypatch):
+    small = [*SMALL, f"hydra.run.dir={tmp_path}"]
+    full = OSError(errno.ENOSPC, "No space left on device", "checkpoint.pt")
+    with monkeypatch.context() as patch:
+        stop_at_save(patch, 1, full)
+        assert "the disk is full: checkpoint.pt. Nothing was saved yet" in refused("bptt", *small)
+
+    def write_half(path, data, write=Path.write_bytes):
+        write(path, data[: len(data) // 2])
+        raise full
+
+    with monkeypatch.context() as patch:
+        stop_at_save(patch, 3, full)
+        said = refused("bptt", *small)
+    assert "The last checkpoint is intact. Make room. Go on with: python " in said
+    assert said.endswith(f"recipes/bptt.py resume={tmp_path}/checkpoint.pt")
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", write_half)
+        assert "the disk is full" in refused("bptt", *small, "resume=auto")
+    assert (tmp_path / "checkpoint.pt").read_bytes() == before
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_without_hard_links_the_checkpoint_before_is_copied(content, tmp_path, monkeypatch):
+    def fail(*_):
+        raise PermissionError
+
+    path = tmp_path / "checkpoint.pt"
+    write_checkpoint(path, content)
+    monkeypatch.setattr(checkpoints.os, "link", fail)
+    write_checkpoint(path, {**content, "version": "0.2"}, keep=path)
+    assert [read_checkpoint(x)["version"] for x in (path, previous(path))] == ["0.2", "0.1"]
+
+
+def test_a_checkpoint_without_an_evaluated_policy_is_no_policy(refused, no_pictures, tmp_path, monkeypatch):
+    poison(monkeypatch, None)
+    refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "max_skipped=0")
+    with pytest.raises(ValueError, match="failure.pt holds no policy: the run stopped before its first evaluation"):
+        evaluation.load_policy(tmp_path / "failure.pt")

@@ -1,0 +1,171 @@
+"""The schema of the configuration: what is refused, and what is said instead."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from training.schema import Training, check
+
+from torchrl_quad import load_drone
+from torchrl_quad.dynamics import presets
+
+CONFIG = Path(__file__).parent.parent / "recipes/config"
+RECIPES = ["abpt", "bptt", "shac", "ppo"]
+TASKS = ["hovering", "landing", "racing", "tracking"]
+
+REFUSED = [  # of ABPT, unless a recipe is named
+    ("actor.max_grad_norm=-1", "actor.max_grad_norm=-1: it must be greater than 0. Longer gradients are shortened"),
+    ("critic.max_grad_norm=0", "critic.max_grad_norm=0: it must be greater than 0"),
+    ("actor.final_lr=-1", "actor.final_lr=-1: it must be at least 0"),
+    ("actor.lr=0", "actor.lr=0: it must be greater than 0"),
+    ("actor.betas=[0.9]", r"actor.betas=\[0.9\]: it must have at least 2 items, not 1. .* such as \[0.9, 0.999\]"),
+    ("actor.betas=[0.9,1.0]", r"actor.betas\[1\]=1.0: it must be less than 1"),
+    ("actor.num_cells=64", r"actor.num_cells=64: it must be a list. .* or \[64\] for a single layer"),
+    ("actor.num_cells=[64,0]", r"actor.num_cells\[1\]=0: it must be at least 1"),
+    ("actor.activation=functional", "actor.activation=functional: it must be 'CELU', 'ELU', .* or 'Tanh'"),
+    ("actor.schedule=step", "actor.schedule=step: it must be 'constant', 'linear', 'exponential' or 'cosine'"),
+    ("actor.scale_init=abc", "actor.scale_init=abc: it must be a number"),
+    ("critic.lmbda=3", "critic.lmbda=3: it must be at most 1"),
+    ("critic.updates=0", "critic.updates=0: it must be at least 1"),
+    ("critic.batch_size=0", "critic.batch_size=0: it must be at least 1"),
+    ("critic.tau=0", "critic.tau=0: it must be greater than 0"),
+    ("gamma=2", "gamma=2: it must be at most 1. .* 0.99 is usual"),
+    ("gamma=-1", "gamma=-1: it must be at least 0"),
+    ("gamma=nan", "gamma=nan: it must be a finite number"),
+    ("gamma=null", "gamma=null: it must be a number"),
+    ("restart_fraction=5", "restart_fraction=5: it must be at most 1"),
+    ("buffer.fraction=2", "buffer.fraction=2: it must be at most 1. .* null for none"),
+    ("buffer.capacity=0", "buffer.capacity=0: it must be at least 1"),
+    ("eval.interval=-1", "eval.interval=-1: it must be at least 1"),
+    ("eval.interval=0", "eval.interval=0: it must be at least 1. Iterations between evaluations"),
+    ("eval.seed=-1", "eval.seed=-1: it must be at least 0"),
+    ("max_skipped=-1", "max_skipped=-1: it must be at least 0"),
+    ("diagnostics=-1", "diagnostics=-1: it must be at least 0"),
+    ("normalize=5", "normalize=5: it must be true or false"),
+    ("compile=1", "compile=1: it must be true or false"),
+    ("horizon=0", "horizon=0: it must be at least 1"),
+    ("horizon=2.5", "horizon=2.5: it must be a whole number"),
+    ("total_steps=nan", "total_steps=nan: it must be a whole number"),
+    ("total_steps=1e6", "total_steps=1000000.0: it must be a whole number, written 1000000"),
+    ("seed=-1", "seed=-1: it must be at least 0"),
+    ("seed=true", "seed=True: it must be a whole number"),
+    ("threads=0", "threads=0: it must be at least 1"),
+    ("device=gpu", "device=gpu: it must be cpu, cuda, or one of several GPUs"),
+    ("num_envs=100000000", "num_envs=100000000: it must be at most 10000000. .* fit into no memory"),
+    ("env.action_delay=1000000", "env.action_delay=1000000: it must be at most 1000"),
+    ("env.dt=0", "env.dt=0: it must be greater than 0"),
+    ("env=3", "env=3: it must be a section with settings of its own"),
+    ("loss.alpha=never", "loss.alpha=never: it must be a number. .* or auto to learn it"),
+    ("loss.alpha=-1", "loss.alpha=-1: it must be at least 0"),
+    ("logger.backend=csvv", "logger.backend=csvv: it must be 'wandb', 'tensorboard' or 'csv'"),
+    ("logger.flight_every=-1", "logger.flight_every=-1: it must be at least 0"),
+    ("resume=none.pt", "resume=none.pt: it must be the path of a checkpoint.pt that exists, or auto"),
+    ("+gama=0.9", "gama is unknown: .* Look for a misspelling"),
+    ("+actor.rate=0.9", "actor.rate is unknown"),
+    ("ppo loss.clip_epsilon=-1", "loss.clip_epsilon=-1: it must be greater than 0"),
+    ("ppo batch_size=0", "batch_size=0: it must be at least 1"),
+    ("ppo epochs=0", "epochs=0: it must be at least 1"),
+    ("evaluate episodes=0 checkpoint=x", "episodes=0: it must be at least 1"),
+    ("evaluate", "checkpoint is missing: write checkpoint=... on the command line"),
+]
+
+
+def composed(recipe, *overrides):
+    with initialize_config_dir(str(CONFIG), version_base=None):
+        return compose(recipe, overrides=list(overrides))
+
+
+@pytest.mark.parametrize(("words", "message"), REFUSED, ids=[words for words, _ in REFUSED])
+def test_a_setting_out_of_its_range_is_refused_with_what_to_write_instead(words, message):
+    first, *rest = words.split()
+    recipe, overrides = (first, rest) if first in (*RECIPES, "evaluate") else ("abpt", [first, *rest])
+    cfg = composed(recipe, *overrides)
+    with pytest.raises(ValueError, match=message):
+        check(cfg)
+
+
+def test_an_exponential_schedule_does_not_end_at_zero_while_a_linear_one_may():
+    check(composed("abpt", "actor.final_lr=0"))
+    with pytest.raises(ValueError, match="actor: it must have a final_lr above 0 with schedule=exponential"):
+        check(composed("abpt", "actor.final_lr=0", "actor.schedule=exponential"))
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_every_configuration_that_ships_passes_the_schema_with_its_tuned_values(recipe):
+    for task in TASKS:
+        cfg = composed(recipe, f"task={task}")
+        check(cfg)
+        tuned = yaml.safe_load((CONFIG / f"tuned/{recipe}_{task}.yaml").read_text())
+        assert contains(OmegaConf.to_container(cfg), tuned)
+    assert composed(recipe, "task=racing", "horizon=7").horizon == 7
+    check(composed(recipe, "env.weights={velocity: 0}", "env.wind={gust: 0.5}"))
+
+
+def contains(whole, part):
+    if not isinstance(part, dict):
+        return whole == part
+    return all(contains(whole[key], value) for key, value in part.items())
+
+
+def test_every_number_that_ships_has_a_type_and_a_range():
+    def numbers(values, schema, path=()):
+        for name, value in values.items():
+            field = schema.model_fields.get(name)
+            if isinstance(value, dict):
+                kinds = [] if field is None else [field.annotation, *getattr(field.annotation, "__args__", ())]
+                inner = [kind for kind in kinds if hasattr(kind, "model_fields")]
+                if inner:
+                    yield from numbers(value, inner[0], (*path, name))
+            elif isinstance(value, (int, float)) and not isinstance(value, bool):
+                yield ".".join((*path, name)), field
+
+    for recipe in RECIPES:
+        found = dict(numbers(OmegaConf.to_container(composed(recipe), resolve=True), Training))
+        assert len(found) > 20
+        for name, field in found.items():
+            assert field is not None, name
+            assert any(word in repr(field) for word in ("Ge(", "Gt(")), name
+
+
+def test_a_refused_run_leaves_no_folder_and_one_line(refused, tmp_path):
+    line = refused("bptt", "gamma=2", f"hydra.run.dir={tmp_path}/outputs/run")
+    assert line.startswith("Error: gamma=2: it must be at most 1.")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_hydra_refuses_ends_in_one_line_too(refused):
+    assert "Could not override 'nonsense'" in refused("bptt", "nonsense=1")
+    assert "nests too many" in refused("bptt", f"env.randomize={'[' * 600}{']' * 600}")
+
+
+# -- YAML --------------------------------------------------------------------------------------------------------------
+
+ALIASES = "a0: &a0 [1, 1]\n" + "".join(f"a{i + 1}: &a{i + 1} [*a{i}, *a{i}]\n" for i in range(40))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (ALIASES.encode(), "line 2 uses the alias \\*a0. Write the values out instead"),
+        (b"mass: " + b"[" * 5000 + b"]" * 5000, "nests more than 20 lists or mappings"),
+        ("mass: 1  # Größe".encode("latin-1"), "not in UTF-8 .byte 13 is 0xf6.. Save it as UTF-8"),
+        (b"#" * 1_000_001, "has more than 1,000,000 bytes"),
+        (b"mass: 2020-99-99", "not a YAML file: month must be in 1..12"),
+        (b"mass: [1", "not a YAML file"),
+        (b"mass: " + b"9" * 5000, "not a YAML file"),
+    ],
+    ids=["aliases", "deep", "latin-1", "large", "date", "cut off", "long number"],
+)
+def test_a_yaml_file_that_no_setting_needs_is_refused_by_name(content, message, tmp_path):
+    (tmp_path / "mine.yaml").write_bytes(content)
+    with pytest.raises(ValueError, match=f"mine.yaml: {message}"):
+        load_drone(tmp_path / "mine.yaml")
+
+
+def test_the_configuration_files_of_the_recipes_are_read_with_the_same_limits(refused, monkeypatch):
+    read = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: b"a: \xe9" if path.name == "shac.yaml" else read(path))
+    assert "config/shac.yaml: not in UTF-8" in refused("bptt")
+    assert presets.parse(b"a: {b: [1, 2]}", "x") == {"a": {"b": [1, 2]}}

@@ -1,0 +1,128 @@
+"""The folder of a run belongs to it alone, and every run ends with an exit status and a line that says how to go on."""
+
+import fcntl
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from small_runs import SMALL, stop_at_save
+from training.checkpoints import read_checkpoint
+from training.folders import own_folder
+
+from torchrl_quad import BPTTLoss
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_two_runs_of_one_second_get_folders_of_their_own(launch, no_pictures, tmp_path, monkeypatch):
+    moment = datetime(2030, 1, 1)
+    monkeypatch.setattr("hydra.core.utils.datetime", SimpleNamespace(now=lambda: moment))
+    monkeypatch.chdir(tmp_path)
+    hydras = tmp_path / "outputs/hovering/bptt/seed0/2030-01-01_00-00-00"
+    with own_folder(hydras, named=False):  # a run that has just started
+        launch("bptt", *SMALL, "actor.lr=0.01")
+        launch("bptt", *SMALL, "actor.lr=0.02")
+    for name, rate in (("_2", 0.01), ("_3", 0.02)):
+        folder = hydras.with_name(hydras.name + name)
+        checkpoint = read_checkpoint(folder / "checkpoint.pt")
+        assert checkpoint["stateful"][1]["param_groups"][0]["initial_lr"] == rate
+        assert json.loads((folder / "summary.json").read_text())["best_steps"] == checkpoint["best"]["steps"]
+
+
+def test_a_proposed_folder_that_another_run_has_or_had_gets_a_number(tmp_path):
+    proposed = tmp_path / "run"
+    with own_folder(proposed, named=False) as first, own_folder(proposed, named=False) as second:
+        assert (first.name, second.name) == ("run", "run_2")
+        (first / "summary.json").touch()
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]  # the empty one is gone
+    with own_folder(proposed, named=False) as third:
+        assert third.name == "run_2"
+    assert [path.name for path in first.iterdir()] == ["summary.json"]
+
+
+def test_a_named_folder_is_refused_while_its_holder_lives_and_taken_over_when_it_is_dead(tmp_path):
+    with (
+        own_folder(tmp_path, named=True),
+        pytest.raises(FileExistsError, match=rf"{tmp_path} is in use by process {os.getpid()} on .* since \d{{4}}-"),
+        own_folder(tmp_path, named=True),
+    ):
+        pass
+    (tmp_path / "run.lock").write_text("process 123 on another machine since 2020-01-01 00:00:00\n")
+    with own_folder(tmp_path, named=True):
+        assert f"process {os.getpid()}" in (tmp_path / "run.lock").read_text()
+    assert not list(tmp_path.iterdir())
+
+
+def test_of_many_that_want_a_folder_at_once_one_gets_it(tmp_path):
+    def want(_):
+        try:
+            with own_folder(tmp_path, named=True):
+                inside.append(1)
+                most.append(len(inside))
+                time.sleep(0.002)
+                inside.pop()
+        except FileExistsError:
+            return False
+        return True
+
+    inside, most = [], []
+    with ThreadPoolExecutor(8) as pool:
+        got = list(pool.map(want, range(200)))
+    assert max(most) == 1 and 0 < sum(got) <= 200
+
+
+def test_a_file_system_without_locks_is_no_reason_to_stop(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError("No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", fail)
+    with own_folder(tmp_path, named=True) as folder:
+        assert folder == tmp_path
+
+
+# -- how a run ends ----------------------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
+    script = ROOT / "recipes/bptt.py"
+    command = [sys.executable, script, *SMALL, "total_steps=1_000_000", f"hydra.run.dir={tmp_path}"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as run:
+        while not (tmp_path / "checkpoint.pt").exists():
+            assert run.poll() is None, run.stderr.read()
+            time.sleep(0.02)
+        run.send_signal(signal.SIGINT)
+        printed = run.communicate(timeout=60)[1]
+    assert run.returncode == 130
+    assert "Traceback" not in printed
+    assert printed.splitlines()[-1] == f"Stopped. Go on with: python {script} resume={tmp_path}/checkpoint.pt"
+
+
+def test_ctrl_c_before_the_first_checkpoint_says_so(refused, no_pictures, tmp_path, monkeypatch):
+    stop_at_save(monkeypatch, 1)
+    said = refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", status=130)
+    assert said == "Stopped. Nothing was saved yet: the first evaluation writes a checkpoint."
+
+
+def test_what_environment_and_loss_refuse_ends_in_one_line_and_leaves_no_folder(refused, launch, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert refused("bptt", *SMALL, "env.drone=hawk").startswith("Error: Unknown drone 'hawk'. Choose from: crazyflie")
+    assert not list(tmp_path.glob("outputs/hovering/bptt/seed0/*"))
+    assert "Unknown curve 'oval'" in refused("bptt", *SMALL, "task=tracking", "env.curve=oval")
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(BaseException, match="Unknown drone 'hawk'") as error:
+        launch("bptt", *SMALL, "env.drone=hawk")
+    assert isinstance(error.value.__cause__, ValueError)  # the traceback starts where it was raised
+
+
+def test_a_bug_keeps_its_traceback(launch, no_pictures, tmp_path, monkeypatch):
+    monkeypatch.setattr(BPTTLoss, "loss_actor", lambda self, rollout: {}["missing"])
+    with pytest.raises(KeyError, match="missing"):
+        launch("bptt", *SMALL, f"hydra.run.dir={tmp_path}")

@@ -1,0 +1,153 @@
+"""What a run logs, and what it does with numbers that are not finite."""
+
+import csv
+import json
+import struct
+from collections import Counter
+
+import pytest
+import yaml
+from omegaconf import OmegaConf
+from small_runs import EVERYTHING, SMALL, assert_equal, poison, rows, stop_at_save
+from training import loop
+from training.checkpoints import read_checkpoint, revision
+
+
+def test_wandb_gets_configuration_metrics_pictures_films_replay_and_checkpoint(launch, tmp_path):
+    small = [*SMALL, f"hydra.run.dir={tmp_path}"]
+    launch("bptt", *small, "logger.backend=wandb", "logger.flight_every=3")
+    launch("bptt", *small, "resume=auto", "total_steps=240")
+    resumed = read_checkpoint(tmp_path / "checkpoint.pt")
+    logs = sorted(tmp_path.glob("wandb/offline-run-*/*.wandb"))
+    assert len(logs) == 2 and len({log.stem for log in logs}) == 1  # one run, of two parts
+    first, second = (wandb_records(log) for log in logs)
+
+    config = {item.key: json.loads(item.value_json) for item in first["run"][0].run.config.update}
+    assert config["task"] == "hovering" and config["env"]["dt"] == 0.005
+    assert config["revision"] == revision() != "unknown"
+    history = [logged(record) for record in first["history"]]
+    curves = [row for row in history if "eval/return" in row]
+    assert [row["eval/step"] for row in curves] == [48, 96, 144, 192]
+    names = {name for name in rows(tmp_path)[0] if "/" in name} | {
+        f"time/{name}" for name in ("seconds", "processor_seconds", "steps_per_second")
+    }
+    assert names <= set(curves[0])
+    assert {name.split("/")[0] for name in names} == {"train", "eval", "reward", "grad", "time"}
+    assert [row["eval/return"] for row in curves] == [row["eval/return"] for row in resumed["rows"][:4]]
+    # The third evaluation and the final one draw the flight; the page comes with the final one alone.
+    items = [item for record in first["history"] for item in record.history.item]
+    media = [(item.nested_key[0], json.loads(item.value_json)) for item in items if item.nested_key[1:] == ["path"]]
+    kinds = {
+        "eval/flight": (2, b"\x89PNG"),
+        "eval/film": (2, b"GIF89a"),
+        "eval/learning_curve": (1, b"\x89PNG"),
+        "eval/replay": (1, b"<!doctype html>"),
+    }
+    assert Counter(name for name, path in media) == {name: count for name, (count, _) in kinds.items()}
+    for name, path in media:
+        assert (logs[0].parent / "files" / path).read_bytes().startswith(kinds[name][1]), name
+    assert first["artifact"][0].artifact.type == "model"
+    assert [entry.path for entry in first["artifact"][0].artifact.manifest.contents] == ["checkpoint.pt"]
+    assert [logged(r)["eval/step"] for r in second["history"] if "eval/return" in logged(r)] == [240]
+
+
+def wandb_records(path):
+    """What an offline run has kept: chunks in blocks of 32 KiB, each after 4 bytes of checksum, its size, its kind."""
+    from wandb.proto import wandb_internal_pb2
+
+    content, at, data, records = path.read_bytes(), 7, b"", {}
+    while at < len(content):
+        if 32768 - at % 32768 < 7:  # too little for a chunk is left empty
+            at += 32768 - at % 32768
+        size, kind = struct.unpack_from("<HB", content, at + 4)
+        data += content[at + 7 : at + 7 + size]
+        at += 7 + size
+        if kind in (1, 4):  # whole, or the last part
+            record = wandb_internal_pb2.Record.FromString(data)
+            records.setdefault(record.WhichOneof("record_type"), []).append(record)
+            data = b""
+    return records
+
+
+def logged(record):
+    return {item.key or item.nested_key[0]: json.loads(item.value_json) for item in record.history.item}
+
+
+def test_tensorboard_gets_the_names_of_the_csv_and_forgets_what_is_flown_again(train, refused, tmp_path, monkeypatch):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    with monkeypatch.context() as patch:
+        stop_at_save(patch, 3)
+        refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "logger.backend=tensorboard", status=130)
+    train("bptt", tmp_path, "resume=auto")
+    (folder,) = {path.parent for path in tmp_path.glob("**/events.out.tfevents*")}
+    events = EventAccumulator(str(folder)).Reload()
+    with open(tmp_path / "metrics.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert set(events.Tags()["scalars"]) == {name for name in table[0] if "/" in name}
+    for name in events.Tags()["scalars"]:
+        scalars = events.Scalars(name)
+        assert [scalar.step for scalar in scalars] == [48, 96, 144, 192], name
+        assert [scalar.value for scalar in scalars] == pytest.approx([float(row[name]) for row in table]), name
+
+
+@pytest.mark.parametrize("recipe", ["abpt", "bptt", "shac", "ppo"])
+def test_a_run_with_diagnostics_learns_the_same_bit_for_bit_and_logs_them(recipe, train, tmp_path):
+    options = [*EVERYTHING, "task=landing", *(["buffer.capacity=24"] if recipe == "abpt" else [])]
+    plain = train(recipe, tmp_path / "plain", *options)
+    audited = train(recipe, tmp_path / "audited", *options, "diagnostics=2")
+    for checkpoint in (plain, audited):
+        checkpoint["names"] = [set(row) for row in checkpoint["rows"]]
+    for row, without in zip(audited["rows"], plain["names"], strict=True):
+        for name in set(row) - without:
+            del row[name]
+    news = [a - b for a, b in zip(audited.pop("names"), plain.pop("names"), strict=True)]
+    terms = ("descent", "approach", "success", "crash")
+    shares = {f"reward/{term}_{share}" for term in terms for share in ("return_share", "gradient_share")}
+    norms = {"grad/cosine", "grad/first_order_norm", "grad/value_norm", "grad/variance", "grad/signal_to_noise"}
+    assert news == [set(), shares | (set() if recipe == "ppo" else norms)] * 2
+    assert_equal(plain, audited)
+    first, second, *_ = rows(tmp_path / "audited")
+    assert first["reward/descent_gradient_share"] == "nan" and 0 < float(second["reward/descent_gradient_share"]) <= 1
+    if recipe != "ppo":
+        assert float(second["grad/variance"]) > 0 and (float(second["grad/cosine"]) <= 1 or recipe == "bptt")
+
+
+def test_the_configuration_goes_along_with_the_results(train, tmp_path):
+    checkpoint = train("bptt", tmp_path, "env.drone=small_racer")
+    saved = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    assert saved["env"]["drone"] == "small_racer"
+    assert OmegaConf.create(checkpoint["config"]) == OmegaConf.create(saved)
+    assert checkpoint["revision"] == json.loads((tmp_path / "summary.json").read_text())["revision"]
+
+
+# -- numbers that are not finite ---------------------------------------------------------------------------------------
+
+
+def test_an_update_that_is_not_finite_is_left_out_and_counted(train, tmp_path, monkeypatch):
+    poison(monkeypatch, 0, 3, 4)
+    checkpoint = train("bptt", tmp_path)
+    assert [row["grad/skipped"] for row in checkpoint["rows"]] == [1, 2, 3, 3]
+    assert all(parameter.isfinite().all() for parameter in checkpoint["best"]["actor"].values())
+    assert checkpoint["stateful"][1]["state"][0]["step"] == 8 - 3
+    assert all(row["grad/actor"] != row["grad/actor"] or row["grad/actor"] > 0 for row in checkpoint["rows"])
+
+
+def test_too_many_of_them_stop_the_run_and_leave_the_state(refused, no_pictures, tmp_path, monkeypatch):
+    poison(monkeypatch, None)
+    said = refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "max_skipped=3", "eval.interval=100")
+    assert "4 updates were skipped because their loss or gradient was not finite; the limit is max_skipped=3" in said
+    assert "actor, iteration 3, loss -" in said and "gradient norm nan, not finite in actor_network_params" in said
+    failure = read_checkpoint(tmp_path / "failure.pt")
+    assert failure["skipped"] == 4
+    carry = failure["processes"][0]["carry"]
+    assert carry["state"]["position"].shape == (4, 3) and carry["state"]["step"].max() > 0
+    assert not (tmp_path / "summary.json").exists()
+
+
+def test_a_run_draws_no_flight_twice(launch, no_pictures, monkeypatch, tmp_path):
+    drawn = []
+    monkeypatch.setattr(loop.drawing, "draw_flight", lambda flight, path, control_dt: drawn.append(len(flight)))
+    small = [*SMALL, "total_steps=48", "eval.interval=1", f"hydra.run.dir={tmp_path}"]
+    launch("bptt", *small, "logger.flight_every=1")
+    assert drawn == [4, 256]  # after the first iteration, and the best policy at the end

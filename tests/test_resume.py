@@ -1,0 +1,98 @@
+"""A run that was stopped goes on as if it had not been."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from small_runs import EVERYTHING, SMALL, assert_equal, rows, stop_at_save
+from training import loop
+from training.checkpoints import read_checkpoint
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.mark.parametrize("recipe", ["abpt", "bptt", "shac", "ppo"])
+def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(recipe, train, refused, tmp_path, monkeypatch):
+    options = [*EVERYTHING, *([] if recipe == "ppo" else ["loss.alpha=auto"])]
+    options += ["buffer.capacity=24"] if recipe == "abpt" else []  # full from the start: what is unused is arbitrary
+    straight = train(recipe, tmp_path / "straight", *options)
+    folder = tmp_path / "stopped"
+    with monkeypatch.context() as patch:
+        stop_at_save(patch, 3)
+        said = refused(recipe, *SMALL, f"hydra.run.dir={folder}", *options, status=130)
+    assert said.startswith("Stopped. Go on with: python ")
+    assert said.endswith(f"recipes/{recipe}.py resume={folder}/checkpoint.pt")
+    assert [row["iteration"] for row in rows(folder)] == ["2", "4", "6"]  # and a checkpoint at 4
+    torch.manual_seed(77)
+    resumed = train(recipe, folder, f"resume={folder}/checkpoint.pt")
+
+    assert_equal(straight, resumed)
+    assert rows(tmp_path / "straight") == rows(folder)
+    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("straight", "stopped")]
+    for summary in summaries:
+        assert summary.pop("seconds") > 0
+    assert summaries[0] == summaries[1]
+
+
+def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint_although_it_left_its_lock(train, tmp_path):
+    options = ["total_steps=480", "buffer.capacity=24"]
+    straight = train("abpt", tmp_path / "straight", *options)
+    folder = tmp_path / "killed"
+    command = [sys.executable, "recipes/abpt.py", *SMALL, *options, f"hydra.run.dir={folder}"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        for _ in range(6000):
+            if (folder / "checkpoint.pt").exists():
+                break
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+    assert read_checkpoint(folder / "checkpoint.pt")["iteration"] < 20
+    assert f"process {process.pid} on" in (folder / "run.lock").read_text()
+    assert_equal(straight, train("abpt", folder, *options, "resume=auto"))
+    assert rows(folder) == rows(tmp_path / "straight")
+    assert not (folder / "run.lock").exists()
+
+
+def test_resume_auto_starts_goes_on_and_leaves_alone_what_is_finished(train, launch, tmp_path, monkeypatch):
+    first = train("bptt", tmp_path, "resume=auto")
+    before = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    printed = launch("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "resume=auto")
+    assert printed == f"Finished before: {tmp_path}\n"
+    assert {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
+    (tmp_path / "summary.json").unlink()  # stopped within the final evaluation
+    train("bptt", tmp_path, "resume=auto")
+    assert (tmp_path / "summary.json").exists()
+
+    monkeypatch.setattr(loop, "revision", lambda: "another")
+    with monkeypatch.context() as patch:  # made longer, and killed after the last checkpoint
+        patch.setattr(loop.Run, "_finish", lambda self: None)
+        longer = train("bptt", tmp_path, "resume=auto", "total_steps=240")
+    assert not (tmp_path / "summary.json").exists()
+    assert longer["iteration"] == 10 and len(rows(tmp_path)) == 5
+    assert longer["stateful"][1]["param_groups"][0]["lr"] == pytest.approx(2e-4)  # the schedule has stretched
+    assert longer["revision"] == f"{first['revision']}, then another"
+    train("bptt", tmp_path, "resume=auto", "total_steps=240")
+    assert json.loads((tmp_path / "summary.json").read_text())["steps"] == 240
+
+
+def test_what_the_command_line_says_must_agree_with_the_checkpoint(train, refused, tmp_path):
+    train("bptt", tmp_path)
+    small = [*SMALL, f"hydra.run.dir={tmp_path}"]
+    said = refused("bptt", *small)
+    assert f"{tmp_path} holds another run. Go on with it, resume={tmp_path}/checkpoint.pt, or choose another" in said
+    said = refused("bptt", *small, "resume=auto", "env.drone=small_racer")
+    assert "env.drone=small_racer contradicts the checkpoint" in said and "trained with env.drone=visfly" in said
+    said = refused("shac", *small, "resume=auto")
+    assert "algorithm=shac contradicts the checkpoint" in said and "trained with algorithm=bptt" in said
+
+
+def test_a_run_that_is_resumed_by_path_goes_on_in_the_folder_of_its_checkpoint(train, launch, tmp_path):
+    train("bptt", tmp_path / "first")
+    path = tmp_path / "first/checkpoint.pt"
+    launch("bptt", f"resume={path}", "total_steps=240", f"hydra.run.dir={tmp_path}/elsewhere")
+    assert read_checkpoint(path)["iteration"] == 10
+    assert not (tmp_path / "elsewhere").exists()

@@ -7,7 +7,7 @@ from torchrl_quad import BPTTLoss, HoveringEnv, differentiable_rollout, make_act
 from torchrl_quad.dynamics import DYNAMICS, quaternion
 from torchrl_quad.dynamics.vector import Components, cat, stack
 
-ITERATIONS = 30
+ITERATIONS = 20
 
 
 class VelocityDrone:
@@ -52,7 +52,7 @@ env = HoveringEnv(num_envs=64, dynamics="velocity", dt=0.02)
 actor = make_actor(env)
 loss, optimizer = BPTTLoss(actor), torch.optim.Adam(actor.parameters(), 2e-2)
 for _ in range(ITERATIONS):
-    rollout, _ = differentiable_rollout(env, actor, None, 64)
+    rollout, _ = differentiable_rollout(env, actor, None, 40)
     optimizer.zero_grad()
     loss(rollout)["loss_actor"].backward()
     optimizer.step()

@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 
 from torchrl_quad.envs import make_env
 
-# An episode ends before an entry of the state is beyond this, and so nothing that is observed ever is.
+# An episode ends before an entry of the state, or of the observation, exceeds this.
 _LIMIT = 1e6
 _INFO = "success", "crash", "reward_terms", "metrics"
 
@@ -30,10 +30,10 @@ class GymVectorEnv(VectorEnv):
     name, each (num_envs), with a mask ``_name`` beside every name as in gymnasium's own vector environments.
 
     The time limit is the task's ``max_episode_steps``. An episode that has ended begins anew at the next step, which
-    ignores the action and is paid nothing; or in the same step, with ``final_obs`` and ``final_info`` in ``info``; or,
+    ignores the action and has no reward; or in the same step, with ``final_obs`` and ``final_info`` in ``info``; or,
     with "Disabled", when ``reset(options={"reset_mask": mask})`` is called with a bool mask (num_envs).
 
-    ``reset(seed=...)`` seeds the one generator of all drones, which without a seed goes on drawing. ``torchrl_env`` is
+    ``reset(seed=...)`` seeds the one generator of all drones; without a seed it continues to draw. ``torchrl_env`` is
     the TorchRL environment, to be read: its ``params``, ``hover_action`` and so on.
 
     Args:
@@ -105,7 +105,7 @@ class GymVectorEnv(VectorEnv):
         env, over, info = self.torchrl_env, self._over, {}
         actions = _checked(actions, self.action_space.shape)
         if self._now is None:
-            raise ResetNeeded("A step needs an episode to stand in: call reset() first.")
+            raise ResetNeeded("A step needs an episode: call reset() first.")
         if self.autoreset_mode is AutoresetMode.DISABLED and over.any():
             raise ResetNeeded(
                 f"The episodes of drones {np.flatnonzero(over).tolist()} have ended. Call reset() before the next "
@@ -200,8 +200,8 @@ class GymEnv(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Fly one control step with an action (4)."""
-        observation, *told, info = self._drones.step(_checked(action, self.action_space.shape)[None])
-        return observation[0], *(x.item() for x in told), _first(info)
+        observation, *outputs, info = self._drones.step(_checked(action, self.action_space.shape)[None])
+        return observation[0], *(x.item() for x in outputs), _first(info)
 
     def render(self) -> np.ndarray | None:
         """A picture (336, 336, 3), uint8; None without ``render_mode="rgb_array"``."""
@@ -231,8 +231,8 @@ def _checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
 # What is handed out is copied: the next step starts from the same memory.
 
 
-def _observation(told: Any) -> np.ndarray:
-    return np.array(told["observation"].numpy(force=True), dtype=np.float32)
+def _observation(outputs: Any) -> np.ndarray:
+    return np.array(outputs["observation"].numpy(force=True), dtype=np.float32)
 
 
 def _array(x: torch.Tensor) -> np.ndarray:
@@ -240,7 +240,7 @@ def _array(x: torch.Tensor) -> np.ndarray:
     return np.array(x.squeeze(-1).numpy(force=True), dtype=bool if x.dtype is torch.bool else np.float64)
 
 
-def _info(told: Any, mask: np.ndarray) -> dict[str, Any]:
+def _info(outputs: Any, mask: np.ndarray) -> dict[str, Any]:
     """Gymnasium's info of the drones under the mask (n), of others zeros."""
 
     def masked(entries: Any) -> dict[str, Any]:
@@ -250,10 +250,10 @@ def _info(told: Any, mask: np.ndarray) -> dict[str, Any]:
             info[f"_{name}"] = mask.copy()
         return info
 
-    return masked({name: told[name] for name in _INFO if name in told.keys()})  # noqa: SIM118, a tensordict
+    return masked({name: outputs[name] for name in _INFO if name in outputs.keys()})  # noqa: SIM118, a tensordict
 
 
 def _first(info: dict[str, Any]) -> dict[str, Any]:
     """The info of the first drone, as a single environment tells it."""
-    told = {name: x for name, x in info.items() if not name.startswith("_")}
-    return {name: _first(x) if isinstance(x, dict) else x[0].item() for name, x in told.items()}
+    outputs = {name: x for name, x in info.items() if not name.startswith("_")}
+    return {name: _first(x) if isinstance(x, dict) else x[0].item() for name, x in outputs.items()}

@@ -186,11 +186,11 @@ class QuadrotorEnv(Task, EnvBase):
         return self.hover_action
 
     def random_state(self) -> dict[str, Any]:
-        """All that is random in this environment, to go on later as if nothing had happened; can be saved by torch."""
+        """Everything random in this environment, to resume from later; torch can save it."""
         return self.randomness.state()
 
     def set_random_state(self, state: dict[str, Any]) -> None:
-        """Go on from what :meth:`random_state` returned."""
+        """Resume from what :meth:`random_state` returned."""
         self.randomness.set_state(state)
 
     @property

@@ -31,7 +31,7 @@ class LandingEnv(QuadrotorEnv):
     - approach: 0.1 (e^(1 - d / (2 c)) - 1) / (e - 1);
     - success: 20, once; crash: -0.1. These two carry no gradient.
 
-    The paper prints an error of the velocity in the place of x; the form above is the published one.
+    The paper prints an error of the velocity instead of x; the form above is the published one.
 
     Start: level and at rest, uniformly within 1 m of (2, 0, 2.5) m along each axis. State added: ``target`` (3) [m].
 

@@ -40,7 +40,7 @@ class RacingEnv(QuadrotorEnv):
     Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. Reward "velocity":
     0.02 min(v_t, 15) - 0.02 |v_a| / (d + 1) - 0.001 |w|, and a gate bonus of 5, where v_t is the velocity towards the
     next gate, v_a the part of the velocity across that direction, and d the distance to the gate [m]. The binary bonus
-    is paid in the step that passes a gate and carries no gradient. In its place a relaxation may stand, paid in each
+    is paid in the step that passes a gate and carries no gradient. A relaxation can replace it, and is paid in each
     step: "log", -5 log(d + 0.01), or "reciprocal", 1 / (d + 0.05).
 
     A gate is passed when the straight line that the drone flew in a control step comes within 0.3 m of its centre. The

@@ -1,7 +1,7 @@
 """The documentation site: ``make docs`` builds it from the Markdown files of the repository and the docstrings.
 
-The source directory is the repository, not this folder. So each page is read from its own place, and a link from file to
-file works on GitHub as it does on the site.
+The source directory is the repository, not this folder. So each page is read from its own place, and links between
+files work on GitHub and on the site.
 """
 
 import ast

@@ -65,6 +65,19 @@ def test_every_example_is_shown(page):
     assert {example.name for example in EXAMPLES} == set(re.findall(r"\d\d_\w+\.py", text))
 
 
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+
+
+def test_every_row_of_how_to_add_names_files_that_exist():
+    rows = re.findall(r"^\| an? .*\|$", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
+    for row in rows:
+        names = re.findall(r"`([\w./]+(?:\.py|\.yaml|/))`", row)
+        missing = [name for name in names if not [*ROOT.glob(name.rstrip("/")), *ROOT.glob(f"*/**/{name.rstrip('/')}")]]
+        assert names and missing == [], row
+    assert len(rows) == 9
+
+
 # -- links -------------------------------------------------------------------------------------------------------------
 
 

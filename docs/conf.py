@@ -1,7 +1,7 @@
 """The documentation site: ``make docs`` builds it from the Markdown files of the repository and the docstrings.
 
-The source directory is the repository, not this folder, so that each page is read where it stands (recipes/README.md
-among the recipes) and a link from file to file works on GitHub as it does on the site.
+The source directory is the repository, not this folder. So each page is read from its own place, and links between
+files work on GitHub and on the site.
 """
 
 import ast
@@ -13,14 +13,11 @@ from sphinx.environment import BuildEnvironment
 from sphinx.util import inspect
 
 import torchrl_quad
-from torchrl_quad.envs import base, options
-
-options.QuadrotorEnv, options.State = base.QuadrotorEnv, base.State  # which it imports for type checkers alone
 
 project = "torchrl_quad"
 version = release = torchrl_quad.__version__
 root_doc = "docs/index"
-include_patterns = ["docs/*.md", "recipes/README.md", "examples/README.md"]
+include_patterns = ["docs/*.md", "recipes/README.md", "examples/README.md", "CONTRIBUTING.md"]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
 
 myst_enable_extensions = ["dollarmath", "substitution"]
@@ -35,13 +32,14 @@ autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 python_maximum_signature_line_length = 90  # a longer one has each argument on a line of its own
 toc_object_entries_show_parents = "hide"
-napoleon_use_rtype = False  # "Returns:" is a sentence here, its types stand in the signature
+napoleon_use_rtype = False  # "Returns:" is a sentence here; its types are in the signature
 
 # Foreign names are not looked up, since a build needs no network.
 nitpick_ignore_regex = [
     (r"py:.*", r"(torch|torchrl|tensordict|gymnasium|numpy|np)\..*"),
     (r"py:.*", r"(collections\.abc|pathlib|dataclasses|enum)\..*"),
-    (r"py:class", r"TensorDictBase|Vector"),  # in annotations of attributes, which keep the name alone
+    (r"py:class", r"Path|State|Tensor|TensorDictBase|Vector"),  # in annotations that keep the name alone
+    (r"py:class", r"torchrl_quad\.engine\.\w+\.(Rows|Layout|Record|Source)"),  # the engine's own
     (r"py:(exc|class|obj)", r"[A-Z][A-Za-z]*Error|ResetNeeded|None|bool|dict|float|int|list|str|tuple|type"),
 ]
 
@@ -50,11 +48,11 @@ html_title = "torchrl_quad"
 html_extra_path = ["index.html"]  # leads from the root of the site to the pages in docs/
 html_copy_source = False
 html_show_copyright = False
-mathjax_path = "https://cdn.jsdelivr.net/npm/mathjax@3/es5/tex-mml-chtml.js"  # fetched by who reads, not by the build
+mathjax_path = "https://cdn.jsdelivr.net/npm/mathjax@3/es5/tex-mml-chtml.js"  # fetched by the reader, not by the build
 
 
 def add_short_names(app: Sphinx, env: BuildEnvironment) -> None:
-    """Let references find torchrl_quad.HoveringEnv, which has its place as torchrl_quad.envs.HoveringEnv."""
+    """Let references to torchrl_quad.HoveringEnv find torchrl_quad.envs.HoveringEnv."""
     objects = env.domains.python_domain.objects
     for name in torchrl_quad.__all__:
         for place in [place for place in objects if place.count(".") == 2 and place.endswith(f".{name}")]:
@@ -72,10 +70,10 @@ def keep_shapes(app: Sphinx, what: str, name: str, value: object, options: objec
 def show_constructor(
     app: Sphinx, what: str, name: str, value: type, options: object, signature: str, returned: str
 ) -> tuple[str, str] | None:
-    """Show what a class takes, which the metaclasses of TorchRL's environments and losses hide."""
+    """Show the arguments of a class, which the metaclasses of TorchRL's environments and losses hide."""
     if what != "class" or signature != "(*args, **kwargs)":
         return None
-    if "__init__" not in vars(value):  # and so the class says where its arguments are described
+    if "__init__" not in vars(value):  # the class then says where its arguments are described
         return "(...)", returned
     constructor = inspect.signature(value.__init__, bound_method=True)
     return inspect.stringify_signature(constructor, show_return_annotation=False, unqualified_typehints=True), returned

@@ -18,7 +18,7 @@ def command(thrust, roll=0.0, pitch=0.0, yaw=0.0):
 
 
 def pilot(time):
-    """Climb, slow down, lean forward, lean back, come level again, and hover; nobody looks where the drone is."""
+    """Climb, slow down, lean forward, lean back, come level again, and hover, without looking where the drone is."""
     if time < 0.4:
         return command(thrust=1.3)
     if time < 0.8:
@@ -42,7 +42,7 @@ for step in range(STEPS):
     if step % 10 == 0:
         (x, _, z), (vx, _, vz) = td["state", "position"][0], td["state", "velocity"][0]
         print(f"{time:8.2f} {x:8.2f} {z:8.2f} {vx:10.2f} {vz:10.2f}")
-    td = env.step_mdp(td)  # what a step has written under "next" is what the following one starts from
+    td = env.step_mdp(td)  # moves "next" to where the following step reads it
 
 plot_flight(torch.stack(flight, 1), "flight.png", env=env)
 print("The flight is drawn in flight.png.")

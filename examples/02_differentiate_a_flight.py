@@ -1,4 +1,4 @@
-"""A flight has derivatives: of where it ends, to every action and to the drone's mass, which can so be fitted."""
+"""Differentiate the end of a flight in every action and in the mass of the drone, and fit the mass."""
 
 import torch
 
@@ -7,14 +7,14 @@ from torchrl_quad import HoveringEnv
 ITERATIONS = 30
 
 torch.manual_seed(0)
-env = HoveringEnv(num_envs=1, dtype=torch.float64)  # in double precision finite differences are good to compare with
+env = HoveringEnv(num_envs=1, dtype=torch.float64)  # finite differences are accurate in double precision
 start = env.reset()
 drone = env.params
 
 
 def fly(mass, actions):
-    """The positions (time, 3) [m] of a drone with a mass [kg] that is given a sequence of actions."""
-    env.params = drone.replace(mass=mass)  # the drone that flies; its controller goes on believing in the nominal one
+    """The positions (time, 3) [m] of a drone with a mass [kg] under a sequence of actions."""
+    env.params = drone.replace(mass=mass)  # the drone that flies; its controller still believes in the nominal one
     td, positions = start, []
     for action in actions:
         td = env.step_mdp(env.step(td.clone().set("action", action.expand(1, 4))))
@@ -37,11 +37,11 @@ with torch.no_grad():
 print(f"height by mass:         {by_mass.item():.8f} m/kg, by finite difference {mass_check:.8f}")
 print(f"height by first thrust: {by_action[0, 0]:.8f} m,    by finite difference {action_check:.8f}")
 
-# 3. Which mass has a drone that has flown like this? Descend the error of the flight that a mass predicts.
+# 3. Which mass had the drone of a recorded flight? Minimise the error of the predicted flight.
 with torch.no_grad():
     recorded = fly(torch.tensor([0.55], dtype=env.dtype), actions)
 log_mass = drone.mass.log().requires_grad_()  # the exponential of any number is a possible mass
-optimizer = torch.optim.Adam([log_mass], 0.02, betas=(0.5, 0.9))  # of one number: little memory will do
+optimizer = torch.optim.Adam([log_mass], 0.02, betas=(0.5, 0.9))  # one number needs little memory
 for iteration in range(ITERATIONS):
     mass = log_mass.exp()
     error = (fly(mass, actions.detach()) - recorded).square().mean()

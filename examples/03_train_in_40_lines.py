@@ -48,4 +48,4 @@ for iteration in range(ITERATIONS):
 with torch.no_grad():
     flight, _ = differentiable_rollout(env, actor, None, 256, exploration_type=ExplorationType.DETERMINISTIC)
 result = env.episode_metrics(flight)
-print(f"success {100 * result['success'].mean():.0f} %, error {100 * result['position_error'].median():.1f} cm")
+print(f"solved {100 * result['solved'].mean():.0f} %, error {100 * result['position_error'].median():.1f} cm")

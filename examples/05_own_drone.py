@@ -1,4 +1,4 @@
-"""A drone of your own is a mapping of sixteen fields; one that is mistyped is refused with what is allowed."""
+"""A drone of your own is a mapping of sixteen fields. A mistyped one is refused, with the allowed values."""
 
 from torchrl_quad import HoveringEnv
 
@@ -26,7 +26,7 @@ camera_drone = {
 
 
 def fly(env, action):
-    """The flight (1, STEPS) of a drone that is given one action all the time."""
+    """The flight (1, STEPS) of a drone under a constant action."""
     return env.rollout(STEPS, lambda td: td.set("action", action.expand(1, 4)))
 
 
@@ -41,7 +41,7 @@ for name, drone in (("visfly", "visfly"), ("camera", camera_drone)):
     thrust, speed = (env.params.mass * env.params.gravity).item(), hover["state", "rotor_speed"][0, 0, 0]
     print(f"{name:7} {thrust:17.2f} {speed:15.0f} {sunk:17.3f} {rate:12.2f}")
 
-# What is wrong with a drone is said when it is built, not when it crashes.
+# A wrong drone is refused when it is built, not when it crashes.
 for mistake in ({"mas": 1.8}, {"mass": -1.8}, {"inertia": [0.03, 0.055]}):
     try:
         HoveringEnv(num_envs=1, drone={**camera_drone, **mistake})

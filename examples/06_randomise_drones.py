@@ -1,4 +1,4 @@
-"""Two policies, one that learns on a single perfect drone and one on drones, wind, sensors and starts that vary."""
+"""Train one policy on a single perfect drone, and another on varied drones, wind, sensors and starts; compare them."""
 
 import torch
 from torchrl.envs.utils import ExplorationType
@@ -8,7 +8,7 @@ from torchrl_quad import BPTTLoss, HoveringEnv, VisitedStateBuffer, differentiab
 ITERATIONS = 35
 
 variations = {
-    # The controller goes on believing in the nominal drone: one that is heavier sinks at the action that should hover.
+    # The controller believes in the nominal drone: a heavier one sinks at the action that should hover.
     "randomize": {"mass": {"scale": [0.8, 1.2]}, "motor_time_constant": {"uniform": [0.02, 0.06]}},
     "wind": {"spread": [1.0, 1.0, 0.0], "gust": 0.5},  # [m/s]
     "observation_noise": {"position": 0.01, "attitude": 0.01, "velocity": 0.05, "angular_velocity": 0.02},
@@ -17,7 +17,7 @@ variations = {
 
 
 def train(env):
-    """A policy that has learnt to hover in an environment, by backpropagation through time."""
+    """Train a policy to hover in an environment, by backpropagation through time."""
     torch.manual_seed(0)
     actor = make_actor(env, input_scale=0.5)
     loss = BPTTLoss(actor)
@@ -38,7 +38,7 @@ def train(env):
 
 def evaluate(actor, **options):
     """The mean distance to the target over the last second [cm], of the median drone, and of the worst in ten."""
-    env = HoveringEnv(num_envs=128, seed=1, **options)  # other drones than those that were trained on
+    env = HoveringEnv(num_envs=128, seed=1, **options)  # other drones than those of the training
     with torch.no_grad():
         flight, _ = differentiable_rollout(env, actor, None, 256, exploration_type=ExplorationType.DETERMINISTIC)
     error = 100 * env.episode_metrics(flight)["position_error"]

@@ -1,4 +1,4 @@
-"""A transform of your own between task and policy, which gradients pass: the target as the drone sees it."""
+"""Write a transform between task and policy that gradients pass: the target as the drone sees it."""
 # ruff: noqa: D102, the methods are those of Transform
 
 import torch
@@ -32,7 +32,7 @@ class TargetInBody(Transform):
 
 
 torch.manual_seed(0)
-# Tilted drones, for which their own axes are others than the world's; in double precision, for the finite difference.
+# Tilted drones, whose axes differ from the world's; in double precision, for the finite difference.
 drones = HoveringEnv(num_envs=8, dtype=torch.float64, random_start={"tilt": 1.0, "yaw": 3.0})
 env = TransformedEnv(drones, TargetInBody())
 actor = make_actor(env, in_keys=["target_in_body", ("state", "quaternion"), ("state", "velocity")], input_scale=1.0)
@@ -46,7 +46,7 @@ def total_reward():
     return flight["next", "reward"].sum()
 
 
-# The policy knows of the target through the transform alone: the derivative has passed it at each of the 32 steps.
+# The policy sees the target only through the transform, so the derivative passes it at each of the 32 steps.
 weight = next(actor.parameters())  # of the first layer: its first column multiplies the way forward
 (gradient,) = torch.autograd.grad(total_reward(), weight)
 with torch.no_grad():

@@ -13,18 +13,18 @@ OPTIONS = {"auto_register_policy_transforms": True}  # TorchRL's default from 0.
 
 
 def ppo(env, actor):
-    """On-policy: a few epochs on each batch, which is then thrown away."""
+    """On-policy: train a few epochs on each batch, then throw it away."""
     value = make_value(env)
     loss = ClipPPOLoss(actor, value, entropy_bonus=False)
     advantage = GAE(gamma=0.99, lmbda=0.95, value_network=value, vectorized=False)
     optimizer = torch.optim.Adam(loss.parameters(), 1e-3)
     for data in Collector(env, actor, frames_per_batch=4096, total_frames=4096 * ITERATIONS, **OPTIONS):
         for batch in 5 * advantage(data).reshape(-1)[torch.randperm(4096)].split(1024):
-            descend(optimizer, loss(batch))
+            minimise(optimizer, loss(batch))
 
 
 def sac(env, actor):
-    """Off-policy: every step is kept, and learnt from many times."""
+    """Off-policy: keep every step, and learn from it many times."""
     loss = SACLoss(actor, make_qvalue(env), action_spec=env.action_spec_unbatched, alpha_init=1e-3, fixed_alpha=True)
     target = SoftUpdate(loss, tau=0.05)
     optimizer = torch.optim.Adam(loss.parameters(), 3e-3)
@@ -32,19 +32,19 @@ def sac(env, actor):
     for data in Collector(env, actor, frames_per_batch=2048, total_frames=2048 * ITERATIONS, **OPTIONS):
         buffer.extend(data.reshape(-1))
         for _ in range(48):
-            descend(optimizer, loss(buffer.sample()))
+            minimise(optimizer, loss(buffer.sample()))
             target.step()
 
 
-def descend(optimizer, losses):
-    """One step down the sum of all losses, which are the entries that are called so."""
+def minimise(optimizer, losses):
+    """Take one step of the optimiser on the sum of all entries called loss."""
     optimizer.zero_grad()
     sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
     optimizer.step()
 
 
 def mean_return(env, actor):
-    """Over an episode, of the actor's mode; 25.6 at most."""
+    """The return of an episode of the actor's mode, averaged over drones; 25.6 at most."""
     with torch.no_grad():
         flight = env.rollout(256, actor, break_when_any_done=False)
     return env.episode_metrics(flight)["return"].mean()

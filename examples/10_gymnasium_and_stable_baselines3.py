@@ -1,5 +1,5 @@
-"""All drones in one gymnasium vector environment, and PPO of stable-baselines3 that learns to hover with them."""
-# ruff: noqa: D102, the methods are those of VecEnv
+"""Train PPO of stable-baselines3 to hover, on all drones of one gymnasium vector environment."""
+# ruff: noqa: D102, the docstrings of the methods are in VecEnv
 
 import gymnasium
 import numpy as np
@@ -8,11 +8,11 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 STEPS = 300_000
-TASK = "torchrl_quad:torchrl_quad/Hovering-v0"  # the part before the colon is the package that knows the task
+TASK = "torchrl_quad:torchrl_quad/Hovering-v0"  # the part before the colon is the package to import
 
 
 class DronesVecEnv(VecEnv):
-    """What stable-baselines3 calls a vector environment, around one of gymnasium whose autoreset mode is "SameStep"."""
+    """A vector environment of stable-baselines3 around one of gymnasium with the autoreset mode "SameStep"."""
 
     def __init__(self, env):
         self.env = env
@@ -43,11 +43,11 @@ class DronesVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper, indices=None):
         return [False for _ in self._get_indices(indices)]
 
-    set_attr = env_method = None  # the drones are one environment, and none can be changed alone
+    set_attr = env_method = None  # the drones are one environment, so none can change alone
 
 
 def train(seed=0):
-    """Train PPO for the budget; its mean return afterwards, over an episode of each drone, 25.6 at most."""
+    """Train PPO for the budget; return its mean return over an episode of each drone, 25.6 at most."""
     drones = VecNormalize(DronesVecEnv(gymnasium.make_vec(TASK, num_envs=128, autoreset_mode="SameStep")))
     options = {"n_steps": 32, "batch_size": 1024, "n_epochs": 5, "learning_rate": 1e-3}
     ppo = PPO("MlpPolicy", drones, **options, seed=seed, device="cpu").learn(STEPS)

@@ -1,4 +1,4 @@
-"""Which terms of a reward have a gradient, whether simulator and critic agree, how the gradient's variance grows."""
+"""Find the terms of a reward that have a gradient, compare simulator and critic, and see how the variance grows."""
 
 import torch
 from torchrl.objectives import SoftUpdate
@@ -24,7 +24,7 @@ loss.make_value_estimator(gamma=0.99, lmbda=0.95)
 
 
 def before_the_gates():
-    """Drones that fly towards their gates at 2 m/s, 1 m before them or less: they earn every term of the reward."""
+    """Start up to 1 m before the gates at 2 m/s towards them: such drones earn every term of the reward."""
     td = env.reset()
     way = td["state", "target"] - td["state", "position"]
     way = way / way.norm(dim=-1, keepdim=True)
@@ -37,7 +37,7 @@ def before_the_gates():
 rollout, _ = differentiable_rollout(env, actor, before_the_gates(), 32)
 print(audit_reward(rollout, actor, gamma=0.99))
 
-# 2. The critic learns of the bonus, too: its gradient points elsewhere than that of the simulator.
+# 2. The critic learns the bonus, too: its gradient points elsewhere than the simulator's.
 optimizer = torch.optim.Adam(loss.qvalue_network_params.parameters(), 1e-3)
 target = SoftUpdate(loss, tau=0.05)
 for iteration in range(ITERATIONS + 1):

@@ -1,4 +1,4 @@
-"""The documentation: the site builds without a warning, links lead somewhere, and what stands in a code block runs."""
+"""The documentation: the site builds without a warning, links lead somewhere, and code blocks run."""
 
 import importlib
 import re
@@ -20,8 +20,9 @@ from test_recipes import RECIPES, ROOT, SMALL, run
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
 PAGES += sorted(ROOT.glob("docs/*.md"))
-PUBLIC = [f"torchrl_quad{part}" for part in ("", ".data", ".dynamics", ".envs", ".modules", ".objectives", ".render")]
-# What stands in blocks beside python and bash: no code, data, and Sphinx's directives, but for those that hold code.
+PARTS = ("data", "dynamics", "engine", "envs", "modules", "objectives", "render")
+PUBLIC = ["torchrl_quad", *(f"torchrl_quad.{part}" for part in PARTS)]
+# Blocks that are not run: text, data, and Sphinx's directives, except those that hold code.
 NOT_RUN = re.compile(r"(|text|yaml|\{(?!code|sourcecode)[\w-]+\}.*)")
 
 
@@ -62,6 +63,19 @@ def test_the_reference_begins_with_a_table_of_what_the_package_exports():
 def test_every_example_is_shown(page):
     text = (ROOT / page).read_text()
     assert {example.name for example in EXAMPLES} == set(re.findall(r"\d\d_\w+\.py", text))
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+
+
+def test_every_row_of_how_to_add_names_files_that_exist():
+    rows = re.findall(r"^\| an? .*\|$", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
+    for row in rows:
+        names = re.findall(r"`([\w./]+(?:\.py|\.yaml|/))`", row)
+        missing = [name for name in names if not [*ROOT.glob(name.rstrip("/")), *ROOT.glob(f"*/**/{name.rstrip('/')}")]]
+        assert names and missing == [], row
+    assert len(rows) == 9
 
 
 # -- links -------------------------------------------------------------------------------------------------------------
@@ -115,7 +129,7 @@ def test_nothing_escapes_these_tests_behind_another_name(page):
 
 @pytest.mark.parametrize("page", [page for page in PAGES if code(page, "python")], ids=name_of)
 def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
-    lines = []  # the code, at the lines where it stands in the page
+    lines = []  # the code, on the same lines as in the page
     for line, content in code(page, "python"):
         lines += [""] * (line - len(lines)) + content.splitlines()
     program = tmp_path / f"{page.stem}.py"
@@ -162,12 +176,12 @@ def test_every_command_runs(command, launch, request, monkeypatch, capsys, tmp_p
 
 
 def make(*arguments):
-    """What make would do."""
+    """The commands that make would run."""
     return run("make", "--dry-run", *arguments)
 
 
 def installs(words):
-    """Try what can be tried of pip without a network: that what is named is what the project has."""
+    """Try as much of pip as works without a network: every name must belong to the project."""
     assert words.pop(0) == "install"
     extras, needs = (metadata("torchrl_quad").get_all(name) for name in ("Provides-Extra", "Requires-Dist"))
     known = {Requirement(need).name for need in needs} | {"torchrl_quad"}
@@ -181,7 +195,7 @@ def installs(words):
 
 
 def recipe(program, words, launch, folder):
-    """Run a recipe on a reduced budget; one that goes on from a checkpoint, from that of another small run."""
+    """Run a recipe on a reduced budget; one that resumes, from the checkpoint of another small run."""
     name = next(Path(word).stem for word in words if word.endswith(".py"))
     arguments = [word for word in words if "=" in word and not word.startswith(("-", "hydra.run.", "hydra.sweep."))]
     if program == "torchrun":

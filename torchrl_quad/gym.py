@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 
 from torchrl_quad.envs import make_env
 
-# An episode ends before an entry of the state is beyond this, and so nothing that is observed ever is.
+# An episode ends before an entry of the state, or of the observation, exceeds this.
 _LIMIT = 1e6
 _INFO = "success", "crash", "reward_terms", "metrics"
 
@@ -30,10 +30,10 @@ class GymVectorEnv(VectorEnv):
     name, each (num_envs), with a mask ``_name`` beside every name as in gymnasium's own vector environments.
 
     The time limit is the task's ``max_episode_steps``. An episode that has ended begins anew at the next step, which
-    ignores the action and is paid nothing; or in the same step, with ``final_obs`` and ``final_info`` in ``info``; or,
+    ignores the action and has no reward; or in the same step, with ``final_obs`` and ``final_info`` in ``info``; or,
     with "Disabled", when ``reset(options={"reset_mask": mask})`` is called with a bool mask (num_envs).
 
-    ``reset(seed=...)`` seeds the one generator of all drones, which without a seed goes on drawing. ``torchrl_env`` is
+    ``reset(seed=...)`` seeds the one generator of all drones; without a seed it continues to draw. ``torchrl_env`` is
     the TorchRL environment, to be read: its ``params``, ``hover_action`` and so on.
 
     Args:

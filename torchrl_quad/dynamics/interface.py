@@ -1,4 +1,4 @@
-"""What environments and the engine ask of a dynamics model: one class is a new drone model."""
+"""The protocol of dynamics models: environments and the engine ask them for nothing else."""
 
 from __future__ import annotations
 

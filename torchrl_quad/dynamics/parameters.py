@@ -37,7 +37,7 @@ _FIELDS = {
     "gravity": ((1,), 1e-2, 1e3),
 }
 LIMITS = {name: (low, high) for name, (_, low, high) in _FIELDS.items()}
-# What the flight controller alone reads, from its nominal drone, and what the drone that flies is made of.
+# The fields that only the flight controller reads, from its nominal drone; and those of the drone that flies.
 CONTROLLER_FIELDS = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
 PLANT_FIELDS = tuple(name for name in _FIELDS if name not in CONTROLLER_FIELDS)
 
@@ -98,7 +98,7 @@ class QuadrotorParams:
         return {name: getattr(self, name) for name in _FIELDS}
 
     def plant(self) -> tuple[Tensor, ...]:
-        """What the drone that flies is made of, in the order of ``PLANT_FIELDS``."""
+        """The fields of the drone that flies, in the order of ``PLANT_FIELDS``."""
         return tuple(getattr(self, name) for name in PLANT_FIELDS)
 
     def replace(self, **changes: Tensor | float | list) -> QuadrotorParams:

@@ -51,7 +51,7 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
 def parse(content: bytes, source: str) -> Any:
     """The content of a YAML file, read in time and memory proportional to its size.
 
-    Aliases are refused, since a file of a few lines can stand for billions of values through them.
+    Aliases are refused, since a file of a few lines can mean billions of values through them.
 
     Raises:
         ValueError: the content is too large, too deep, not in UTF-8, no YAML, or uses an alias.

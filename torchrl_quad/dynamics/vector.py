@@ -21,7 +21,7 @@ Component = Tensor | float
 class Components:
     """The k components of a vector (*, k), each a tensor (*) or, where all drones share it, a number.
 
-    Behaves as the tensor it stands for: arithmetic goes entry by entry, and k = 1 goes with any k.
+    Behaves like the tensor (*, k): arithmetic goes entry by entry, and k = 1 goes with any k.
     """
 
     def __init__(self, components: Sequence[Component]) -> None:
@@ -80,7 +80,7 @@ def unbind(vector: Tensor, constant: bool = False) -> Components:
 
 
 def unbind_rows(matrix: Tensor) -> list[Components]:
-    """The rows of a constant matrix (*, k, k), each taken apart."""
+    """The rows of a constant matrix (*, k, k), each as components."""
     return [unbind(row, constant=True) for row in matrix.unbind(-2)]
 
 

@@ -1,4 +1,4 @@
-"""The loop of a horizon: policy, step, reset where an episode ends, and the tensordict of it all."""
+"""Fly a horizon: policy, step, reset where an episode ends, and one tensordict of it all."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def _record(stepper: Stepper, state: State, tensordict: TensorDictBase) -> Recor
 
 
 def _restarted(stepper: Stepper, source: Source, end: Record, done: Tensor) -> Record:
-    """The record to go on from, (1, n) of it anew; gradients stop there."""
+    """The record to continue from, with fresh starts where ``done`` (1, n); gradients stop there."""
     entries = flat(source.starts(done[0]))
     state = {key: entries[flat_key("state", *_path(key))].detach() for key in stepper.layout.place}
     fresh = _record(stepper, state, TensorDict({k: x.detach() for k, x in entries.items()}, done.shape[1:]))

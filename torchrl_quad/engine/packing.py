@@ -1,4 +1,4 @@
-"""How the many entries of a state become the rows of a few tensors, and how names of nested entries are written.
+"""Pack the many entries of a state into the rows of a few tensors, and convert names of nested entries.
 
 A tensordict with its thirty entries costs far more than the physics of a step. Inside a horizon all entries of one kind
 lie below each other as the rows of one tensor. Only the finished horizon becomes a tensordict again.

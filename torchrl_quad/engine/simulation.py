@@ -1,4 +1,4 @@
-"""What the engine flies: any control step that is a pure function, in three parts."""
+"""The protocol of the simulations that the engine flies: a control step as a pure function, in three parts."""
 
 from __future__ import annotations
 

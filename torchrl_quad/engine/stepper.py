@@ -1,4 +1,4 @@
-"""A control step on rows: eager, or compiled with its derivative as one node of the graph."""
+"""Run a control step on rows: eager, or compiled with its derivative as one node of the graph."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class Stepper:
         self.output_layout = Layout({key: x for key, x in outputs.items() if key != "observation"})
         self.compiled: _Compiled | None = None
         if options is not None:
-            # Gradients of outputs that nothing depends on. They are three tensors: one that came twice would make
-            # the compiler guard on it, and compile again when it comes once.
+            # Gradients of outputs that nothing depends on. They are three tensors: the compiler would guard
+            # on one that comes twice, and compile again when it comes once.
             examples = self.layout.pack(state).floats, self.output_layout.pack(outputs).floats, observation
             self.zeros = tuple(torch.zeros_like(x) for x in examples)
 

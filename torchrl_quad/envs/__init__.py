@@ -3,17 +3,21 @@
 from typing import Any
 
 from torchrl_quad.envs.base import QuadrotorEnv
+from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.hovering import HoveringEnv
 from torchrl_quad.envs.landing import LandingEnv
 from torchrl_quad.envs.racing import RacingEnv, load_track
+from torchrl_quad.envs.task import Task
 from torchrl_quad.envs.tracking import TrackingEnv
 
 __all__ = [
     "TASKS",
+    "Disturbance",
     "HoveringEnv",
     "LandingEnv",
     "QuadrotorEnv",
     "RacingEnv",
+    "Task",
     "TrackingEnv",
     "load_track",
     "make_env",

@@ -184,15 +184,15 @@ class QuadrotorEnv(Task, EnvBase):
 
     @property
     def neutral_action(self) -> Tensor:
-        """The action that a policy starts from: hovering."""
+        """The action that a new policy starts from, which hovers."""
         return self.hover_action
 
     def random_state(self) -> dict[str, Any]:
-        """All that is random in this environment, to go on later as if nothing had happened; can be saved by torch."""
+        """Everything random in this environment, to resume from later; torch can save it."""
         return self.randomness.state()
 
     def set_random_state(self, state: dict[str, Any]) -> None:
-        """Go on from what :meth:`random_state` returned."""
+        """Resume from what :meth:`random_state` returned."""
         self.randomness.set_state(state)
 
     @property

@@ -1,4 +1,4 @@
-"""What environments refuse, with what is wrong, why, and what to write instead."""
+"""Refuse wrong arguments, states and actions, with the reason and a remedy."""
 
 from __future__ import annotations
 

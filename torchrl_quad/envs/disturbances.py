@@ -1,4 +1,4 @@
-"""What makes any task harder, or more like the real one: other drones, wind, sensors, starts, and your own."""
+"""Make any task harder, or more realistic: other drones, wind, sensors, starts, and disturbances of your own."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ MAX_WIND = 100.0  # [m/s]
 
 
 class Disturbance:
-    """The protocol of all disturbances. A new one overrides what it does; ``disturbances=[MyOwn()]`` switches it on.
+    """The protocol of all disturbances. A new one overrides some methods; ``disturbances=[MyOwn()]`` switches it on.
 
-    What it keeps between steps are entries of the state, each (n, ...): they are restored, stored and compiled with it.
+    Its memory is in entries of the state, each (n, ...), which are restored, stored and compiled with it.
     An entry ``("drone", field)`` changes a parameter of the drone that flies, ``wind`` the air it flies in.
     """
 
@@ -44,12 +44,12 @@ class Disturbance:
         return {}
 
     def observe(self, state: State) -> State:
-        """The state as the policy sees it. Rewards, crashes and success know the truth."""
+        """The state as the policy sees it. Rewards, crashes and success use the true one."""
         return state
 
 
 class DroneRandomization(Disturbance):
-    """Another drone in each episode: any parameter of the drone that flies, drawn at reset.
+    """Fly another drone in each episode: any of its parameters, drawn at reset.
 
     A mapping, or a YAML file of one, from fields of :class:`~torchrl_quad.QuadrotorParams` to a distribution and its
     two numbers:
@@ -125,7 +125,7 @@ class DroneRandomization(Disturbance):
 
 @dataclasses.dataclass(frozen=True)
 class Wind(Disturbance):
-    """A mean wind for each episode, and gusts about it: a first-order Gauss-Markov process, per axis and in time.
+    """Blow a mean wind in each episode, and gusts about it: a first-order Gauss-Markov process in time, per axis.
 
     Entries of the state: ``mean_wind`` and ``wind``, each (3) [m/s], world frame, held over a control step.
 
@@ -177,7 +177,7 @@ class Wind(Disturbance):
 
 @dataclasses.dataclass(frozen=True)
 class Sensors(Disturbance):
-    """What the policy sees of the drone: late, and with white noise. Rewards, crashes and success know the truth.
+    """Show the policy the drone late, and with white noise. Rewards, crashes and success use the true state.
 
     Entry of the state: ``measurements`` (delay + 1, 13), oldest first: position, quaternion, velocity and angular
     velocity, as measured.
@@ -241,7 +241,7 @@ class Sensors(Disturbance):
 
 @dataclasses.dataclass(frozen=True)
 class RandomStart(Disturbance):
-    """Episodes that do not start level and at rest: what is drawn here is added to the task's own start.
+    """Turn and push the drone at the start: the draws are added to the task's own start.
 
     Raises:
         ValueError: a value is negative, not finite, or beyond the bounds of a flight.

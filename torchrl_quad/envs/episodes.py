@@ -1,4 +1,4 @@
-"""Where episodes end in a rollout, and what was measured there."""
+"""Find the ends of episodes in a rollout, and read measurements there."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def first_episode(rollout: TensorDictBase) -> Tensor:
-    """Marks the steps of a rollout up to and with the first end of each environment, bool (num_envs, time, 1)."""
+    """Mark the steps of each environment's first episode, its last one included, bool (num_envs, time, 1)."""
     done = rollout["next", "done"]
     return (done.cumsum(1) - done.int()) == 0
 
@@ -19,7 +19,7 @@ def at_episode_end(rollout: TensorDictBase, value: Tensor) -> Tensor:
 
 
 def summarise_episodes(rollout: TensorDictBase) -> dict[str, Tensor]:
-    """What the first episode of each environment came to; see ``QuadrotorEnv.episode_metrics``."""
+    """Judge the first episode of each environment; see ``QuadrotorEnv.episode_metrics``."""
     ends, first = rollout["next"], first_episode(rollout)
     crash, success = (at_episode_end(rollout, ends[name]) for name in ("crash", "success"))
     dtype = ends["reward"].dtype

@@ -1,4 +1,4 @@
-"""What keeps broken environments from reaching the others: bounds of a state, and of where gradients may come from."""
+"""Keep broken environments from reaching the others: bounds for states, and a filter for gradients."""
 
 from __future__ import annotations
 

@@ -87,11 +87,11 @@ class Randomness:
         return nested({key: torch.stack([x[key] for x in self._starts], 1)[row] for key in self._starts[0]})
 
     def state(self) -> dict[str, Any]:
-        """All that is needed to go on as if nothing had happened: tensors and plain values."""
+        """Everything needed to resume: tensors and plain values."""
         return {"generator": self.generator.get_state(), **copy.deepcopy(self._drawn())}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from what :meth:`state` returned."""
+        """Resume from what :meth:`state` returned."""
         self.generator.set_state(state["generator"].cpu())
         state = copy.deepcopy(state)
         self._position, self._used = state["position"], state["used"]

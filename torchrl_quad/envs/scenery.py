@@ -1,4 +1,4 @@
-"""What a task says for pictures and reports: what it shows beside its drones, and how its metrics read."""
+"""Describe a task to pictures and reports: the scenery beside its drones, and the names and units of its metrics."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Metric:
         return " ".join(filter(None, (number, self.unit, "(median)" if self.median else "")))
 
 
-#: The metrics that every task has; a task adds its own: ``metric_info = {**EPISODE_METRICS, "lap_time": Metric(...)}``.
+#: The metrics of every task. A task adds its own by ``metric_info = {**EPISODE_METRICS, "lap_time": Metric(...)}``.
 EPISODE_METRICS: dict[str, Metric] = {
     "return": Metric("return"),
     "solved": Metric("episodes solved", "%", 100.0),
@@ -55,19 +55,19 @@ EPISODE_METRICS: dict[str, Metric] = {
 
 
 def describe_metric(name: str, metric_info: Mapping[str, Metric]) -> Metric:
-    """How to print and draw a metric; one that nobody describes goes by its name, without a unit."""
+    """The description of a metric; one without a description gets its name, without a unit."""
     return metric_info.get(name) or EPISODE_METRICS.get(name) or Metric(name.replace("_", " "))
 
 
 @dataclass(frozen=True)
 class Scenery:
-    """What pictures of a task show beside its drones; positions are in m, in the world frame.
+    """The things that pictures show beside the drones; positions are in m, in the world frame.
 
-    Places, a curve or gates say where targets are. A task that gives none of them need not say it: pictures then show
-    where the entry ``target`` (num_envs, 3) of the state has been in the flight.
+    Places, a curve or gates show where targets are. Without them, pictures show where the entry ``target``
+    (num_envs, 3) of the state has been in the flight.
     """
 
-    target: str = "target"  #: what the target is called, as in "distance to the target"
+    target: str = "target"  #: the name of the target, as in "distance to the target"
     places: Tensor | None = None  #: targets that do not move (k, 3)
     curve: Tensor | None = None  #: a line (m, 3) along which the target moves
     gates: Tensor | None = None  #: centres of gates (k, 3), in the order of flight; the target is one of them

@@ -1,4 +1,4 @@
-"""What TorchRL has to know of the entries that an environment reads and writes."""
+"""Build the specs that TorchRL reads: shapes and types of the entries of an environment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One control step, for any task and any drone: the one place that says what it is."""
+"""The control step, for any task and any drone, defined in one place."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ class ControlStep:
         if parameters or self.drawn:
             # A parameter of its own for each environment, where there is a gradient to be kept apart.
             plant = tuple(_rows(fields[name], name, n if parameters else 1) for name in names)
-        # Compiled regions must not share memory between their inputs: what is a view of the state is copied.
+        # Compiled regions must not share memory between their inputs, so views of the state are copied.
         wind = (state["wind"].t().clone(),) if "wind" in state else ()
         x = torch.cat([state[name].t() for name in self.dynamics.sizes])
         return state, valid, x, (self.dynamics.setpoint_rows(applied), plant, wind)

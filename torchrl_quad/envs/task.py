@@ -1,4 +1,4 @@
-"""What a task defines, and what it may use: everything that a task's author needs to know."""
+"""The interface for a task's author: what a task defines, and what it may use."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Task(abc.ABC):
         return state
 
     def metrics(self, state: State) -> State:
-        """What to measure beside the reward, by name, each (num_envs, 1), without gradient."""
+        """Measurements beside the reward, by name, each (num_envs, 1), without gradient."""
         return {}
 
     def state_bounds(self) -> dict[Any, tuple[float, float]]:
@@ -84,11 +84,11 @@ class Task(abc.ABC):
         return {}
 
     def scenery(self) -> Scenery:
-        """What pictures show beside the drones."""
+        """The things that pictures show beside the drones."""
         return Scenery()
 
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
-        """What the first episode of each environment came to, in a rollout (num_envs, time) from fresh starts.
+        """Judge the first episode of each environment, in a rollout (num_envs, time) from fresh starts.
 
         Returns:
             by name, each (num_envs): ``return``, the undiscounted sum of rewards; ``crash`` and ``solved``, 0 or 1;

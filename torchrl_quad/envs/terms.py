@@ -1,4 +1,4 @@
-"""What several tasks observe, reward and avoid."""
+"""Parts that several tasks share: observations, reward terms, boxes."""
 
 import torch
 from torch import Tensor

@@ -68,20 +68,21 @@ def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) ->
     from training import building, loop
 
     import torchrl_quad
-    from torchrl_quad import envs, objectives
+    from torchrl_quad import objectives
     from torchrl_quad.data import rollout as rollouts
+    from torchrl_quad.engine import stepper
+    from torchrl_quad.envs import base
 
     clocks = Clocks()
-    horizon = envs.horizon
-    clocks.around(horizon.Stepper, "__call__", "physics")
-    clocks.around(horizon._Step, "backward", "physics")
+    clocks.around(stepper.Stepper, "step_rows", "physics")
+    clocks.around(stepper._Step, "backward", "physics")
     clocks.around(ProbabilisticTensorDictSequential, "forward", "actor")
-    clocks.around(horizon, "fly", "bookkeeping")
+    clocks.around(base, "fly", "bookkeeping")
     clocks.around(rollouts, "differentiable_rollout", "bookkeeping")
     clocks.around(objectives.PathwiseLoss, "loss_actor", "loss")
     for loss, name in ((objectives.ABPTLoss, "loss_qvalue"), (objectives.SHACLoss, "loss_value")):
         clocks.around(loss, name, "critic")
-    clocks.around(objectives.pathwise.PathwiseCriticLoss, "write_value_target", "critic")
+    clocks.around(objectives.critic.PathwiseCriticLoss, "write_value_target", "critic")
     clocks.around(torch.optim.Adam, "step", "optimiser")
     clocks.around(torch.nn.utils, "clip_grad_norm_", "optimiser")
     clocks.around(building, "update_normalizer", "bookkeeping")

@@ -14,15 +14,13 @@ The memory is what the process (on Linux) has gained between the start of a hori
 
 import argparse
 import gc
-import multiprocessing
 import os
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import torch
-from report import RESULTS, save
+from report import RESULTS, in_own_process, save
 from throughput import FixedActions
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
@@ -93,10 +91,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--output", type=Path, default=RESULTS / "memory.csv")
     args = parser.parse_args()
-    rows = []
-    for mode in tqdm(args.modes):
-        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-            rows.append(pool.submit(measure, mode, args.num_envs, args.horizon, args.rounds).result())
+    rows = [in_own_process(measure, mode, args.num_envs, args.horizon, args.rounds) for mode in tqdm(args.modes)]
     save(args.output, rows, num_envs=args.num_envs, horizon=args.horizon)
 
 

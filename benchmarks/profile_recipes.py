@@ -8,17 +8,15 @@ Runs the recipes themselves, with clocks around their parts; a clock stops while
 
 import argparse
 import functools
-import multiprocessing
 import runpy
 import sys
 import tempfile
 import time
 from collections import defaultdict
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import torch
-from report import RESULTS, save
+from report import RESULTS, in_own_process, save
 from tensordict.nn import ProbabilisticTensorDictSequential
 from tqdm import tqdm
 
@@ -131,10 +129,10 @@ def main() -> None:
     parser.add_argument("--skip", type=int, default=5, help="iterations before the clocks start")
     parser.add_argument("--output", type=Path, default=RESULTS / "profile.csv")
     args = parser.parse_args()
-    rows = []
-    for algorithm in tqdm(args.algorithms):
-        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-            rows.append(pool.submit(profile, algorithm, args.overrides, args.skip, args.iterations).result())
+    rows = [
+        in_own_process(profile, algorithm, args.overrides, args.skip, args.iterations)
+        for algorithm in tqdm(args.algorithms)
+    ]
     save(args.output, rows, overrides=" ".join(args.overrides))
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import types
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,6 +16,19 @@ from torch.func import vjp
 
 from torchrl_quad.engine.packing import Layout, Rows, flat, nested
 from torchrl_quad.engine.simulation import Simulation, State, Transition
+
+
+def has_compiler() -> bool:
+    """Whether torch can compile here; a warning says what is missing."""
+    if shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++"):
+        return True
+    warnings.warn(
+        "compile: torch.compile needs a C++ compiler, and neither g++ nor clang++ is on the PATH. The environment "
+        "stays eager: correct, but several times slower. Install one (Debian: apt install g++), or name yours in the "
+        "environment variable CXX.",
+        stacklevel=3,
+    )
+    return False
 
 
 class Record(NamedTuple):

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
-import shutil
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,13 +13,13 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams, load_drone
-from torchrl_quad.engine import State, Stepper, can_fly, fly, nested
+from torchrl_quad.engine import State, Stepper, can_fly, fly, has_compiler, nested
 from torchrl_quad.envs import checks
 from torchrl_quad.envs.disturbances import Disturbance, choose_disturbances
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenery import merge_reset, visible_state
 from torchrl_quad.envs.specs import set_specs
-from torchrl_quad.envs.step import ControlStep
+from torchrl_quad.envs.step import ControlStep, draw_start, sample_state
 from torchrl_quad.envs.task import Task
 
 
@@ -57,19 +54,15 @@ class QuadrotorEnv(Task, EnvBase):
         action_delay: control steps between an action and its effect.
         integrator: "euler", "semi_implicit_euler" or "rk4".
         max_episode_steps: control steps after which an episode is truncated.
-        observe_last_action: append the commands that are still on their way to the observation, which makes the delay
-            visible to the policy. Off in the paper.
-        observation_noise: standard deviations of white noise on the observation, a mapping with any of ``position``
-            [m], ``attitude`` [rad], ``velocity`` [m/s], ``angular_velocity`` [rad/s]; or a
-            :class:`~torchrl_quad.envs.disturbances.Sensors`.
+        observe_last_action: append the commands that are still on their way to the observation. Off in the paper.
+        observation_noise: standard deviations of white noise on the observation: a mapping with fields of
+            :class:`~torchrl_quad.envs.disturbances.Sensors`, or one of these.
         observation_delay: control steps by which the observation of the drone lags behind.
         weights: other weights of reward terms, by name: ``{"velocity": 0.0}``.
         randomize: another drone in each episode: a mapping, or the path of a YAML file, from parameters to
             distributions; see :class:`~torchrl_quad.envs.disturbances.DroneRandomization`.
-        wind: a mapping with any of ``mean``, ``spread``, ``gust``, ``gust_time``, or a
-            :class:`~torchrl_quad.envs.disturbances.Wind`.
-        random_start: a mapping with any of ``tilt``, ``yaw``, ``velocity``, ``angular_velocity``, or a
-            :class:`~torchrl_quad.envs.disturbances.RandomStart`.
+        wind: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.Wind`, or one of these.
+        random_start: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.RandomStart`, or one of these.
         disturbances: disturbances of your own; see :class:`~torchrl_quad.envs.disturbances.Disturbance`.
         compile: compile the control step and its derivative, which takes half a minute for each number of environments,
             and a few seconds once torch has it in its cache; see ``docs/performance.md``. First derivatives only.
@@ -113,14 +106,11 @@ class QuadrotorEnv(Task, EnvBase):
             observe_last_action,
         )  # fmt: skip
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
-        self.num_envs, self.dtype, self.control_dt = num_envs, dtype, control_dt
-        self.action_delay, self.max_episode_steps = action_delay, max_episode_steps
-        self.observe_last_action = observe_last_action
+        self.num_envs, self.dtype, self.control_dt, self.action_delay = num_envs, dtype, control_dt, action_delay
+        self.max_episode_steps, self.observe_last_action = max_episode_steps, observe_last_action
         self.initial_state_source: Callable[[int], TensorDictBase] | None = None
-        params = (drone if isinstance(drone, QuadrotorParams) else load_drone(drone)).to(
-            device=self.device, dtype=dtype
-        )
-        checks.check_params(params, num_envs)
+        params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone)
+        params = checks.checked_params(params.to(device=self.device, dtype=dtype), num_envs)
         model = {"dt": dt, "substeps": substeps, "integrator": integrator}
         self._make_dynamics = functools.partial(DYNAMICS[dynamics], **model)
         self.dynamics: Dynamics = self._make_dynamics(params)
@@ -136,7 +126,7 @@ class QuadrotorEnv(Task, EnvBase):
         self.set_up()
         self.task_entries = [key for key in self.initial_state(num_envs) if key not in self.dynamics.sizes]
         self.task_advances = type(self).advance is not Task.advance
-        state = self._sample_state(num_envs)
+        state = sample_state(self, num_envs)
         checks.check_task(self, state)
         self._connect(state)
         set_specs(self)
@@ -159,33 +149,22 @@ class QuadrotorEnv(Task, EnvBase):
 
     def set_params(self, params: QuadrotorParams) -> None:
         """Set :attr:`params`, also through a TransformedEnv, where an assignment would not reach this environment."""
-        checks.check_params(params, self.num_envs)
+        params = checks.checked_params(params, self.num_envs)
         fits = all(x.dtype == self.dtype and x.device == self.device for x in params.fields().values())
         self._params = params if fits else params.to(device=self.device, dtype=self.dtype)
 
     def set_initial_state_source(self, source: Callable[[int], TensorDictBase] | None) -> None:
         """Choose where resets start, also through a TransformedEnv.
 
-        Args:
-            source: ``source(n)`` returns n complete states, the content of ``td["state"]``; None for the task's own
-                starts.
+        ``source(n)`` returns n complete states, the content of ``td["state"]``. None means the task's own starts.
         """
-        checks.require(
-            source is None or callable(source),
-            "initial_state_source must be a function from a number n to n states, or None for the task's own starts; "
-            f"got {type(source).__name__}.",
-        )
+        checks.check_source(source)
         self.initial_state_source = source
         self.randomness.forget()
 
     def sample_start(self, n: int) -> TensorDict:
         """Draw n complete Markov states from the task's own starts: a tensordict [n] with ``state``."""
-        return TensorDict({"state": nested(self._sample_state(n))}, [n], self.device)
-
-    @property
-    def neutral_action(self) -> Tensor:
-        """The action that a new policy starts from, which hovers."""
-        return self.hover_action
+        return TensorDict({"state": nested(sample_state(self, n))}, [n], self.device)
 
     def random_state(self) -> dict[str, Any]:
         """Everything random in this environment, to resume from later; torch can save it."""
@@ -207,15 +186,7 @@ class QuadrotorEnv(Task, EnvBase):
         TransformedEnv's own ``compile`` takes minutes and makes nothing faster.
         """
         kwargs.pop("warmup", None)  # TorchRL's option for steps whose input changes its layout: ours never does
-        if shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++"):
-            self._stepper = Stepper(self.control_step, kwargs)
-        else:
-            warnings.warn(
-                "compile: torch.compile needs a C++ compiler, and neither g++ nor clang++ is on the PATH. The "
-                "environment stays eager: correct, but several times slower. Install one (Debian: apt install g++), or "
-                "name yours in the environment variable CXX.",
-                stacklevel=2,
-            )
+        self._stepper = Stepper(self.control_step, kwargs if has_compiler() else None)
         return self
 
     def eager(self) -> QuadrotorEnv:
@@ -234,19 +205,16 @@ class QuadrotorEnv(Task, EnvBase):
         self.disturbances = self._make_disturbances(self.nominal, self.dynamics.plant_fields)
         self.randomness = Randomness(self.device, self.dtype)
         self.set_up()
-        self._connect(
-            {key: x.to(self.device) for key, x in self.control_step.safe_state.items()}, self._stepper.options
-        )
+        safe_state = {key: x.to(self.device) for key, x in self.control_step.safe_state.items()}
+        self._connect(safe_state, self._stepper.options)
         self.set_seed(self._seed)
         return self
 
     def render(self, drones: Sequence[int] | None = None, *, size: int = 336) -> Any:
         """Draw the drones as the last reset, step or rollout left them, with their targets, into one picture.
 
-        TorchRL's ``PixelRenderTransform`` asks for it, and ``VideoRecorder`` films it:
-        ``TransformedEnv(env, Compose(PixelRenderTransform(), VideoRecorder(logger, "flight", fps=50)))``. Keywords of
-        the transform arrive here: ``PixelRenderTransform(drones=[0, 1], size=480)``. The view grows when a drone leaves
-        it.
+        TorchRL's ``PixelRenderTransform(drones=[0, 1], size=480)`` calls it, and ``VideoRecorder`` films it. The view
+        grows when a drone leaves it.
 
         Args:
             drones: indices of those to draw; by default the first six.
@@ -256,8 +224,7 @@ class QuadrotorEnv(Task, EnvBase):
             the picture (size, size, 3), a numpy array of uint8.
 
         Raises:
-            ValueError: there is no state yet, as before the first reset and after ``to``; or an argument is out of its
-                range.
+            ValueError: there is no state yet, as before the first reset; or an argument is out of its range.
             ImportError: matplotlib is missing.
         """
         from torchrl_quad.render.frames import draw_frame  # matplotlib is needed only here
@@ -273,38 +240,8 @@ class QuadrotorEnv(Task, EnvBase):
         self.randomness.noise_shapes = {
             name: (self.num_envs, x.noise_size) for name, x in self.disturbances.items() if x.noise_size
         }
-        self.randomness.draw_start = self._draw_start
+        self.randomness.draw_start = functools.partial(draw_start, self)
         self.render_state: State = {}  # positions, quaternions and targets, for render()
-
-    def _sample_state(self, n: int) -> State:
-        state = self.initial_state(n)
-        for disturbance in self.disturbances.values():
-            state |= disturbance.start(self.randomness, state)
-        if self.action_delay:
-            hover = self.hover_action.expand(n, 4).unsqueeze(1)
-            state["action_queue"] = hover.expand(n, self.action_delay, 4).clone()
-        state["step"] = torch.zeros(n, 1, dtype=torch.int64, device=self.device)
-        return state
-
-    def _draw_start(self) -> dict[str, Any]:
-        """What a reset of all environments writes, nested."""
-        if self.initial_state_source is None:
-            return self._outputs_at_start(self._sample_state(self.num_envs))
-        source = self.initial_state_source(self.num_envs)
-        return self._outputs_at_start(checks.restore_state(self, source, "initial_state_source"))
-
-    def _outputs_at_start(self, state: State) -> dict[str, Any]:
-        return {"state": nested(state), **self.control_step.at_start(state)}
-
-    def observation(self, state: State) -> Tensor:
-        """The observation (num_envs, k) of a state as the policy sees it: through sensors, with the last actions."""
-        seen = state
-        for disturbance in self.disturbances.values():
-            seen = disturbance.observe(seen)
-        observation = self.observe(seen)
-        if self.observe_last_action:
-            observation = torch.cat((observation, state["action_queue"].flatten(1)), -1)
-        return observation
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = seed
@@ -318,7 +255,7 @@ class QuadrotorEnv(Task, EnvBase):
                 tensordict is not None and "state" in tensordict,
                 f'{source} needs a tensordict with the state to set in "state"; got none.',
             )
-            entries = self._outputs_at_start(checks.restore_state(self, tensordict.get("state"), source, mask))
+            entries = self.control_step.reset(checks.restore_state(self, tensordict.get("state"), source, mask))
         else:
             everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
             entries = self.randomness.starts(everyone if mask is None else mask.reshape(-1))
@@ -352,9 +289,8 @@ class QuadrotorEnv(Task, EnvBase):
                 state = checks.read_state(start.get("state"), self.control_step.safe_state, "rollout")
                 rollout = fly(self._stepper, self.randomness, policy, state, start, max_steps)
                 checks.require_finite(rollout["action"])
-                # Copied, so that not all of the rollout's memory is kept.
-                last = visible_state(rollout["next", "state"])
-                self._keep_for_render({key: x[:, -1].clone() for key, x in last.items()})
+                last = visible_state(rollout["next", "state"]).items()
+                self._keep_for_render({key: x[:, -1].clone() for key, x in last})  # not the memory of all steps
                 return rollout
             options |= {"tensordict": start, "auto_reset": False}
         return super().rollout(max_steps, policy, callback, **options)

@@ -118,8 +118,8 @@ def checked_weights(weights: Any, known: Mapping[str, float]) -> Mapping[str, fl
     return weights
 
 
-def check_params(params: Any, num_envs: int) -> None:
-    """Refuse what is not a drone, or a drone for another number of environments."""
+def checked_params(params: Any, num_envs: int) -> QuadrotorParams:
+    """The drone, if it is one, for this number of environments."""
     if not isinstance(params, QuadrotorParams):
         raise TypeError(
             f"params must be QuadrotorParams, such as env.params.replace(mass=0.5) or load_drone('visfly'); got "
@@ -128,6 +128,16 @@ def check_params(params: Any, num_envs: int) -> None:
     for name, value in params.fields().items():
         batch = value.shape[0] if value.dim() > params.dim(name) else 1
         require(batch in (1, num_envs), f"drone: field {name!r} is for {batch} environments, and num_envs={num_envs}.")
+    return params
+
+
+def check_source(source: Any) -> None:
+    """Refuse a source of states that cannot be called."""
+    require(
+        source is None or callable(source),
+        "initial_state_source must be a function from a number n to n states, or None for the task's own starts; "
+        f"got {type(source).__name__}.",
+    )
 
 
 def check_task(env: Any, state: State) -> None:

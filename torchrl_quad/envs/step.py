@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.dynamics.parameters import RawParams
-from torchrl_quad.engine import State, Transition
-from torchrl_quad.envs.checks import check_action
+from torchrl_quad.engine import State, Transition, nested
+from torchrl_quad.envs.checks import check_action, restore_state
 from torchrl_quad.envs.guard import MAX_VALUE, Containment, Guard, is_traced, is_true, like
 
 
@@ -100,7 +100,17 @@ class ControlStep:
         """The outputs that any state has, also the first of an episode."""
         with torch.no_grad():
             metrics = self.env.metrics(state)
-        return {"observation": self.env.observation(state), "metrics": metrics}
+        return {"observation": self.observe(state), "metrics": metrics}
+
+    def observe(self, state: State) -> Tensor:
+        """The observation (n, k) as the policy sees it: through sensors, with the commands on their way if wanted."""
+        seen = state
+        for disturbance in self.env.disturbances.values():
+            seen = disturbance.observe(seen)
+        observation = self.env.observe(seen)
+        if not self.env.observe_last_action:
+            return observation
+        return torch.cat((observation, state["action_queue"].flatten(1)), -1)
 
     def at_start(self, state: State) -> dict[str, Any]:
         """All outputs of the first state of an episode, nested; there is no reward yet."""
@@ -108,6 +118,10 @@ class ControlStep:
         flags = {name: no.clone() for name in ("crash", "terminated", "truncated", "done")}
         terms = {name: torch.zeros_like(term) for name, term in self.env.reward_terms(state).items()}
         return {**self.measure(state), "reward_terms": terms, "success": self.env.is_success(state), **flags}
+
+    def reset(self, state: State) -> dict[str, Any]:
+        """All entries that a reset to a state writes, nested."""
+        return {"state": nested(state), **self.at_start(state)}
 
     # -- for the engine ------------------------------------------------------------------------------------------------
 
@@ -152,6 +166,26 @@ class ControlStep:
         """Judge where the rows ``x`` have flown."""
         sizes = self.dynamics.sizes
         return self.judge(before, dict(zip(sizes, x.t().split(list(sizes.values()), 1), strict=True)), valid, noise)
+
+
+def sample_state(env: Any, n: int) -> State:
+    """Draw n states at the start of an episode: the task's start, disturbed, with commands to hover on their way."""
+    state = env.initial_state(n)
+    for disturbance in env.disturbances.values():
+        state |= disturbance.start(env.randomness, state)
+    if env.action_delay:
+        hover = env.hover_action.expand(n, 4).unsqueeze(1)
+        state["action_queue"] = hover.expand(n, env.action_delay, 4).clone()
+    state["step"] = torch.zeros(n, 1, dtype=torch.int64, device=env.device)
+    return state
+
+
+def draw_start(env: Any) -> dict[str, Any]:
+    """All entries that a reset of all environments writes, nested."""
+    if env.initial_state_source is None:
+        return env.control_step.reset(sample_state(env, env.num_envs))
+    source = env.initial_state_source(env.num_envs)
+    return env.control_step.reset(restore_state(env, source, "initial_state_source"))
 
 
 def _rows(parameter: Tensor, name: str, n: int) -> Tensor:

@@ -109,6 +109,11 @@ class Task(abc.ABC):
         """The action (4) that holds the nominal drone where it is; (num_envs, 4) where drones differ in it."""
         return self.dynamics.hover_action
 
+    @property
+    def neutral_action(self) -> Tensor:
+        """The action that a new policy starts from, which hovers."""
+        return self.hover_action
+
     def hover_state(self, position: Tensor) -> State:
         """Level, still, rotors at hover speed, at the positions (n, 3) [m]."""
         return self.dynamics.rest(position)

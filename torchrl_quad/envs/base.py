@@ -34,9 +34,8 @@ class QuadrotorEnv(Task, EnvBase):
     weighted terms whose sum is the reward, and ``("metrics", name)``, what the task measures, without gradient. At a
     reset the terms are zero.
 
-    ``env.params`` is the drone that flies, ``env.nominal`` the drone that its controller believes in. To change the
-    drone, assign ``env.params = env.params.replace(mass=0.5)``, or under transforms call ``env.set_params(...)``. A
-    parameter that requires grad can be fitted.
+    ``env.params`` is the drone that flies, ``env.nominal`` the drone that its controller believes in. Assign
+    ``env.params = env.params.replace(mass=0.5)`` to change it. A parameter that requires grad can be fitted.
 
     The action is (4) in [-1, 1]: collective thrust (-1..1 maps to 0..max_thrust_to_weight times the nominal weight),
     then roll, pitch and yaw rate in units of the drone's max_body_rate.
@@ -59,18 +58,17 @@ class QuadrotorEnv(Task, EnvBase):
             :class:`~torchrl_quad.envs.disturbances.Sensors`, or one of these.
         observation_delay: control steps by which the observation of the drone lags behind.
         weights: other weights of reward terms, by name: ``{"velocity": 0.0}``.
-        randomize: another drone in each episode: a mapping, or the path of a YAML file, from parameters to
-            distributions; see :class:`~torchrl_quad.envs.disturbances.DroneRandomization`.
+        randomize: distributions of parameters for another drone in each episode, a mapping or a YAML file; see
+            :class:`~torchrl_quad.envs.disturbances.DroneRandomization`.
         wind: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.Wind`, or one of these.
         random_start: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.RandomStart`, or one of these.
         disturbances: disturbances of your own; see :class:`~torchrl_quad.envs.disturbances.Disturbance`.
-        compile: compile the control step and its derivative, which takes half a minute for each number of environments,
-            and a few seconds once torch has it in its cache; see ``docs/performance.md``. First derivatives only.
+        compile: compile the step and its first derivative, which takes half a minute the first time; see
+            ``docs/performance.md``.
 
     Raises:
-        TypeError: an argument is unknown; the message names the closest one, and all of them.
-        ValueError: an argument is out of its range. Of a step: the action or the state has the wrong shape, precision
-            or device, or the action is not finite.
+        TypeError: an argument is unknown.
+        ValueError: an argument is out of range. Of a step: action or state do not fit, or an action is not finite.
     """
 
     batch_locked = True

@@ -30,9 +30,8 @@ class QuadrotorEnv(Task, EnvBase):
     every entry of ``"next"`` to the actions, to the state, and to ``env.params``. A task subclasses this and defines
     what :class:`~torchrl_quad.envs.Task` asks for; :class:`~torchrl_quad.envs.HoveringEnv` is the pattern.
 
-    Beside ``"observation"`` and ``"state"`` a step writes ``"success"``, ``"crash"``, ``("reward_terms", name)``, the
-    weighted terms whose sum is the reward, and ``("metrics", name)``, what the task measures, without gradient. At a
-    reset the terms are zero.
+    Beside ``"observation"`` and ``"state"`` a step writes ``"success"``, ``"crash"``, ``("reward_terms", name)``, whose
+    sum is the reward, and ``("metrics", name)``, what the task measures, without gradient.
 
     ``env.params`` is the drone that flies, ``env.nominal`` the drone that its controller believes in. Assign
     ``env.params = env.params.replace(mass=0.5)`` to change it. A parameter that requires grad can be fitted.
@@ -44,8 +43,8 @@ class QuadrotorEnv(Task, EnvBase):
         num_envs: number of drones that fly in parallel.
         device: device of all tensors.
         dtype: torch.float32 or torch.float64.
-        seed: seed of the environment's own random generator; None takes another one each time. One seed gives one
-            flight. Copies with one seed, as in ParallelEnv, fly alike: give each its own, or call ``set_seed``.
+        seed: of the environment's own random generator; None takes another one each time. One seed gives one flight:
+            give each of several copies its own, as in ParallelEnv.
         drone: name of a preset, path of a YAML file, mapping, or :class:`~torchrl_quad.QuadrotorParams`.
         dynamics: "quadrotor", or "point_mass", whose thrust and body rates follow the action at once.
         dt: physics step [s].

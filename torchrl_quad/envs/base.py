@@ -157,7 +157,7 @@ class QuadrotorEnv(Task, EnvBase):
         """
         checks.check_source(source)
         self.initial_state_source = source
-        self.randomness.forget()
+        self.randomness.forget_starts()
 
     def sample_start(self, n: int) -> TensorDict:
         """Draw n complete Markov states from the task's own starts: a tensordict [n] with ``state``."""

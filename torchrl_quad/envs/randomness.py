@@ -44,7 +44,12 @@ class Randomness:
     def forget(self) -> None:
         """Throw away what was drawn in advance."""
         self._position, self._noise = STEPS_PER_DRAW, {}
-        self._forget_starts()
+        self.forget_starts()
+
+    def forget_starts(self) -> None:
+        """Throw away the starts that were drawn in advance, as when they come from elsewhere."""
+        self._starts: list[dict[Any, Tensor]] = []
+        self._used: Tensor | None = None  # how many of these starts each environment has used
 
     def uniform(self, *shape: int) -> Tensor:
         """Uniform numbers in [-1, 1]."""
@@ -67,14 +72,14 @@ class Randomness:
         if self._position == STEPS_PER_DRAW:
             self._position = 0
             self._noise = {name: self.normal(STEPS_PER_DRAW, *shape) for name, shape in self.noise_shapes.items()}
-            self._forget_starts()
+            self.forget_starts()
         self._position += 1
         return {name: x[self._position - 1] for name, x in self._noise.items()}
 
     def starts(self, mask: Tensor) -> dict[str, Any]:
         """What a reset writes for the environments in the mask, bool (n); the rows of the others mean nothing."""
         if mask.all():
-            self._forget_starts()
+            self.forget_starts()
             return self.draw_start()
         used = torch.zeros(len(mask), dtype=torch.int64) if self._used is None else self._used
         mask = mask.cpu()
@@ -100,7 +105,3 @@ class Randomness:
 
     def _drawn(self) -> dict[str, Any]:
         return {"position": self._position, "noise": self._noise, "starts": self._starts, "used": self._used}
-
-    def _forget_starts(self) -> None:
-        self._starts: list[dict[Any, Tensor]] = []
-        self._used: Tensor | None = None  # how many of these starts each environment has used

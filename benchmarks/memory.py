@@ -14,15 +14,13 @@ The memory is what the process (on Linux) has gained between the start of a hori
 
 import argparse
 import gc
-import multiprocessing
 import os
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import torch
-from report import RESULTS, save
+from report import RESULTS, in_own_process, save
 from throughput import FixedActions
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
@@ -30,7 +28,8 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_quad import differentiable_rollout, make_env
-from torchrl_quad.envs.horizon import Ends, Rows
+from torchrl_quad.engine.packing import Rows
+from torchrl_quad.engine.stepper import Record
 
 MODES = ["eager", "recompute", "compiled"]
 
@@ -42,16 +41,17 @@ def resident() -> int:
 
 def recompute(env: EnvBase) -> None:
     """Let an environment keep only the input of each step."""
-    once = type(env.stepper)
+    once = env._stepper.step_rows
 
-    class Checkpointed(once):
-        def __call__(self, state: Rows, valid: Tensor, action: Tensor, *others: Any) -> Ends:
-            def step(floats: Tensor, action: Tensor) -> tuple[Tensor, ...]:
-                return once.__call__(self, state._replace(floats=floats), valid, action, *others).leaves()
+    def step_rows(rows: Rows, *others: Any) -> Record:
+        def step(floats: Tensor) -> tuple[Tensor, ...]:
+            end = once(rows._replace(floats=floats), *others)
+            return *end.state, *end.outputs, end.observation
 
-            return Ends.of(checkpoint(step, state.floats, action, use_reentrant=False))
+        leaves = checkpoint(step, rows.floats, use_reentrant=False)
+        return Record(Rows(*leaves[:3]), Rows(*leaves[3:6]), leaves[6])
 
-    env.stepper.__class__ = Checkpointed
+    env._stepper.step_rows = step_rows
 
 
 def measure(mode: str, n: int, horizon: int, rounds: int) -> dict[str, float | str]:
@@ -91,10 +91,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--output", type=Path, default=RESULTS / "memory.csv")
     args = parser.parse_args()
-    rows = []
-    for mode in tqdm(args.modes):
-        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-            rows.append(pool.submit(measure, mode, args.num_envs, args.horizon, args.rounds).result())
+    rows = [in_own_process(measure, mode, args.num_envs, args.horizon, args.rounds) for mode in tqdm(args.modes)]
     save(args.output, rows, num_envs=args.num_envs, horizon=args.horizon)
 
 

@@ -8,17 +8,15 @@ Runs the recipes themselves, with clocks around their parts; a clock stops while
 
 import argparse
 import functools
-import multiprocessing
 import runpy
 import sys
 import tempfile
 import time
 from collections import defaultdict
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import torch
-from report import RESULTS, save
+from report import RESULTS, in_own_process, save
 from tensordict.nn import ProbabilisticTensorDictSequential
 from tqdm import tqdm
 
@@ -68,20 +66,21 @@ def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) ->
     from training import building, loop
 
     import torchrl_quad
-    from torchrl_quad import envs, objectives
+    from torchrl_quad import objectives
     from torchrl_quad.data import rollout as rollouts
+    from torchrl_quad.engine import stepper
+    from torchrl_quad.envs import base
 
     clocks = Clocks()
-    horizon = envs.horizon
-    clocks.around(horizon.Stepper, "__call__", "physics")
-    clocks.around(horizon._Step, "backward", "physics")
+    clocks.around(stepper.Stepper, "step_rows", "physics")
+    clocks.around(stepper._Step, "backward", "physics")
     clocks.around(ProbabilisticTensorDictSequential, "forward", "actor")
-    clocks.around(horizon, "fly", "bookkeeping")
+    clocks.around(base, "fly", "bookkeeping")
     clocks.around(rollouts, "differentiable_rollout", "bookkeeping")
     clocks.around(objectives.PathwiseLoss, "loss_actor", "loss")
     for loss, name in ((objectives.ABPTLoss, "loss_qvalue"), (objectives.SHACLoss, "loss_value")):
         clocks.around(loss, name, "critic")
-    clocks.around(objectives.pathwise.PathwiseCriticLoss, "write_value_target", "critic")
+    clocks.around(objectives.critic.PathwiseCriticLoss, "write_value_target", "critic")
     clocks.around(torch.optim.Adam, "step", "optimiser")
     clocks.around(torch.nn.utils, "clip_grad_norm_", "optimiser")
     clocks.around(building, "update_normalizer", "bookkeeping")
@@ -130,10 +129,10 @@ def main() -> None:
     parser.add_argument("--skip", type=int, default=5, help="iterations before the clocks start")
     parser.add_argument("--output", type=Path, default=RESULTS / "profile.csv")
     args = parser.parse_args()
-    rows = []
-    for algorithm in tqdm(args.algorithms):
-        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-            rows.append(pool.submit(profile, algorithm, args.overrides, args.skip, args.iterations).result())
+    rows = [
+        in_own_process(profile, algorithm, args.overrides, args.skip, args.iterations)
+        for algorithm in tqdm(args.algorithms)
+    ]
     save(args.output, rows, overrides=" ".join(args.overrides))
 
 

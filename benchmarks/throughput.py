@@ -2,14 +2,16 @@
 
 python benchmarks/throughput.py --num-envs 64 256 1024 --threads 1
 
-=========  =============================================================================================
-physics    the control step alone: rate controller, rotors and rigid body, four physics steps
-env        the whole environment through ``differentiable_rollout``, with fixed actions
-actor      the same with a 64-64 policy
-rollout    the same through ``env.rollout``
-torchrl    the same through TorchRL's own loop, which transforms and other policies fall back to
-crazyflow  its body-rate model (JAX), ten substeps, where it is installed: pip install crazyflow
-=========  =============================================================================================
+==========  ============================================================================================
+physics     the control step alone: rate controller, rotors and rigid body, four physics steps
+env         the whole environment through ``differentiable_rollout``, with fixed actions
+point mass  the same with ``dynamics="point_mass"``
+actor       the environment with a 64-64 policy
+rollout     the same through ``env.rollout``
+torchrl     the same through TorchRL's own loop, which transforms and other policies fall back to
+step        one eager ``env.step`` after another: racing with gusts and noisy sensors, fixed actions
+crazyflow   its body-rate model (JAX), ten substeps, where it is installed: pip install crazyflow
+==========  ============================================================================================
 
 All of one size are timed in turns, round after round, and the best round counts. Writes
 ``benchmarks/results/throughput.csv`` size by size, and leaves out what stands there already.
@@ -24,6 +26,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from report import RESULTS, finished, save
@@ -34,8 +37,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_quad import differentiable_rollout, make_actor, make_env
-from torchrl_quad.dynamics import QuadrotorState, control_step
-from torchrl_quad.dynamics.compiled import CompiledControlStep
+from torchrl_quad.engine import State, Stepper, Transition
 
 
 class FixedActions(TensorDictModuleBase):
@@ -52,68 +54,87 @@ class FixedActions(TensorDictModuleBase):
 
 
 class Physics:
-    """The control step of an environment without the environment."""
+    """The control step of an environment without the environment: a simulation that does nothing else."""
 
-    def __init__(self, env: EnvBase, compiled: bool) -> None:
-        self.env, self.compiled = env, compiled
-        state = env.reset()["state"]
-        self.start = QuadrotorState(*(state[name] for name in QuadrotorState._fields))
-        step = CompiledControlStep(env.controller, env.dt, env.substeps, env.integrator)
+    parameters = ()
 
-        def setpoint(action: Tensor) -> Tensor:
-            return torch.cat([x.t() for x in env.controller.setpoint(action)])
+    def __init__(self, env: EnvBase) -> None:
+        self.dynamics, self.substeps = env.dynamics, env.dynamics.substeps
+        self.start = env.reset()["state"].select(*self.dynamics.sizes).to_dict()
+        self.valid = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
+        self.stepper = Stepper(self, {} if env.is_compiled else None)
 
-        def adjoint(states: list[Tensor], action: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
-            asked, pull_back = torch.func.vjp(setpoint, action)
-            grad, grad_asked, *_ = step.pull_back(states, asked, (), (), grad)
-            return grad, pull_back(grad_asked)[0]
-
-        options = {"fullgraph": True, "dynamic": False}
-        forward = torch.compile(lambda state, action: step.fly(state, setpoint(action), (), ()), **options)
-        backward = torch.compile(adjoint, **options)
-
-        class Step(torch.autograd.Function):
-            @staticmethod
-            def forward(ctx, state: Tensor, action: Tensor) -> Tensor:
-                states = forward(state.detach(), action.detach())
-                ctx.save_for_backward(action.detach(), *states)
-                return states[-1]
-
-            @staticmethod
-            @torch.autograd.function.once_differentiable
-            def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor]:
-                action, *states = ctx.saved_tensors
-                return backward(states, action, grad)
-
-        self.step = Step
-
-    def __call__(self, actions: Tensor) -> Tensor:
-        if self.compiled:
-            state = torch.cat(self.start, -1).t().contiguous()
+    def fly(self, actions: Tensor) -> Tensor:
+        """A number that depends on all actions (horizon, n, 4)."""
+        if not self.stepper.is_compiled:
+            state = self.start
             for action in actions.unbind():
-                state = self.step.apply(state, action)
-            return state.sum()
-        env, state = self.env, self.start
+                state = self.stepper.step(state, self.valid, action, {}).state
+            return torch.cat(list(state.values()), -1).sum()
+        rows = self.stepper.layout.pack(self.start)
         for action in actions.unbind():
-            state = control_step(state, action, env.nominal, env.controller, env.dt, env.substeps, env.integrator)
-        return torch.cat(state, -1).sum()
+            rows = self.stepper.step_rows(rows, self.valid, action, {}).state
+        return rows.floats.sum()
+
+    # -- for the engine ------------------------------------------------------------------------------------------------
+
+    def example(self) -> tuple[State, State]:
+        return self.start, self.outputs(self.start)
+
+    def outputs(self, state: State) -> State:
+        return {"observation": state["position"], "reward": state["position"][:, :1]}
+
+    def __call__(self, state: State, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Transition:
+        state = self.dynamics.control_step(state, action, self.dynamics.nominal, None)
+        return Transition(state, self.outputs(state), valid)
+
+    def begin(self, state: State, valid: Tensor, action: Tensor, parameters: tuple[Tensor, ...]) -> tuple[Any, ...]:
+        x = torch.cat([state[name].t() for name in self.dynamics.sizes])
+        return state, valid, x, (self.dynamics.setpoint_rows(action), (), ())
+
+    def rows_step(self) -> Callable[..., Tensor]:
+        return self.dynamics.rows_step()
+
+    def finish(self, before: State, x: Tensor, valid: Tensor, noise: dict[str, Tensor]) -> Transition:
+        sizes = self.dynamics.sizes
+        state = dict(zip(sizes, x.t().split(list(sizes.values()), 1), strict=True))
+        return Transition(state, self.outputs(state), valid)
 
 
-def flights(env: EnvBase, compiled: bool) -> dict[str, Callable[[Tensor], Tensor]]:
+def flights(task: str, options: dict[str, Any]) -> dict[str, Callable[[Tensor], Tensor]]:
     """From a horizon of actions (horizon, n, 4) to a number, by name; those with a policy ignore the actions."""
+    env = make_env(task, **options)
     actor, start = make_actor(env), env.reset()
-    options = {"tensordict": start, "auto_reset": False, "break_when_any_done": False}
+    points = make_env(task, dynamics="point_mass", **options)
+    as_is = {"tensordict": start, "auto_reset": False, "break_when_any_done": False}
 
     def return_of(rollout: TensorDictBase) -> Tensor:
         return rollout["next", "reward"].sum()
 
-    return {
-        "physics": Physics(env, compiled),
-        "env": lambda actions: return_of(differentiable_rollout(env, FixedActions(actions), start, len(actions))[0]),
-        "actor": lambda actions: return_of(differentiable_rollout(env, actor, start, len(actions))[0]),
-        "rollout": lambda actions: return_of(env.rollout(len(actions), actor, **options)),
-        "torchrl": lambda actions: return_of(EnvBase.rollout(env, len(actions), actor, **options)),
+    def fly(env: EnvBase, policy: TensorDictModuleBase, actions: Tensor) -> Tensor:
+        start = env.reset()
+        return return_of(differentiable_rollout(env, policy, start, len(actions))[0])
+
+    cases = {
+        "physics": Physics(env).fly,
+        "env": lambda actions: fly(env, FixedActions(actions), actions),
+        "point mass": lambda actions: fly(points, FixedActions(actions), actions),
+        "actor": lambda actions: fly(env, actor, actions),
+        "rollout": lambda actions: return_of(env.rollout(len(actions), actor, **as_is)),
+        "torchrl": lambda actions: return_of(EnvBase.rollout(env, len(actions), actor, **as_is)),
     }
+    if env.is_compiled:
+        return cases
+    racing = make_env("racing", wind={"gust": 0.5}, observation_noise={"position": 0.01}, **options)
+
+    def steps(actions: Tensor) -> Tensor:
+        td, total = racing.reset(), 0.0
+        for action in actions.unbind():
+            td = racing.step(td.set("action", action))["next"]
+            total = total + td["reward"].sum()
+        return total
+
+    return {**cases, "step": steps}
 
 
 def crazyflow(n: int) -> tuple[Callable[[Tensor], None], Callable[[Tensor], None]]:
@@ -150,10 +171,10 @@ def with_gradient(flight: Callable[[Tensor], Tensor], actions: Tensor) -> None:
 
 def measure(n: int, mode: str, task: str, horizon: int, rounds: int, device: str) -> list[dict[str, float | str]]:
     """The best of several rounds for each case."""
-    env = make_env(task, num_envs=n, device=device, compile=mode == "compiled")
-    actions = env.hover_action + 0.1 * torch.randn(horizon, n, 4, device=device)
+    options = {"num_envs": n, "device": device, "compile": mode == "compiled"}
+    actions = make_env(task).hover_action.to(device) + 0.1 * torch.randn(horizon, n, 4, device=device)
     cases = {}
-    for name, flight in flights(env, mode == "compiled").items():
+    for name, flight in flights(task, options).items():
         cases[name] = partial(forward_only, flight), partial(with_gradient, flight)
     if importlib.util.find_spec("crazyflow") and mode == "compiled":
         cases["crazyflow"] = crazyflow(n)

@@ -21,7 +21,7 @@ def main(cfg: DictConfig) -> None:
     folder, env = Path(cfg.checkpoint).parent, build_env(trained, 1, 0)
     write_summary(folder / "evaluation.json", summary)
     path = folder / "evaluation"
-    draw_flight(flight, path, env.control_dt)
+    draw_flight(flight, path, env)
     publish_flight(flight, path.with_suffix(".pdf"), path.with_suffix(".html"), env)
     print_summary(summary, env.metric_info, folder)
 

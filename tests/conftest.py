@@ -77,7 +77,7 @@ def no_pictures(monkeypatch):
 
     monkeypatch.setattr(drawing, "draw_flight", lambda *args: None)
     monkeypatch.setattr(drawing, "publish_flight", lambda *args: None)
-    monkeypatch.setattr(drawing, "draw_learning_curve", lambda metrics, path: path.touch())
+    monkeypatch.setattr(drawing, "draw_learning_curve", lambda metrics, path, env: path.touch())
 
 
 @pytest.fixture

@@ -88,13 +88,13 @@ def test_terminal_velocity_is_where_drag_balances_weight():
 
 
 def test_drag_opposes_motion_along_every_axis_in_both_directions():
-    params = drone(gravity=1e-9)
+    params = drone(gravity=0.01)
     for axis in range(3):
         for sign in (-1.0, 1.0):
             velocity = torch.zeros(1, 3, dtype=F64)
             velocity[0, axis] = 5.0 * sign
             linear, _ = accelerations(body(velocity=velocity), NO_WRENCH, params)
-            assert (linear * velocity).sum() < 0
+            assert (linear * velocity).sum() < -0.05
 
 
 def test_energy_is_conserved_without_drag_and_lost_with_it():

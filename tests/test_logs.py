@@ -147,7 +147,7 @@ def test_too_many_of_them_stop_the_run_and_leave_the_state(refused, no_pictures,
 
 def test_a_run_draws_no_flight_twice(launch, no_pictures, monkeypatch, tmp_path):
     drawn = []
-    monkeypatch.setattr(loop.drawing, "draw_flight", lambda flight, path, control_dt: drawn.append(len(flight)))
+    monkeypatch.setattr(loop.drawing, "draw_flight", lambda flight, path, env: drawn.append(len(flight)))
     small = [*SMALL, "total_steps=48", "eval.interval=1", f"hydra.run.dir={tmp_path}"]
     launch("bptt", *small, "logger.flight_every=1")
     assert drawn == [4, 256]  # after the first iteration, and the best policy at the end

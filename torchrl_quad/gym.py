@@ -144,10 +144,12 @@ class GymVectorEnv(VectorEnv):
         self.torchrl_env.close()
 
     def _restart(self, mask: np.ndarray) -> None:
-        fresh = self.torchrl_env.reset()
-        keep = self._now is not None and not mask.all()
-        self._now = fresh.where(torch.as_tensor(mask, device=self.torchrl_env.device), self._now) if keep else fresh
-        self.torchrl_env._see(self._now["state"])  # where the others are, too: the reset was that of all drones
+        """Begin anew with the drones of the mask, as a rollout does where their episodes end."""
+        start = None
+        if self._now is not None:
+            chosen = torch.as_tensor(mask, device=self.torchrl_env.device).unsqueeze(-1)
+            start = self._now.exclude("action").set("_reset", chosen)
+        self._now = self.torchrl_env.reset(start, set_state=False)
         self._over = self._over & ~mask
 
     def _final(self, after: Any) -> dict[str, Any]:
@@ -200,8 +202,8 @@ class GymEnv(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Fly one control step with an action (4)."""
-        observation, *outputs, info = self._drones.step(_checked(action, self.action_space.shape)[None])
-        return observation[0], *(x.item() for x in outputs), _first(info)
+        observation, *ends, info = self._drones.step(_checked(action, self.action_space.shape)[None])
+        return observation[0], *(x.item() for x in ends), _first(info)
 
     def render(self) -> np.ndarray | None:
         """A picture (336, 336, 3), uint8; None without ``render_mode="rgb_array"``."""
@@ -254,6 +256,6 @@ def _info(outputs: Any, mask: np.ndarray) -> dict[str, Any]:
 
 
 def _first(info: dict[str, Any]) -> dict[str, Any]:
-    """The info of the first drone, as a single environment tells it."""
-    outputs = {name: x for name, x in info.items() if not name.startswith("_")}
-    return {name: _first(x) if isinstance(x, dict) else x[0].item() for name, x in outputs.items()}
+    """The info of the first drone, as a single environment gives it."""
+    own = {name: x for name, x in info.items() if not name.startswith("_")}
+    return {name: _first(x) if isinstance(x, dict) else x[0].item() for name, x in own.items()}

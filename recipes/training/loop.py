@@ -218,7 +218,7 @@ class Run:
         self.logs.add(row)
         every = self.cfg.logger.flight_every
         if every and len(self.rows) % every == 0 and self.done < self.iterations:  # at the end the best one is drawn
-            drawing.draw_flight(flight, self.folder / "flight", self.cfg.env.control_dt)
+            drawing.draw_flight(flight, self.folder / "flight", self.env)
             self.logs.show_flight(steps)
         if metrics["eval/return"] >= self.best["return"]:
             policy = {"actor": self.actor, **({"normalizer": self.env.transform} if self.cfg.normalize else {})}
@@ -244,9 +244,9 @@ class Run:
         steps = self.iterations * self.steps_per_iteration
         summary |= {"steps": steps, "best_steps": self.best["steps"], "seconds": round(self.seconds, 2)}
         summary |= {"revision": self.revision}
-        drawing.draw_flight(flight, self.folder / "flight", self.cfg.env.control_dt)
+        drawing.draw_flight(flight, self.folder / "flight", self.env)
         drawing.publish_flight(flight, self.folder / "episode.pdf", self.folder / "flight.html", self.env)
-        drawing.draw_learning_curve(self.folder / "metrics.csv", self.folder / "learning_curve.png")
+        drawing.draw_learning_curve(self.folder / "metrics.csv", self.folder / "learning_curve.png", self.env)
         self.logs.show_flight(steps)
         self.logs.finish(summary)
         write_summary(self.folder / "summary.json", summary)

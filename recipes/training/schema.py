@@ -70,6 +70,7 @@ class Env(Section):
     """The arguments of the environment; it checks itself what is not listed here."""
 
     model_config = ConfigDict(strict=True, extra="allow")
+    dynamics: Literal["quadrotor", "point_mass"]
     dt: Positive = Field(description="The physics step [s].")
     control_dt: Positive = Field(description="The control step [s], a whole multiple of env.dt.")
     action_delay: int = Field(ge=0, le=1000, description="Control steps from a command to its effect; 1 is usual.")
@@ -127,6 +128,9 @@ class Loss(Section):
     alpha: Annotated[Real, Field(ge=0)] | Literal["auto"] | None = Field(
         None, description="The coefficient of the entropy bonus: a number, 0 for none, or auto to learn it."
     )
+    terminal_gradient: bool | None = None
+    target_bootstrap: bool | None = None
+    average_over_horizon: bool | None = None
     num_qvalue_nets: int | None = Field(None, ge=1, le=64, description="Critics whose smallest value counts.")
     clip_epsilon: Annotated[Real, Field(gt=0, lt=1)] | None = Field(
         None, description="How far the ratio of probabilities may move from 1; 0.2 is usual."

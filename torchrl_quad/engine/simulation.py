@@ -13,8 +13,8 @@ class Transition(NamedTuple):
     """Where a control step leads."""
 
     state: State  #: the state at its end
-    outputs: State  #: observation, reward, flags and so on
-    valid: Tensor  #: bool (n), False where the numbers became meaningless; no gradient passes through those
+    outputs: dict[str, Any]  #: observation, reward, flags and so on; mappings of names hold further ones
+    valid: Tensor  #: bool (n): False where the numbers became meaningless; no gradient passes through those
 
 
 class Simulation(Protocol):
@@ -29,7 +29,7 @@ class Simulation(Protocol):
     parameters: tuple[Tensor, ...]
     """Tensors beside state and action that gradients may reach, such as the mass of a drone."""
 
-    def example(self) -> tuple[State, State]:
+    def example(self) -> tuple[State, dict[str, Any]]:
         """A state, and outputs of the kind that a step gives; the engine reads names, shapes and types."""
 
     def check_action(self, action: Tensor | None) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.func import vjp
 
-from torchrl_quad.engine.packing import Layout, Rows
+from torchrl_quad.engine.packing import Layout, Rows, flat, nested
 from torchrl_quad.engine.simulation import Simulation, State, Transition
 
 
@@ -36,6 +36,7 @@ class Stepper:
         state, outputs = simulation.example()
         self.layout = Layout(state)
         observation = outputs["observation"]
+        outputs = flat(outputs)
         self.output_layout = Layout({key: x for key, x in outputs.items() if key != "observation"})
         self.compiled: _Compiled | None = None
         if options is not None:
@@ -58,7 +59,7 @@ class Stepper:
         if not self.is_compiled:
             return self.simulation(state, valid, action, noise)
         state, outputs, observation = self.step_rows(self.layout.pack(state), valid, action, noise)
-        outputs = {**self.output_layout.unpack(outputs), "observation": observation}
+        outputs = {**nested(self.output_layout.unpack(outputs)), "observation": observation}
         return Transition(self.layout.unpack(state), outputs, valid)
 
     def step_rows(self, rows: Rows, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Record:
@@ -72,7 +73,7 @@ class Stepper:
         """
         if not self.is_compiled:
             end = self.simulation(self.layout.unpack(rows), valid, action, noise)
-            return Record(self.layout.pack(end.state), self.output_layout.pack(end.outputs), end.outputs["observation"])
+            return _record(end, self.layout, self.output_layout)
         if self.compiled is None:
             self.compiled = _Compiled(self.simulation, self.layout, self.output_layout, self.options)
         leaves = _Step.apply(self, rows[1:], valid, noise, rows.floats, action, *self.simulation.parameters)
@@ -105,8 +106,7 @@ class _Compiled:
         for _ in range(self.simulation.substeps):
             states.append(self.substep(states[-1], *inputs))
         end = self.simulation.finish(before, states[-1], valid, noise)
-        record = Record(self.layout.pack(end.state), self.output_layout.pack(end.outputs), end.outputs["observation"])
-        return states, record
+        return states, _record(end, self.layout, self.output_layout)
 
     def _adjoint(
         self,
@@ -126,8 +126,8 @@ class _Compiled:
 
         def finish(floats: State, x: Tensor) -> tuple[Any, Any]:
             end = self.simulation.finish({**others, **floats}, x, is_valid, noise)
-            outputs = self.output_layout.pack(end.outputs).floats
-            return (self.layout.pack(end.state).floats, outputs, end.outputs["observation"]), end.valid
+            record = _record(end, self.layout, self.output_layout)
+            return (record.state.floats, record.outputs.floats, record.observation), end.valid
 
         primals, pull_begin, (is_valid, others) = vjp(begin, rows.floats, action, parameters, has_aux=True)
         _, inputs, before = primals
@@ -174,6 +174,10 @@ class _Step(torch.autograd.Function):
             list(more[:count]), rows, valid, action, tuple(more[count:]), ctx.noise, tuple(grads)
         )
         return None, None, None, None, floats, action, *parameters
+
+
+def _record(end: Transition, layout: Layout, output_layout: Layout) -> Record:
+    return Record(layout.pack(end.state), output_layout.pack(flat(end.outputs)), end.outputs["observation"])
 
 
 def _flat(inputs: Sequence[Any]) -> list[Tensor]:

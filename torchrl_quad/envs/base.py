@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 import warnings
@@ -120,15 +121,16 @@ class QuadrotorEnv(Task, EnvBase):
             device=self.device, dtype=dtype
         )
         checks.check_params(params, num_envs)
-        self._make_dynamics = lambda nominal: DYNAMICS[dynamics](nominal, dt, substeps, integrator)
+        model = {"dt": dt, "substeps": substeps, "integrator": integrator}
+        self._make_dynamics = functools.partial(DYNAMICS[dynamics], **model)
         self.dynamics: Dynamics = self._make_dynamics(params)
         self._params = params if params.requires_grad else self.nominal
         self.weights = {**self.weights, **checks.checked_weights(weights or {}, self.weights)}
-        self._make_disturbances = lambda: choose_disturbances(
-            self.nominal, self.dynamics.plant_fields, random_start, randomize, wind, observation_noise,
-            observation_delay, disturbances,
+        self._make_disturbances = functools.partial(
+            choose_disturbances, random_start=random_start, randomize=randomize, wind=wind,
+            observation_noise=observation_noise, observation_delay=observation_delay, more=disturbances,
         )  # fmt: skip
-        self.disturbances = self._make_disturbances()
+        self.disturbances = self._make_disturbances(self.nominal, self.dynamics.plant_fields)
         self.randomness = Randomness(self.device, dtype)
         self.randomness.seed(seed)
         self.set_up()
@@ -229,7 +231,7 @@ class QuadrotorEnv(Task, EnvBase):
         follows = self.params is self.nominal
         self.dynamics = self._make_dynamics(self.nominal.to(device=self.device))
         self._params = self.nominal if follows else self.params.to(device=self.device)
-        self.disturbances = self._make_disturbances()
+        self.disturbances = self._make_disturbances(self.nominal, self.dynamics.plant_fields)
         self.randomness = Randomness(self.device, self.dtype)
         self.set_up()
         self._connect(
@@ -330,10 +332,8 @@ class QuadrotorEnv(Task, EnvBase):
         state, valid = self.control_step.guard(state)
         end = self._stepper.step(state, valid, action, self.randomness.noise())
         checks.require_finite(action)
-        outputs = nested(end.outputs)
-        outputs["metrics"] = {name: x.detach() for name, x in outputs.get("metrics", {}).items()}
         self._keep_for_render(end.state)
-        return TensorDict({"state": nested(end.state), **outputs}, self.batch_size, self.device)
+        return TensorDict({"state": nested(end.state), **end.outputs}, self.batch_size, self.device)
 
     def rollout(self, max_steps: int, policy: Any = None, callback: Any = None, **options: Any) -> TensorDictBase:
         """As TorchRL's rollout, and with the same numbers; several times faster where the engine can fly it.

@@ -58,7 +58,8 @@ def check_arguments(
     """Refuse arguments of an environment that are out of range; return the physics steps in a control step."""
     require_count("num_envs", num_envs, 1, MAX_ENVS)
     require(dtype in (torch.float32, torch.float64), f"dtype must be torch.float32 or torch.float64, got {dtype}.")
-    is_seed = seed is None or (isinstance(seed, numbers.Integral) and 0 <= seed < 2**63)
+    is_whole = isinstance(seed, numbers.Integral) and not isinstance(seed, bool)
+    is_seed = seed is None or (is_whole and 0 <= seed < 2**63)
     require(is_seed, f"seed must be a whole number from 0, or None for another one each time; got {seed!r}.")
     require(dynamics in list(DYNAMICS), f"Unknown dynamics {dynamics!r}. Choose from: {names(DYNAMICS)}.")
     for name, value in (("dt", dt), ("control_dt", control_dt)):
@@ -185,7 +186,8 @@ def read_state(state: Any, safe_state: State, source: str) -> State:
         isinstance(state, TensorDictBase),
         f'{source}: a state is a tensordict, such as env.reset()["state"]; got {type(state).__name__}.',
     )
-    entries = {key: state.get(key, None) for key in safe_state}
+    given = dict(state.items())  # one look at all names is quicker than many
+    entries = {key: state.get(key, None) if isinstance(key, tuple) else given.get(key) for key in safe_state}
     for key, x in entries.items():
         like = safe_state[key]
         if x is None or x.shape != like.shape or x.dtype != like.dtype or x.device != like.device:

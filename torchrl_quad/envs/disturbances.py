@@ -14,6 +14,8 @@ from torch import Tensor
 from torchrl_quad.dynamics import QuadrotorParams, presets, quaternion
 from torchrl_quad.dynamics.parameters import CONTROLLER_FIELDS, PLANT_FIELDS
 from torchrl_quad.engine import State
+from torchrl_quad.envs.checks import MAX_DELAY, require_count
+from torchrl_quad.envs.guard import MAX_ANGULAR_VELOCITY, MAX_SPEED
 from torchrl_quad.envs.randomness import Randomness
 
 _DISTRIBUTIONS = {
@@ -194,8 +196,7 @@ class Sensors(Disturbance):
         for name in ("position", "attitude", "velocity", "angular_velocity"):
             if not (_is_number(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ValueError(f"observation_noise: {name} must be zero or positive, got {getattr(self, name)!r}.")
-        if not (isinstance(self.delay, int) and self.delay >= 0):
-            raise ValueError(f"observation_delay must be zero or more control steps, got {self.delay!r}.")
+        require_count("observation_delay", self.delay, 0, MAX_DELAY, "zero or more control steps")
 
     @property
     def noise_size(self) -> int:
@@ -227,10 +228,14 @@ class Sensors(Disturbance):
         velocity, angular_velocity = state["velocity"], state["angular_velocity"]
         if noise is not None:
             by_position, by_attitude, by_velocity, by_rate = noise.split(3, -1)
-            position = position + self.position * by_position
-            attitude = quaternion.multiply(attitude, quaternion.from_axis_angle(self.attitude * by_attitude))
-            velocity = velocity + self.velocity * by_velocity
-            angular_velocity = angular_velocity + self.angular_velocity * by_rate
+            if self.position:
+                position = position + self.position * by_position
+            if self.attitude:
+                attitude = quaternion.multiply(attitude, quaternion.from_axis_angle(self.attitude * by_attitude))
+            if self.velocity:
+                velocity = velocity + self.velocity * by_velocity
+            if self.angular_velocity:
+                angular_velocity = angular_velocity + self.angular_velocity * by_rate
         return torch.cat((position, attitude, velocity, angular_velocity), -1).unsqueeze(1)
 
 
@@ -239,7 +244,7 @@ class RandomStart(Disturbance):
     """Turn and push the drone at the start: the draws are added to the task's own start.
 
     Raises:
-        ValueError: a value is negative or not finite.
+        ValueError: a value is negative, not finite, or beyond the bounds of a flight.
     """
 
     tilt: float = 0.0  #: [rad], at most; about a random horizontal axis
@@ -252,6 +257,9 @@ class RandomStart(Disturbance):
             value = getattr(self, field.name)
             if not (_is_number(value) and value >= 0):
                 raise ValueError(f"random_start: {field.name} must be zero or positive, got {value!r}.")
+        for name, most in (("velocity", MAX_SPEED), ("angular_velocity", MAX_ANGULAR_VELOCITY)):
+            if getattr(self, name) > most:
+                raise ValueError(f"random_start: {name} must be at most {most:g}, got {getattr(self, name)!r}.")
 
     def start(self, random: Randomness, state: State) -> State:
         """Turn and push the starts of a task."""
@@ -313,6 +321,8 @@ def choose_disturbances(
     sensors = build(Sensors, "observation_noise", observation_noise or {}, delay=observation_delay)
     if sensors.noise_size or sensors.delay:
         chosen["sensors"] = sensors
+    if not isinstance(more, Sequence):
+        raise TypeError(f"disturbances must be a list of Disturbance, got {type(more).__name__}.")
     for disturbance in more:
         if not isinstance(disturbance, Disturbance):
             raise TypeError(f"disturbances: each must be a Disturbance, got {type(disturbance).__name__}.")

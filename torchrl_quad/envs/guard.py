@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import Dynamics, QuadrotorParams
 from torchrl_quad.dynamics.parameters import LIMITS, RawParams
+from torchrl_quad.dynamics.vector import is_same
 from torchrl_quad.engine import State
 
 # Beyond these the model means nothing, and its numbers or their derivatives may overflow.
@@ -33,7 +34,9 @@ class Guard:
     def __init__(self, safe_state: State, dynamics: Dynamics, task_entries: list[Any]) -> None:
         self.safe_state, self.task_entries = safe_state, task_entries
         self.bounds = {key: _bounds(key, x, dynamics) for key, x in safe_state.items() if x.is_floating_point()}
-        self.low, self.high = (torch.cat(x, 1) for x in zip(*self.bounds.values(), strict=True))
+        n = max(len(low) for low, _ in self.bounds.values())
+        bounds = zip(*self.bounds.values(), strict=True)
+        self.low, self.high = (torch.cat([x.expand(n, -1) for x in side], 1) for side in bounds)
         self.widths = [low.shape[1] for low, _ in self.bounds.values()]
 
     def __call__(self, state: State) -> tuple[State, Tensor]:
@@ -44,12 +47,13 @@ class Guard:
                 valid = torch.stack([x.all(1) for x in inside.values()]).all(0)
             else:
                 values = torch.cat([state[key].flatten(1) for key in self.bounds], 1)
-                inside = (values >= self.low) & (values <= self.high)  # NaN is neither
+                unit = self._is_unit(state["quaternion"])
+                if is_same(values.clamp(self.low, self.high), values) and is_true(unit):  # NaN is not the same
+                    return dict(state), unit
+                inside = (values >= self.low) & (values <= self.high)
                 valid = inside.all(1)
             valid = valid & self._is_unit(state["quaternion"])
             if not is_traced():
-                if valid.device.type == "cpu" and bool(valid.all()):
-                    return dict(state), valid
                 inside = dict(zip(self.bounds, inside.split(self.widths, 1), strict=True))
         keep, safe = valid.unsqueeze(1), dict(state)
         for key in self.bounds:
@@ -61,7 +65,7 @@ class Guard:
         """What is wrong with a state, in words, and where it is wrong, bool (n)."""
         found = {}
         for key, inside in self._inside(state).items():
-            low, high = (x.flatten()[0].item() for x in self.bounds[key])
+            low, high = (x.min().item() for x in self.bounds[key])
             found[f"{key!r} must be finite and between {low:.4g} and {high:.4g}"] = ~inside.all(1)
         found["'quaternion' must have unit norm"] = ~self._is_unit(state["quaternion"])
         return found
@@ -101,6 +105,8 @@ class Containment:
     def enter(self, state: State, action: Tensor, params: QuadrotorParams) -> tuple[State, Tensor, Any]:
         """The same values, whose gradients come back from meaningful environments alone."""
         keys = [key for key, x in state.items() if x.requires_grad]
+        if not (keys or action.requires_grad or params.requires_grad):
+            return state, action, params
         action, *values = _Contain.apply(self, action, *(state[key] for key in keys))
         state = {**state, **dict(zip(keys, values, strict=True))}
         fields = {name: x for name, x in params.fields().items() if x.requires_grad}
@@ -127,6 +133,11 @@ class _Contain(torch.autograd.Function):
 def is_traced() -> bool:
     """Whether no value of a tensor can be looked at here."""
     return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
+
+
+def is_true(flags: Tensor) -> bool:
+    """Whether all flags are set, where a look at them is free; False where it is not."""
+    return flags.device.type == "cpu" and not is_traced() and bool(flags.all())
 
 
 def like(flags: Tensor, x: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """The racing task."""
 
+import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -37,11 +38,11 @@ class RacingEnv(QuadrotorEnv):
     angular velocity                            3     rad/s, body frame
     ==========================================  ====  =============================================
 
-    Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. Reward "velocity":
-    0.02 min(v_t, 15) - 0.02 |v_a| / (d + 1) - 0.001 |w|, and a gate bonus of 5, where v_t is the velocity towards the
-    next gate, v_a the part of the velocity across that direction, and d the distance to the gate [m]. The binary bonus
-    is paid in the step that passes a gate and carries no gradient. A relaxation can replace it, and is paid in each
-    step: "log", -5 log(d + 0.01), or "reciprocal", 1 / (d + 0.05).
+    Reward "velocity": 0.02 min(v_t, 15) - 0.02 |v_a| / (d + 1) - 0.001 |w|, and a gate bonus of 5, where v_t is the
+    velocity towards the next gate, v_a the part of the velocity across that direction, and d the distance to the gate
+    [m]. Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. The binary bonus
+    is paid in the step that passes a gate and carries no gradient. Two relaxations replace it by a bonus in each step:
+    "log", -5 log(d + 0.01), and "reciprocal", 1 / (d + 0.05).
 
     A gate is passed when the straight line that the drone flew in a control step comes within 0.3 m of its centre. The
     reward of that step is already about the gate after it.
@@ -61,7 +62,7 @@ class RacingEnv(QuadrotorEnv):
         num_envs: number of drones that fly in parallel.
         track: "visfly", the path of a YAML file, or a mapping, with ``gates``, a list of at least two centres [m]; and,
             if wanted, ``starts``, as many points [m] (by default half way between gates), and ``gate_radius`` [m].
-        reward: "position" or "velocity".
+        reward: "velocity" or "position".
         gate_bonus: "binary", "log" or "reciprocal".
         max_episode_steps: control steps after which an episode is truncated.
         **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
@@ -191,6 +192,10 @@ class RacingEnv(QuadrotorEnv):
 
     def metrics(self, state: State) -> State:
         return {"gates_passed": state["gates_passed"].to(self.dtype), "lap_time": state["lap_time"]}
+
+    def state_bounds(self) -> dict[Any, tuple[float, float]]:
+        counts = dict.fromkeys(("gates_passed", "lap_time"), (0, math.inf))
+        return {"gate": (0, len(self.gates) - 1), "pass_step": (-1, math.inf), **counts}
 
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Gives a ``lap_time`` only to drones that flew a full lap; adds ``time_near_gate``, within 1 m of the next."""

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.dynamics.parameters import RawParams
-from torchrl_quad.engine import State, Transition, flat
+from torchrl_quad.engine import State, Transition
 from torchrl_quad.envs.checks import check_action
-from torchrl_quad.envs.guard import MAX_VALUE, Containment, Guard, is_traced, like
+from torchrl_quad.envs.guard import MAX_VALUE, Containment, Guard, is_traced, is_true, like
 
 
 class ControlStep:
@@ -53,10 +53,12 @@ class ControlStep:
         queue = torch.cat((state["action_queue"], action.unsqueeze(1)), 1)
         return {**state, "action_queue": queue[:, 1:]}, queue[:, 0], valid
 
-    def plant_params(self, params: QuadrotorParams, state: State) -> Any:
+    def plant_params(self, params: QuadrotorParams | RawParams, state: State) -> Any:
         """The parameters of the drones that fly: those given, with what each episode has drawn."""
         drawn = {name: state["drone", name] for name in self.drawn}
-        return RawParams(**{**params.fields(), **drawn}) if drawn else params
+        if not drawn:
+            return params
+        return RawParams(**{**(params._asdict() if isinstance(params, RawParams) else params.fields()), **drawn})
 
     def apply_disturbances(self, state: State, noise: dict[str, Tensor]) -> State:
         """The state with what wind, sensors and so on have made of it in this step."""
@@ -70,12 +72,15 @@ class ControlStep:
         state = self.apply_disturbances({**before, **drone, "step": before["step"] + 1}, noise)
         state, meaningful = self.guard(state)
         valid = valid & meaningful
-        keep = valid.unsqueeze(1)
+        keep, everywhere = valid.unsqueeze(1), is_true(valid)
         if env.task_advances:
             advanced = env.advance(before, state)
             for key in env.task_entries:
-                state[key] = torch.where(like(keep, state[key]), advanced[key], state[key])
-        terms = {name: torch.where(keep, term, 0.0) for name, term in env.reward_terms(state).items()}
+                new = advanced[key]
+                state[key] = new if everywhere else torch.where(like(keep, new), new, state[key])
+        terms = env.reward_terms(state)
+        if not everywhere:
+            terms = {name: torch.where(keep, term, 0.0) for name, term in terms.items()}
         crash, success = env.is_crash(state) | ~keep, env.is_success(state) & keep
         terminated = crash | success if env.ends_on_success else crash
         truncated = state["step"] >= env.max_episode_steps
@@ -89,12 +94,13 @@ class ControlStep:
             "truncated": truncated,
             "done": terminated | truncated,
         }
-        return Transition(state, flat(outputs), valid)
+        return Transition(state, outputs, valid)
 
     def measure(self, state: State) -> dict[str, Any]:
         """The outputs that any state has, also the first of an episode."""
-        detached = {key: x.detach() for key, x in state.items()}
-        return {"observation": self.env.observation(state), "metrics": self.env.metrics(detached)}
+        with torch.no_grad():
+            metrics = self.env.metrics(state)
+        return {"observation": self.env.observation(state), "metrics": metrics}
 
     def at_start(self, state: State) -> dict[str, Any]:
         """All outputs of the first state of an episode, nested; there is no reward yet."""
@@ -114,7 +120,7 @@ class ControlStep:
 
     def example(self) -> tuple[State, State]:
         """The safe state and outputs of it."""
-        outputs = flat(self.at_start(self.safe_state))
+        outputs = self.at_start(self.safe_state)
         return self.safe_state, {**outputs, "reward": outputs["observation"][:, :1]}
 
     def check_action(self, action: Tensor | None) -> None:

@@ -160,6 +160,9 @@ class TrackingEnv(QuadrotorEnv):
         counted = torch.where(settled, state["step"] - self.settling_steps, state["step"]).clamp_min(1)
         return {"position_error": distance(state), "tracking_rmse": (state["squared_error"] / counted).sqrt()}
 
+    def state_bounds(self) -> dict[Any, tuple[float, float]]:
+        return {"phase": (0, 2 * math.pi), "squared_error": (0, math.inf)}
+
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Judges the episode by its ``tracking_rmse``."""
         metrics = super().episode_metrics(rollout)

@@ -1,4 +1,4 @@
-"""Random drones, wind, sensors and starts, on every task."""
+"""Random drones, wind, sensors, starts, and disturbances of one's own, on every task."""
 
 import pytest
 import torch
@@ -7,7 +7,8 @@ from torchrl.envs import check_env_specs
 
 from torchrl_quad import HoveringEnv, VisitedStateBuffer, differentiable_rollout, load_drone, make_actor, make_env
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.envs.options import Sensors
+from torchrl_quad.envs import TASKS
+from torchrl_quad.envs.disturbances import Disturbance, Sensors
 
 EVERYTHING = {
     "wind": {"mean": [1.0, 0.0, 0.0], "spread": [0.5, 0.5, 0.0], "gust": 0.5},
@@ -41,16 +42,16 @@ def test_sensors_that_are_given_whole_keep_their_delay():
         assert env.reset()["state", "measurements"].shape == (2, delay + 1, 13)
 
 
-@pytest.mark.parametrize("task", ["hovering", "landing", "racing", "tracking"])
-def test_every_task_takes_every_option_and_a_restored_state_flies_the_same(task):
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_takes_every_disturbance_and_a_restored_state_flies_the_same(task):
     env = make_env(task, num_envs=3, dtype=torch.float64, **EVERYTHING)
     check_env_specs(env, break_when_any_done="both")
     env.set_seed(1)
     whole = fly(env, env.reset(), hold(env, 4))
-    generator = env.rng.get_state()
+    generator = env.random_state()
     rest = fly(env, env.step_mdp(whole[:, -1]), hold(env, 4))
     env.reset()
-    env.rng.set_state(generator)
+    env.set_random_state(generator)
     restored = env.reset(TensorDict({"state": whole["next", "state"][:, -1].clone()}, [3]), set_state=True)
     torch.testing.assert_close(restored["observation"], whole["next", "observation"][:, -1], rtol=0, atol=0)
     again = fly(env, restored, hold(env, 4))
@@ -58,8 +59,8 @@ def test_every_task_takes_every_option_and_a_restored_state_flies_the_same(task)
         assert torch.equal(value, again["next", key]), key
 
 
-@pytest.mark.parametrize("task", ["hovering", "landing", "racing", "tracking"])
-def test_gradients_with_every_option_agree_with_finite_differences(task):
+@pytest.mark.parametrize("task", TASKS)
+def test_gradients_with_every_disturbance_agree_with_finite_differences(task):
     env = make_env(task, num_envs=2, dtype=torch.float64, **EVERYTHING)
     start = env.rollout(3)["next", "state"][:, -1].clone()
     actions = (env.hover_action + 0.1 * torch.randn(2, 8, 4, dtype=torch.float64)).requires_grad_()
@@ -145,7 +146,7 @@ def test_a_yaml_file_of_distributions_is_read(tmp_path):
         ({"mass": {"uniform": [2.0, 1.0]}}, "mass needs two numbers"),
         (
             {"mass": {"uniform": [-0.1, 1.0]}},
-            "drones that may be drawn are not all possible: .* 'mass' must be positive",
+            "drones that may be drawn are not all possible: .* 'mass' must be between",
         ),
         ({"mass": {"normal": [0.5, 0.2]}}, "not all possible"),
         ({"mass": {"normal": [0.5, -0.1]}}, "mass needs two numbers, mean and standard deviation"),
@@ -206,13 +207,13 @@ def test_the_noise_has_the_size_asked_for_and_rewards_do_not_see_it():
     env = HoveringEnv(num_envs=4000, observation_noise=noise)
     flight = fly(env, env.reset(), hold(env, 3))
     seen, state = flight["next", "observation"][:, -1], flight["next", "state"][:, -1]
-    error = seen[:, :3] * 10 - (state["target"] - state["position"])
+    error = seen[:, :3] - (state["target"] - state["position"])
     assert error.std(0).tolist() == pytest.approx([0.2] * 3, rel=0.05)
-    assert (seen[:, 7:10] * 10).std(0).tolist() == pytest.approx([0.3] * 3, rel=0.05)
-    assert (seen[:, 10:] * 10).std(0).tolist() == pytest.approx([0.4] * 3, rel=0.05)
-    angle = quaternion.rotate(seen[:, 3:7], torch.tensor([0.0, 0.0, 1.0]).expand(4000, 3))[:, :2]
+    assert seen[:, 7:10].std(0).tolist() == pytest.approx([0.3] * 3, rel=0.05)
+    assert seen[:, 10:].std(0).tolist() == pytest.approx([0.4] * 3, rel=0.05)
+    angle = quaternion.rotate(seen[:, 3:7] / 10, torch.tensor([0.0, 0.0, 1.0]).expand(4000, 3))[:, :2]
     assert angle.std(0).tolist() == pytest.approx([0.05] * 2, rel=0.05)
-    assert seen[:, 3:7].norm(dim=-1).tolist() == pytest.approx([1.0] * 4000, abs=1e-5)
+    assert seen[:, 3:7].norm(dim=-1).tolist() == pytest.approx([10.0] * 4000, abs=1e-4)
     silent = HoveringEnv(num_envs=4000)
     assert torch.equal(flight["next", "reward"], fly(silent, silent.reset(), hold(env, 3))["next", "reward"])
 
@@ -247,12 +248,81 @@ def test_random_starts_tilt_turn_and_push_within_their_bounds():
         ({"observation_noise": {"delay": 1}}, "observation_noise: unknown key 'delay'"),
         ({"observation_noise": {"position": -1.0}}, "observation_noise: position must be zero or positive"),
         ({"observation_delay": -1}, "observation_delay must be zero or more control steps, got -1"),
+        ({"observation_delay": 10**7}, "observation_delay must be at most 1,000, got 10000000"),
         ({"random_start": {"tilt": float("nan")}}, "random_start: tilt must be zero or positive"),
+        ({"random_start": {"velocity": 1e9}}, "random_start: velocity must be at most 300, got 1000000000.0"),
     ],
 )
 def test_bad_options_say_what_is_allowed(kwargs, message):
     with pytest.raises(ValueError, match=message):
         HoveringEnv(num_envs=1, **kwargs)
+
+
+# -- of one's own -----------------------------------------------------------------------------------------------------
+
+
+class GyroBias(Disturbance):
+    """The policy sees body rates with an offset that wanders."""
+
+    noise_size = 3
+
+    def start(self, random, state):
+        return {"gyro_bias": 0.1 * random.normal(len(state["position"]), 3)}
+
+    def advance(self, state, noise, dt):
+        return {"gyro_bias": state["gyro_bias"] + 0.05 * dt**0.5 * noise}
+
+    def observe(self, state):
+        return {**state, "angular_velocity": state["angular_velocity"] + state["gyro_bias"]}
+
+
+class BatterySag(Disturbance):
+    """Thrust falls by a fifth in ten seconds, from a charge that differs between episodes."""
+
+    def __init__(self, thrust_map):
+        self.thrust_map = thrust_map
+
+    def start(self, random, state):
+        charge = 1.0 - 0.05 * (random.uniform(len(state["position"]), 1) + 1.0)
+        return {"charge": charge, ("drone", "thrust_map"): charge * self.thrust_map.to(charge)}
+
+    def advance(self, state, noise, dt):
+        charge = state["charge"] - 0.02 * dt
+        return {"charge": charge, ("drone", "thrust_map"): charge * self.thrust_map.to(charge)}
+
+
+def own():
+    return [GyroBias(), BatterySag(load_drone("visfly").thrust_map)]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_disturbances_of_one_s_own_fly_in_every_task_and_are_restored_with_the_state(task):
+    env = make_env(task, num_envs=3, dtype=torch.float64, max_episode_steps=40, disturbances=own())
+    check_env_specs(env)
+    td = env.reset()
+    flight = fly(env, td, hold(env, 20))
+    state = flight["next", "state"]
+    torch.testing.assert_close(td["observation"][:, -3:], td["state", "gyro_bias"])  # at rest there is nothing else
+    assert (state["gyro_bias"].diff(dim=1) != 0).all()
+    torch.testing.assert_close(state["charge"][:, -1], td["state", "charge"] - 0.02 * 0.4)
+    torch.testing.assert_close(state["drone", "thrust_map"][:, -1], state["charge"][:, -1] * env.nominal.thrust_map)
+    assert (state["velocity"][:, -1, 2] < -0.02).all()  # the controller believes in a full battery
+    env.set_seed(99)  # other noise; it changes what is seen, and not the battery
+    restored = env.reset(TensorDict({"state": state[:, 11].clone()}, [3]), set_state=True)
+    torch.testing.assert_close(restored["observation"], flight["next", "observation"][:, 11], rtol=0, atol=0)
+    again = fly(env, restored, hold(env, 3))["next", "state"]
+    for key in ("position", "charge", ("drone", "thrust_map")):
+        assert torch.equal(again[key], state[key][:, 12:15])
+
+
+def test_what_is_not_a_disturbance_is_refused():
+    with pytest.raises(TypeError, match="disturbances must be a list of Disturbance, got GyroBias"):
+        HoveringEnv(num_envs=1, disturbances=GyroBias())
+    with pytest.raises(TypeError, match="disturbances: each must be a Disturbance, got GyroBiases"):
+        HoveringEnv(num_envs=1, disturbances=[type("GyroBiases", (), {})()])
+    sag = own()[1]
+    with pytest.raises(ValueError, match=r"Entry \('drone', 'thrust_map'\) changes no parameter of the drone"):
+        HoveringEnv(num_envs=1, disturbances=[sag], dynamics="point_mass")
 
 
 # -- weights -----------------------------------------------------------------------------------------------------------

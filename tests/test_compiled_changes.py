@@ -1,0 +1,41 @@
+"""A compiled environment follows every change that an eager one follows."""
+
+import torch
+from torch._dynamo.utils import counters
+
+from torchrl_quad import HoveringEnv
+
+BONUS = 1.0
+
+
+class Paid(HoveringEnv):
+    """Pays a global of this module and an attribute of its class."""
+
+    extra = 10.0
+
+    def reward_terms(self, state):
+        return {"paid": torch.full_like(state["position"][:, :1], BONUS + self.extra)}
+
+
+def test_a_compiled_step_sees_changed_attributes_classes_and_globals(monkeypatch):
+    eager, compiled = Paid(num_envs=2), Paid(num_envs=2).compile()
+
+    def step(env):
+        td = env.reset().set("action", env.hover_action.repeat(2, 1))
+        after = env.step(td)["next"]
+        return after["reward"].flatten().tolist(), after["success"].flatten().tolist()
+
+    def both():
+        assert step(compiled) == step(eager)
+        return step(eager)
+
+    assert both() == ([11.0, 11.0], [False, False])
+    for env in (eager, compiled):
+        env.success_radius = 50.0  # an attribute of the class becomes one of the environment
+    monkeypatch.setattr(Paid, "extra", 20.0)
+    assert both() == ([21.0, 21.0], [True, True])
+    monkeypatch.setitem(globals(), "BONUS", 2.0)
+    assert both()[0] == [22.0, 22.0]
+    before = counters["stats"]["unique_graphs"]
+    both()
+    assert counters["stats"]["unique_graphs"] == before

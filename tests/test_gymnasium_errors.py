@@ -1,0 +1,66 @@
+"""What the gymnasium environments refuse, and how they say it."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+
+from torchrl_quad.gym import GymEnv, GymVectorEnv
+
+HOVERING = "torchrl_quad/Hovering-v0"
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros((3, 3)), r"The action has shape \(3, 3\), expected \(3, 4\): thrust, .* a row for each drone."),
+        (np.zeros(4), r"shape \(4,\), expected \(3, 4\)"),
+        (None, r"shape \(\), expected \(3, 4\)"),
+        ([[0, 0, 0, 0], [0, np.nan, 0, 0], [0, 0, 0, np.inf]], r"NaN or infinite at \[\[1, 1\], \[2, 3\]\]"),
+    ],
+)
+def test_an_action_that_cannot_be_flown_is_refused(action, message):
+    env = GymVectorEnv("hovering", 3)
+    env.reset()
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+
+
+def test_one_drone_s_action_is_refused_in_its_own_words():
+    env = GymEnv("hovering")
+    env.reset()
+    with pytest.raises(ValueError, match=r"shape \(3,\), expected \(4,\): thrust, roll, .* each in \[-1, 1\]\.$"):
+        env.step(np.zeros(3))
+    with pytest.raises(ValueError, match=r"NaN or infinite at \[\[2\]\], .* np.nan_to_num"):
+        env.step([0, 0, np.nan, 0])
+
+
+def test_unknown_options_are_refused_with_those_that_exist():
+    with pytest.raises(ValueError, match="Unknown autoreset_mode 'same'. Choose from: NextStep, SameStep, Disabled."):
+        GymVectorEnv("hovering", autoreset_mode="same")
+    with pytest.raises(ValueError, match="Unknown task 'hover'. Choose from: hovering, landing, racing, tracking."):
+        GymEnv("hover")
+    with pytest.raises(ValueError, match="num_envs is for many drones, .* Write gymnasium.make_vec instead."):
+        gymnasium.make(HOVERING, num_envs=2)
+    for build in (GymEnv, GymVectorEnv):
+        with pytest.raises(ValueError, match="Unknown render_mode 'human'. Choose \"rgb_array\""):
+            build("hovering", render_mode="human")
+    with pytest.raises(TypeError, match="control_dt"):
+        GymEnv("hovering", frameskip=2)
+
+
+@pytest.mark.parametrize("mask", [[True, False], np.ones(3), np.zeros(3, dtype=bool), np.ones((3, 1), dtype=bool)])
+def test_a_reset_mask_has_to_mark_some_of_the_drones(mask):
+    with pytest.raises(ValueError, match=r"reset_mask must be a bool array of shape \(3,\) .* leave it out"):
+        GymVectorEnv("hovering", 3).reset(options={"reset_mask": mask})
+
+
+def test_a_step_outside_an_episode_is_refused():
+    env = GymVectorEnv("hovering", 2, autoreset_mode="Disabled", max_episode_steps=1)
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) first"):
+        env.step(np.zeros((2, 4)))
+    env.reset()
+    env.step(np.zeros((2, 4)))
+    env.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(ResetNeeded, match=r"episodes of drones \[1\] have ended. Call reset\(\) before"):
+        env.step(np.zeros((2, 4)))

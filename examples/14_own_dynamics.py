@@ -7,11 +7,11 @@ from torchrl_quad import BPTTLoss, HoveringEnv, differentiable_rollout, make_act
 from torchrl_quad.dynamics import DYNAMICS, quaternion
 from torchrl_quad.dynamics.vector import Components, cat, stack
 
-ITERATIONS = 20
+ITERATIONS = 40
 
 
 class VelocityDrone:
-    """Level at all times; its velocity approaches the command (3) [m/s] in 0.3 s. The fourth number does nothing."""
+    """Always level; its velocity approaches the command (3) [m/s] in 0.3 s. The fourth number does nothing."""
 
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}
     plant_fields, limits, time_constant, top_speed = (), {}, 0.3, 3.0
@@ -29,9 +29,9 @@ class VelocityDrone:
         return position + velocity * self.dt, velocity
 
     def control_step(self, state, action, params, wind):
-        position, velocity = state["position"], state["velocity"]
+        position, velocity, command = state["position"], state["velocity"], self.setpoint_rows(action).t()
         for _ in range(self.substeps):
-            position, velocity = self.physics_step(position, velocity, self.top_speed * action[:, :3].clamp(-1, 1))
+            position, velocity = self.physics_step(position, velocity, command)
         return {**{key: state[key] for key in self.sizes}, "position": position, "velocity": velocity}
 
     def setpoint_rows(self, action):
@@ -46,14 +46,14 @@ class VelocityDrone:
         return step
 
 
-DYNAMICS["velocity"] = VelocityDrone
 torch.manual_seed(0)
+DYNAMICS["velocity"] = VelocityDrone
 env = HoveringEnv(num_envs=64, dynamics="velocity", dt=0.02)
-actor = make_actor(env)
-loss, optimizer = BPTTLoss(actor), torch.optim.Adam(actor.parameters(), 2e-2)
+actor = make_actor(env, input_scale=0.5)
+loss, optimizer = BPTTLoss(actor), torch.optim.Adam(actor.parameters(), 1e-2)
 for _ in range(ITERATIONS):
     rollout, _ = differentiable_rollout(env, actor, None, 40)
     optimizer.zero_grad()
     loss(rollout)["loss_actor"].backward()
     optimizer.step()
-print("distance to the target [m]:", rollout["next", "metrics", "position_error"][:, -1].median().item())
+    print(f"{rollout['next', 'metrics', 'position_error'][:, -1].median():.2f} m from the target after 0.8 s")

@@ -14,7 +14,7 @@ class Transition(NamedTuple):
 
     state: State  #: the state at its end
     outputs: dict[str, Any]  #: observation, reward, flags and so on; mappings of names hold further ones
-    valid: Tensor  #: bool (n): False where the numbers became meaningless; no gradient passes through those
+    valid: Tensor  #: where the numbers still mean something, bool (n); no gradient passes elsewhere
 
 
 class Simulation(Protocol):

@@ -62,7 +62,7 @@ def test_randomised_drones_are_drawn_with_their_own_rotors(tmp_path):
     _, numbers = read(tmp_path / "replay.html")
     drone = rollout["state", "drone"][:, 0]
     torch.testing.assert_close(numbers("rotors", 3, 4, 2), drone["rotor_positions"])
-    thrust = env.controller.rotors.thrust(rollout["state", "rotor_speed"][:, 0])
+    thrust = env.dynamics.controller.rotors.thrust(rollout["state", "rotor_speed"][:, 0])
     torch.testing.assert_close(numbers("lift", 3, 6, 4)[:, 0], 4 * thrust / (drone["mass"] * 9.81), rtol=1e-4, atol=0)
 
 

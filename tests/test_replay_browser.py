@@ -198,7 +198,7 @@ def test_the_slider_scrubs_to_the_state_of_the_rollout(replay, flight):
         np.testing.assert_allclose(bodies[:, 1:8:2] - bodies[:, :1], hubs, atol=1e-5)
         lines = replay.trace("thrust").reshape(NUM_ENVS, 4, 3, 3)
         lengths = np.linalg.norm(lines[:, :, 1] - lines[:, :, 0], axis=-1)
-        thrust = env.controller.rotors.thrust(state["rotor_speed"])
+        thrust = env.dynamics.controller.rotors.thrust(state["rotor_speed"])
         hover = (env.params.mass * env.params.gravity / 4).item()
         np.testing.assert_allclose(lengths, 3 * 0.075 * thrust / hover, rtol=1e-3)
 

@@ -14,7 +14,7 @@ crazyflow   its body-rate model (JAX), ten substeps, where it is installed: pip 
 ==========  ============================================================================================
 
 All of one size are timed in turns, round after round, and the best round counts. Writes
-``benchmarks/results/throughput.csv`` size by size, and leaves out what stands there already.
+``benchmarks/results/throughput.csv`` size by size, and leaves out what is there already.
 """
 
 from __future__ import annotations

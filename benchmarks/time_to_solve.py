@@ -4,7 +4,7 @@ python benchmarks/time_to_solve.py --algorithms abpt --seeds 0 1 2
 
 Runs the recipes, and takes the first evaluation, on fresh starts, in which at least 99 % of the episodes succeed.
 Nothing is left out of the clock: imports, compilation and evaluations count. "Cold" is an empty compile cache. Writes
-``benchmarks/results/time_to_solve.csv`` run by run, and leaves out what stands there already.
+``benchmarks/results/time_to_solve.csv`` run by run, and leaves out what is there already.
 """
 
 import argparse

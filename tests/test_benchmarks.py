@@ -24,7 +24,7 @@ SMALL = "num_envs=4 horizon=4 env.max_episode_steps=20 compile=false"
 def test_a_benchmark_writes_a_table(name, arguments, rows, tmp_path):
     output = tmp_path / "results.csv"
     command = [sys.executable, str(BENCHMARKS / f"{name}.py"), *arguments.split(), "--output", str(output)]
-    subprocess.run(command, check=True, timeout=120, cwd=tmp_path, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    subprocess.run(command, check=True, timeout=300, cwd=tmp_path, env={**os.environ, "OMP_NUM_THREADS": "1"})
     with open(output, newline="") as file:
         results = list(csv.DictReader(file))
     assert len(results) == rows

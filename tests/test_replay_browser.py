@@ -106,7 +106,7 @@ def open_page(browser):
 @pytest.fixture(scope="module")
 def flight():
     """Three races of a random policy, which crash."""
-    env = RacingEnv(num_envs=NUM_ENVS, seed=0)
+    env = RacingEnv(num_envs=NUM_ENVS, seed=0, reward="position")
     return env, env.rollout(STEPS, break_when_any_done=False)
 
 

@@ -115,9 +115,8 @@ def test_a_compiled_step_has_exact_derivatives():
     assert torch.autograd.gradcheck(flight, (actions, *params), fast_mode=True, atol=1e-6, rtol=1e-5)
 
 
-@pytest.mark.parametrize("options", [{}, {"gate_bonus": "log", **EVERYTHING}], ids=["plain", "everything"])
-def test_compiled_flights_equal_eager_ones_and_never_recompile(options):
-    env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, **options)
+def test_compiled_flights_equal_eager_ones_and_never_recompile():
+    env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, gate_bonus="log", **EVERYTHING)
     actor = make_actor(env)
 
     def train():
@@ -154,14 +153,12 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(options):
     assert compiled["next", "done"].any()
 
 
-def test_a_compiled_environment_follows_changes_and_shares_nothing_with_others():
+def test_a_compiled_environment_shares_nothing_with_others():
     first, second = (HoveringEnv(num_envs=2, weights={"survival": w}).compile() for w in (0.1, 0.7))
-    for env, survival in ((first, 0.1), (second, 0.7), (first, 0.1)):
-        assert env.rollout(2)["next", "reward_terms", "survival"].flatten().tolist() == pytest.approx([survival] * 4)
-    first.weights = {**first.weights, "survival": 0.3}
+    first.rollout(1)
     copied = copy.deepcopy(first)
     copied.weights = {**copied.weights, "survival": 0.5}
-    for env, survival in ((first, 0.3), (copied, 0.5)):
+    for env, survival in ((first, 0.1), (second, 0.7), (copied, 0.5), (first, 0.1)):
         assert env.rollout(2)["next", "reward_terms", "survival"].flatten().tolist() == pytest.approx([survival] * 4)
 
 

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
-State = dict[Any, Tensor]  # entries (n, ...) by name; a nested entry has a tuple of names
+#: Entries (n, ...) of a state by name; a nested entry has a tuple of names.
+State = dict[Any, Tensor]
 
 
 class Transition(NamedTuple):

@@ -6,7 +6,7 @@ through the ends of episodes.
 
 from torchrl_quad.engine.horizon import can_fly, fly
 from torchrl_quad.engine.packing import flat, nested
-from torchrl_quad.engine.simulation import Simulation, State, Transition
+from torchrl_quad.engine.simulation import Simulation, Transition
 from torchrl_quad.engine.stepper import Stepper, has_compiler
 
-__all__ = ["Simulation", "State", "Stepper", "Transition", "can_fly", "flat", "fly", "has_compiler", "nested"]
+__all__ = ["Simulation", "Stepper", "Transition", "can_fly", "flat", "fly", "has_compiler", "nested"]

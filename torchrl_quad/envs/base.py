@@ -13,7 +13,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams, load_drone
-from torchrl_quad.engine import State, Stepper, can_fly, fly, has_compiler, nested
+from torchrl_quad.engine import Stepper, can_fly, fly, has_compiler, nested
+from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import checks
 from torchrl_quad.envs.disturbances import Disturbance, choose_disturbances
 from torchrl_quad.envs.randomness import Randomness

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import DYNAMICS, INTEGRATORS, QuadrotorParams
-from torchrl_quad.engine import State
+from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.guard import is_traced
 
 # Beyond these an environment would not fit into memory, or take for ever to build.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import QuadrotorParams, presets, quaternion
 from torchrl_quad.dynamics.parameters import CONTROLLER_FIELDS, PLANT_FIELDS
-from torchrl_quad.engine import State
+from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.checks import MAX_DELAY, require_count
 from torchrl_quad.envs.guard import MAX_ANGULAR_VELOCITY, MAX_SPEED
 from torchrl_quad.envs.randomness import Randomness

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl_quad.dynamics import Dynamics, QuadrotorParams
 from torchrl_quad.dynamics.parameters import LIMITS, RawParams
 from torchrl_quad.dynamics.vector import is_same
-from torchrl_quad.engine import State
+from torchrl_quad.engine.simulation import State
 
 # Beyond these the model means nothing, and its numbers or their derivatives may overflow.
 MAX_VALUE = 1e6  # of any entry of the state, in its unit

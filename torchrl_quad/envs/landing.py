@@ -4,7 +4,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_quad.engine import State
+from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.episodes import at_episode_end
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import presets
-from torchrl_quad.engine import State
+from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import Dynamics, QuadrotorParams
-from torchrl_quad.engine import State
+from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.episodes import summarise_episodes
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery

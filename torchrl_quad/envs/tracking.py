@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_quad.engine import State
+from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
 from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, norm, outside, target_reward

@@ -37,7 +37,8 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_quad import differentiable_rollout, make_actor, make_env
-from torchrl_quad.engine import State, Stepper, Transition
+from torchrl_quad.engine import Stepper, Transition
+from torchrl_quad.engine.simulation import State
 
 
 class FixedActions(TensorDictModuleBase):

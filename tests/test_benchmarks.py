@@ -15,8 +15,8 @@ SMALL = "num_envs=4 horizon=4 env.max_episode_steps=20 compile=false"
 @pytest.mark.parametrize(
     ("name", "arguments", "rows"),
     [
-        ("throughput", "--num-envs 4 8 --modes eager --horizon 2 --rounds 1", 14),
-        ("memory", "--num-envs 4 --modes eager recompute --horizon 2 --rounds 1", 2),
+        ("throughput", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 7),
+        ("memory", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 1),
         ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),
         ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
     ],

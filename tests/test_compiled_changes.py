@@ -1,5 +1,7 @@
 """A compiled environment follows every change that an eager one follows."""
 
+import copy
+
 import torch
 from torch._dynamo.utils import counters
 
@@ -39,3 +41,6 @@ def test_a_compiled_step_sees_changed_attributes_classes_and_globals(monkeypatch
     before = counters["stats"]["unique_graphs"]
     both()
     assert counters["stats"]["unique_graphs"] == before
+    copied = copy.deepcopy(compiled)
+    copied.extra = 30.0  # a copy shares nothing with what it was made of
+    assert step(copied)[0] == [32.0, 32.0] and step(compiled)[0] == [22.0, 22.0]

@@ -94,7 +94,9 @@ def test_a_file_system_without_locks_is_no_reason_to_stop(tmp_path, monkeypatch)
 def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
     script = ROOT / "recipes/bptt.py"
     command = [sys.executable, script, *SMALL, "total_steps=1_000_000", f"hydra.run.dir={tmp_path}"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as run:
+    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    options["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # ignored where tests run behind "&"
+    with subprocess.Popen(command, **options) as run:
         while not (tmp_path / "checkpoint.pt").exists():
             assert run.poll() is None, run.stderr.read()
             time.sleep(0.02)

@@ -1,11 +1,8 @@
 """The quick rollout against TorchRL's own, and the compiled step against the eager one."""
 
-import copy
-
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
-from torch import nn
 from torch._dynamo.utils import counters
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -93,28 +90,6 @@ def test_a_step_of_one_s_own_is_flown_and_an_output_that_nobody_wants_does_no_ha
     assert HoveringEnv(num_envs=2).rollout(3, policy, break_when_any_done=False).shape == (2, 3)
 
 
-def test_a_compiled_step_has_exact_derivatives():
-    # Not from rest, where the norm of the velocity has a kink.
-    start_moving = {"velocity": 1.0, "angular_velocity": 1.0}
-    env = HoveringEnv(num_envs=3, dtype=torch.float64, max_episode_steps=6, random_start=start_moving).compile()
-    start = env.reset()
-    start["state", "step"] = torch.tensor([[3], [0], [1]])
-    again = env.reset()["state"]
-    env.initial_state_source = lambda n: again
-    hold = TensorDictModule(nn.Identity(), in_keys=["observation"], out_keys=["action"])
-
-    def flight(actions, mass, drag):
-        env.params = env.nominal.replace(mass=mass, linear_drag=drag)
-        sequence = iter(actions.unbind(1))
-        hold.module.forward = lambda _: next(sequence)
-        rollout = env.rollout(8, hold, tensordict=start, auto_reset=False, break_when_any_done=False)
-        return torch.cat([rollout["next", key].flatten() for key in ("reward", "observation")])
-
-    actions = (env.hover_action + 0.2 * torch.randn(3, 8, 4, dtype=torch.float64)).requires_grad_()
-    params = [x.clone().requires_grad_() for x in (env.params.mass, env.params.linear_drag)]
-    assert torch.autograd.gradcheck(flight, (actions, *params), fast_mode=True, atol=1e-6, rtol=1e-5)
-
-
 def test_compiled_flights_equal_eager_ones_and_never_recompile():
     env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, gate_bonus="log", **EVERYTHING)
     actor = make_actor(env)
@@ -151,15 +126,6 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile():
     torch.testing.assert_close(entries(compiled_slow), entries(slow))
     torch.testing.assert_close(compiled_slow_grad, slow_grad)
     assert compiled["next", "done"].any()
-
-
-def test_a_compiled_environment_shares_nothing_with_others():
-    first, second = (HoveringEnv(num_envs=2, weights={"survival": w}).compile() for w in (0.1, 0.7))
-    first.rollout(1)
-    copied = copy.deepcopy(first)
-    copied.weights = {**copied.weights, "survival": 0.5}
-    for env, survival in ((first, 0.1), (second, 0.7), (copied, 0.5), (first, 0.1)):
-        assert env.rollout(2)["next", "reward_terms", "survival"].flatten().tolist() == pytest.approx([survival] * 4)
 
 
 def test_drones_that_break_crash_alone_in_a_compiled_step():

@@ -232,12 +232,6 @@ def test_visited_states_restart_what_transforms_remember():
     assert (carry["step_count"] == 0).all() and (carry["episode_reward"] == 0).all()
 
 
-def test_a_compiled_step_keeps_its_gradients_under_transforms():
-    eager, compiled = (make(BEFORE_THE_POLICY["all"](), dt=0.02, seed=1, compile=how) for how in (False, True))
-    actor = lively(make_actor(eager))
-    torch.testing.assert_close(gradient(compiled, actor), gradient(eager, actor))
-
-
 # -- losses and collectors ---------------------------------------------------------------------------------------------
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from typing import Any
 
 import torch
@@ -44,7 +46,7 @@ class Guard:
         with torch.no_grad():
             if is_traced():  # a compiler makes one loop of many small operations; one by one they cost more than a copy
                 inside = self._inside(state)
-                valid = torch.stack([x.all(1) for x in inside.values()]).all(0)
+                valid = functools.reduce(operator.and_, (x.all(1) for x in inside.values()))
             else:
                 values = torch.cat([state[key].flatten(1) for key in self.bounds], 1)
                 unit = self._is_unit(state["quaternion"])

@@ -51,8 +51,8 @@ class ControlStep:
         action = torch.where(valid.unsqueeze(1), action, self.dynamics.hover_action)
         if "action_queue" not in state:
             return state, action, valid
-        queue = torch.cat((state["action_queue"], action.unsqueeze(1)), 1)
-        return {**state, "action_queue": queue[:, 1:]}, queue[:, 0], valid
+        queue = state["action_queue"]
+        return {**state, "action_queue": torch.cat((queue[:, 1:], action.unsqueeze(1)), 1)}, queue[:, 0], valid
 
     def plant_params(self, params: QuadrotorParams | RawParams, state: State) -> Any:
         """The parameters of the drones that fly: those given, with what each episode has drawn."""
@@ -166,7 +166,8 @@ class ControlStep:
     def finish(self, before: State, x: Tensor, valid: Tensor, noise: dict[str, Tensor]) -> Transition:
         """Judge where the rows ``x`` have flown."""
         sizes = self.dynamics.sizes
-        return self.judge(before, dict(zip(sizes, x.t().split(list(sizes.values()), 1), strict=True)), valid, noise)
+        drone = {name: part.t() for name, part in zip(sizes, x.split(list(sizes.values())), strict=True)}
+        return self.judge(before, drone, valid, noise)
 
 
 def sample_state(env: Any, n: int) -> State:

@@ -123,7 +123,6 @@ class QuadrotorEnv(Task, EnvBase):
         self.randomness.seed(seed)
         self.set_up()
         self.task_entries = [key for key in self.initial_state(num_envs) if key not in self.dynamics.sizes]
-        self.task_advances = type(self).advance is not Task.advance
         state = sample_state(self, num_envs)
         checks.check_task(self, state)
         self._connect(state)
@@ -255,8 +254,7 @@ class QuadrotorEnv(Task, EnvBase):
             )
             entries = self.control_step.reset(checks.restore_state(self, tensordict.get("state"), source, mask))
         else:
-            everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-            entries = self.randomness.starts(everyone if mask is None else mask.reshape(-1))
+            entries = self.randomness.starts(None if mask is None else mask.reshape(-1))
         self._keep_for_render(entries["state"], mask)
         return TensorDict(entries, self.batch_size, self.device)
 

@@ -76,9 +76,9 @@ class Randomness:
         self._position += 1
         return {name: x[self._position - 1] for name, x in self._noise.items()}
 
-    def starts(self, mask: Tensor) -> dict[str, Any]:
-        """What a reset writes for the environments in the mask, bool (n); the rows of the others mean nothing."""
-        if mask.all():
+    def starts(self, mask: Tensor | None) -> dict[str, Any]:
+        """What a reset writes for the environments in the mask, bool (n), or for all; other rows mean nothing."""
+        if mask is None or mask.all():
             self.forget_starts()
             return self.draw_start()
         used = torch.zeros(len(mask), dtype=torch.int64) if self._used is None else self._used

@@ -13,6 +13,7 @@ from torchrl_quad.engine import Transition, nested
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.checks import check_action, restore_state
 from torchrl_quad.envs.guard import MAX_VALUE, Containment, Guard, is_traced, is_true, like
+from torchrl_quad.envs.task import Task
 
 
 class ControlStep:
@@ -28,6 +29,7 @@ class ControlStep:
     def __init__(self, env: Any, safe_state: State) -> None:
         self.env, self.dynamics, self.substeps = env, env.dynamics, env.dynamics.substeps
         self.safe_state, self.guard = safe_state, Guard(safe_state, env.dynamics, env.task_entries)
+        self.task_advances = type(env).advance is not Task.advance
         self.drawn = [key[1] for key in safe_state if isinstance(key, tuple) and key[0] == "drone"]
 
     def __call__(self, state: State, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Transition:
@@ -74,7 +76,7 @@ class ControlStep:
         state, meaningful = self.guard(state)
         valid = valid & meaningful
         keep, everywhere = valid.unsqueeze(1), is_true(valid)
-        if env.task_advances:
+        if self.task_advances:
             advanced = env.advance(before, state)
             for key in env.task_entries:
                 new = advanced[key]

@@ -125,6 +125,7 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile():
     torch.testing.assert_close(compiled_grad, eager_grad)
     torch.testing.assert_close(entries(compiled_slow), entries(slow))
     torch.testing.assert_close(compiled_slow_grad, slow_grad)
+    assert not any(flight["next", "metrics"].requires_grad for flight in (eager, slow, compiled, compiled_slow))
     assert compiled["next", "done"].any()
 
 

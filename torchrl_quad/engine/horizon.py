@@ -106,9 +106,7 @@ def _entries(stepper: Stepper, records: list[Record], *prefix: str) -> dict[Key,
         for rows in ([record.state for record in records], [record.outputs for record in records])
     )
     entries = {flat_key("state", *_path(key)): x for key, x in stepper.layout.unpack(state).items()}
-    # Metrics have no gradient.
-    outputs = stepper.output_layout.unpack(outputs).items()
-    entries |= {key: x.detach() if "metrics" in key else x for key, x in outputs}
+    entries |= stepper.unpack_outputs(outputs)
     entries["observation"] = torch.stack([record.observation for record in records], 1)
     return {flat_key(*prefix, *_path(key)): x for key, x in entries.items()}
 

@@ -70,13 +70,19 @@ class Stepper:
         # Compiled functions stay bound to the environment that they were made of: a copy makes its own.
         return {**self.__dict__, "compiled": None}
 
-    def step(self, state: State, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Transition:
-        """One step on entries."""
+    def step(
+        self, state: State, valid: Tensor, action: Tensor, noise: dict[str, Tensor]
+    ) -> tuple[State, dict[str, Any]]:
+        """One step on entries: the state at its end, and its outputs."""
         if not self.is_compiled:
-            return self.simulation(state, valid, action, noise)
+            end = self.simulation(state, valid, action, noise)
+            return end.state, end.outputs
         state, outputs, observation = self.step_rows(self.layout.pack(state), valid, action, noise)
-        outputs = {**nested(self.output_layout.unpack(outputs)), "observation": observation}
-        return Transition(self.layout.unpack(state), outputs, valid)
+        return self.layout.unpack(state), {**nested(self.unpack_outputs(outputs)), "observation": observation}
+
+    def unpack_outputs(self, rows: Rows) -> dict[Any, Tensor]:
+        """The outputs of a step, or of a horizon, by name; metrics have no gradient."""
+        return {key: x.detach() if "metrics" in key else x for key, x in self.output_layout.unpack(rows).items()}
 
     def step_rows(self, rows: Rows, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Record:
         """One step on rows.

@@ -263,10 +263,10 @@ class QuadrotorEnv(Task, EnvBase):
         checks.check_action(action, self.control_step.safe_state["position"])
         state = checks.read_state(tensordict.get("state", None), self.control_step.safe_state, "step")
         state, valid = self.control_step.guard(state)
-        end = self._stepper.step(state, valid, action, self.randomness.noise())
+        state, outputs = self._stepper.step(state, valid, action, self.randomness.noise())
         checks.require_finite(action)
-        self._keep_for_render(end.state)
-        return TensorDict({"state": nested(end.state), **end.outputs}, self.batch_size, self.device)
+        self._keep_for_render(state)
+        return TensorDict({"state": nested(state), **outputs}, self.batch_size, self.device)
 
     def rollout(self, max_steps: int, policy: Any = None, callback: Any = None, **options: Any) -> TensorDictBase:
         """As TorchRL's rollout, and with the same numbers; several times faster where the engine can fly it.

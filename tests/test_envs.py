@@ -5,6 +5,7 @@ import pickle
 
 import pytest
 import torch
+from flying import fly
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
@@ -12,16 +13,6 @@ from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_
 from torchrl_quad import HoveringEnv, QuadrotorParams, differentiable_rollout, load_drone, make_actor, make_env
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs import TASKS
-
-
-def fly(env, td, actions):
-    """Step through a list of actions; returns the steps, stacked along time."""
-    steps = []
-    for action in actions:
-        td = td.copy().set("action", action)
-        steps.append(env.step(td))
-        td = env.step_mdp(steps[-1])
-    return torch.stack(steps, 1)
 
 
 def hold(env, steps):

@@ -2,19 +2,10 @@
 
 import pytest
 import torch
+from flying import fly
 
 from torchrl_quad import HoveringEnv, available_drones, load_drone, make_actor
 from torchrl_quad.dynamics import INTEGRATORS
-
-
-def fly(env, td, actions):
-    """Step through a list of actions; returns the steps, stacked along time."""
-    steps = []
-    for action in actions:
-        td = td.copy().set("action", action)
-        steps.append(env.step(td))
-        td = env.step_mdp(steps[-1])
-    return torch.stack(steps, 1)
 
 
 def gradients_of_the_first(env, key=None, value=None):

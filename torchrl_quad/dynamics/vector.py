@@ -179,7 +179,12 @@ def is_same(a: Vector, b: Vector) -> bool:
     """Whether a tensor on the processor equals another, where a look at its values is free; False where it is not."""
     if not isinstance(a, Tensor) or a.device.type != "cpu":
         return False
-    return not (torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()) and torch.equal(a, b)
+    return not is_traced() and torch.equal(a, b)
+
+
+def is_traced() -> bool:
+    """Whether no value of a tensor can be looked at here."""
+    return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
 
 
 def where_same(a: Vector, b: Vector, other: Vector) -> Vector:

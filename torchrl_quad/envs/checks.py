@@ -14,8 +14,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import DYNAMICS, INTEGRATORS, QuadrotorParams
+from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine.simulation import State
-from torchrl_quad.envs.guard import is_traced
 
 # Beyond these an environment would not fit into memory, or take for ever to build.
 MAX_ENVS, MAX_DELAY, MAX_STEPS = 10_000_000, 1_000, 2**31

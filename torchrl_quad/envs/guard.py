@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import Dynamics, QuadrotorParams
 from torchrl_quad.dynamics.parameters import LIMITS, RawParams
-from torchrl_quad.dynamics.vector import is_same
+from torchrl_quad.dynamics.vector import is_same, is_traced
 from torchrl_quad.engine.simulation import State
 
 # Beyond these the model means nothing, and its numbers or their derivatives may overflow.
@@ -39,24 +39,17 @@ class Guard:
         n = max(len(low) for low, _ in self.bounds.values())
         bounds = zip(*self.bounds.values(), strict=True)
         self.low, self.high = (torch.cat([x.expand(n, -1) for x in side], 1) for side in bounds)
-        self.widths = [low.shape[1] for low, _ in self.bounds.values()]
 
     def __call__(self, state: State) -> tuple[State, Tensor]:
         """The state with safe entries where it is meaningless, and bool (n) that says where it was meaningful."""
         with torch.no_grad():
-            if is_traced():  # a compiler makes one loop of many small operations; one by one they cost more than a copy
-                inside = self._inside(state)
-                valid = functools.reduce(operator.and_, (x.all(1) for x in inside.values()))
-            else:
+            unit = self._is_unit(state["quaternion"])
+            if is_true(unit):  # then the usual case is quick to see: nothing is wrong, and nothing to be replaced
                 values = torch.cat([state[key].flatten(1) for key in self.bounds], 1)
-                unit = self._is_unit(state["quaternion"])
-                if is_same(values.clamp(self.low, self.high), values) and is_true(unit):  # NaN is not the same
+                if is_same(values.clamp(self.low, self.high), values):  # NaN is not the same
                     return dict(state), unit
-                inside = (values >= self.low) & (values <= self.high)
-                valid = inside.all(1)
-            valid = valid & self._is_unit(state["quaternion"])
-            if not is_traced():
-                inside = dict(zip(self.bounds, inside.split(self.widths, 1), strict=True))
+            inside = self._inside(state)
+            valid = functools.reduce(operator.and_, (x.all(1) for x in inside.values()), unit)
         keep, safe = valid.unsqueeze(1), dict(state)
         for key in self.bounds:
             mine = inside[key].reshape(state[key].shape) if key in self.task_entries else like(keep, state[key])
@@ -130,11 +123,6 @@ class _Contain(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         keep = ctx.containment.valid.unsqueeze(1)
         return None, *(None if g is None else torch.where(like(keep, g), g, 0.0) for g in grads)
-
-
-def is_traced() -> bool:
-    """Whether no value of a tensor can be looked at here."""
-    return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
 
 
 def is_true(flags: Tensor) -> bool:

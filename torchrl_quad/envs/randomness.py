@@ -93,7 +93,8 @@ class Randomness:
 
     def state(self) -> dict[str, Any]:
         """Everything needed to resume: tensors and plain values."""
-        return {"generator": self.generator.get_state(), **copy.deepcopy(self._drawn())}
+        drawn = {"position": self._position, "noise": self._noise, "starts": self._starts, "used": self._used}
+        return {"generator": self.generator.get_state(), **copy.deepcopy(drawn)}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Resume from what :meth:`state` returned."""
@@ -102,6 +103,3 @@ class Randomness:
         self._position, self._used = state["position"], state["used"]
         self._noise = {name: x.to(self.device) for name, x in state["noise"].items()}
         self._starts = [{key: x.to(self.device) for key, x in start.items()} for start in state["starts"]]
-
-    def _drawn(self) -> dict[str, Any]:
-        return {"position": self._position, "noise": self._noise, "starts": self._starts, "used": self._used}

@@ -70,7 +70,7 @@ class Physics:
         if not self.stepper.is_compiled:
             state = self.start
             for action in actions.unbind():
-                state = self.stepper.step(state, self.valid, action, {}).state
+                state, _ = self.stepper.step(state, self.valid, action, {})
             return torch.cat(list(state.values()), -1).sum()
         rows = self.stepper.layout.pack(self.start)
         for action in actions.unbind():

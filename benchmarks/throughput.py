@@ -36,22 +36,9 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from torchrl_quad import differentiable_rollout, make_actor, make_env
+from torchrl_quad import ActionSequence, differentiable_rollout, make_actor, make_env
 from torchrl_quad.engine import Stepper, Transition
 from torchrl_quad.engine.simulation import State
-
-
-class FixedActions(TensorDictModuleBase):
-    """A policy that does not look."""
-
-    in_keys, out_keys = ["observation"], ["action"]
-
-    def __init__(self, actions: Tensor) -> None:
-        super().__init__()
-        self.sequence = iter(actions.unbind())
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set("action", next(self.sequence))
 
 
 class Physics:
@@ -118,8 +105,8 @@ def flights(task: str, options: dict[str, Any]) -> dict[str, Callable[[Tensor], 
 
     cases = {
         "physics": Physics(env).fly,
-        "env": lambda actions: fly(env, FixedActions(actions), actions),
-        "point mass": lambda actions: fly(points, FixedActions(actions), actions),
+        "env": lambda actions: fly(env, ActionSequence(actions), actions),
+        "point mass": lambda actions: fly(points, ActionSequence(actions), actions),
         "actor": lambda actions: fly(env, actor, actions),
         "rollout": lambda actions: return_of(env.rollout(len(actions), actor, **as_is)),
         "torchrl": lambda actions: return_of(EnvBase.rollout(env, len(actions), actor, **as_is)),

@@ -4,9 +4,10 @@ It takes a :class:`Simulation`, packs its entries into rows, compiles it and its
 through the ends of episodes.
 """
 
+from torchrl_quad.engine.compiling import has_compiler
 from torchrl_quad.engine.horizon import can_fly, fly
 from torchrl_quad.engine.packing import flat, nested
 from torchrl_quad.engine.simulation import Simulation, Transition
-from torchrl_quad.engine.stepper import Stepper, has_compiler
+from torchrl_quad.engine.stepper import Stepper
 
 __all__ = ["Simulation", "Stepper", "Transition", "can_fly", "flat", "fly", "has_compiler", "nested"]

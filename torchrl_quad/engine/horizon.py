@@ -10,8 +10,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_quad.engine.packing import Key, Rows, flat, flat_key, nested
+from torchrl_quad.engine.policy import PlainPolicy, plain
+from torchrl_quad.engine.program import Record, policy_inputs
 from torchrl_quad.engine.simulation import State
-from torchrl_quad.engine.stepper import Record, Stepper
+from torchrl_quad.engine.stepper import Stepper
 
 
 class Source(Protocol):
@@ -35,6 +37,11 @@ def can_fly(stepper: Stepper, policy: Any, tensordict: TensorDictBase) -> bool:
     return reads <= state | {"observation"} and "action" in writes and needed <= given <= state | needed | writes
 
 
+def flies_inside(stepper: Stepper, policy: Any) -> bool:
+    """Whether the policy acts inside the compiled step, as opposed to being called before each step."""
+    return _plain(stepper, policy) is not None
+
+
 def fly(
     stepper: Stepper, source: Source, policy: TensorDictModuleBase, state: State, tensordict: TensorDictBase, steps: int
 ) -> TensorDict:
@@ -48,16 +55,74 @@ def fly(
         tensordict: what a reset or a step wrote about that state.
         steps: at least one.
     """
-    n = len(tensordict)
     state, valid = stepper.simulation.guard(state)
-    roots = [_record(stepper, state, tensordict)]
+    start = _record(stepper, state, tensordict)
+    plain = _plain(stepper, policy)
+    if plain is None:
+        roots, ends, written = _call(stepper, source, policy, start, valid, steps)
+    else:
+        roots, ends, written = _fly_inside(stepper, source, plain, start, valid, steps)
+    rollout = {**roots, **ends, **{flat_key(*_path(key)): x for key, x in written.items()}}
+    del rollout["reward"]
+    return TensorDict(nested(rollout), (len(tensordict), steps), tensordict.device, names=[None, "time"])
+
+
+def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | None:
+    """The policy as the engine can fly it inside its step, if it can."""
+    policy = plain(policy) if stepper.is_compiled else None
+    if policy is None or not policy.weights:
+        return policy
+    state, observation = stepper.layout.unpack(stepper.example.state), stepper.example.observation
+    width = sum(x.shape[-1] for x in policy_inputs(policy, state, observation))
+    first = policy.weights[0]
+    return (
+        policy
+        if (first.shape[1], first.dtype, first.device) == (width, observation.dtype, observation.device)
+        else None
+    )
+
+
+def _fly_inside(
+    stepper: Stepper, source: Source, policy: PlainPolicy, start: Record, valid: Tensor, steps: int
+) -> tuple[dict[Key, Tensor], ...]:
+    """The entries of all roots and of all ends, and what the policy wrote, of one compiled horizon."""
+    kind, done_row, _ = stepper.output_layout.place["done"]
+
+    def restarted(end: Record) -> tuple[Record, Tensor] | None:
+        done = end.outputs[kind][done_row]
+        return (_restarted(stepper, source, end, done), done[0]) if done.any() else None
+
+    flight = stepper.fly(policy, start, valid, steps, source.noise, restarted)
+    leaves = [[*record.state, *record.outputs, record.observation] for record in (start, flight.ends)]
+    again = [(t, [*fresh.state, *fresh.outputs, fresh.observation], done) for t, fresh, done in flight.restarts]
+    roots = [
+        _roots(first, x, [(t, fresh[i], done) for t, fresh, done in again], 0 if i < 6 else 1)
+        for i, (first, x) in enumerate(zip(*leaves, strict=True))
+    ]
+    roots = Record(Rows(*roots[:3]), Rows(*roots[3:6]), roots[6])
+    return _entries(stepper, roots), _entries(stepper, flight.ends, "next"), flight.written
+
+
+def _roots(start: Tensor, ends: Tensor, again: list[tuple[int, Tensor, Tensor]], dim: int) -> Tensor:
+    """Where steps begin: at the start, where the step before ended, or afresh."""
+    roots = [start, *ends.unbind(dim)[:-1]]
+    for t, fresh, done in again:
+        roots[t + 1] = torch.where(done.unsqueeze(1) if dim else done, fresh, roots[t + 1])
+    return torch.stack(roots, dim)
+
+
+def _call(
+    stepper: Stepper, source: Source, policy: TensorDictModuleBase, start: Record, valid: Tensor, steps: int
+) -> tuple[dict[Key, Tensor], ...]:
+    """The same for a policy that is called before each step."""
+    roots = [start]
     ends: list[Record] = []
     written = []
     reads_state = any(flat_key(*_path(key)) != "observation" for key in policy.in_keys)
     kind, done_row, _ = stepper.output_layout.place["done"]
     for t in range(steps):
         root = roots[-1]
-        td = TensorDict({"observation": root.observation}, [n], tensordict.device)
+        td = TensorDict({"observation": root.observation}, [len(valid)], root.observation.device)
         if reads_state:
             td["state"] = nested(stepper.layout.unpack(root.state))
         td = policy(td)
@@ -71,13 +136,8 @@ def fly(
         done = end.outputs[kind][done_row]
         if t < steps - 1:
             roots.append(_restarted(stepper, source, end, done) if done.any() else end)
-    by_policy = {
-        flat_key(*_path(key)): torch.stack(x, 1)
-        for key, x in zip(policy.out_keys, zip(*written, strict=True), strict=True)
-    }
-    rollout = _entries(stepper, roots) | _entries(stepper, ends, "next") | by_policy
-    del rollout["reward"]
-    return TensorDict(nested(rollout), (n, steps), tensordict.device, names=[None, "time"])
+    written = {key: torch.stack(x, 1) for key, x in zip(policy.out_keys, zip(*written, strict=True), strict=True)}
+    return _entries(stepper, _stacked(roots)), _entries(stepper, _stacked(ends), "next"), written
 
 
 def _record(stepper: Stepper, state: State, tensordict: TensorDictBase) -> Record:
@@ -99,15 +159,20 @@ def _restarted(stepper: Stepper, source: Source, end: Record, done: Tensor) -> R
     )
 
 
-def _entries(stepper: Stepper, records: list[Record], *prefix: str) -> dict[Key, Tensor]:
-    """All entries of some records, each (n, time, ...)."""
-    state, outputs = (
-        Rows(*(torch.stack(x) for x in zip(*rows, strict=True)))
-        for rows in ([record.state for record in records], [record.outputs for record in records])
+def _stacked(records: list[Record]) -> Record:
+    """Some records as one, as :func:`_entries` reads it."""
+    rows = (
+        Rows(*(torch.stack(x) for x in zip(*part, strict=True)))
+        for part in ([record.state for record in records], [record.outputs for record in records])
     )
-    entries = {flat_key("state", *_path(key)): x for key, x in stepper.layout.unpack(state).items()}
-    entries |= stepper.unpack_outputs(outputs)
-    entries["observation"] = torch.stack([record.observation for record in records], 1)
+    return Record(*rows, torch.stack([record.observation for record in records], 1))
+
+
+def _entries(stepper: Stepper, records: Record, *prefix: str) -> dict[Key, Tensor]:
+    """All entries of the records of a horizon, each (n, time, ...)."""
+    entries = {flat_key("state", *_path(key)): x for key, x in stepper.layout.unpack(records.state).items()}
+    entries |= stepper.unpack_outputs(records.outputs)
+    entries["observation"] = records.observation
     return {flat_key(*prefix, *_path(key)): x for key, x in entries.items()}
 
 

@@ -66,6 +66,14 @@ class Layout:
             entries[key] = x if len(shape) == 1 else x.unflatten(-1, shape)
         return entries
 
+    def add(self, floats: Tensor, entries: Entries) -> Tensor:
+        """The rows of floats with some entries (n, ...) added to their own."""
+        if not entries:
+            return floats
+        own = [(where, entries.get(key)) for key, (kind, where, _) in self.place.items() if kind == 0]
+        parts = [floats[where] if x is None else floats[where] + x.flatten(1).t() for where, x in own]
+        return torch.cat(parts)
+
 
 def flat(entries: Mapping[Any, Any], *prefix: str) -> dict[Key, Tensor]:
     """The entries of nested mappings, by one key each."""

@@ -17,6 +17,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_quad.data.unwrap import base_env
+from torchrl_quad.modules.plain import TanhGaussianActor
 
 OBSERVATION = ("observation",)
 
@@ -90,7 +91,7 @@ def make_actor(
     net.head = NormalParamExtractor(scale_mapping=f"biased_softplus_{scale_init}")
     params = TensorDictModule(net, in_keys=list(in_keys), out_keys=["loc", "scale"])
     bounds = {} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high}
-    return ProbabilisticActor(
+    return TanhGaussianActor(
         params,
         in_keys=["loc", "scale"],
         spec=spec,

@@ -1,0 +1,142 @@
+"""Compile a function of tensors; check what was assumed of everything else once in a horizon, not at every step."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import types
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+Function = Callable[..., tuple[Tensor, ...]]
+
+
+def has_compiler() -> bool:
+    """Whether torch can compile here; a warning says what is missing."""
+    if shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++"):
+        return True
+    warnings.warn(
+        "compile: torch.compile needs a C++ compiler, and neither g++ nor clang++ is on the PATH. The environment "
+        "stays eager: correct, but several times slower. Install one (Debian: apt install g++), or name yours in the "
+        "environment variable CXX.",
+        stacklevel=3,
+    )
+    return False
+
+
+class Compiled:
+    """A compiled function from tensors to a tuple of tensors.
+
+    A call checks every assumption of the compiler: on the tensors, and on whatever else the function reads, such as
+    attributes of a task. Where one no longer holds, it compiles again. :meth:`again` calls what the last call has
+    compiled with other tensors of the same kind, and checks nothing else.
+
+    Args:
+        method: a method whose arguments are tensors, and which returns a tuple of tensors.
+        options: keywords of ``torch.compile``.
+    """
+
+    def __init__(self, method: types.MethodType, options: dict[str, Any]) -> None:
+        mode = torch._inductor.list_mode_options(options["mode"]) if options.get("mode") else {}
+        self.patches = {"cpp.vec_isa_ok": True, **mode, **options.get("options", {})}
+        backend = options.get("backend", "inductor")
+        self.backend = None if backend == "inductor" else torch._dynamo.lookup_backend(backend)
+        given = {name: x for name, x in options.items() if name not in ("mode", "options", "backend")}
+        watch = {"guard_filter_fn": _watched}
+        self.checked = torch.compile(
+            _own(method), **{"fullgraph": True, "dynamic": False, **given}, backend=self._compile, options=watch
+        )
+        self.direct: _Direct | None = None
+
+    def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Check everything, and call."""
+        outputs = self.checked(*inputs)
+        self.direct = _Direct.of(self.last, inputs, outputs)
+        self.last = None
+        return outputs
+
+    def again(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Call on the assumptions of the last call, with tensors of the same shapes, strides and types."""
+        return self(*inputs) if self.direct is None else self.direct(inputs)
+
+    def _compile(self, graph: torch.fx.GraphModule, examples: list[Tensor], **_: Any) -> Function:
+        if self.backend is None:
+            function = torch._inductor.compile(graph, examples, options=self.patches)
+        else:
+            function = self.backend(graph, examples)
+
+        def call(*inputs: Tensor) -> tuple[Tensor, ...]:
+            outputs = function(*inputs)
+            self.last = function, inputs, outputs
+            return outputs
+
+        return call
+
+
+class _Direct:
+    """What a call has compiled, with the places of the function's own inputs and outputs among those of the graph."""
+
+    def __init__(self, function: Function, template: list[Any], places: list[int | None], results: list[int]) -> None:
+        self.function, self.template, self.places, self.results = function, template, places, results
+
+    @classmethod
+    def of(
+        cls, last: tuple[Function, Sequence[Any], Sequence[Any]], inputs: Sequence[Tensor], outputs: Sequence[Tensor]
+    ) -> _Direct | None:
+        """None where the places are not unique, as when one tensor is given twice."""
+        function, taken, given = last
+        place = {id(x): i for i, x in enumerate(taken)}
+        source = {id(x): i for i, x in enumerate(given)}
+        known = all(id(x) in source for x in outputs) and len({id(x) for x in inputs}) == len(inputs)
+        if not known:
+            return None
+        places = [place.get(id(x)) for x in inputs]
+        own = set(places)
+        return cls(
+            function,
+            [None if i in own else x for i, x in enumerate(taken)],
+            places,
+            [source[id(x)] for x in outputs],
+        )
+
+    def __call__(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        values = self.template.copy()
+        for i, x in zip(self.places, inputs, strict=True):
+            if i is not None:
+                values[i] = x
+        outputs = self.function(*values)
+        return tuple([outputs[i] for i in self.results])
+
+
+def _own(method: types.MethodType) -> types.MethodType:
+    """The same method with a code object of its own: what is compiled for it is not shared with other environments."""
+    f = method.__func__
+    copy = types.FunctionType(f.__code__.replace(), f.__globals__, f.__name__, f.__defaults__, f.__closure__)
+    return types.MethodType(copy, method.__self__)
+
+
+# Of some 700 assumptions the compiled step keeps those that a user can break: on its input, on torch's state, on the
+# attributes of the environment and its class, on globals of the modules that tasks live in. Checking the others at each
+# call would cost more than the physics.
+_FIXED_TYPES = {"TYPE_MATCH", "BUILTIN_MATCH", "MODULE_MATCH", "CLASS_MATCH", "DUPLICATE_INPUT"}
+_FIXED_PLACES = ("self.layout", "self.output_layout", "self.substep", "self.pull", "__import__", "list(dict.keys(__imp")
+_FIXED_MODULES = ("torch_dot", "torch'", "torchrl_quad_dot_dynamics", "torchrl_quad_dot_engine", "builtins")
+
+
+def _watched(guards: Sequence[Any]) -> list[bool]:
+    def watched(guard: Any) -> bool:
+        name = guard.name
+        if guard.guard_type in _FIXED_TYPES or name.startswith(_FIXED_PLACES) or "___unnamed" in name:
+            return False
+        if guard.guard_type == "NOT_PRESENT_IN_GENERIC_DICT":
+            return name.startswith("self.simulation")
+        if name.startswith("G["):
+            module = name.removeprefix("G['").removeprefix("__import_")
+            return name.startswith("G['__import_") and not module.startswith(_FIXED_MODULES)
+        return True
+
+    return [watched(guard) for guard in guards]

@@ -1,0 +1,200 @@
+"""A horizon as one node of the graph: compiled steps forwards, compiled adjoints backwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from torchrl_quad.engine.packing import Layout, Rows
+from torchrl_quad.engine.policy import PlainPolicy
+from torchrl_quad.engine.program import PolicyProgram, Record, StepProgram, name_in_state, policy_inputs
+
+LEARNING_BATCH = 16384  # so many steps of one drone make a batch for the gradient of the weights
+
+
+class Horizon(NamedTuple):
+    """What a horizon flies with, beside the tensors that have gradients."""
+
+    step: StepProgram
+    policy: PlainPolicy
+    policy_program: PolicyProgram | None  # None calls the policy as it is
+    start: Record
+    valid: Tensor  # where the start is meaningful, bool (n)
+    steps: int
+    noise: Callable[[], dict[str, Tensor]]  # of the next step
+    restarted: Callable[[Record], tuple[Record, Tensor] | None]  # where to go on, and who goes on afresh, bool (n)
+
+
+class Flight(NamedTuple):
+    """All steps of a horizon, their tensors one above the other."""
+
+    ends: Record  # rows (steps, rows, n), observations (n, steps, k)
+    written: dict[Any, Tensor]  # by the policy, (n, steps, ...)
+    restarts: list[tuple[int, Record, Tensor]]  # where some went on afresh: the step before, from where, and who
+
+
+def fly_horizon(horizon: Horizon, drawn: Tensor) -> Flight:
+    """Fly a horizon; gradients reach its start, what was drawn (steps, n, k), the policy's weights, the parameters."""
+    start, policy, parameters = horizon.start, horizon.policy, horizon.step.simulation.parameters
+    tensors = start.state.floats, start.observation, drawn, *policy.weights, *parameters
+    keeps = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
+    restarts: list[tuple[int, Record, Tensor]] = []
+    leaves = _Horizon.apply(horizon, keeps, restarts, *tensors)
+    ends = Record(Rows(*leaves[:3]), Rows(*leaves[3:6]), leaves[6])
+    return Flight(ends, dict(zip(policy.out_keys, leaves[7:], strict=True)), restarts)
+
+
+class _Horizon(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, horizon: Horizon, keeps: bool, restarts: list, floats, observation, drawn, *tensors):
+        step, policy = horizon.step, _Policy(horizon)
+        floats, observation, drawn, *tensors = (x.detach().contiguous() for x in (floats, observation, drawn, *tensors))
+        policy.weights, parameters = tensors[: len(policy.weights)], tensors[len(policy.weights) :]
+        rows, valid = Rows(floats, *horizon.start.state[1:]), horizon.valid
+        saved, ends, entries = [], [], []
+        for t in range(horizon.steps):
+            inputs = policy.inputs(rows, observation)
+            kept, written = policy.forward(inputs, drawn[t], is_first=t == 0)
+            noise = horizon.noise()
+            step.noise_names = tuple(noise)
+            # The stride of a single row can be anything, and a compiler takes another one for another kind of input.
+            others = (x.reshape(-1).view(x.shape) for x in rows[1:])
+            start = (rows.floats, *others, valid, written[policy.action], *parameters, *noise.values())
+            states_end = (step.forward if t == 0 else step.forward.again)(*start)
+            states, leaves = states_end[: step.substeps], states_end[step.substeps :]
+            end = Record(Rows(*leaves[:3]), Rows(*leaves[3:6]), leaves[6])
+            if keeps:
+                saved.append((start, states, inputs, kept, drawn[t]))
+            ends.append(leaves)
+            entries.append(written)
+            if t == 0:
+                valid = torch.ones_like(valid)  # a step leads to meaningful states
+            if t < horizon.steps - 1 and (again := horizon.restarted(end)) is not None:
+                restarts.append((t, *again))
+                end = again[0]
+            rows, observation = end.state, end.observation
+        ctx.horizon, ctx.restarts, ctx.parameter_count = horizon, restarts, len(parameters)
+        ctx.like = [leaves[0], leaves[3], leaves[6], *written]
+        ctx.shapes = [tuple(map(len, parts[:4])) for parts in saved]
+        ctx.save_for_backward(
+            *policy.weights, *(x for parts in saved for part in (*parts[:4], parts[4:]) for x in part)
+        )
+        ctx.set_materialize_grads(False)
+        stacked = [_stack(x, 0) for x in zip(*(leaves[:6] for leaves in ends), strict=True)]
+        ctx.mark_non_differentiable(*stacked[1:3], *stacked[4:6])
+        observations = _stack([leaves[6] for leaves in ends], 1)
+        return *stacked, observations, *(_stack(x, 1) for x in zip(*entries, strict=True))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads):
+        horizon, policy, step = ctx.horizon, _Policy(ctx.horizon), ctx.horizon.step
+        saved = iter(ctx.saved_tensors)
+        policy.weights = _take(saved, len(policy.weights))
+        steps = [(*(_take(saved, count) for count in counts), next(saved)) for counts in ctx.shapes]
+        zeros = [torch.zeros_like(x) for x in ctx.like]  # one each: a compiler would count on two being one
+        fresh = {t: who for t, _, who in ctx.restarts}
+        of_end, of_written = (grads[0], grads[3], grads[6]), grads[7:]
+        grad_floats = grad_observation = None
+        grads_drawn, grads_parameter = [], []
+        for t in reversed(range(horizon.steps)):
+            start, states, inputs, kept, drawn = steps.pop()  # what is not needed any more is freed
+            if t in fresh:
+                grad_floats = torch.where(fresh[t], 0.0, grad_floats)
+                if grad_observation is not None:
+                    grad_observation = torch.where(fresh[t].unsqueeze(1), 0.0, grad_observation)
+            end = [None if g is None else g[:, t] if i == 2 else g[t] for i, g in enumerate(of_end)]
+            end[0], end[2] = _add(end[0], grad_floats), _add(end[2], grad_observation)
+            end = [zero if g is None else g.contiguous() for g, zero in zip(end, zeros, strict=False)]
+            is_first = t == horizon.steps - 1
+            grad_floats, grad_action, *grad_parameters = (step.adjoint if is_first else step.adjoint.again)(
+                *start, *states, *end
+            )
+            written = [None if g is None else g[:, t].contiguous() for g in of_written]
+            written[policy.action] = _add(written[policy.action], grad_action)
+            written = [zero if g is None else g for g, zero in zip(written, zeros[3:], strict=True)]
+            grad_inputs, grad_drawn = policy.adjoint(inputs, kept, drawn, written, is_first=is_first)
+            grad_floats, grad_observation = policy.add(grad_floats, grad_inputs)
+            grads_drawn.append(grad_drawn)
+            grads_parameter.append(grad_parameters)
+        drawn = torch.stack(grads_drawn[::-1]) if ctx.needs_input_grad[5] else None
+        parameters = (torch.stack(x).sum(0) for x in zip(*grads_parameter, strict=True))
+        return None, None, None, grad_floats, grad_observation, drawn, *policy.weight_gradients(), *parameters
+
+
+class _Policy:
+    """The policy of one pass over a horizon, on lists of tensors; backwards it gathers the gradient of its weights."""
+
+    def __init__(self, horizon: Horizon) -> None:
+        self.policy, self.program, self.weights = horizon.policy, horizon.policy_program, horizon.policy.weights
+        self.layout: Layout = horizon.step.layout
+        self.action = list(self.policy.out_keys).index("action")
+        self.steps: list[tuple[Any, ...]] = []  # whose gradient in the weights is still to be taken
+        self.total: list[Tensor] | None = None
+
+    def inputs(self, rows: Rows, observation: Tensor) -> list[Tensor]:
+        """What it reads."""
+        if tuple(self.policy.in_keys) == ("observation",):
+            return [observation]
+        return policy_inputs(self.policy, self.layout.unpack(rows) if self.policy.in_keys else {}, observation)
+
+    def forward(self, inputs: list[Tensor], drawn: Tensor, *, is_first: bool) -> tuple[list[Tensor], list[Tensor]]:
+        """What it keeps, and what it writes."""
+        if self.program is None:
+            kept, written = self.policy.forward(self.weights, inputs, drawn)
+            return kept, [written[key] for key in self.policy.out_keys]
+        function = self.program.forward if is_first else self.program.forward.again
+        values = function(*self.weights, *inputs, drawn)
+        count = len(values) - len(self.policy.out_keys)
+        return values[:count], values[count:]
+
+    def adjoint(
+        self, inputs: list[Tensor], kept: list[Tensor], drawn: Tensor, grads: list[Tensor], *, is_first: bool
+    ) -> tuple[list[Tensor], Tensor]:
+        """The gradients of its inputs, and of what was drawn, from those of what it wrote."""
+        if self.program is None:
+            grads = dict(zip(self.policy.out_keys, grads, strict=True))
+            grad_kept, grad_inputs, grad_drawn = self.policy.adjoint(self.weights, inputs, kept, drawn, grads)
+        else:
+            function = self.program.adjoint if is_first else self.program.adjoint.again
+            values = function(*self.weights, *inputs, drawn, *kept, *grads)
+            grad_kept, grad_inputs, grad_drawn = values[: len(kept)], values[len(kept) : -1], values[-1]
+        if self.weights:
+            self.steps.append((inputs, kept, grad_kept))
+            if len(self.steps) * len(drawn) >= LEARNING_BATCH:
+                self._learn()
+        return grad_inputs, grad_drawn
+
+    def add(self, grad_floats: Tensor, grad_inputs: list[Tensor]) -> tuple[Tensor, Tensor | None]:
+        """The gradients of the state's floats, the policy's share included, and of the observation."""
+        of_state = dict(zip(self.policy.in_keys, grad_inputs, strict=True))
+        of_observation = of_state.pop("observation", None)
+        return self.layout.add(grad_floats, {name_in_state(key): g for key, g in of_state.items()}), of_observation
+
+    def weight_gradients(self) -> list[Tensor]:
+        """The gradient of each weight, over all steps."""
+        if self.steps:
+            self._learn()
+        return self.total or []
+
+    def _learn(self) -> None:
+        batch = ([torch.cat(x) for x in zip(*part, strict=True)] for part in zip(*self.steps, strict=True))
+        grads = self.policy.weight_gradient(*batch)
+        self.total = grads if self.total is None else [a + b for a, b in zip(self.total, grads, strict=True)]
+        self.steps = []
+
+
+def _take(values: Iterable[Tensor], count: int) -> list[Tensor]:
+    return [next(values) for _ in range(count)]
+
+
+def _stack(steps: Any, dim: int) -> Tensor:
+    return torch.stack(steps, dim) if len(steps) > 1 else steps[0].unsqueeze(dim)
+
+
+def _add(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+    return b if a is None else a if b is None else a + b

@@ -1,0 +1,164 @@
+"""Two compiled functions and their adjoints: a control step on rows, and a policy on plain tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.func import vjp
+
+from torchrl_quad.engine.compiling import Compiled
+from torchrl_quad.engine.packing import Layout, Rows, flat
+from torchrl_quad.engine.policy import PlainPolicy
+from torchrl_quad.engine.simulation import Simulation, State, Transition
+
+
+class Record(NamedTuple):
+    """A transition on rows."""
+
+    state: Rows  # at the end of the step
+    outputs: Rows  # reward, flags and so on, without the observation
+    observation: Tensor  # (n, k)
+
+
+class StepProgram:
+    """A compiled control step and its adjoint, on flat lists of tensors.
+
+    ======== ======================================================================================================
+    start    the rows of the state (floats, integers, flags), valid (n), the action (n, k)
+    others   the parameters that gradients may reach, then the noise of each disturbance
+    end      the rows of the state and of the outputs, and the observation (n, k)
+    ======== ======================================================================================================
+
+    ``forward(*start, *others)`` returns the state after each substep, each (rows, n), and the end.
+    ``adjoint(*start, *others, *states, *grads)`` takes the gradients in the floats of the end (state, outputs,
+    observation), and returns those in the floats of the start (state, action), and in the parameters.
+
+    Args:
+        simulation: what happens in a step.
+        layout: the rows of a state.
+        output_layout: the rows of the outputs of a step.
+        options: keywords of ``torch.compile``.
+    """
+
+    def __init__(self, simulation: Simulation, layout: Layout, output_layout: Layout, options: dict[str, Any]) -> None:
+        self.simulation, self.layout, self.output_layout = simulation, layout, output_layout
+        self.substeps, self.noise_names, self.parameter_count = simulation.substeps, (), len(simulation.parameters)
+        substep = simulation.rows_step()
+
+        def pull(x: Tensor, inputs: tuple[Any, ...], grad: Tensor) -> tuple[Tensor, ...]:
+            grad_x, grad_inputs = vjp(lambda x, inputs: substep(x, *inputs), x, inputs)[1](grad)
+            return (grad_x, *_flat(grad_inputs))  # a flat tuple: only such a region is traced once for all
+
+        self.substep, self.pull = (torch.compiler.nested_compile_region(f) for f in (substep, pull))
+        self.forward = Compiled(self._forward, options)
+        self.adjoint = Compiled(self._adjoint, options)
+
+    def _forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        rows, valid, action, parameters, noise, _ = self._parts(inputs)
+        before, valid, x, more = self.simulation.begin(self.layout.unpack(rows), valid, action, parameters)
+        states = []
+        for _ in range(self.substeps):
+            x = self.substep(x, *more)
+            states.append(x)
+        end = record(self.simulation.finish(before, x, valid, noise), self.layout, self.output_layout)
+        return *states, *end.state, *end.outputs, end.observation
+
+    def _adjoint(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        rows, valid, action, parameters, noise, more = self._parts(inputs)
+        states, grads = more[: self.substeps], more[self.substeps :]
+
+        def begin(floats: Tensor, action: Tensor, parameters: tuple[Tensor, ...]) -> tuple[Any, Any]:
+            state = self.layout.unpack(rows._replace(floats=floats))
+            before, is_valid, x, inputs = self.simulation.begin(state, valid, action, parameters)
+            floats = {key: x for key, x in before.items() if x.is_floating_point()}
+            return (x, inputs, floats), (is_valid, {key: x for key, x in before.items() if key not in floats})
+
+        def finish(floats: State, x: Tensor) -> tuple[Any, Any]:
+            end = self.simulation.finish({**others, **floats}, x, is_valid, noise)
+            end_record = record(end, self.layout, self.output_layout)
+            return (end_record.state.floats, end_record.outputs.floats, end_record.observation), end.valid
+
+        primals, pull_begin, (is_valid, others) = vjp(begin, rows.floats, action, parameters, has_aux=True)
+        first, inputs, before = primals
+        _, pull_finish, keep = vjp(finish, before, states[-1], has_aux=True)
+        grad_before, grad_x = pull_finish(grads)
+        total = None
+        for x in reversed((first, *states[:-1])):
+            grad_x, *more = self.pull(x, inputs, grad_x.contiguous())
+            total = more if total is None else [a + b for a, b in zip(total, more, strict=True)]
+        # What has become meaningless may have infinite derivatives. They must not reach what all share.
+        grad_x, *total = (torch.where(keep, g, 0.0) for g in (grad_x, *total))
+        grad_before = {
+            key: torch.where(keep.reshape(-1, *(1 for _ in g.shape[1:])), g, 0.0) for key, g in grad_before.items()
+        }
+        grad_floats, grad_action, grad_parameters = pull_begin((grad_x, _like(inputs, total), grad_before))
+        return grad_floats, grad_action, *grad_parameters
+
+    def _parts(self, inputs: Sequence[Tensor]) -> tuple[Any, ...]:
+        """Rows, valid, action, parameters, noise by name, and the rest of a flat list."""
+        noise_at = 5 + self.parameter_count
+        rest_at = noise_at + len(self.noise_names)
+        noise = dict(zip(self.noise_names, inputs[noise_at:rest_at], strict=True))
+        return Rows(*inputs[:3]), inputs[3], inputs[4], inputs[5:noise_at], noise, inputs[rest_at:]
+
+
+class PolicyProgram:
+    """A compiled policy and its adjoint, on flat lists of tensors.
+
+    ``forward(*weights, *inputs, drawn)`` returns what the policy keeps, and what it writes, in the order of its
+    ``out_keys``. ``adjoint(*weights, *inputs, drawn, *kept, *grads)`` takes the gradients of what it wrote, and returns
+    those of what it kept, of its inputs, and of what was drawn.
+
+    Args:
+        policy: all policies of its signature can use the program.
+        options: keywords of ``torch.compile``.
+    """
+
+    def __init__(self, policy: PlainPolicy, options: dict[str, Any]) -> None:
+        self.policy, self.counts = policy, (len(policy.weights), len(policy.in_keys))
+        self.forward = Compiled(self._forward, options)
+        self.adjoint = Compiled(self._adjoint, options)
+
+    def _forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        weights, inputs, (drawn,) = _split(inputs, *self.counts)
+        kept, written = self.policy.forward(weights, inputs, drawn)
+        return *kept, *(written[key] for key in self.policy.out_keys)
+
+    def _adjoint(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        weights, inputs, (drawn, *more) = _split(inputs, *self.counts)
+        count = len(more) - len(self.policy.out_keys)
+        grads = dict(zip(self.policy.out_keys, more[count:], strict=True))
+        grad_kept, grad_inputs, grad_drawn = self.policy.adjoint(weights, inputs, more[:count], drawn, grads)
+        return *grad_kept, *grad_inputs, grad_drawn
+
+
+def record(end: Transition, layout: Layout, output_layout: Layout) -> Record:
+    """A transition on rows."""
+    return Record(layout.pack(end.state), output_layout.pack(flat(end.outputs)), end.outputs["observation"])
+
+
+def policy_inputs(policy: PlainPolicy, state: State, observation: Tensor) -> list[Tensor]:
+    """The entries that a policy reads."""
+    return [observation if key == "observation" else state[name_in_state(key)] for key in policy.in_keys]
+
+
+def name_in_state(key: tuple[str, ...]) -> Any:
+    """The name within the state of a key ("state", ...)."""
+    return key[1] if len(key) == 2 else key[1:]
+
+
+def _split(values: Sequence[Any], first: int, second: int) -> tuple[Sequence[Any], ...]:
+    return values[:first], values[first : first + second], values[first + second :]
+
+
+def _flat(inputs: Sequence[Any]) -> list[Tensor]:
+    return [x for part in inputs for x in (part if isinstance(part, tuple) else (part,))]
+
+
+def _like(inputs: Sequence[Any], flat: Sequence[Tensor]) -> tuple[Any, ...]:
+    """The reverse of :func:`_flat`."""
+    flat = iter(flat)
+    return tuple(tuple(next(flat) for _ in part) if isinstance(part, tuple) else next(flat) for part in inputs)

@@ -1,0 +1,133 @@
+"""Policies as pure functions of tensors, which environments fly inside their compiled step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import vjp
+from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.modules import ProbabilisticActor
+
+
+class TanhGaussianActor(ProbabilisticActor):
+    """What :func:`~torchrl_quad.make_actor` builds: a tanh-Gaussian policy that environments can fly as pure functions.
+
+    It computes the same either way.
+    """
+
+    def plain(self) -> PlainTanhGaussian | None:
+        """The policy as pure functions of its present weights; None if somebody has changed its parts, or hooks it."""
+        kind = exploration_type()
+        network = getattr(self[0], "module", None)
+        is_known = kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC) and type(self) is TanhGaussianActor
+        if not is_known or not hasattr(network, "mlp"):
+            return None
+        for module in self.modules():
+            if module._forward_hooks or module._forward_pre_hooks or module._backward_hooks:
+                return None
+        layers, activations = list(network.mlp)[::2], list(network.mlp)[1::2]
+        if any(type(layer) is not nn.Linear for layer in layers) or not all(map(_is_pointwise, activations)):
+            return None
+        return PlainTanhGaussian(self, layers, activations, kind is ExplorationType.RANDOM)
+
+
+class PlainTanhGaussian:
+    """A tanh-Gaussian policy on plain tensors; see the engine's ``PlainPolicy``."""
+
+    def __init__(
+        self, actor: TanhGaussianActor, layers: list[nn.Linear], activations: list[nn.Module], is_random: bool
+    ) -> None:
+        network, sample = actor[0].module, actor[1]
+        self.in_keys, self.out_keys, self.scales = list(actor[0].in_keys), list(actor.out_keys), network.scales
+        self.head, self.activations, self.is_random = network.head, activations, is_random
+        self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
+        self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
+        self.width = layers[-1].out_features // 2
+        bounds = sample.distribution_kwargs
+        self.low, self.high = (bounds[name].tolist() if bounds else None for name in ("low", "high"))
+        mapping = self.head.scale_mapping
+        self.signature = (
+            *map(str, (self.in_keys, self.out_keys, self.scales, self.activations, self.low, self.high)),
+            *(tuple(x.shape) for x in self.weights),
+            (self.head.scale_lb, mapping.bias, mapping.min_val),
+        )
+
+    def drawn(self, steps: int, n: int) -> Tensor:
+        """Standard normal noise, as the distribution would draw it step by step; zeros for the mode."""
+        like = self.weights[0]
+        noise = torch.zeros((steps, n, self.width), device=like.device, dtype=like.dtype)
+        for x in noise if self.is_random else ():
+            x.normal_()
+        return noise
+
+    def forward(
+        self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
+    ) -> tuple[list[Tensor], dict[Any, Tensor]]:
+        """What each layer returns before its activation, and loc, scale, action, and log-probability if wanted."""
+        x, kept = self._input(inputs), []
+        for weight, bias, activation in zip(weights[::2], weights[1::2], [*self.activations, None], strict=True):
+            kept.append(torch.addmm(bias, x, weight.t()))
+            x = kept[-1] if activation is None else activation(kept[-1])
+        return kept, self._sample(kept[-1], drawn)
+
+    def adjoint(
+        self,
+        weights: Sequence[Tensor],
+        inputs: Sequence[Tensor],
+        kept: Sequence[Tensor],
+        drawn: Tensor,
+        grads: dict[Any, Tensor],
+    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
+        """The gradients of each layer's return, of the inputs and of the noise."""
+        _, pull = vjp(self._sample, kept[-1], drawn)
+        grad, grad_drawn = pull(grads)
+        grad_kept = [grad]
+        for weight, activation, x in zip(weights[-2:0:-2], self.activations[::-1], kept[-2::-1], strict=True):
+            grad = vjp(activation, x)[1](grad @ weight)[0]
+            grad_kept.append(grad)
+        grads = (grad @ weights[0]).split([x.shape[-1] for x in inputs], -1)
+        return grad_kept[::-1], [g * scale for g, scale in zip(grads, self.scales, strict=True)], grad_drawn
+
+    def weight_gradient(
+        self, inputs: Sequence[Tensor], kept: Sequence[Tensor], grad_kept: Sequence[Tensor]
+    ) -> list[Tensor]:
+        """The gradients of weight and bias of each layer, over a batch."""
+        grads = []
+        for i, grad in enumerate(grad_kept):
+            x = self._input(inputs) if i == 0 else self.activations[i - 1](kept[i - 1])
+            grads += [grad.t() @ x, grad.sum(0)]
+        return grads
+
+    def _input(self, inputs: Sequence[Tensor]) -> Tensor:
+        return torch.cat([x if scale == 1.0 else x * scale for x, scale in zip(inputs, self.scales, strict=True)], -1)
+
+    def _sample(self, raw: Tensor, noise: Tensor) -> dict[Any, Tensor]:
+        loc, scale = self.head(raw)
+        x = loc + scale * noise
+        limit = 1.0 - torch.finfo(x.dtype).resolution
+        squashed = torch.tanh(x)
+        # Clipped as in TorchRL's TanhNormal, which keeps the derivative where it clips.
+        squashed = squashed + (squashed.clamp(-limit, limit) - squashed).detach()
+        action = squashed
+        if self.low is not None:
+            low, high = (raw.new_tensor(bound) for bound in (self.low, self.high))
+            action = (high + low) / 2 + (high - low) / 2 * squashed
+        written = {"loc": loc, "scale": scale, "action": action}
+        if self.log_prob_key is not None:
+            x = x + (torch.atanh(squashed) - x).detach()
+            density = -((x - loc) ** 2) / (2 * scale**2) - scale.log() - 0.5 * math.log(2 * math.pi)
+            slope = 2.0 * (math.log(2.0) - x - nn.functional.softplus(-2.0 * x))
+            if self.low is not None:
+                slope = slope + ((high - low) / 2).log()
+            written[self.log_prob_key] = (density - slope).sum(-1)
+        return written
+
+
+def _is_pointwise(activation: nn.Module) -> bool:
+    """Whether an activation is a function of its input alone: one of torch's without parameters or random numbers."""
+    known = type(activation).__module__ == "torch.nn.modules.activation" and not isinstance(activation, nn.RReLU)
+    return known and not list(activation.parameters())

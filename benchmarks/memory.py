@@ -21,15 +21,14 @@ from typing import Any
 
 import torch
 from report import RESULTS, in_own_process, save
-from throughput import FixedActions
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from torchrl_quad import differentiable_rollout, make_env
+from torchrl_quad import ActionSequence, differentiable_rollout, make_env
 from torchrl_quad.engine.packing import Rows
-from torchrl_quad.engine.stepper import Record
+from torchrl_quad.engine.program import Record
 
 MODES = ["eager", "recompute", "compiled"]
 
@@ -66,7 +65,7 @@ def measure(mode: str, n: int, horizon: int, rounds: int) -> dict[str, float | s
         actions = (env.hover_action + 0.1 * torch.randn(steps, n, 4)).requires_grad_()
         gc.collect()
         before, begin = resident(), time.perf_counter()
-        rollout, _ = differentiable_rollout(env, FixedActions(actions), start, steps)
+        rollout, _ = differentiable_rollout(env, ActionSequence(actions), start, steps)
         middle, held = time.perf_counter(), resident() - before
         rollout["next", "reward"].sum().backward()
         return {"held": held, "data": rollout.bytes(), "fwd": middle - begin, "bwd": time.perf_counter() - middle}

@@ -68,12 +68,15 @@ def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) ->
     import torchrl_quad
     from torchrl_quad import objectives
     from torchrl_quad.data import rollout as rollouts
-    from torchrl_quad.engine import stepper
+    from torchrl_quad.engine import node, stepper
     from torchrl_quad.envs import base
 
     clocks = Clocks()
     clocks.around(stepper.Stepper, "step_rows", "physics")
-    clocks.around(stepper._Step, "backward", "physics")
+    for name in ("forward", "backward"):
+        clocks.around(node._Horizon, name, "physics")
+    for name in ("forward", "adjoint", "weight_gradients"):
+        clocks.around(node._Policy, name, "actor")
     clocks.around(ProbabilisticTensorDictSequential, "forward", "actor")
     clocks.around(base, "fly", "bookkeeping")
     clocks.around(rollouts, "differentiable_rollout", "bookkeeping")

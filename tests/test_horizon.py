@@ -2,12 +2,13 @@
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
 from torch._dynamo.utils import counters
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import HoveringEnv, RacingEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad import ActionSequence, HoveringEnv, RacingEnv, differentiable_rollout, make_actor, make_env
 from torchrl_quad.envs import TASKS
 
 EVERYTHING = {
@@ -90,30 +91,53 @@ def test_a_step_of_one_s_own_is_flown_and_an_output_that_nobody_wants_does_no_ha
     assert HoveringEnv(num_envs=2).rollout(3, policy, break_when_any_done=False).shape == (2, 3)
 
 
-def test_compiled_flights_equal_eager_ones_and_never_recompile():
-    env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, gate_bonus="log", **EVERYTHING)
-    actor = make_actor(env)
+def losses_of(flight):
+    """A number that depends on all that a loss may read: rewards, both ends of each step, and what the policy wrote."""
+    read = [("next", "reward"), "observation", ("next", "observation"), ("state", "velocity"), "action", "loc", "scale"]
+    read += [("next", "state", "rotor_speed"), ("next", "reward_terms", "velocity"), "action_log_prob"]
+    parts = [flight[key] for key in read if key in flight]
+    return sum((x * torch.linspace(0.5, 1.5, x.numel(), dtype=x.dtype).view_as(x)).sum() for x in parts)
 
-    def train():
+
+def test_compiled_flights_equal_eager_ones_and_never_recompile():
+    options = {**EVERYTHING, "gate_bonus": "log", "reward": "position"}
+    env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, **options)
+    drag = env.nominal.linear_drag.clone().requires_grad_()
+    env.params = env.nominal.replace(linear_drag=drag)
+    actor = make_actor(env, in_keys=["observation", ("state", "velocity")], return_log_prob=True)
+    called = TensorDictSequential(actor)
+
+    def train(policy):
+        """Two horizons, through the ends of episodes, from a start that wants a gradient."""
         env.set_seed(0)
-        mode = {"exploration_type": ExplorationType.DETERMINISTIC}
-        flight, carry = differentiable_rollout(env, actor, None, 50, **mode)
-        more, _ = differentiable_rollout(env, actor, carry, 7, **mode)
-        loss = flight["next", "reward"].sum() + more["next", "reward"].sum()
-        return flight, torch.autograd.grad(loss, list(actor.parameters()))
+        torch.manual_seed(0)
+        start = env.reset()
+        start["state", "velocity"].requires_grad_()
+        flight, carry = differentiable_rollout(env, policy, start, 50)
+        more, _ = differentiable_rollout(env, policy, carry, 7)
+        wanted = [drag, start["state", "velocity"], *actor.parameters()]
+        return flight, torch.autograd.grad(losses_of(flight) + losses_of(more), wanted)
 
     def train_in_torchrls_loop():
         env.set_seed(0)
         return fly(lambda *a, **k: EnvBase.rollout(env, *a, **k), env, actor, env.reset(), 45)
 
-    eager, eager_grad = train()
-    slow, slow_grad = train_in_torchrls_loop()
+    def optimise_actions():
+        env.set_seed(0)
+        actions = (env.hover_action + 0.05 * torch.ones(50, 4, 4, dtype=env.dtype)).requires_grad_()
+        flight, _ = differentiable_rollout(env, ActionSequence(actions), None, 50)
+        torch.testing.assert_close(flight["action"], actions.transpose(0, 1))
+        return flight, torch.autograd.grad(losses_of(flight), actions)
+
+    def all_ways():
+        return train(actor), train(called), train_in_torchrls_loop(), optimise_actions()
+
+    eager = all_ways()
     env.compile()
-    train()
-    train_in_torchrls_loop()
+    assert env.flies_inside(actor) and not env.flies_inside(called)
+    all_ways()
     compiled_so_far = counters["stats"]["unique_graphs"]
-    compiled, compiled_grad = train()
-    compiled_slow, compiled_slow_grad = train_in_torchrls_loop()
+    compiled = all_ways()
     with torch.no_grad():
         train_free = env.rollout(11, actor, break_when_any_done=False)
         env.rollout(3, actor)
@@ -121,12 +145,12 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile():
     env.set_initial_state_source(lambda n: train_free["next", "state"][:, 2])
     env.rollout(40, actor, break_when_any_done=False)["next", "reward"].sum().backward()
     assert counters["stats"]["unique_graphs"] == compiled_so_far
-    torch.testing.assert_close(entries(compiled), entries(eager))
-    torch.testing.assert_close(compiled_grad, eager_grad)
-    torch.testing.assert_close(entries(compiled_slow), entries(slow))
-    torch.testing.assert_close(compiled_slow_grad, slow_grad)
-    assert not any(flight["next", "metrics"].requires_grad for flight in (eager, slow, compiled, compiled_slow))
-    assert compiled["next", "done"].any()
+    for (flight, grads), (expected, expected_grads) in zip(compiled, eager, strict=True):
+        torch.testing.assert_close(entries(flight), entries(expected))
+        torch.testing.assert_close(grads, expected_grads)
+        assert not flight["next", "metrics"].requires_grad and not expected["next", "metrics"].requires_grad
+        assert flight["next", "done"].any()
+    torch.testing.assert_close(compiled[0], compiled[1])
 
 
 def test_drones_that_break_crash_alone_in_a_compiled_step():
@@ -196,3 +220,76 @@ def test_without_a_cpp_compiler_the_step_stays_eager_and_says_so(monkeypatch):
         env = HoveringEnv(num_envs=2, compile=True)
     assert not env.is_compiled
     assert env.rollout(2)["next", "reward"].isfinite().all()
+
+
+@pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"return_log_prob": True},
+        {"activation": nn.Tanh, "in_keys": ["observation", ("state", "velocity")], "input_scale": (1.0, 0.3)},
+        {"activation": nn.SiLU, "num_cells": (16,), "action_init": torch.full((4,), 0.2)},
+    ],
+)
+def test_a_policy_on_plain_tensors_is_the_policy(env64, options, kind):
+    actor = make_actor(env64, **{"return_log_prob": True, **options})
+    for parameter in actor.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)
+    with set_exploration_type(kind):
+        plain = actor.plain()
+        torch.manual_seed(3)
+        td = env64.reset()
+        inputs = [td[key].requires_grad_() for key in plain.in_keys]
+        written = actor(td.copy()).select(*plain.out_keys)
+        torch.manual_seed(3)
+        drawn = plain.drawn(1, 4)[0]
+    kept, mine = plain.forward(plain.weights, inputs, drawn)
+    torch.testing.assert_close(mine, dict(written.items()))
+    grads = {key: torch.randn_like(x) for key, x in mine.items()}
+    total = sum((written[key] * grads[key]).sum() for key in grads)
+    expected = torch.autograd.grad(total, [*inputs, *plain.weights])
+    grad_kept, grad_inputs, _ = plain.adjoint(plain.weights, inputs, kept, drawn, grads)
+    torch.testing.assert_close(tuple(grad_inputs), expected[: len(inputs)])
+    torch.testing.assert_close(tuple(plain.weight_gradient(inputs, kept, grad_kept)), expected[len(inputs) :])
+
+
+def test_a_saturated_policy_keeps_the_gradient_that_torchrl_gives(env):
+    actor = make_actor(env, return_log_prob=True)
+    actor[0].module.mlp[-1].bias.data += 12.0
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        plain, td = actor.plain(), env.reset()
+        written, weights = actor(td.copy()), list(plain.weights)
+        mine = plain.forward(plain.weights, [td["observation"]], plain.drawn(1, 4)[0])[1]
+    assert (written["action"] > 0.999).all()
+    for key in ("action", "action_log_prob"):
+        torch.testing.assert_close(mine[key], written[key])
+        expected, found = (torch.autograd.grad(x[key].sum(), weights, retain_graph=True) for x in (written, mine))
+        torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_policies_that_somebody_has_changed_are_called():
+    env = HoveringEnv(num_envs=2)
+    compiled, actor = HoveringEnv(num_envs=2).compile(), make_actor(env)
+    assert compiled.flies_inside(actor) and not env.flies_inside(actor)
+    assert compiled.flies_inside(ActionSequence(torch.zeros(3, 2, 4)))
+    seen = []
+    hook = actor[0].module.mlp[1].register_forward_hook(lambda *_: seen.append(1))
+    assert not compiled.flies_inside(actor)
+    hook.remove()
+    with set_exploration_type(ExplorationType.MODE):
+        assert not compiled.flies_inside(actor)
+    assert compiled.flies_inside(actor)
+    actor[0].module.mlp[1] = nn.PReLU()
+    others = [actor, make_actor(env, activation=nn.RReLU), make_actor(HoveringEnv(num_envs=2, dtype=torch.float64))]
+    others += [
+        make_actor(HoveringEnv(num_envs=2, observe_last_action=True)),
+        TensorDictModule(nn.Linear(13, 4), ["observation"], ["action"]),
+    ]
+    assert not any(map(compiled.flies_inside, others))
+
+
+def test_a_sequence_of_actions_is_played_once(env):
+    sequence = ActionSequence(torch.zeros(5, 4, 4))
+    env.rollout(3, sequence, break_when_any_done=False)
+    with pytest.raises(ValueError, match="5 actions, 0 of them unplayed, and the flight wants 1 more"):
+        env.rollout(3, sequence, break_when_any_done=False)

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
 import torchrl_quad
@@ -117,12 +117,14 @@ class Run:
         if self.cfg.compile and self.done < self.iterations:
             self._warm_up()
         step = self.steps_per_iteration
+        inside = not isinstance(self.env, TransformedEnv) and self.env.flies_inside(self.actor)
+        way = "policy inside the step" if inside else "policy before the step"
         with tqdm(
             total=self.iterations * step,
             initial=self.done * step,
             unit="step",
             unit_scale=True,
-            desc=f"{self.cfg.algorithm} {self.cfg.task} {self.cfg.seed}",
+            desc=f"{self.cfg.algorithm} {self.cfg.task} {self.cfg.seed}, {way}",
             disable=rank() > 0,
         ) as bar:
             for iteration in range(self.done, self.iterations):

@@ -114,9 +114,9 @@ class _Horizon(torch.autograd.Function):
             grad_floats, grad_action, *grad_parameters = (step.adjoint if is_first else step.adjoint.again)(
                 *start, *states, *end
             )
-            written = [None if g is None else g[:, t].contiguous() for g in of_written]
+            written = [None if g is None else g[:, t] for g in of_written]
             written[policy.action] = _add(written[policy.action], grad_action)
-            written = [zero if g is None else g for g, zero in zip(written, zeros[3:], strict=True)]
+            written = [zero if g is None else g.contiguous() for g, zero in zip(written, zeros[3:], strict=True)]
             grad_inputs, grad_drawn = policy.adjoint(inputs, kept, drawn, written, is_first=is_first)
             grad_floats, grad_observation = policy.add(grad_floats, grad_inputs)
             grads_drawn.append(grad_drawn)

@@ -95,7 +95,7 @@ class StepProgram:
             key: torch.where(keep.reshape(-1, *(1 for _ in g.shape[1:])), g, 0.0) for key, g in grad_before.items()
         }
         grad_floats, grad_action, grad_parameters = pull_begin((grad_x, _like(inputs, total), grad_before))
-        return grad_floats, grad_action, *grad_parameters
+        return grad_floats, grad_action.contiguous(), *grad_parameters
 
     def _parts(self, inputs: Sequence[Tensor]) -> tuple[Any, ...]:
         """Rows, valid, action, parameters, noise by name, and the rest of a flat list."""

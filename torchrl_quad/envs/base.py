@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams, load_drone
-from torchrl_quad.engine import Stepper, can_fly, fly, has_compiler, nested
+from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compiler, nested
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import checks
 from torchrl_quad.envs.disturbances import Disturbance, choose_disturbances
@@ -177,14 +177,16 @@ class QuadrotorEnv(Task, EnvBase):
         return self._stepper.is_compiled
 
     def compile(self, **kwargs: Any) -> QuadrotorEnv:
-        """Compile the control step and its derivative; the keywords go to torch.compile.
-
-        Under transforms, compile the environment inside, ``TransformedEnv(HoveringEnv(compile=True), ...)``:
-        TransformedEnv's own ``compile`` takes minutes and makes nothing faster.
-        """
+        """Compile the control step and its derivative; the keywords go to torch.compile. Under transforms, compile the
+        environment inside, ``TransformedEnv(HoveringEnv(compile=True), ...)``: TransformedEnv's own takes minutes."""
         kwargs.pop("warmup", None)  # TorchRL's option for steps whose input changes its layout: ours never does
         self._stepper = Stepper(self.control_step, kwargs if has_compiler() else None)
         return self
+
+    def flies_inside(self, policy: Any) -> bool:
+        """Whether :meth:`rollout` flies a policy inside the compiled step, as it does those of ``make_actor``, which is
+        fastest, or calls it before each step; the numbers are the same. Under transforms it is always called."""
+        return flies_inside(self._stepper, policy)
 
     def eager(self) -> QuadrotorEnv:
         """Undo :meth:`compile`."""
@@ -210,8 +212,7 @@ class QuadrotorEnv(Task, EnvBase):
     def render(self, drones: Sequence[int] | None = None, *, size: int = 336) -> Any:
         """Draw the drones as the last reset, step or rollout left them, with their targets, into one picture.
 
-        TorchRL's ``PixelRenderTransform(drones=[0, 1], size=480)`` calls it, and ``VideoRecorder`` films it. The view
-        grows when a drone leaves it.
+        TorchRL's ``PixelRenderTransform(drones=[0, 1], size=480)`` calls it, and ``VideoRecorder`` films it.
 
         Args:
             drones: indices of those to draw; by default the first six.
@@ -269,16 +270,13 @@ class QuadrotorEnv(Task, EnvBase):
         return TensorDict({"state": nested(state), **outputs}, self.batch_size, self.device)
 
     def rollout(self, max_steps: int, policy: Any = None, callback: Any = None, **options: Any) -> TensorDictBase:
-        """As TorchRL's rollout, and with the same numbers; several times faster where the engine can fly it.
-
-        The engine flies through the ends of episodes (``break_when_any_done=False``) with a TensorDictModule that reads
-        the observation or the state, and no other option than ``tensordict`` (with ``auto_reset=False``).
-        """
+        """As TorchRL's, with the same numbers; several times faster with ``break_when_any_done=False``, no other option
+        than ``tensordict`` (with ``auto_reset=False``), and a TensorDictModule that reads observation or state."""
         checks.require_count("max_steps", max_steps, 1, checks.MAX_STEPS)
         start, auto_reset = options.get("tensordict"), options.get("auto_reset", True)
         quick = callback is None and options.get("break_when_any_done") is False and auto_reset == (start is None)
-        cls = type(self)  # the engine knows nothing of a step of a subclass's own
-        quick = quick and (cls._step, cls._reset) == (QuadrotorEnv._step, QuadrotorEnv._reset)
+        own = type(self)._step, type(self)._reset  # the engine knows nothing of a step of a subclass's own
+        quick = quick and own == (QuadrotorEnv._step, QuadrotorEnv._reset)
         if quick and set(options) <= {"break_when_any_done", "auto_reset", "tensordict"}:
             start = self.reset() if start is None else start
             if can_fly(self._stepper, policy, start):

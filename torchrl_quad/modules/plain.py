@@ -21,7 +21,7 @@ class TanhGaussianActor(ProbabilisticActor):
 
     def plain(self) -> PlainTanhGaussian | None:
         """The policy as pure functions of its present weights; None if somebody has changed its parts, or hooks it."""
-        kind = exploration_type()
+        kind = exploration_type() or self[1].default_interaction_type
         network = getattr(self[0], "module", None)
         is_known = kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC) and type(self) is TanhGaussianActor
         if not is_known or not hasattr(network, "mlp"):

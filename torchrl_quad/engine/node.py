@@ -13,7 +13,7 @@ from torchrl_quad.engine.packing import Layout, Rows
 from torchrl_quad.engine.policy import PlainPolicy
 from torchrl_quad.engine.program import PolicyProgram, Record, StepProgram, name_in_state, policy_inputs
 
-LEARNING_BATCH = 16384  # so many steps of one drone make a batch for the gradient of the weights
+LEARNING_BATCH = 1024  # so many steps of one drone make a batch for the gradient of the weights
 
 
 class Horizon(NamedTuple):
@@ -182,7 +182,9 @@ class _Policy:
         return self.total or []
 
     def _learn(self) -> None:
-        batch = ([torch.cat(x) for x in zip(*part, strict=True)] for part in zip(*self.steps, strict=True))
+        batch = self.steps[0]
+        if len(self.steps) > 1:
+            batch = ([torch.cat(x) for x in zip(*part, strict=True)] for part in zip(*self.steps, strict=True))
         grads = self.policy.weight_gradient(*batch)
         self.total = grads if self.total is None else [a + b for a, b in zip(self.total, grads, strict=True)]
         self.steps = []

@@ -55,14 +55,7 @@ class Stepper:
         return {key: x.detach() if "metrics" in key else x for key, x in self.output_layout.unpack(rows).items()}
 
     def step_rows(self, rows: Rows, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Record:
-        """One step on rows.
-
-        Args:
-            rows: the state at its start.
-            valid: where that state was meaningful, bool (n); elsewhere the episode ends.
-            action: (n, k).
-            noise: what each disturbance has drawn for this step, by name.
-        """
+        """One step on rows, from a state under an action (n, k); the rest is that of :meth:`fly`."""
         if not self.is_compiled:
             return record(
                 self.simulation(self.layout.unpack(rows), valid, action, noise), self.layout, self.output_layout
@@ -81,7 +74,16 @@ class Stepper:
         noise: Callable[[], dict[str, Tensor]],
         restarted: Callable[[Record], tuple[Record, Tensor] | None] = lambda end: None,
     ) -> Flight:
-        """A compiled horizon with its graph, as one node; see :class:`~torchrl_quad.engine.node.Horizon`."""
+        """A compiled horizon with its graph, as one node.
+
+        Args:
+            policy: acts inside the step.
+            start: where it begins.
+            valid: where that state is meaningful, bool (n); elsewhere the episode ends with the first step.
+            steps: at least one.
+            noise: gives what each disturbance has drawn for the next step, by name.
+            restarted: from the end of a step where to go on, and who begins anew, bool (n); None if nobody does.
+        """
         drawn = policy.drawn(steps, len(valid))
         self.simulation.check_action(drawn[0])
         count = len(self.simulation.parameters)

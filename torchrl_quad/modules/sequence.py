@@ -19,7 +19,7 @@ class ActionSequence(TensorDictModuleBase):
         rollout["next", "reward"].sum().backward()  # fills actions.grad
 
     Args:
-        actions: (horizon, *batch, k) for a batch of environments; gradients reach them.
+        actions: (horizon, num_envs, k); gradients reach them.
 
     Raises:
         ValueError: (in use) there are no actions left.
@@ -39,7 +39,7 @@ class ActionSequence(TensorDictModuleBase):
         return GivenActions(self.take)
 
     def take(self, steps: int) -> Tensor:
-        """The next actions, (steps, *batch, k)."""
+        """The next actions, (steps, num_envs, k)."""
         left = len(self.actions) - self.played
         if steps > left:
             raise ValueError(

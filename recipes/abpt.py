@@ -4,8 +4,8 @@ python recipes/abpt.py task=hovering seed=0
 """
 
 from omegaconf import DictConfig
-from torchrl.objectives import SoftUpdate
 from training.building import (
+    TargetUpdate,
     actor_parameters,
     iterations,
     make_optimizer,
@@ -26,7 +26,7 @@ def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
     loss = ABPTLoss(actor, make_qvalue(env, **network(cfg, "critic")), **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
-    target = SoftUpdate(loss, tau=cfg.critic.tau)
+    target = TargetUpdate(loss, tau=cfg.critic.tau)
     buffer = VisitedStateBuffer(cfg.buffer.capacity, seed=own_seed(cfg))
 
     actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
@@ -44,7 +44,7 @@ def main(cfg: DictConfig) -> None:
 
         # The critics: towards the TD(lambda) targets of the target networks.
         data = loss.write_value_target(rollout.detach())
-        read = data.select(*loss.in_keys, loss.tensor_keys.value_target)
+        read = data.select(*loss.qvalue_network.in_keys, loss.tensor_keys.value_target)
         for batch in minibatches(read, cfg.critic):
             loss_qvalue, critic_metrics = loss.loss_qvalue(batch)
             run.optimise("critic", critic_optimizer, loss_qvalue, cfg.critic.max_grad_norm)

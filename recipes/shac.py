@@ -4,8 +4,8 @@ python recipes/shac.py task=hovering seed=0
 """
 
 from omegaconf import DictConfig
-from torchrl.objectives import SoftUpdate
 from training.building import (
+    TargetUpdate,
     actor_parameters,
     iterations,
     make_optimizer,
@@ -25,7 +25,7 @@ def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
     loss = SHACLoss(actor, make_value(env, **network(cfg, "critic")), **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
-    target = SoftUpdate(loss, tau=cfg.critic.tau)
+    target = TargetUpdate(loss, tau=cfg.critic.tau)
     actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
     critic_parameters = loss.value_network_params.parameters()
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
@@ -41,7 +41,7 @@ def main(cfg: DictConfig) -> None:
 
         # The critic: towards the TD(lambda) targets of the target network.
         data = loss.write_value_target(rollout.detach())
-        read = data.select(*loss.in_keys, loss.tensor_keys.value_target)
+        read = data.select(*loss.value_network.in_keys, loss.tensor_keys.value_target)
         for batch in minibatches(read, cfg.critic):
             loss_value, critic_metrics = loss.loss_value(batch)
             run.optimise("critic", critic_optimizer, loss_value, cfg.critic.max_grad_norm)

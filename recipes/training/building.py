@@ -12,7 +12,9 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torch.optim import lr_scheduler
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import ObservationNormalizer, make_actor, make_env
 from torchrl_quad.objectives import PathwiseLoss
@@ -72,7 +74,7 @@ def make_optimizer(
     cfg: DictConfig, parameters: Iterable[nn.Parameter], iterations: int
 ) -> tuple[torch.optim.Adam, lr_scheduler.LRScheduler]:
     """Build Adam, and the schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run."""
-    optimizer = torch.optim.Adam(parameters, cfg.lr, betas=tuple(cfg.betas))
+    optimizer = torch.optim.Adam(parameters, cfg.lr, betas=tuple(cfg.betas), fused=True)
     last, decay = max(iterations - 1, 1), cfg.final_lr / cfg.lr
     factor = {  # a function of the finished share of the run, so that a run can be resumed and made longer
         "constant": lambda share: 1.0,
@@ -81,6 +83,16 @@ def make_optimizer(
         "cosine": lambda share: decay + (1.0 - decay) * 0.5 * (1.0 + math.cos(math.pi * share)),
     }[cfg.schedule]
     return optimizer, lr_scheduler.LambdaLR(optimizer, lambda iteration: factor(min(iteration / last, 1.0)))
+
+
+class TargetUpdate(SoftUpdate):
+    """TorchRL's soft update of a loss's target critic, with all its parameters in one call."""
+
+    def step(self) -> None:
+        """Move the target by ``tau`` towards the critic."""
+        name = f"{self.loss_module.critic_name}_params"
+        target, critic = (getattr(self.loss_module, f"{prefix}{name}").values(True, True) for prefix in ("target_", ""))
+        get_ema_multi_avg_fn(self.eps)(list(target), list(critic), None)
 
 
 def update_normalizer(env: EnvBase, rollout: TensorDictBase) -> None:

@@ -154,8 +154,8 @@ class Run:
         Raises:
             FloatingPointError: more than ``max_skipped`` steps were skipped; the run is saved as it is.
         """
-        value, norm = backward(loss, optimizer, max_grad_norm)
-        finite = value.isfinite() and norm.isfinite()
+        value, norm = torch.stack(backward(loss, optimizer, max_grad_norm)).tolist()  # waits for a GPU once
+        finite = math.isfinite(value) and math.isfinite(norm)
         if finite:
             self.record(**{f"grad_{name}": norm})
         else:

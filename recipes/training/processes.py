@@ -89,4 +89,4 @@ def backward(loss: Tensor, optimizer: torch.optim.Optimizer, max_grad_norm: floa
         flat = nn.utils.parameters_to_vector(tensors)
         dist.all_reduce(flat)
         nn.utils.vector_to_parameters(flat / world_size(), tensors)
-    return loss, nn.utils.clip_grad_norm_(parameters, max_grad_norm)
+    return loss, nn.utils.clip_grad_norm_(parameters, max_grad_norm, foreach=True)

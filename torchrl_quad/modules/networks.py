@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
@@ -17,21 +16,9 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_quad.data.unwrap import base_env
-from torchrl_quad.modules.plain import TanhGaussianActor
+from torchrl_quad.modules.plain import Critic, Network, TanhGaussianActor
 
 OBSERVATION = ("observation",)
-
-
-class Network(nn.Module):
-    """A multi-layer perceptron on the concatenation of its inputs, each multiplied by a constant of its own."""
-
-    def __init__(self, mlp: MLP, scales: Sequence[float]) -> None:
-        super().__init__()
-        self.mlp, self.scales, self.head = mlp, tuple(scales), nn.Identity()
-
-    def forward(self, *inputs: Tensor) -> Any:
-        """The head's output for inputs (*, k_i); the head receives (*, out_features)."""
-        return self.head(self.mlp(torch.cat([x * scale for x, scale in zip(inputs, self.scales, strict=True)], -1)))
 
 
 def make_actor(
@@ -117,7 +104,7 @@ def make_value(
     turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one.
     """
     net = _network(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
-    return ValueOperator(net, in_keys=list(in_keys))
+    return Critic(net, in_keys=list(in_keys))
 
 
 def make_qvalue(
@@ -136,7 +123,7 @@ def make_qvalue(
     """
     in_keys = [*in_keys, "action"]
     net = _network(env, in_keys, 1, num_cells, activation, input_scale, action_scale, layer_norm=True)
-    return ValueOperator(net, in_keys=in_keys)
+    return Critic(net, in_keys=in_keys)
 
 
 def _network(

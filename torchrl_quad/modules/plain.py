@@ -1,16 +1,63 @@
-"""Policies as pure functions of tensors, which environments fly inside their compiled step."""
+"""Networks as pure functions of tensors: policies that environments fly in their compiled step, and critics."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.func import vjp
 from torchrl.envs.utils import ExplorationType, exploration_type
-from torchrl.modules import ProbabilisticActor
+from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
+
+
+class Network(nn.Module):
+    """A multi-layer perceptron on the concatenation of its inputs, each multiplied by a constant of its own."""
+
+    def __init__(self, mlp: MLP, scales: Sequence[float]) -> None:
+        super().__init__()
+        self.mlp, self.scales, self.head = mlp, tuple(scales), nn.Identity()
+
+    def forward(self, *inputs: Tensor) -> Any:
+        """The head's output for inputs (*, k_i); the head receives (*, out_features)."""
+        return self.head(self.mlp(_concatenated(inputs, self.scales)))
+
+
+class Critic(ValueOperator):
+    """What :func:`~torchrl_quad.make_value` and :func:`~torchrl_quad.make_qvalue` build.
+
+    Losses call it as a pure function, which computes the same.
+    """
+
+    def plain(self) -> Callable[[Mapping[str, Tensor], Sequence[Tensor]], Tensor] | None:
+        """The prediction (*, 1) as a function of the parameters, by name, and the inputs, each (*, k).
+
+        None if somebody has changed its parts, or hooks it.
+        """
+        network = self.module
+        is_known = type(self) is Critic and type(network) is Network and type(network.mlp) is MLP
+        if not is_known or type(network.head) is not nn.Identity or _is_hooked(self):
+            return None
+        layers = {f"module.mlp.{name}": layer for name, layer in network.mlp.named_children()}
+        known = (nn.Linear, nn.LayerNorm)
+        if not all(type(layer) in known or _is_pointwise(layer) for layer in layers.values()):
+            return None
+
+        def predict(params: Mapping[str, Tensor], inputs: Sequence[Tensor]) -> Tensor:
+            x = _concatenated(inputs, network.scales)
+            for name, layer in layers.items():
+                own = params.get(f"{name}.weight"), params.get(f"{name}.bias")
+                if type(layer) is nn.Linear:
+                    x = nn.functional.linear(x, *own)
+                elif type(layer) is nn.LayerNorm:
+                    x = nn.functional.layer_norm(x, layer.normalized_shape, *own, layer.eps)
+                else:
+                    x = layer(x)
+            return x
+
+        return predict
 
 
 class TanhGaussianActor(ProbabilisticActor):
@@ -24,11 +71,8 @@ class TanhGaussianActor(ProbabilisticActor):
         kind = exploration_type() or self[1].default_interaction_type
         network = getattr(self[0], "module", None)
         is_known = kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC) and type(self) is TanhGaussianActor
-        if not is_known or not hasattr(network, "mlp"):
+        if not is_known or type(network) is not Network or _is_hooked(self):
             return None
-        for module in self.modules():
-            if module._forward_hooks or module._forward_pre_hooks or module._backward_hooks:
-                return None
         layers, activations = list(network.mlp)[::2], list(network.mlp)[1::2]
         if any(type(layer) is not nn.Linear for layer in layers) or not all(map(_is_pointwise, activations)):
             return None
@@ -68,7 +112,7 @@ class PlainTanhGaussian:
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
     ) -> tuple[list[Tensor], dict[Any, Tensor]]:
         """What each layer returns before its activation, and loc, scale, action, and log-probability if wanted."""
-        x, kept = self._input(inputs), []
+        x, kept = _concatenated(inputs, self.scales), []
         for weight, bias, activation in zip(weights[::2], weights[1::2], [*self.activations, None], strict=True):
             kept.append(torch.addmm(bias, x, weight.t()))
             x = kept[-1] if activation is None else activation(kept[-1])
@@ -98,12 +142,9 @@ class PlainTanhGaussian:
         """The gradients of weight and bias of each layer, over a batch."""
         grads = []
         for i, grad in enumerate(grad_kept):
-            x = self._input(inputs) if i == 0 else self.activations[i - 1](kept[i - 1])
+            x = _concatenated(inputs, self.scales) if i == 0 else self.activations[i - 1](kept[i - 1])
             grads += [grad.t() @ x, grad.sum(0)]
         return grads
-
-    def _input(self, inputs: Sequence[Tensor]) -> Tensor:
-        return torch.cat([x if scale == 1.0 else x * scale for x, scale in zip(inputs, self.scales, strict=True)], -1)
 
     def _sample(self, raw: Tensor, noise: Tensor) -> dict[Any, Tensor]:
         loc, scale = self.head(raw)
@@ -125,6 +166,15 @@ class PlainTanhGaussian:
                 slope = slope + ((high - low) / 2).log()
             written[self.log_prob_key] = (density - slope).sum(-1)
         return written
+
+
+def _concatenated(inputs: Sequence[Tensor], scales: Sequence[float]) -> Tensor:
+    return torch.cat([x if scale == 1.0 else x * scale for x, scale in zip(inputs, scales, strict=True)], -1)
+
+
+def _is_hooked(module: nn.Module) -> bool:
+    hooks = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+    return any(getattr(part, name) for part in module.modules() for name in hooks)
 
 
 def _is_pointwise(activation: nn.Module) -> bool:

@@ -11,8 +11,8 @@ from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_quad.objectives.calls import sample_action
 from torchrl_quad.objectives.critic import PathwiseCriticLoss
 from torchrl_quad.objectives.pathwise import segments
 
@@ -124,18 +124,9 @@ class ABPTLoss(PathwiseCriticLoss):
         self._require_graph(action, self.tensor_keys.action)
         start, _ = segments(tensordict.get(("next", self.tensor_keys.done)))
         first = tensordict.select(*self.qvalue_network.in_keys)[start.squeeze(-1)]
-        value = self._critics(first, self._critic_params(target=False)).amin(0)
+        value = self._critics(first).amin(0)
         return torch.zeros_like(start, dtype=value.dtype).masked_scatter(start, value).sum((-2, -1))
 
-    def _value(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        with set_exploration_type(ExplorationType.RANDOM), self.actor_network_params.to_module(self.actor_network):
-            tensordict = self.actor_network(tensordict.select(*self._critic_inputs()))
-        return super()._value(tensordict, params)
-
-    def _critics(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        inputs = tensordict.select(*self.qvalue_network.in_keys)
-        values = []
-        for critic in params.unbind(0):
-            with critic.to_module(self.qvalue_network):
-                values.append(self.qvalue_network(inputs.copy()).get(self.tensor_keys.state_action_value))
-        return torch.stack(values)
+    def _value(self, tensordict: TensorDictBase, *, target: bool) -> Tensor:
+        states = tensordict.select(*self._critic_inputs())
+        return super()._value(sample_action(self.actor_network, self.actor_network_params, states), target=target)

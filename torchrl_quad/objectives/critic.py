@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.utils import ValueEstimators
 
+from torchrl_quad.objectives.calls import predict
 from torchrl_quad.objectives.pathwise import PathwiseLoss, segments
 
 
@@ -73,27 +73,32 @@ class PathwiseCriticLoss(PathwiseLoss):
         self._require_rollout(tensordict)
         data = tensordict.detach()
         with torch.no_grad():
-            next_value = self._value(data.get("next"), self._critic_params(target=True))
+            next_value = self._value(data.get("next"), target=True)
             terminated = data.get(("next", self.tensor_keys.terminated))
             next_value = torch.where(terminated, 0.0, next_value)  # also where the last state was not finite
             target = self.value_estimator.value_estimate(data, next_value=next_value)
         tensordict.set(self.tensor_keys.value_target, target)
         return tensordict
 
-    @abc.abstractmethod
-    def _critics(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        """The prediction of each critic: (critics, *, 1)."""
+    def _critics(self, tensordict: TensorDictBase, *, target: bool = False, learning: bool = False) -> Tensor:
+        """The prediction of each critic or of its target: (critics, *, 1).
 
-    def _value(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        """The value (*, 1) of states: the least of the critics' predictions."""
-        return self._critics(tensordict, params).amin(0)
+        It has a gradient in what the critics read, and none in their parameters; where they learn, the other way round.
+        """
+        network = getattr(self, self.critic_name)
+        params = getattr(self, f"{'target_' if target else ''}{self.critic_name}_params")
+        return predict(network, params, tensordict, getattr(self.tensor_keys, self.prediction_key), learning=learning)
+
+    def _value(self, tensordict: TensorDictBase, *, target: bool) -> Tensor:
+        """The value (*, 1) of states: the least of the predictions of the critics or of their targets."""
+        return self._critics(tensordict, target=target).amin(0)
 
     def _critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        data = tensordict.detach()
-        target = data.get(self.tensor_keys.value_target, None)
+        key = self.tensor_keys.value_target
+        target = tensordict.get(key, None)
         if target is None:
-            target = self.write_value_target(data.copy()).get(self.tensor_keys.value_target)
-        prediction = self._critics(data, getattr(self, f"{self.critic_name}_params"))
+            target = self.write_value_target(tensordict.copy()).get(key)
+        target, prediction = target.detach(), self._critics(tensordict, learning=True)
         error = (prediction - target).square().sum(0)
         with torch.no_grad():
             residual = (target - prediction).var(correction=0) / target.var(correction=0).clamp_min(1e-12)
@@ -103,17 +108,12 @@ class PathwiseCriticLoss(PathwiseLoss):
             "explained_variance": 1.0 - residual,
         }
 
-    def _critic_params(self, *, target: bool) -> TensorDictBase:
-        """The parameters of the critic or of its target, cut off from the graph."""
-        prefix = "target_" if target else ""
-        return getattr(self, f"{prefix}{self.critic_name}_params").detach()
-
     def _terminal_value(self, tensordict: TensorDictBase) -> Tensor:
         """gamma^n V(s_n) of each segment that did not terminate, summed over the segments: (*)."""
         _, end = segments(tensordict.get(("next", self.tensor_keys.done)))
         where = end & ~tensordict.get(("next", self.tensor_keys.terminated))
         next_state = tensordict.get("next").select(*self._critic_inputs(), strict=False)[where.squeeze(-1)]
-        value = self._value(next_state, self._critic_params(target=self.target_bootstrap))
+        value = self._value(next_state, target=self.target_bootstrap)
         discount = self.value_estimator.gamma * self._discounts(tensordict)
         return (discount * torch.zeros_like(discount).masked_scatter(where, value.to(discount.dtype))).sum((-2, -1))
 

@@ -95,8 +95,3 @@ class SHACLoss(PathwiseCriticLoss):
     def _terminal_value(self, tensordict: TensorDictBase) -> Tensor:
         value = super()._terminal_value(tensordict)
         return value if self.terminal_gradient else value.detach()
-
-    def _critics(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        inputs = tensordict.select(*self.value_network.in_keys)
-        with params.to_module(self.value_network):
-            return self.value_network(inputs).get(self.tensor_keys.value).unsqueeze(0)

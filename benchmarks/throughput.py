@@ -7,7 +7,7 @@ physics     the control step alone: rate controller, rotors and rigid body, four
 env         the whole environment through ``differentiable_rollout``, with fixed actions
 point mass  the same with ``dynamics="point_mass"``
 actor       the environment with a 64-64 policy
-rollout     the same through ``env.rollout``
+called      the same with a policy that is called before each step, as policies of other classes are
 torchrl     the same through TorchRL's own loop, which transforms and other policies fall back to
 step        one eager ``env.step`` after another: racing with gusts and noisy sensors, fixed actions
 crazyflow   its body-rate model (JAX), ten substeps, where it is installed: pip install crazyflow
@@ -31,13 +31,14 @@ from typing import Any
 import torch
 from report import RESULTS, finished, save
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_quad import ActionSequence, differentiable_rollout, make_actor, make_env
 from torchrl_quad.engine import Stepper, Transition
+from torchrl_quad.engine.policy import GivenActions
 from torchrl_quad.engine.simulation import State
 
 
@@ -59,15 +60,17 @@ class Physics:
             for action in actions.unbind():
                 state, _ = self.stepper.step(state, self.valid, action, {})
             return torch.cat(list(state.values()), -1).sum()
-        rows = self.stepper.layout.pack(self.start)
-        for action in actions.unbind():
-            rows = self.stepper.step_rows(rows, self.valid, action, {}).state
-        return rows.floats.sum()
+        start = self.stepper.example._replace(state=self.stepper.layout.pack(self.start))
+        flight = self.stepper.fly(GivenActions(lambda _: actions), start, self.valid, len(actions), dict)
+        return flight.ends.state.floats[-1].sum()
 
     # -- for the engine ------------------------------------------------------------------------------------------------
 
     def example(self) -> tuple[State, State]:
         return self.start, self.outputs(self.start)
+
+    def check_action(self, action: Tensor | None) -> None:
+        pass
 
     def outputs(self, state: State) -> State:
         return {"observation": state["position"], "reward": state["position"][:, :1]}
@@ -108,7 +111,7 @@ def flights(task: str, options: dict[str, Any]) -> dict[str, Callable[[Tensor], 
         "env": lambda actions: fly(env, ActionSequence(actions), actions),
         "point mass": lambda actions: fly(points, ActionSequence(actions), actions),
         "actor": lambda actions: fly(env, actor, actions),
-        "rollout": lambda actions: return_of(env.rollout(len(actions), actor, **as_is)),
+        "called": lambda actions: fly(env, TensorDictSequential(actor), actions),
         "torchrl": lambda actions: return_of(EnvBase.rollout(env, len(actions), actor, **as_is)),
     }
     if env.is_compiled:

@@ -50,13 +50,14 @@ class Compiled:
         self.checked = torch.compile(
             _own(method), **{"fullgraph": True, "dynamic": False, **given}, backend=self._compile, options=watch
         )
+        self.last: tuple[Function, Sequence[Any], Sequence[Any]] | None = None  # call of what was compiled
         self.direct: _Direct | None = None
 
     def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Check everything, and call."""
         outputs = self.checked(*inputs)
-        self.direct = _Direct.of(self.last, inputs, outputs)
-        self.last = None
+        self.direct = None if self.last is None else _Direct.of(self.last, inputs, outputs)
+        self.last = None  # it holds tensors
         return outputs
 
     def again(self, *inputs: Tensor) -> tuple[Tensor, ...]:

@@ -74,12 +74,8 @@ def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | None:
         return policy
     state, observation = stepper.layout.unpack(stepper.example.state), stepper.example.observation
     width = sum(x.shape[-1] for x in policy_inputs(policy, state, observation))
-    first = policy.weights[0]
-    return (
-        policy
-        if (first.shape[1], first.dtype, first.device) == (width, observation.dtype, observation.device)
-        else None
-    )
+    fits = policy.weights[0].shape[1] == width
+    return policy if fits and policy.weights[0].dtype == observation.dtype else None
 
 
 def _fly_inside(

@@ -74,8 +74,8 @@ def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | None:
         return policy
     state, observation = stepper.layout.unpack(stepper.example.state), stepper.example.observation
     width = sum(x.shape[-1] for x in policy_inputs(policy, state, observation))
-    fits = policy.weights[0].shape[1] == width
-    return policy if fits and policy.weights[0].dtype == observation.dtype else None
+    wanted, first = (width, observation.dtype, observation.device), policy.weights[0]
+    return policy if (first.shape[1], first.dtype, first.device) == wanted else None
 
 
 def _fly_inside(

@@ -18,7 +18,7 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "engine": set(),
     "envs": {"dynamics", "engine"},
     "render": {"dynamics", "envs", "files", UNWRAP},
-    "modules": {UNWRAP, "engine.policy"},
+    "modules": {UNWRAP},
     "objectives": {UNWRAP},
     "data": set(),
     "files": set(),

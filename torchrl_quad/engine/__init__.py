@@ -7,7 +7,20 @@ through the ends of episodes.
 from torchrl_quad.engine.compiling import has_compiler
 from torchrl_quad.engine.horizon import can_fly, flies_inside, fly
 from torchrl_quad.engine.packing import flat, nested
+from torchrl_quad.engine.policy import ActionSequence, PlainPolicy
 from torchrl_quad.engine.simulation import Simulation, Transition
 from torchrl_quad.engine.stepper import Stepper
 
-__all__ = ["Simulation", "Stepper", "Transition", "can_fly", "flat", "flies_inside", "fly", "has_compiler", "nested"]
+__all__ = [
+    "ActionSequence",
+    "PlainPolicy",
+    "Simulation",
+    "Stepper",
+    "Transition",
+    "can_fly",
+    "flat",
+    "flies_inside",
+    "fly",
+    "has_compiler",
+    "nested",
+]

@@ -158,13 +158,14 @@ class _Policy:
         """The gradients of its inputs, and of what was drawn, from those of what it wrote."""
         if self.program is None:
             grads = dict(zip(self.policy.out_keys, grads, strict=True))
-            grad_kept, grad_inputs, grad_drawn = self.policy.adjoint(self.weights, inputs, kept, drawn, grads)
+            traces, grad_inputs, grad_drawn = self.policy.adjoint(self.weights, inputs, kept, drawn, grads)
         else:
             function = self.program.adjoint if is_first else self.program.adjoint.again
             values = function(*self.weights, *inputs, drawn, *kept, *grads)
-            grad_kept, grad_inputs, grad_drawn = values[: len(kept)], values[len(kept) : -1], values[-1]
+            end = len(values) - 1 - len(inputs)
+            traces, grad_inputs, grad_drawn = values[:end], values[end:-1], values[-1]
         if self.weights:
-            self.steps.append((inputs, kept, grad_kept))
+            self.steps.append(traces)
             if len(self.steps) * len(drawn) >= LEARNING_BATCH:
                 self._learn()
         return grad_inputs, grad_drawn
@@ -182,10 +183,8 @@ class _Policy:
         return self.total or []
 
     def _learn(self) -> None:
-        batch = self.steps[0]
-        if len(self.steps) > 1:
-            batch = ([torch.cat(x) for x in zip(*part, strict=True)] for part in zip(*self.steps, strict=True))
-        grads = self.policy.weight_gradient(*batch)
+        traces = self.steps[0] if len(self.steps) == 1 else [torch.cat(x) for x in zip(*self.steps, strict=True)]
+        grads = self.policy.weight_gradient(traces)
         self.total = grads if self.total is None else [a + b for a, b in zip(self.total, grads, strict=True)]
         self.steps = []
 

@@ -1,10 +1,12 @@
-"""The protocol of policies that the engine can fly inside a compiled step, on plain tensors."""
+"""Policies that the engine can fly inside a compiled step, on plain tensors: their protocol, and given actions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, Protocol
 
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 
@@ -12,15 +14,14 @@ class PlainPolicy(Protocol):
     """A policy as pure functions of tensors; a TensorDictModule gives it by a method ``plain()``, or gives None.
 
     A backward pass needs the gradient of its inputs step by step, and that of its weights only once, for many steps in
-    a single batch. So ``adjoint`` returns the gradient of what ``forward`` kept, and ``weight_gradient`` goes on from
-    there.
+    a single batch. So ``adjoint`` returns traces, and ``weight_gradient`` goes on from there.
     """
 
     signature: Hashable
     """Policies with the same signature compute the same function of their tensors, and share what is compiled."""
 
     in_keys: Sequence[Any]
-    """The entries that it reads: the observation, or entries of the state."""
+    """The entries that it reads, of the state or the observation."""
 
     weights: tuple[Tensor, ...]
     """The tensors that it learns, of which gradients are wanted."""
@@ -41,11 +42,9 @@ class PlainPolicy(Protocol):
         drawn: Tensor,
         grads: dict[Any, Tensor],
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
-        """The gradients of what it kept, of its inputs and of what was drawn, from those of its entries."""
+        """Traces for ``weight_gradient``, each (n, ...), and the gradients of its inputs and of what was drawn."""
 
-    def weight_gradient(
-        self, inputs: Sequence[Tensor], kept: Sequence[Tensor], grad_kept: Sequence[Tensor]
-    ) -> list[Tensor]:
+    def weight_gradient(self, traces: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of its weights, over a batch (n) of any steps."""
 
 
@@ -79,11 +78,50 @@ class GivenActions:
         """The gradient of the action."""
         return [], [], grads["action"]
 
-    def weight_gradient(
-        self, inputs: Sequence[Tensor], kept: Sequence[Tensor], grad_kept: Sequence[Tensor]
-    ) -> list[Tensor]:
+    def weight_gradient(self, traces: Sequence[Tensor]) -> list[Tensor]:
         """Nothing: it learns nothing."""
         return []
+
+
+class ActionSequence(TensorDictModuleBase):
+    """A policy that plays given actions one after another, to optimise a trajectory itself. It plays them once.
+
+    .. code-block:: python
+
+        actions = torch.zeros(32, env.num_envs, 4, requires_grad=True)
+        rollout, _ = differentiable_rollout(env, ActionSequence(actions), env.reset(), len(actions))
+        rollout["next", "reward"].sum().backward()  # fills actions.grad
+
+    Args:
+        actions: (horizon, num_envs, k); gradients reach them.
+
+    Raises:
+        ValueError: (in use) there are no actions left.
+    """
+
+    def __init__(self, actions: Tensor) -> None:
+        self.in_keys, self.out_keys = [], ["action"]
+        super().__init__()
+        self.actions, self.played = actions, 0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the next action."""
+        return tensordict.set("action", self.take(1)[0])
+
+    def plain(self) -> GivenActions:
+        """The rest of the sequence on plain tensors, for an environment that flies it inside its compiled step."""
+        return GivenActions(self.take)
+
+    def take(self, steps: int) -> Tensor:
+        """The next actions, (steps, num_envs, k)."""
+        left = len(self.actions) - self.played
+        if steps > left:
+            raise ValueError(
+                f"The sequence has {len(self.actions)} actions, {left} of them unplayed, and the flight wants {steps} "
+                "more. Give as many actions as the flight has steps, and build a new ActionSequence for each flight."
+            )
+        self.played += steps
+        return self.actions[self.played - steps : self.played]
 
 
 def plain(policy: Any) -> PlainPolicy | None:

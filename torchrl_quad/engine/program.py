@@ -110,7 +110,7 @@ class PolicyProgram:
 
     ``forward(*weights, *inputs, drawn)`` returns what the policy keeps, and what it writes, in the order of its
     ``out_keys``. ``adjoint(*weights, *inputs, drawn, *kept, *grads)`` takes the gradients of what it wrote, and returns
-    those of what it kept, of its inputs, and of what was drawn.
+    the traces, and the gradients of its inputs and of what was drawn.
 
     Args:
         policy: all policies of its signature can use the program.
@@ -131,8 +131,8 @@ class PolicyProgram:
         weights, inputs, (drawn, *more) = _split(inputs, *self.counts)
         count = len(more) - len(self.policy.out_keys)
         grads = dict(zip(self.policy.out_keys, more[count:], strict=True))
-        grad_kept, grad_inputs, grad_drawn = self.policy.adjoint(weights, inputs, more[:count], drawn, grads)
-        return *grad_kept, *grad_inputs, grad_drawn
+        traces, grad_inputs, grad_drawn = self.policy.adjoint(weights, inputs, more[:count], drawn, grads)
+        return *traces, *grad_inputs, grad_drawn
 
 
 def record(end: Transition, layout: Layout, output_layout: Layout) -> Record:

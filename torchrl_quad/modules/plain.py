@@ -126,25 +126,25 @@ class PlainTanhGaussian:
         drawn: Tensor,
         grads: dict[Any, Tensor],
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
-        """The gradients of each layer's return, of the inputs and of the noise."""
+        """What each layer read, and the gradient of what it returned; the gradients of inputs and noise."""
         _, pull = vjp(self._sample, kept[-1], drawn)
         grad, grad_drawn = pull(grads)
-        grad_kept = [grad]
+        read, grads_kept = [], [grad]
         for weight, activation, x in zip(weights[-2:0:-2], self.activations[::-1], kept[-2::-1], strict=True):
-            grad = vjp(activation, x)[1](grad @ weight)[0]
-            grad_kept.append(grad)
+            activated, pull = vjp(activation, x)
+            (grad,) = pull(grad @ weight)
+            read.append(activated)
+            grads_kept.append(grad)
+        read.append(_concatenated(inputs, self.scales))
         grads = (grad @ weights[0]).split([x.shape[-1] for x in inputs], -1)
-        return grad_kept[::-1], [g * scale for g, scale in zip(grads, self.scales, strict=True)], grad_drawn
+        grads = [g if scale == 1.0 else g * scale for g, scale in zip(grads, self.scales, strict=True)]
+        return [*read[::-1], *grads_kept[::-1]], grads, grad_drawn
 
-    def weight_gradient(
-        self, inputs: Sequence[Tensor], kept: Sequence[Tensor], grad_kept: Sequence[Tensor]
-    ) -> list[Tensor]:
+    def weight_gradient(self, traces: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of weight and bias of each layer, over a batch."""
-        grads = []
-        for i, grad in enumerate(grad_kept):
-            x = _concatenated(inputs, self.scales) if i == 0 else self.activations[i - 1](kept[i - 1])
-            grads += [grad.t() @ x, grad.sum(0)]
-        return grads
+        count = len(traces) // 2
+        pairs = zip(traces[:count], traces[count:], strict=True)
+        return [g for x, grad in pairs for g in (grad.t() @ x, grad.sum(0))]
 
     def _sample(self, raw: Tensor, noise: Tensor) -> dict[Any, Tensor]:
         loc, scale = self.head(raw)

@@ -280,11 +280,13 @@ def test_policies_that_somebody_has_changed_are_called():
         assert not compiled.flies_inside(actor)
     assert compiled.flies_inside(actor)
     actor[0].module.mlp[1] = nn.PReLU()
-    others = [actor, make_actor(env, activation=nn.RReLU), make_actor(HoveringEnv(num_envs=2, dtype=torch.float64))]
+    other_head = make_actor(env)
+    other_head[0].module.head = nn.Identity()
+    others = [actor, other_head, make_actor(env, activation=nn.RReLU)]
     others += [
-        make_actor(HoveringEnv(num_envs=2, observe_last_action=True)),
-        TensorDictModule(nn.Linear(13, 4), ["observation"], ["action"]),
+        make_actor(HoveringEnv(num_envs=2, **x)) for x in ({"dtype": torch.float64}, {"observe_last_action": True})
     ]
+    others += [TensorDictModule(nn.Linear(13, 4), ["observation"], ["action"])]
     assert not any(map(compiled.flies_inside, others))
 
 

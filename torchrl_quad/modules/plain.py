@@ -7,10 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
+from tensordict.nn import NormalParamExtractor
+from tensordict.nn.utils import biased_softplus
 from torch import Tensor, nn
 from torch.func import vjp
 from torchrl.envs.utils import ExplorationType, exploration_type
-from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 
 class Network(nn.Module):
@@ -73,6 +75,10 @@ class TanhGaussianActor(ProbabilisticActor):
         is_known = kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC) and type(self) is TanhGaussianActor
         if not is_known or type(network) is not Network or _is_hooked(self):
             return None
+        mapping = getattr(network.head, "scale_mapping", None)
+        parts = (network.head, NormalParamExtractor), (mapping, biased_softplus), (network.mlp, MLP)
+        if any(type(x) is not cls for x, cls in parts) or self[1].distribution_class is not TanhNormal:
+            return None
         layers, activations = list(network.mlp)[::2], list(network.mlp)[1::2]
         if any(type(layer) is not nn.Linear for layer in layers) or not all(map(_is_pointwise, activations)):
             return None
@@ -91,9 +97,8 @@ class PlainTanhGaussian:
         self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
         self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
         self.width = layers[-1].out_features // 2
-        bounds = sample.distribution_kwargs
+        bounds, mapping = sample.distribution_kwargs, self.head.scale_mapping
         self.low, self.high = (bounds[name].tolist() if bounds else None for name in ("low", "high"))
-        mapping = self.head.scale_mapping
         self.signature = (
             *map(str, (self.in_keys, self.out_keys, self.scales, self.activations, self.low, self.high)),
             *(tuple(x.shape) for x in self.weights),

@@ -13,22 +13,19 @@ The memory is what the process (on Linux) has gained between the start of a hori
 """
 
 import argparse
+import functools
 import gc
 import os
 import time
 from pathlib import Path
-from typing import Any
 
 import torch
 from report import RESULTS, in_own_process, save
-from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_quad import ActionSequence, differentiable_rollout, make_env
-from torchrl_quad.engine.packing import Rows
-from torchrl_quad.engine.program import Record
 
 MODES = ["eager", "recompute", "compiled"]
 
@@ -40,17 +37,8 @@ def resident() -> int:
 
 def recompute(env: EnvBase) -> None:
     """Let an environment keep only the input of each step."""
-    once = env._stepper.step_rows
-
-    def step_rows(rows: Rows, *others: Any) -> Record:
-        def step(floats: Tensor) -> tuple[Tensor, ...]:
-            end = once(rows._replace(floats=floats), *others)
-            return *end.state, *end.outputs, end.observation
-
-        leaves = checkpoint(step, rows.floats, use_reentrant=False)
-        return Record(Rows(*leaves[:3]), Rows(*leaves[3:6]), leaves[6])
-
-    env._stepper.step_rows = step_rows
+    once = env._stepper.step
+    env._stepper.step = functools.partial(checkpoint, once, use_reentrant=False)
 
 
 def measure(mode: str, n: int, horizon: int, rounds: int) -> dict[str, float | str]:

@@ -72,7 +72,7 @@ def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) ->
     from torchrl_quad.envs import base
 
     clocks = Clocks()
-    clocks.around(stepper.Stepper, "step_rows", "physics")
+    clocks.around(stepper.Stepper, "step", "physics")
     for name in ("forward", "backward"):
         clocks.around(node._Horizon, name, "physics")
     for name in ("forward", "adjoint", "weight_gradients"):

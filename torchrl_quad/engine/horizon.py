@@ -56,14 +56,15 @@ def fly(
         steps: at least one.
     """
     state, valid = stepper.simulation.guard(state)
-    start = _record(stepper, state, tensordict)
     plain = _plain(stepper, policy)
-    if plain is None:
-        roots, ends, written = _call(stepper, source, policy, start, valid, steps)
+    if not stepper.is_compiled:
+        roots, ends, written = _fly_eager(stepper, source, policy, state, tensordict, valid, steps)
+    elif plain is None:
+        roots, ends, written = _call(stepper, source, policy, _record(stepper, state, tensordict), valid, steps)
     else:
-        roots, ends, written = _fly_inside(stepper, source, plain, start, valid, steps)
+        roots, ends, written = _fly_inside(stepper, source, plain, _record(stepper, state, tensordict), valid, steps)
     rollout = {**roots, **ends, **{flat_key(*_path(key)): x for key, x in written.items()}}
-    del rollout["reward"]
+    rollout.pop("reward", None)  # there is none before the first step
     return TensorDict(nested(rollout), (len(tensordict), steps), tensordict.device, names=[None, "time"])
 
 
@@ -110,21 +111,15 @@ def _roots(start: Tensor, ends: Tensor, again: list[tuple[int, Tensor, Tensor]],
 def _call(
     stepper: Stepper, source: Source, policy: TensorDictModuleBase, start: Record, valid: Tensor, steps: int
 ) -> tuple[dict[Key, Tensor], ...]:
-    """The same for a policy that is called before each step."""
+    """The same for a policy that is called before each compiled step."""
     roots = [start]
     ends: list[Record] = []
     written = []
-    reads_state = any(flat_key(*_path(key)) != "observation" for key in policy.in_keys)
     kind, done_row, _ = stepper.output_layout.place["done"]
     for t in range(steps):
         root = roots[-1]
-        td = TensorDict({"observation": root.observation}, [len(valid)], root.observation.device)
-        if reads_state:
-            td["state"] = nested(stepper.layout.unpack(root.state))
-        td = policy(td)
-        written.append([td.get(key) for key in policy.out_keys])
-        action = td.get("action")
-        stepper.simulation.check_action(action)
+        action, entries = _act(stepper, policy, root.observation, stepper.layout.unpack(root.state))
+        written.append(entries)
         end = stepper.step_rows(root.state, valid, action, source.noise())
         ends.append(end)
         if t == 0:
@@ -132,8 +127,67 @@ def _call(
         done = end.outputs[kind][done_row]
         if t < steps - 1:
             roots.append(_restarted(stepper, source, end, done) if done.any() else end)
-    written = {key: torch.stack(x, 1) for key, x in zip(policy.out_keys, zip(*written, strict=True), strict=True)}
-    return _entries(stepper, _stacked(roots)), _entries(stepper, _stacked(ends), "next"), written
+    return _entries(stepper, _stacked(roots)), _entries(stepper, _stacked(ends), "next"), _over_time(written)
+
+
+def _fly_eager(
+    stepper: Stepper,
+    source: Source,
+    policy: TensorDictModuleBase,
+    state: State,
+    tensordict: TensorDictBase,
+    valid: Tensor,
+    steps: int,
+) -> tuple[dict[Key, Tensor], ...]:
+    """The same without a compiler, on entries: each is a tensor of its own anyway."""
+    outputs = {key: tensordict.get(key) for key in ("observation", *stepper.output_layout.place) if key != "reward"}
+    roots, ends, written = [_of_state(state) | outputs], [], []
+    for t in range(steps):
+        action, entries = _act(stepper, policy, roots[-1]["observation"], state)
+        written.append(entries)
+        state, outputs = stepper.step(state, valid, action, source.noise())
+        ends.append(_of_state(state) | flat(outputs))
+        if t == 0:
+            valid = torch.ones_like(valid)  # a step leads to meaningful states
+        if t < steps - 1:
+            root = {key: x for key, x in ends[-1].items() if key != "reward"}
+            done = outputs["done"]
+            if done.any():
+                fresh = flat(source.starts(done[:, 0]))
+                root = {
+                    key: torch.where(done.reshape(-1, *(1 for _ in x.shape[1:])), fresh[key].detach(), x)
+                    for key, x in root.items()
+                }
+                state = {key: root[flat_key("state", *_path(key))] for key in state}
+            roots.append(root)
+    return (
+        _over_time(roots),
+        {flat_key("next", *_path(key)): x for key, x in _over_time(ends).items()},
+        _over_time(written),
+    )
+
+
+def _act(
+    stepper: Stepper, policy: TensorDictModuleBase, observation: Tensor, state: State
+) -> tuple[Tensor, dict[Key, Tensor]]:
+    """The action of a policy that is called, and all that it writes."""
+    td = TensorDict({"observation": observation}, [len(observation)], observation.device)
+    if any(flat_key(*_path(key)) != "observation" for key in policy.in_keys):
+        td["state"] = nested(state)
+    td = policy(td)
+    action = td.get("action")
+    stepper.simulation.check_action(action)
+    return action, {key: td.get(key) for key in policy.out_keys}
+
+
+def _over_time(steps: list[dict[Key, Tensor]]) -> dict[Key, Tensor]:
+    """The entries of several steps, each (n, time, ...)."""
+    return {key: torch.stack([entries[key] for entries in steps], 1) for key in steps[0]}
+
+
+def _of_state(state: State) -> dict[Key, Tensor]:
+    """The entries of a state by their names in a tensordict."""
+    return {flat_key("state", *_path(key)): x for key, x in state.items()}
 
 
 def _record(stepper: Stepper, state: State, tensordict: TensorDictBase) -> Record:
@@ -166,7 +220,7 @@ def _stacked(records: list[Record]) -> Record:
 
 def _entries(stepper: Stepper, records: Record, *prefix: str) -> dict[Key, Tensor]:
     """All entries of the records of a horizon, each (n, time, ...)."""
-    entries = {flat_key("state", *_path(key)): x for key, x in stepper.layout.unpack(records.state).items()}
+    entries = _of_state(stepper.layout.unpack(records.state))
     entries |= stepper.unpack_outputs(records.outputs)
     entries["observation"] = records.observation
     return {flat_key(*prefix, *_path(key)): x for key, x in entries.items()}

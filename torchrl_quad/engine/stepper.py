@@ -55,11 +55,7 @@ class Stepper:
         return {key: x.detach() if "metrics" in key else x for key, x in self.output_layout.unpack(rows).items()}
 
     def step_rows(self, rows: Rows, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Record:
-        """One step on rows, from a state under an action (n, k); the rest is that of :meth:`fly`."""
-        if not self.is_compiled:
-            return record(
-                self.simulation(self.layout.unpack(rows), valid, action, noise), self.layout, self.output_layout
-            )
+        """One compiled step on rows, from a state under an action (n, k); the rest is that of :meth:`fly`."""
         start = Record(rows, self.example.outputs, self.example.observation)
         flight = self.fly(GivenActions(lambda _: action.unsqueeze(0)), start, valid, 1, lambda: noise)
         state, outputs, observation = flight.ends

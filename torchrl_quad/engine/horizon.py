@@ -71,12 +71,10 @@ def fly(
 def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | None:
     """The policy as the engine can fly it inside its step, if it can."""
     policy = plain(policy) if stepper.is_compiled else None
-    if policy is None or not policy.weights:
-        return policy
-    state, observation = stepper.layout.unpack(stepper.example.state), stepper.example.observation
-    width = sum(x.shape[-1] for x in policy_inputs(policy, state, observation))
-    wanted, first = (width, observation.dtype, observation.device), policy.weights[0]
-    return policy if (first.shape[1], first.dtype, first.device) == wanted else None
+    state = stepper.layout.unpack(stepper.example.state)
+    if policy is None or not {flat_key(*_path(key)) for key in policy.in_keys} <= {"observation", *_of_state(state)}:
+        return None
+    return policy if policy.fits(policy_inputs(policy, state, stepper.example.observation)) else None
 
 
 def _fly_inside(

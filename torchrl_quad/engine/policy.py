@@ -23,8 +23,14 @@ class PlainPolicy(Protocol):
     in_keys: Sequence[Any]
     """The entries that it reads, of the state or the observation."""
 
+    out_keys: Sequence[Any]
+    """The entries that it writes."""
+
     weights: tuple[Tensor, ...]
     """The tensors that it learns, of which gradients are wanted."""
+
+    def fits(self, inputs: Sequence[Tensor]) -> bool:
+        """Whether it can read inputs of this width, precision and device; otherwise it is called, and can complain."""
 
     def drawn(self, steps: int, n: int) -> Tensor:
         """What changes from step to step and does not depend on the state, such as noise: (steps, n, k)."""
@@ -56,6 +62,10 @@ class GivenActions:
 
     def __init__(self, take: Callable[[int], Tensor]) -> None:
         self.take = take  # from a number of steps to their actions (steps, n, k)
+
+    def fits(self, inputs: Sequence[Tensor]) -> bool:
+        """It reads nothing."""
+        return True
 
     def drawn(self, steps: int, n: int) -> Tensor:
         """The actions of the next steps."""

@@ -105,6 +105,11 @@ class PlainTanhGaussian:
             (self.head.scale_lb, mapping.bias, mapping.min_val),
         )
 
+    def fits(self, inputs: Sequence[Tensor]) -> bool:
+        """Whether the first layer can read inputs of this width, precision and device."""
+        x, weight = torch.cat([x[:1] for x in inputs], -1), self.weights[0]
+        return (x.shape[-1], x.dtype, x.device) == (weight.shape[1], weight.dtype, weight.device)
+
     def drawn(self, steps: int, n: int) -> Tensor:
         """Standard normal noise, as the distribution would draw it step by step; zeros for the mode."""
         like = self.weights[0]

@@ -75,7 +75,7 @@ def test_every_row_of_how_to_add_names_files_that_exist():
         names = re.findall(r"`([\w./]+(?:\.py|\.yaml|/))`", row)
         missing = [name for name in names if not [*ROOT.glob(name.rstrip("/")), *ROOT.glob(f"*/**/{name.rstrip('/')}")]]
         assert names and missing == [], row
-    assert len(rows) == 9
+    assert len(rows) == 10
 
 
 # -- links -------------------------------------------------------------------------------------------------------------

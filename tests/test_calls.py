@@ -80,11 +80,22 @@ def replace(owner, name, part):
         lambda critic: critic.module.mlp.__setitem__(2, nn.Dropout(0.5)),
         lambda critic: critic.module.mlp.__setitem__(2, nn.PReLU()),
         lambda critic: nn.utils.parametrizations.weight_norm(critic.module.mlp[0]),
+        lambda critic: critic.module.mlp.__setitem__(5, critic.module.mlp[2]),
         lambda critic: replace(critic.module, "head", nn.Softplus()),
         lambda critic: replace(critic, "module", Doubled(critic.module)),
         lambda critic: replace(critic, "__class__", type("Mine", (ValueOperator,), {})),
     ],
-    ids=["hook", "backward hook", "dropout", "parameters", "parametrization", "head", "module", "class"],
+    ids=[
+        "hook",
+        "backward hook",
+        "dropout",
+        "parameters",
+        "parametrization",
+        "shared layer",
+        "head",
+        "module",
+        "class",
+    ],
 )
 def test_a_critic_that_somebody_has_changed_is_called_as_it_is(env, change):
     critic = make_value(env)

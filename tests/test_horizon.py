@@ -151,6 +151,9 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile():
         assert not flight["next", "metrics"].requires_grad and not expected["next", "metrics"].requires_grad
         assert flight["next", "done"].any()
     torch.testing.assert_close(compiled[0], compiled[1])
+    loss = differentiable_rollout(env, actor, None, 5)[0]["next", "reward"].sum()
+    with pytest.raises(RuntimeError, match="first derivatives only"):
+        torch.autograd.grad(loss, list(actor.parameters()), create_graph=True)
 
 
 def test_drones_that_break_crash_alone_in_a_compiled_step():
@@ -219,6 +222,8 @@ def test_without_a_cpp_compiler_the_step_stays_eager_and_says_so(monkeypatch):
     with pytest.warns(UserWarning, match="neither g.. nor clang.. is on the PATH"):
         env = HoveringEnv(num_envs=2, compile=True)
     assert not env.is_compiled
+    with torch._dynamo.config.patch(disable=True):  # as TORCH_COMPILE_DISABLE=1 does
+        assert not HoveringEnv(num_envs=2, compile=True).is_compiled
     assert env.rollout(2)["next", "reward"].isfinite().all()
 
 
@@ -286,7 +291,12 @@ def test_policies_that_somebody_has_changed_are_called():
     others += [
         make_actor(HoveringEnv(num_envs=2, **x)) for x in ({"dtype": torch.float64}, {"observe_last_action": True})
     ]
+    others += [make_actor(HoveringEnv(num_envs=2, wind={"gust": 0.5}), in_keys=["observation", ("state", "wind")])]
     others += [TensorDictModule(nn.Linear(13, 4), ["observation"], ["action"])]
+    others += [make_actor(env, in_keys=["observation", "observation"])]
+    for change in ({0: nn.Linear(13, 64, bias=False)}, {1: nn.ELU(inplace=True)}, {5: nn.Tanh()}):
+        others.append(make_actor(env))
+        others[-1][0].module.mlp._modules.update({str(i): layer for i, layer in change.items()})
     assert not any(map(compiled.flies_inside, others))
 
 

@@ -16,7 +16,9 @@ Function = Callable[..., tuple[Tensor, ...]]
 
 
 def has_compiler() -> bool:
-    """Whether torch can compile here; a warning says what is missing."""
+    """Whether torch can compile here, and may (TORCH_COMPILE_DISABLE); a warning says what is missing."""
+    if torch._dynamo.config.disable:
+        return False
     if shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++"):
         return True
     warnings.warn(
@@ -55,9 +57,12 @@ class Compiled:
 
     def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Check everything, and call."""
-        outputs = self.checked(*inputs)
-        self.direct = None if self.last is None else _Direct.of(self.last, inputs, outputs)
-        self.last = None  # it holds tensors
+        self.direct = None
+        try:
+            outputs = self.checked(*inputs)
+            self.direct = None if self.last is None else _Direct.of(self.last, inputs, outputs)
+        finally:
+            self.last = None  # it holds tensors
         return outputs
 
     def again(self, *inputs: Tensor) -> tuple[Tensor, ...]:

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from torchrl_quad.engine.packing import Layout, Rows
 from torchrl_quad.engine.policy import PlainPolicy
@@ -78,7 +77,7 @@ class _Horizon(torch.autograd.Function):
                 end = again[0]
             rows, observation = end.state, end.observation
         ctx.horizon, ctx.restarts, ctx.parameter_count = horizon, restarts, len(parameters)
-        ctx.like = [leaves[0], leaves[3], leaves[6], *written]
+        ctx.like = [(x.shape, x.dtype, x.device) for x in (leaves[0], leaves[3], leaves[6], *written)]
         ctx.shapes = [tuple(map(len, parts[:4])) for parts in saved]
         ctx.save_for_backward(
             *policy.weights, *(x for parts in saved for part in (*parts[:4], parts[4:]) for x in part)
@@ -90,19 +89,24 @@ class _Horizon(torch.autograd.Function):
         return *stacked, observations, *(_stack(x, 1) for x in zip(*entries, strict=True))
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, *grads):
+        if torch.is_grad_enabled():  # so it is under create_graph=True alone
+            raise RuntimeError(
+                "A compiled flight has first derivatives only. For second ones (create_graph=True) call env.eager() "
+                "and fly again."
+            )
         horizon, policy, step = ctx.horizon, _Policy(ctx.horizon), ctx.horizon.step
         saved = iter(ctx.saved_tensors)
         policy.weights = _take(saved, len(policy.weights))
         steps = [(*(_take(saved, count) for count in counts), next(saved)) for counts in ctx.shapes]
-        zeros = [torch.zeros_like(x) for x in ctx.like]  # one each: a compiler would count on two being one
+        # A tensor for each: a compiler would count on two being one.
+        zeros = [torch.zeros(shape, dtype=dtype, device=device) for shape, dtype, device in ctx.like]
         fresh = {t: who for t, _, who in ctx.restarts}
         of_end, of_written = (grads[0], grads[3], grads[6]), grads[7:]
         grad_floats = grad_observation = None
         grads_drawn, grads_parameter = [], []
         for t in reversed(range(horizon.steps)):
-            start, states, inputs, kept, drawn = steps.pop()  # what is not needed any more is freed
+            start, states, inputs, kept, drawn = steps[t]
             if t in fresh:
                 grad_floats = torch.where(fresh[t], 0.0, grad_floats)
                 if grad_observation is not None:

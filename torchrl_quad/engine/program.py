@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -118,7 +119,9 @@ class PolicyProgram:
     """
 
     def __init__(self, policy: PlainPolicy, options: dict[str, Any]) -> None:
-        self.policy, self.counts = policy, (len(policy.weights), len(policy.in_keys))
+        self.counts = len(policy.weights), len(policy.in_keys)
+        self.policy = copy.copy(policy)
+        self.policy.weights = ()  # those of the first one would live as long as the program
         self.forward = Compiled(self._forward, options)
         self.adjoint = Compiled(self._adjoint, options)
 

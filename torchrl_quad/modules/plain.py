@@ -44,7 +44,9 @@ class Critic(ValueOperator):
             return None
         layers = {f"module.mlp.{name}": layer for name, layer in network.mlp.named_children()}
         known = (nn.Linear, nn.LayerNorm)
-        if not all(type(layer) in known or _is_pointwise(layer) for layer in layers.values()):
+        if len(layers) < len(network.mlp) or not all(
+            type(layer) in known or _is_pointwise(layer) for layer in layers.values()
+        ):
             return None
 
         def predict(params: Mapping[str, Tensor], inputs: Sequence[Tensor]) -> Tensor:
@@ -73,14 +75,18 @@ class TanhGaussianActor(ProbabilisticActor):
         kind = exploration_type() or self[1].default_interaction_type
         network = getattr(self[0], "module", None)
         is_known = kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC) and type(self) is TanhGaussianActor
-        if not is_known or type(network) is not Network or _is_hooked(self):
+        if not is_known or type(network) is not Network or _is_hooked(self) or len(self.module) != 2:
+            return None
+        if len(set(map(str, self[0].in_keys))) < len(self[0].in_keys):
             return None
         mapping = getattr(network.head, "scale_mapping", None)
         parts = (network.head, NormalParamExtractor), (mapping, biased_softplus), (network.mlp, MLP)
         if any(type(x) is not cls for x, cls in parts) or self[1].distribution_class is not TanhNormal:
             return None
         layers, activations = list(network.mlp)[::2], list(network.mlp)[1::2]
-        if any(type(layer) is not nn.Linear for layer in layers) or not all(map(_is_pointwise, activations)):
+        if any(type(layer) is not nn.Linear or layer.bias is None for layer in layers):
+            return None
+        if len(activations) != len(layers) - 1 or not all(map(_is_pointwise, activations)):
             return None
         return PlainTanhGaussian(self, layers, activations, kind is ExplorationType.RANDOM)
 
@@ -190,4 +196,4 @@ def _is_hooked(module: nn.Module) -> bool:
 def _is_pointwise(activation: nn.Module) -> bool:
     """Whether an activation is a function of its input alone: one of torch's without parameters or random numbers."""
     known = type(activation).__module__ == "torch.nn.modules.activation" and not isinstance(activation, nn.RReLU)
-    return known and not list(activation.parameters())
+    return known and not getattr(activation, "inplace", False) and not list(activation.parameters())

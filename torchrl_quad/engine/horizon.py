@@ -9,8 +9,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_quad.engine.packing import Key, Rows, flat, flat_key, nested
-from torchrl_quad.engine.policy import PlainPolicy, plain
+from torchrl_quad.engine.packing import Key, Rows, flat, flat_key, like, nested
+from torchrl_quad.engine.policy import GivenActions, PlainPolicy, plain
 from torchrl_quad.engine.program import Record, policy_inputs
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.engine.stepper import Stepper
@@ -68,17 +68,19 @@ def fly(
     return TensorDict(nested(rollout), (len(tensordict), steps), tensordict.device, names=[None, "time"])
 
 
-def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | None:
+def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | GivenActions | None:
     """The policy as the engine can fly it inside its step, if it can."""
     policy = plain(policy) if stepper.is_compiled else None
+    if policy is None:
+        return None
     state = stepper.layout.unpack(stepper.example.state)
-    if policy is None or not {flat_key(*_path(key)) for key in policy.in_keys} <= {"observation", *_of_state(state)}:
+    if not {flat_key(*_path(key)) for key in policy.in_keys} <= {"observation", *_of_state(state)}:
         return None
     return policy if policy.fits(policy_inputs(policy, state, stepper.example.observation)) else None
 
 
 def _fly_inside(
-    stepper: Stepper, source: Source, policy: PlainPolicy, start: Record, valid: Tensor, steps: int
+    stepper: Stepper, source: Source, policy: PlainPolicy | GivenActions, start: Record, valid: Tensor, steps: int
 ) -> tuple[dict[Key, Tensor], ...]:
     """The entries of all roots and of all ends, and what the policy wrote, of one compiled horizon."""
     kind, done_row, _ = stepper.output_layout.place["done"]
@@ -152,10 +154,7 @@ def _fly_eager(
             done = outputs["done"]
             if done.any():
                 fresh = flat(source.starts(done[:, 0]))
-                root = {
-                    key: torch.where(done.reshape(-1, *(1 for _ in x.shape[1:])), fresh[key].detach(), x)
-                    for key, x in root.items()
-                }
+                root = {key: torch.where(like(done, x), fresh[key].detach(), x) for key, x in root.items()}
                 state = {key: root[flat_key("state", *_path(key))] for key in state}
             roots.append(root)
     return (

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.engine.packing import Layout, Rows
-from torchrl_quad.engine.policy import PlainPolicy
+from torchrl_quad.engine.policy import GivenActions, PlainPolicy
 from torchrl_quad.engine.program import PolicyProgram, Record, StepProgram, name_in_state, policy_inputs
 
 LEARNING_BATCH = 1024  # so many steps of one drone make a batch for the gradient of the weights
@@ -19,8 +19,8 @@ class Horizon(NamedTuple):
     """What a horizon flies with, beside the tensors that have gradients."""
 
     step: StepProgram
-    policy: PlainPolicy
-    policy_program: PolicyProgram | None  # None calls the policy as it is
+    policy: PlainPolicy | GivenActions
+    policy_program: PolicyProgram | None  # None for given actions
     start: Record
     valid: Tensor  # where the start is meaningful, bool (n)
     steps: int
@@ -149,8 +149,7 @@ class _Policy:
     def forward(self, inputs: list[Tensor], drawn: Tensor, *, is_first: bool) -> tuple[list[Tensor], list[Tensor]]:
         """What it keeps, and what it writes."""
         if self.program is None:
-            kept, written = self.policy.forward(self.weights, inputs, drawn)
-            return kept, [written[key] for key in self.policy.out_keys]
+            return [], [drawn]
         function = self.program.forward if is_first else self.program.forward.again
         values = function(*self.weights, *inputs, drawn)
         count = len(values) - len(self.policy.out_keys)
@@ -161,18 +160,15 @@ class _Policy:
     ) -> tuple[list[Tensor], Tensor]:
         """The gradients of its inputs, and of what was drawn, from those of what it wrote."""
         if self.program is None:
-            grads = dict(zip(self.policy.out_keys, grads, strict=True))
-            traces, grad_inputs, grad_drawn = self.policy.adjoint(self.weights, inputs, kept, drawn, grads)
-        else:
-            function = self.program.adjoint if is_first else self.program.adjoint.again
-            values = function(*self.weights, *inputs, drawn, *kept, *grads)
-            end = len(values) - 1 - len(inputs)
-            traces, grad_inputs, grad_drawn = values[:end], values[end:-1], values[-1]
+            return [], grads[self.action]
+        function = self.program.adjoint if is_first else self.program.adjoint.again
+        values = function(*self.weights, *inputs, drawn, *kept, *grads)
+        end = len(values) - 1 - len(inputs)
         if self.weights:
-            self.steps.append(traces)
+            self.steps.append(values[:end])
             if len(self.steps) * len(drawn) >= LEARNING_BATCH:
                 self._learn()
-        return grad_inputs, grad_drawn
+        return values[end:-1], values[-1]
 
     def add(self, grad_floats: Tensor, grad_inputs: list[Tensor]) -> tuple[Tensor, Tensor | None]:
         """The gradients of the state's floats, the policy's share included, and of the observation."""

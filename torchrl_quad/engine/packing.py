@@ -100,3 +100,8 @@ def flat_key(key: Any, *more: str) -> Key:
     """A key of a tensordict as :func:`flat` writes it: a string, or a tuple of two strings and more."""
     path = (*key, *more) if isinstance(key, tuple) else (key, *more)
     return path if len(path) > 1 else path[0]
+
+
+def like(flags: Tensor, x: Tensor) -> Tensor:
+    """Flags (n) or (n, 1) that broadcast to a tensor (n, ...)."""
+    return flags.reshape(-1, *(1 for _ in x.shape[1:]))

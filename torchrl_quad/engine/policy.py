@@ -57,7 +57,6 @@ class PlainPolicy(Protocol):
 class GivenActions:
     """Actions that are known beforehand, whatever the state; also those of a policy that can only be called."""
 
-    signature = "given actions"
     in_keys, out_keys, weights = (), ("action",), ()
 
     def __init__(self, take: Callable[[int], Tensor]) -> None:
@@ -70,27 +69,6 @@ class GivenActions:
     def drawn(self, steps: int, n: int) -> Tensor:
         """The actions of the next steps."""
         return self.take(steps)
-
-    def forward(
-        self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
-    ) -> tuple[list[Tensor], dict[Any, Tensor]]:
-        """The action of this step."""
-        return [], {"action": drawn}
-
-    def adjoint(
-        self,
-        weights: Sequence[Tensor],
-        inputs: Sequence[Tensor],
-        kept: Sequence[Tensor],
-        drawn: Tensor,
-        grads: dict[Any, Tensor],
-    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
-        """The gradient of the action."""
-        return [], [], grads["action"]
-
-    def weight_gradient(self, traces: Sequence[Tensor]) -> list[Tensor]:
-        """Nothing: it learns nothing."""
-        return []
 
 
 class ActionSequence(TensorDictModuleBase):
@@ -134,7 +112,7 @@ class ActionSequence(TensorDictModuleBase):
         return self.actions[self.played - steps : self.played]
 
 
-def plain(policy: Any) -> PlainPolicy | None:
+def plain(policy: Any) -> PlainPolicy | GivenActions | None:
     """A policy as pure functions, or None where it can only be called."""
     make = getattr(policy, "plain", None)
     return make() if callable(make) else None

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.func import vjp
 
 from torchrl_quad.engine.compiling import Compiled
-from torchrl_quad.engine.packing import Layout, Rows, flat
+from torchrl_quad.engine.packing import Layout, Rows, flat, like
 from torchrl_quad.engine.policy import PlainPolicy
 from torchrl_quad.engine.simulation import Simulation, State, Transition
 
@@ -92,9 +92,7 @@ class StepProgram:
             total = more if total is None else [a + b for a, b in zip(total, more, strict=True)]
         # What has become meaningless may have infinite derivatives. They must not reach what all share.
         grad_x, *total = (torch.where(keep, g, 0.0) for g in (grad_x, *total))
-        grad_before = {
-            key: torch.where(keep.reshape(-1, *(1 for _ in g.shape[1:])), g, 0.0) for key, g in grad_before.items()
-        }
+        grad_before = {key: torch.where(like(keep, g), g, 0.0) for key, g in grad_before.items()}
         grad_floats, grad_action, grad_parameters = pull_begin((grad_x, _like(inputs, total), grad_before))
         return grad_floats, grad_action.contiguous(), *grad_parameters
 

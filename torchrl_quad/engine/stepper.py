@@ -63,7 +63,7 @@ class Stepper:
 
     def fly(
         self,
-        policy: PlainPolicy,
+        policy: PlainPolicy | GivenActions,
         start: Record,
         valid: Tensor,
         steps: int,
@@ -86,7 +86,7 @@ class Stepper:
         if count not in self.steps:
             self.steps[count] = StepProgram(self.simulation, self.layout, self.output_layout, self.options)
         program = None
-        if policy.weights:
+        if not isinstance(policy, GivenActions):
             if policy.signature not in self.policies:
                 self.policies[policy.signature] = PolicyProgram(policy, self.options)
             program = self.policies[policy.signature]

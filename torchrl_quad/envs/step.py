@@ -11,9 +11,10 @@ from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.dynamics.parameters import RawParams
 from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine import Transition, nested
+from torchrl_quad.engine.packing import like
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.checks import check_action, restore_state
-from torchrl_quad.envs.guard import MAX_VALUE, Containment, Guard, is_true, like
+from torchrl_quad.envs.guard import MAX_VALUE, Containment, Guard, is_true
 from torchrl_quad.envs.task import Task
 
 

@@ -2,9 +2,11 @@
 
 import pytest
 import torch
+from flying import look_at_nothing
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torch._dynamo.utils import counters
+from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -91,6 +93,31 @@ def test_a_step_of_one_s_own_is_flown_and_an_output_that_nobody_wants_does_no_ha
     assert HoveringEnv(num_envs=2).rollout(3, policy, break_when_any_done=False).shape == (2, 3)
 
 
+class Looks(TorchDispatchMode):
+    """Counts how often a value of a tensor is read."""
+
+    count = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.count += function is torch.ops.aten._local_scalar_dense.default
+        return function(*args, **(kwargs or {}))
+
+
+def test_an_accelerator_is_not_waited_for_inside_a_horizon(monkeypatch):
+    env = HoveringEnv(num_envs=4, max_episode_steps=7, wind={"gust": 0.5})
+    policy, start = TensorDictModule(lambda x: x[:, :4].sin(), ["observation"], ["action"]), env.reset()
+
+    def looks(steps):
+        with Looks() as seen:
+            flight = env.rollout(steps, policy, tensordict=start, auto_reset=False, break_when_any_done=False)
+        assert flight["next", "done"].any()
+        return seen.count
+
+    assert looks(20) > looks(10)
+    look_at_nothing(monkeypatch)
+    assert looks(20) == looks(10) == 1  # whether the actions were finite, at the end
+
+
 def losses_of(flight):
     """A number that depends on all that a loss may read: rewards, both ends of each step, and what the policy wrote."""
     read = [("next", "reward"), "observation", ("next", "observation"), ("state", "velocity"), "action", "loc", "scale"]
@@ -99,7 +126,7 @@ def losses_of(flight):
     return sum((x * torch.linspace(0.5, 1.5, x.numel(), dtype=x.dtype).view_as(x)).sum() for x in parts)
 
 
-def test_compiled_flights_equal_eager_ones_and_never_recompile():
+def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
     options = {**EVERYTHING, "gate_bonus": "log", "reward": "position"}
     env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, **options)
     drag = env.nominal.linear_drag.clone().requires_grad_()
@@ -129,8 +156,13 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile():
         torch.testing.assert_close(flight["action"], actions.transpose(0, 1))
         return flight, torch.autograd.grad(losses_of(flight), actions)
 
+    def as_on_an_accelerator():
+        with monkeypatch.context() as patch:
+            look_at_nothing(patch)
+            return train(actor)
+
     def all_ways():
-        return train(actor), train(called), train_in_torchrls_loop(), optimise_actions()
+        return train(actor), train(called), train_in_torchrls_loop(), optimise_actions(), as_on_an_accelerator()
 
     eager = all_ways()
     env.compile()

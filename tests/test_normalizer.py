@@ -3,8 +3,10 @@
 import pytest
 import torch
 from torchrl.envs import TransformedEnv, VecNormV2, check_env_specs
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad import HoveringEnv, ObservationNormalizer, differentiable_rollout, make_actor
+from torchrl_quad.data.normalizer import NormalizedPolicy
 
 
 def test_the_normalizer_s_statistics_are_those_of_all_observations_seen():
@@ -43,6 +45,46 @@ def test_gradients_pass_the_normalizer_and_an_update_before_backward_changes_not
     before, after = gradient(update=False), gradient(update=True)
     assert torch.equal(before, after)
     assert before.abs().sum() > 0
+
+
+@pytest.mark.parametrize("in_keys", [["observation"], [("state", "velocity"), "observation", ("state", "position")]])
+@pytest.mark.parametrize("is_called", [False, True])
+def test_under_the_normalizer_alone_the_environment_inside_flies_with_the_same_numbers(in_keys, is_called, monkeypatch):
+    base = HoveringEnv(num_envs=4, dtype=torch.float64, max_episode_steps=6)
+    env = TransformedEnv(base, ObservationNormalizer(base))
+    actor = make_actor(env, in_keys=in_keys, input_scale=0.7, return_log_prob=True)
+    if is_called:
+        actor[0].module.mlp[1].register_forward_hook(lambda *_: None)
+    env.transform.update(env.rollout(20, break_when_any_done=False))
+
+    def fly():
+        env.set_seed(2)
+        torch.manual_seed(2)
+        rollout, carry = differentiable_rollout(env, actor, env.reset(), 10)
+        loss = rollout["next", "reward"].sum() + rollout["next", "observation"].sum() + rollout["loc"].square().sum()
+        return dict(rollout.items(True, True)), carry, torch.autograd.grad(loss, list(actor.parameters()))
+
+    inside = fly()
+    plain = NormalizedPolicy(actor, env.transform).plain()
+    assert (plain is None) == is_called
+    monkeypatch.setattr("torchrl_quad.data.rollout.ObservationNormalizer", type(None))
+    torch.testing.assert_close(inside, fly())
+
+
+def test_a_normalized_policy_on_plain_tensors_is_the_policy():
+    env = HoveringEnv(num_envs=4, dtype=torch.float64)
+    normalizer = ObservationNormalizer(env)
+    normalizer.update(env.rollout(20))
+    actor = make_actor(env, in_keys=[("state", "velocity"), "observation"], input_scale=(0.3, 0.7))
+    policy, td = NormalizedPolicy(actor, normalizer), env.reset()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        plain, written = policy.plain(), policy(td.copy())
+        inputs = [td["state", "velocity"], td["observation"]]
+        _, mine = plain.forward(plain.weights, inputs, plain.drawn(1, 4)[0])
+    torch.testing.assert_close(mine["action"], written["action"])
+    expected, found = (torch.autograd.grad(x["action"].sum(), list(actor.parameters())) for x in (written, mine))
+    torch.testing.assert_close(found, expected)
+    assert torch.equal(written["observation"], td["observation"])
 
 
 @pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers with non-empty batch-size:UserWarning")

@@ -4,6 +4,7 @@ import io
 
 import pytest
 import torch
+from flying import look_at_nothing
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv
@@ -40,7 +41,10 @@ def starts(flight):
     return [flight["state", "position"][i, 1:][begins[i]] for i in range(len(flight))]
 
 
-def test_one_seed_gives_one_flight_however_it_is_flown():
+@pytest.mark.parametrize("device", ["a processor", "an accelerator"])
+def test_one_seed_gives_one_flight_however_it_is_flown(device, monkeypatch):
+    if device == "an accelerator":
+        look_at_nothing(monkeypatch)
     options = {"auto_reset": False, "break_when_any_done": False}
     env = HoveringEnv(**RESTLESS)
     expected = env.rollout(STEPS, POLICY, tensordict=env.reset(), **options)

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 import torchrl_quad
@@ -117,7 +117,7 @@ class Run:
         if self.cfg.compile and self.done < self.iterations:
             self._warm_up()
         step = self.steps_per_iteration
-        inside = not isinstance(self.env, TransformedEnv) and self.env.flies_inside(self.actor)
+        inside = self.env.flies_inside(self.actor)
         way = "policy inside the step" if inside else "policy before the step"
         with tqdm(
             total=self.iterations * step,

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.envs import EnvBase, ObservationNorm
 
 
@@ -48,6 +52,14 @@ class ObservationNormalizer(ObservationNorm):
         self.register_buffer("variance", torch.zeros_like(loc))
         self.register_buffer("count", torch.zeros_like(loc[0], dtype=torch.float64))
 
+    def normalize(self, observation: Tensor) -> Tensor:
+        """The observation (*, k) as the policy sees it."""
+        return (observation - self.loc) / self.scale
+
+    def undo(self, observation: Tensor) -> Tensor:
+        """The reverse of :meth:`normalize`, with the present statistics."""
+        return observation * self.scale + self.loc
+
     @torch.no_grad()
     def update(self, rollout: TensorDictBase) -> None:
         """Add the next observations of a rollout (any batch size), as this transform wrote them, to the statistics.
@@ -56,7 +68,7 @@ class ObservationNormalizer(ObservationNorm):
         their state to observe them anew.
         """
         written = rollout.get(("next", self.out_keys[0])).reshape(-1, self.loc.shape[-1])
-        seen = written[written.isfinite().all(-1)] * self.scale + self.loc
+        seen = self.undo(written[written.isfinite().all(-1)])
         if len(seen) == 0:
             return
         count = self.count + len(seen)
@@ -66,3 +78,29 @@ class ObservationNormalizer(ObservationNorm):
         # New tensors: those of before may belong to a graph.
         self.count, self.loc, self.variance = count, self.loc + share * gap, spread
         self.scale = spread.sqrt().clamp_min(self.min_scale)
+
+
+class NormalizedPolicy(TensorDictModuleBase):
+    """A policy of normalised observations, as one of observations that are not normalised yet."""
+
+    def __init__(self, policy: TensorDictModuleBase, normalizer: ObservationNormalizer) -> None:
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+        super().__init__()
+        self.policy, self.normalizer = policy, normalizer
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write what the policy writes, and leave the observation as it is."""
+        (key,) = self.normalizer.in_keys
+        seen = tensordict.copy().set(key, self.normalizer.normalize(tensordict.get(key)))
+        return tensordict.update(self.policy(seen).select(*self.out_keys))
+
+    def plain(self) -> Any:
+        """The same on plain tensors, where the policy gives itself so and can normalise; None elsewhere."""
+        plain = self.policy.plain() if hasattr(self.policy, "plain") else None
+        (key,) = self.normalizer.in_keys
+        if plain is None or key not in plain.in_keys:
+            return plain
+        if not hasattr(plain, "normalize"):
+            return None
+        plain.normalize(key, self.normalizer.loc, self.normalizer.scale)
+        return plain

@@ -6,8 +6,10 @@ import numbers
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_quad.data.normalizer import NormalizedPolicy, ObservationNormalizer
 
 
 def differentiable_rollout(
@@ -54,7 +56,7 @@ def differentiable_rollout(
     carry = env.reset() if carry is None else carry.copy()
     try:
         with set_exploration_type(exploration_type):
-            rollout = env.rollout(horizon, actor, tensordict=carry, auto_reset=False, break_when_any_done=False)
+            rollout = _rollout(env, actor, carry, horizon)
     except KeyError as error:
         missing = [key for key in actor.in_keys if key not in carry]
         if not missing:
@@ -68,3 +70,21 @@ def differentiable_rollout(
         if not buffer.is_leaf:
             buffer.detach_()
     return rollout, env.maybe_reset(env.step_mdp(rollout[..., -1]).detach().clone())
+
+
+def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> TensorDictBase:
+    """The environment's own rollout.
+
+    Where its only transform is our normaliser, the environment inside flies, which may do so compiled, and what it
+    observed is normalised afterwards.
+    """
+    options = {"auto_reset": False, "break_when_any_done": False}
+    if not (isinstance(env, TransformedEnv) and type(env.transform) is ObservationNormalizer):
+        return env.rollout(horizon, actor, tensordict=start, **options)
+    normalizer = env.transform
+    (key,) = normalizer.in_keys
+    start = start.set(key, normalizer.undo(start.get(key)))
+    rollout = env.base_env.rollout(horizon, NormalizedPolicy(actor, normalizer), tensordict=start, **options)
+    for name in (key, ("next", key)):
+        rollout.set(name, normalizer.normalize(rollout.get(name)))
+    return rollout

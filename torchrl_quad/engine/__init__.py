@@ -6,7 +6,7 @@ through the ends of episodes.
 
 from torchrl_quad.engine.compiling import has_compiler
 from torchrl_quad.engine.horizon import can_fly, flies_inside, fly
-from torchrl_quad.engine.packing import flat, nested
+from torchrl_quad.engine.packing import flat, looks_are_free, nested
 from torchrl_quad.engine.policy import ActionSequence, PlainPolicy
 from torchrl_quad.engine.simulation import Simulation, Transition
 from torchrl_quad.engine.stepper import Stepper
@@ -22,5 +22,6 @@ __all__ = [
     "flies_inside",
     "fly",
     "has_compiler",
+    "looks_are_free",
     "nested",
 ]

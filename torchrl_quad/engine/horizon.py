@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_quad.engine.packing import Key, Rows, flat, flat_key, like, nested
+from torchrl_quad.engine.packing import Key, Rows, flat, flat_key, like, looks_are_free, nested
 from torchrl_quad.engine.policy import GivenActions, PlainPolicy, plain
 from torchrl_quad.engine.program import Record, policy_inputs
 from torchrl_quad.engine.simulation import State
@@ -87,7 +87,7 @@ def _fly_inside(
 
     def restarted(end: Record) -> tuple[Record, Tensor] | None:
         done = end.outputs[kind][done_row]
-        return (_restarted(stepper, source, end, done), done[0]) if done.any() else None
+        return (_restarted(stepper, source, end, done), done[0]) if _may_restart(done) else None
 
     flight = stepper.fly(policy, start, valid, steps, source.noise, restarted)
     leaves = [[*record.state, *record.outputs, record.observation] for record in (start, flight.ends)]
@@ -126,7 +126,7 @@ def _call(
             valid = torch.ones_like(valid)  # a step leads to meaningful states
         done = end.outputs[kind][done_row]
         if t < steps - 1:
-            roots.append(_restarted(stepper, source, end, done) if done.any() else end)
+            roots.append(_restarted(stepper, source, end, done) if _may_restart(done) else end)
     return _entries(stepper, _stacked(roots)), _entries(stepper, _stacked(ends), "next"), _over_time(written)
 
 
@@ -152,7 +152,7 @@ def _fly_eager(
         if t < steps - 1:
             root = {key: x for key, x in ends[-1].items() if key != "reward"}
             done = outputs["done"]
-            if done.any():
+            if _may_restart(done):
                 fresh = flat(source.starts(done[:, 0]))
                 root = {key: torch.where(like(done, x), fresh[key].detach(), x) for key, x in root.items()}
                 state = {key: root[flat_key("state", *_path(key))] for key in state}
@@ -204,6 +204,11 @@ def _restarted(stepper: Stepper, source: Source, end: Record, done: Tensor) -> R
         fresh.outputs.where(done, end.outputs),
         torch.where(done.t(), fresh.observation, end.observation),
     )
+
+
+def _may_restart(done: Tensor) -> bool:
+    """Whether an episode may have ended: whoever asks an accelerator has to wait for it."""
+    return not looks_are_free(done.device) or bool(done.any())
 
 
 def _stacked(records: list[Record]) -> Record:

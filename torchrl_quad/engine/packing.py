@@ -105,3 +105,8 @@ def flat_key(key: Any, *more: str) -> Key:
 def like(flags: Tensor, x: Tensor) -> Tensor:
     """Flags (n) or (n, 1) that broadcast to a tensor (n, ...)."""
     return flags.reshape(-1, *(1 for _ in x.shape[1:]))
+
+
+def looks_are_free(device: torch.device) -> bool:
+    """Whether a value on the device can be read at once; an accelerator would have to finish all that it was given."""
+    return device.type == "cpu"

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl_quad.dynamics import Dynamics, QuadrotorParams
 from torchrl_quad.dynamics.parameters import LIMITS, RawParams
 from torchrl_quad.dynamics.vector import is_same, is_traced
-from torchrl_quad.engine.packing import like
+from torchrl_quad.engine.packing import like, looks_are_free
 from torchrl_quad.engine.simulation import State
 
 # Beyond these the model means nothing, and its numbers or their derivatives may overflow.
@@ -128,4 +128,4 @@ class _Contain(torch.autograd.Function):
 
 def is_true(flags: Tensor) -> bool:
     """Whether all flags are set, where a look at them is free; False where it is not."""
-    return flags.device.type == "cpu" and not is_traced() and bool(flags.all())
+    return looks_are_free(flags.device) and not is_traced() and bool(flags.all())

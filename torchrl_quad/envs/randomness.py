@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_quad.engine import flat, nested
+from torchrl_quad.engine import flat, looks_are_free, nested
 
 STEPS_PER_DRAW = 32
 
@@ -20,6 +20,9 @@ class Randomness:
     Noise is drawn for 32 steps at once. Starts are drawn for all environments at once, when the first of them needs
     one. The others keep theirs until their episode ends, for the rest of the 32 steps; one that ends again takes the
     next draw. A step at a time and a horizon at a time draw alike.
+
+    An accelerator is never asked who needs a start. There the 32 steps have one draw of starts, made with their noise,
+    and an episode that ends again takes the start of the environment after its own.
 
     Args:
         device: of the generator and of all it draws.
@@ -73,16 +76,23 @@ class Randomness:
             self._position = 0
             self._noise = {name: self.normal(STEPS_PER_DRAW, *shape) for name, shape in self.noise_shapes.items()}
             self.forget_starts()
+            if not looks_are_free(self.device):
+                self._starts.append(flat(self.draw_start()))
         self._position += 1
         return {name: x[self._position - 1] for name, x in self._noise.items()}
 
     def starts(self, mask: Tensor | None) -> dict[str, Any]:
         """What a reset writes for the environments in the mask, bool (n), or for all; other rows mean nothing."""
-        if mask is None or mask.all():
+        is_free = looks_are_free(self.device)
+        if mask is None or (is_free and mask.all()):
             self.forget_starts()
             return self.draw_start()
-        used = torch.zeros(len(mask), dtype=torch.int64) if self._used is None else self._used
-        mask = mask.cpu()
+        used = torch.zeros_like(mask, dtype=torch.int64) if self._used is None else self._used
+        if not is_free:
+            self._starts = self._starts or [flat(self.draw_start())]
+            self._used = used + mask
+            row = (torch.arange(len(mask), device=self.device) + used) % len(mask)
+            return nested({key: x[row] for key, x in self._starts[0].items()})
         while len(self._starts) <= used[mask].max():
             self._starts.append(flat(self.draw_start()))
         self._used = used + mask
@@ -101,5 +111,6 @@ class Randomness:
         self.generator.set_state(state["generator"].cpu())
         state = copy.deepcopy(state)
         self._position, self._used = state["position"], state["used"]
+        self._used = None if self._used is None else self._used.to(self.device)
         self._noise = {name: x.to(self.device) for name, x in state["noise"].items()}
         self._starts = [{key: x.to(self.device) for key, x in start.items()} for start in state["starts"]]

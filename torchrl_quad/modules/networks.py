@@ -157,7 +157,7 @@ def _network(
         **(norm if layer_norm else {}),
     )
     dtype = next((spec.dtype for spec in specs if spec.dtype.is_floating_point), None)
-    return Network(mlp.to(dtype), scales)
+    return Network(mlp.to(dtype), scales, [spec.shape[-1] for spec in specs])
 
 
 def _single(env: EnvBase) -> EnvBase:

@@ -16,11 +16,17 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 
 class Network(nn.Module):
-    """A multi-layer perceptron on the concatenation of its inputs, each multiplied by a constant of its own."""
+    """A multi-layer perceptron on the concatenation of its inputs, each multiplied by a constant of its own.
 
-    def __init__(self, mlp: MLP, scales: Sequence[float]) -> None:
+    Args:
+        mlp: the perceptron.
+        scales: the constants.
+        widths: the sizes of the inputs.
+    """
+
+    def __init__(self, mlp: MLP, scales: Sequence[float], widths: Sequence[int]) -> None:
         super().__init__()
-        self.mlp, self.scales, self.head = mlp, tuple(scales), nn.Identity()
+        self.mlp, self.scales, self.widths, self.head = mlp, tuple(scales), tuple(widths), nn.Identity()
 
     def forward(self, *inputs: Tensor) -> Any:
         """The head's output for inputs (*, k_i); the head receives (*, out_features)."""
@@ -99,6 +105,7 @@ class PlainTanhGaussian:
     ) -> None:
         network, sample = actor[0].module, actor[1]
         self.in_keys, self.out_keys, self.scales = list(actor[0].in_keys), list(actor.out_keys), network.scales
+        self.widths = network.widths
         self.head, self.activations, self.is_random = network.head, activations, is_random
         self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
         self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
@@ -110,6 +117,14 @@ class PlainTanhGaussian:
             *(tuple(x.shape) for x in self.weights),
             (self.head.scale_lb, mapping.bias, mapping.min_val),
         )
+
+    def normalize(self, key: Any, loc: Tensor, scale: Tensor) -> None:
+        """Subtract ``loc`` (k) from the input ``key``, and divide it by ``scale`` (k); the first layer can do both."""
+        at = self.in_keys.index(key)
+        weight, bias, *others = self.weights
+        before, own, after = weight.split([sum(self.widths[:at]), len(loc), sum(self.widths[at + 1 :])], 1)
+        own = own / scale
+        self.weights = (torch.cat((before, own, after), 1), bias - own @ (loc * self.scales[at]), *others)
 
     def fits(self, inputs: Sequence[Tensor]) -> bool:
         """Whether the first layer can read inputs of this width, precision and device."""

@@ -13,6 +13,7 @@ from training.building import (
     network,
     own_seed,
     set_up,
+    trust_region,
     update_normalizer,
 )
 from training.launch import recipe
@@ -34,13 +35,15 @@ def main(cfg: DictConfig) -> None:
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
     stateful = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
+    bound = trust_region(cfg, actor)
     run = Run(cfg, env, actor, loss, stateful, buffer)
     for _ in run:
         # The actor: up the N-step and the 0-step return of one horizon, through the dynamics.
         rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         loss_actor, actor_metrics = loss.loss_actor(rollout)
         loss_alpha = actor_metrics.get("loss_alpha", 0.0)
-        run.optimise("actor", actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
+        with bound.around(rollout):
+            run.optimise("actor", actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
 
         # The critics: towards the TD(lambda) targets of the target networks.
         data = loss.write_value_target(rollout.detach())
@@ -60,7 +63,7 @@ def main(cfg: DictConfig) -> None:
 
         actor_schedule.step()
         critic_schedule.step()
-        run.record(loss_actor=loss_actor, loss_qvalue=loss_qvalue, **actor_metrics, **critic_metrics)
+        run.record(loss_actor=loss_actor, loss_qvalue=loss_qvalue, **actor_metrics, **bound.metrics, **critic_metrics)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ python recipes/bptt.py task=hovering seed=0
 """
 
 from omegaconf import DictConfig
-from training.building import actor_parameters, iterations, make_optimizer, set_up, update_normalizer
+from training.building import actor_parameters, iterations, make_optimizer, set_up, trust_region, update_normalizer
 from training.launch import recipe
 from training.loop import Run
 
@@ -17,16 +17,18 @@ def main(cfg: DictConfig) -> None:
     loss = BPTTLoss(actor, **cfg.loss).make_value_estimator(gamma=cfg.gamma)
     optimizer, schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
 
+    bound = trust_region(cfg, actor)
     run = Run(cfg, env, actor, loss, [optimizer, schedule])
     for _ in run:
         rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         loss_actor, metrics = loss.loss_actor(rollout)
         loss_alpha = metrics.get("loss_alpha", 0.0)
-        run.optimise("actor", optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
+        with bound.around(rollout):
+            run.optimise("actor", optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
         update_normalizer(env, rollout)
         run.carry = restart(env, end, cfg.restart_fraction)
         schedule.step()
-        run.record(loss_actor=loss_actor, **metrics)
+        run.record(loss_actor=loss_actor, **metrics, **bound.metrics)
 
 
 if __name__ == "__main__":

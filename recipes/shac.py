@@ -12,6 +12,7 @@ from training.building import (
     minibatches,
     network,
     set_up,
+    trust_region,
     update_normalizer,
 )
 from training.launch import recipe
@@ -31,13 +32,15 @@ def main(cfg: DictConfig) -> None:
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
     stateful = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
+    bound = trust_region(cfg, actor)
     run = Run(cfg, env, actor, loss, stateful)
     for _ in run:
         # The actor: up the return of one horizon and the value of its end, through the dynamics.
         rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         loss_actor, actor_metrics = loss.loss_actor(rollout)
         loss_alpha = actor_metrics.get("loss_alpha", 0.0)
-        run.optimise("actor", actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
+        with bound.around(rollout):
+            run.optimise("actor", actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
 
         # The critic: towards the TD(lambda) targets of the target network.
         data = loss.write_value_target(rollout.detach())
@@ -51,7 +54,7 @@ def main(cfg: DictConfig) -> None:
         run.carry = restart(env, end, cfg.restart_fraction)
         actor_schedule.step()
         critic_schedule.step()
-        run.record(loss_actor=loss_actor, loss_value=loss_value, **actor_metrics, **critic_metrics)
+        run.record(loss_actor=loss_actor, loss_value=loss_value, **actor_metrics, **bound.metrics, **critic_metrics)
 
 
 if __name__ == "__main__":

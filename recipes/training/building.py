@@ -16,7 +16,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import SoftUpdate
 
-from torchrl_quad import ObservationNormalizer, make_actor, make_env
+from torchrl_quad import ObservationNormalizer, TrustRegion, make_actor, make_env
 from torchrl_quad.objectives import PathwiseLoss
 from training.processes import cat_all, rank, world_size
 
@@ -93,6 +93,11 @@ class TargetUpdate(SoftUpdate):
         name = f"{self.loss_module.critic_name}_params"
         target, critic = (getattr(self.loss_module, f"{prefix}{name}").values(True, True) for prefix in ("target_", ""))
         get_ema_multi_avg_fn(self.eps)(list(target), list(critic), None)
+
+
+def trust_region(cfg: DictConfig, actor: TensorDictModuleBase) -> TrustRegion:
+    """The bound of a configuration on what an update does to the policy; all processes shorten alike."""
+    return TrustRegion(actor, cfg.actor.max_kl, average=lambda x: cat_all(x.view(1)).mean())
 
 
 def update_normalizer(env: EnvBase, rollout: TensorDictBase) -> None:

@@ -108,6 +108,7 @@ class Actor(Optimised):
     """The policy."""
 
     scale_init: Positive = Field(description="The standard deviation of the policy's noise at the start.")
+    max_kl: Positive | None = Field(description="How far one update may move the policy; null for no bound.")
 
 
 class Critic(Optimised):
@@ -127,6 +128,9 @@ class Loss(Section):
     model_config = ConfigDict(strict=True, extra="allow")
     alpha: Annotated[Real, Field(ge=0)] | Literal["auto"] | None = Field(
         None, description="The coefficient of the entropy bonus: a number, 0 for none, or auto to learn it."
+    )
+    clip_action_gradient: Positive | None = Field(
+        None, description="So many medians long may the gradient in one action be; null for no bound."
     )
     terminal_gradient: bool | None = None
     target_bootstrap: bool | None = None

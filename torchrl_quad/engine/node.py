@@ -37,19 +37,26 @@ class Flight(NamedTuple):
 
 
 def fly_horizon(horizon: Horizon, drawn: Tensor) -> Flight:
-    """Fly a horizon; gradients reach its start, what was drawn (steps, n, k), the policy's weights, the parameters."""
+    """Fly a horizon; gradients reach its start, what was drawn (steps, n, k), the policy's weights, the parameters.
+
+    They reach the actions as well: the node of all that is flown has ``actions``, a tensor (steps, n, k) that stands
+    for them, and ``learns``, to be switched off for a backward pass that wants no gradient of the policy's weights.
+    """
     start, policy, parameters = horizon.start, horizon.policy, horizon.step.simulation.parameters
     tensors = start.state.floats, start.observation, drawn, *policy.weights, *parameters
     keeps = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
+    actions = drawn.new_zeros(()).expand(drawn.shape).requires_grad_(keeps)
     restarts: list[tuple[int, Record, Tensor]] = []
-    leaves = _Horizon.apply(horizon, keeps, restarts, *tensors)
+    leaves = _Horizon.apply(horizon, keeps, restarts, actions, *tensors)
+    if keeps:
+        leaves[0].grad_fn.actions, leaves[0].grad_fn.learns = actions, True
     ends = Record(Rows(*leaves[:3]), Rows(*leaves[3:6]), leaves[6])
     return Flight(ends, dict(zip(policy.out_keys, leaves[7:], strict=True)), restarts)
 
 
 class _Horizon(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, horizon: Horizon, keeps: bool, restarts: list, floats, observation, drawn, *tensors):
+    def forward(ctx: Any, horizon: Horizon, keeps: bool, restarts: list, _, floats, observation, drawn, *tensors):
         step, policy = horizon.step, _Policy(horizon)
         floats, observation, drawn, *tensors = (x.detach().contiguous() for x in (floats, observation, drawn, *tensors))
         policy.weights, parameters = tensors[: len(policy.weights)], tensors[len(policy.weights) :]
@@ -95,7 +102,7 @@ class _Horizon(torch.autograd.Function):
                 "A compiled flight has first derivatives only. For second ones (create_graph=True) call env.eager() "
                 "and fly again."
             )
-        horizon, policy, step = ctx.horizon, _Policy(ctx.horizon), ctx.horizon.step
+        horizon, policy, step = ctx.horizon, _Policy(ctx.horizon, ctx.learns), ctx.horizon.step
         saved = iter(ctx.saved_tensors)
         policy.weights = _take(saved, len(policy.weights))
         steps = [(*(_take(saved, count) for count in counts), next(saved)) for counts in ctx.shapes]
@@ -104,7 +111,7 @@ class _Horizon(torch.autograd.Function):
         fresh = {t: who for t, _, who in ctx.restarts}
         of_end, of_written = (grads[0], grads[3], grads[6]), grads[7:]
         grad_floats = grad_observation = None
-        grads_drawn, grads_parameter = [], []
+        grads_action, grads_drawn, grads_parameter = [], [], []
         for t in reversed(range(horizon.steps)):
             start, states, inputs, kept, drawn = steps[t]
             if t in fresh:
@@ -120,20 +127,23 @@ class _Horizon(torch.autograd.Function):
             )
             written = [None if g is None else g[:, t] for g in of_written]
             written[policy.action] = _add(written[policy.action], grad_action)
+            grads_action.append(written[policy.action])
             written = [zero if g is None else g.contiguous() for g, zero in zip(written, zeros[3:], strict=True)]
             grad_inputs, grad_drawn = policy.adjoint(inputs, kept, drawn, written, is_first=is_first)
             grad_floats, grad_observation = policy.add(grad_floats, grad_inputs)
             grads_drawn.append(grad_drawn)
             grads_parameter.append(grad_parameters)
-        drawn = torch.stack(grads_drawn[::-1]) if ctx.needs_input_grad[5] else None
+        actions = torch.stack(grads_action[::-1]) if ctx.needs_input_grad[3] else None
+        drawn = torch.stack(grads_drawn[::-1]) if ctx.needs_input_grad[6] else None
         parameters = (torch.stack(x).sum(0) for x in zip(*grads_parameter, strict=True))
-        return None, None, None, grad_floats, grad_observation, drawn, *policy.weight_gradients(), *parameters
+        return None, None, None, actions, grad_floats, grad_observation, drawn, *policy.weight_gradients(), *parameters
 
 
 class _Policy:
     """The policy of one pass over a horizon, on lists of tensors; backwards it gathers the gradient of its weights."""
 
-    def __init__(self, horizon: Horizon) -> None:
+    def __init__(self, horizon: Horizon, learns: bool = True) -> None:
+        self.learns = learns
         self.policy, self.program, self.weights = horizon.policy, horizon.policy_program, horizon.policy.weights
         self.layout: Layout = horizon.step.layout
         self.action = list(self.policy.out_keys).index("action")
@@ -164,7 +174,7 @@ class _Policy:
         function = self.program.adjoint if is_first else self.program.adjoint.again
         values = function(*self.weights, *inputs, drawn, *kept, *grads)
         end = len(values) - 1 - len(inputs)
-        if self.weights:
+        if self.weights and self.learns:
             self.steps.append(values[:end])
             if len(self.steps) * len(drawn) >= LEARNING_BATCH:
                 self._learn()
@@ -176,11 +186,11 @@ class _Policy:
         of_observation = of_state.pop("observation", None)
         return self.layout.add(grad_floats, {name_in_state(key): g for key, g in of_state.items()}), of_observation
 
-    def weight_gradients(self) -> list[Tensor]:
+    def weight_gradients(self) -> list[Tensor | None]:
         """The gradient of each weight, over all steps."""
         if self.steps:
             self._learn()
-        return self.total or []
+        return self.total or [None] * len(self.weights)
 
     def _learn(self) -> None:
         traces = self.steps[0] if len(self.steps) == 1 else [torch.cat(x) for x in zip(*self.steps, strict=True)]

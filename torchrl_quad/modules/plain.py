@@ -139,6 +139,14 @@ class PlainTanhGaussian:
             x.normal_()
         return noise
 
+    def noise(self, action: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
+        """The noise that led to actions (n, k)."""
+        if self.low is not None:
+            low, high = (action.new_tensor(bound) for bound in (self.low, self.high))
+            action = (2.0 * action - (high + low)) / (high - low)
+        limit = 1.0 - torch.finfo(action.dtype).resolution
+        return (torch.atanh(action.clamp(-limit, limit)) - loc) / scale
+
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
     ) -> tuple[list[Tensor], dict[Any, Tensor]]:

@@ -5,5 +5,6 @@ from torchrl_quad.objectives.bptt import BPTTLoss
 from torchrl_quad.objectives.critic import PathwiseCriticLoss
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.objectives.shac import SHACLoss
+from torchrl_quad.objectives.trust_region import TrustRegion
 
-__all__ = ["ABPTLoss", "BPTTLoss", "PathwiseCriticLoss", "PathwiseLoss", "SHACLoss"]
+__all__ = ["ABPTLoss", "BPTTLoss", "PathwiseCriticLoss", "PathwiseLoss", "SHACLoss", "TrustRegion"]

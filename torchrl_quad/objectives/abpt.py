@@ -127,6 +127,11 @@ class ABPTLoss(PathwiseCriticLoss):
         value = self._critics(first).amin(0)
         return torch.zeros_like(start, dtype=value.dtype).masked_scatter(start, value).sum((-2, -1))
 
+    def _beside_actions(self, tensordict: TensorDictBase) -> Tensor | float:
+        if not self.n_step_return:
+            return 0.0
+        return self._terminal_value(tensordict.detach()) / (1 + self.zero_step_return)
+
     def _value(self, tensordict: TensorDictBase, *, target: bool) -> Tensor:
         states = tensordict.select(*self._critic_inputs())
         return super()._value(sample_action(self.actor_network, self.actor_network_params, states), target=target)

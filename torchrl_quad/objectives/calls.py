@@ -25,9 +25,8 @@ def sample_action(actor: TensorDictModule, params: TensorDictParams, tensordict:
         plain = actor.plain() if hasattr(actor, "plain") else None
         if plain is None:
             return actor(tensordict)
-        inputs = [tensordict[key] for key in plain.in_keys]
-        rows = [x.reshape(-1, x.shape[-1]) for x in inputs]
-        _, written = plain.forward(plain.weights, rows, plain.drawn(1, len(rows[0]))[0])
+        inputs = [rows(tensordict[key]) for key in plain.in_keys]
+        _, written = plain.forward(plain.weights, inputs, plain.drawn(1, len(inputs[0]))[0])
     return tensordict.update({key: x.view(*tensordict.shape, *x.shape[1:]) for key, x in written.items()})
 
 
@@ -63,3 +62,8 @@ def predict(
         weights = {name: x.detach() for name, x in weights.items()}
     copies = zip(*(x.unbind(0) for x in weights.values()), strict=True) if params.batch_dims else [weights.values()]
     return stack([plain(dict(zip(weights, own, strict=True)), inputs) for own in copies])
+
+
+def rows(x: Tensor) -> Tensor:
+    """An entry (*, k) as (n, k)."""
+    return x.reshape(-1, x.shape[-1])

@@ -15,6 +15,8 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import ValueEstimators, default_value_kwargs, dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_quad.objectives.action_gradients import MedianClip, act_again, action_gradient
+
 
 def segments(done: Tensor) -> tuple[Tensor, Tensor]:
     """Mark the first and the last step of each segment, both bool (*, horizon, 1), as ``done`` is.
@@ -49,6 +51,9 @@ class PathwiseLoss(LossModule):
             rollout (an actor built with ``return_log_prob=True``), since a tanh-Gaussian has no closed entropy.
         target_entropy: with ``alpha="auto"``; "auto" means minus the number of action entries.
         alpha_init: with ``alpha="auto"``, the coefficient to start from.
+        clip_action_gradient: shorten the gradient in each single action, of one drone in one step, to so many times
+            the running median of their lengths, before the policy learns from it: 1 to 5 keep tumbling drones from
+            outweighing all others. Needs a policy of ``make_actor``. An entropy bonus then counts at fixed states.
         reduction: "mean" or "sum" over environments (over samples for a critic), or "none".
 
     Raises:
@@ -93,6 +98,7 @@ class PathwiseLoss(LossModule):
         alpha: float | str = 0.0,
         target_entropy: float | str = "auto",
         alpha_init: float = 1e-2,
+        clip_action_gradient: float | None = None,
         reduction: str = "mean",
     ) -> None:
         super().__init__()
@@ -104,8 +110,13 @@ class PathwiseLoss(LossModule):
             raise ValueError(
                 f"alpha_init must be positive and finite, got {alpha_init}; set alpha to 0 for no entropy bonus."
             )
+        if clip_action_gradient is not None and not 0 < clip_action_gradient < math.inf:
+            raise ValueError(
+                f"clip_action_gradient must be None or a positive number of medians, got {clip_action_gradient}."
+            )
         self._in_keys = None
         self.reduction = reduction
+        self.clip = None if clip_action_gradient is None else MedianClip(clip_action_gradient)
         self.convert_to_functional(actor_network, "actor_network")
         self.target_entropy = target_entropy
         self.automatic_alpha = alpha == "auto"
@@ -115,8 +126,8 @@ class PathwiseLoss(LossModule):
         else:
             self.register_coeff_buffer("fixed_alpha", float(alpha), **number)
         self.has_entropy_bonus = alpha == "auto" or alpha > 0
-        entropy_keys = ["entropy", "alpha"] if self.has_entropy_bonus else []
-        self.out_keys = [*self.out_keys, *entropy_keys, *(["loss_alpha"] if self.automatic_alpha else [])]
+        more_keys = [*(["clipped"] if self.clip else []), *(["entropy", "alpha"] if self.has_entropy_bonus else [])]
+        self.out_keys = [*self.out_keys, *more_keys, *(["loss_alpha"] if self.automatic_alpha else [])]
 
     def convert_to_functional(self, module: TensorDictModule, module_name: str, *args: Any, **kwargs: Any) -> None:
         """As TorchRL's, and refuse anything but a TensorDictModule."""
@@ -219,6 +230,12 @@ class PathwiseLoss(LossModule):
             the loss, and its metadata by name; with an automatic alpha this includes ``loss_alpha``.
         """
         objective, metadata = self._objective(tensordict)
+        if self.clip is not None:
+            grad, metadata["clipped"] = self.clip(self._action_gradient(objective, tensordict))
+            written = act_again(self.actor_network, self.actor_network_params, tensordict, self.tensor_keys.action)
+            learned = (grad * written[self.tensor_keys.action]).sum((-2, -1)) + self._beside_actions(tensordict)
+            objective = objective.detach() + learned - learned.detach()
+            tensordict = tensordict.copy().update(written)
         if self.has_entropy_bonus:
             entropy = self._entropy(tensordict)
             objective = objective + self.alpha * entropy
@@ -246,6 +263,14 @@ class PathwiseLoss(LossModule):
         """J of each environment, (*), and its metadata."""
         objective = sum(self.objective_parts(tensordict).values())
         return objective, {"n_step_return": objective.detach().mean()}
+
+    def _action_gradient(self, objective: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """The gradient of J (*) of each environment in each of its actions: (*, horizon, k)."""
+        return action_gradient(objective.sum(), tensordict.get(self.tensor_keys.action))
+
+    def _beside_actions(self, tensordict: TensorDictBase) -> Tensor | float:
+        """What of J depends on the policy beside the actions that were flown, at fixed states: (*)."""
+        return 0.0
 
     def _discounts(self, tensordict: TensorDictBase) -> Tensor:
         """The discount of each step in its segment: (*, horizon, 1)."""

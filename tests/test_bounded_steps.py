@@ -1,0 +1,208 @@
+"""Bounds on what a policy learns from: the gradient of each action, and the length of an update."""
+
+import pytest
+import torch
+from tensordict.nn import TensorDictSequential
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_quad import (
+    ABPTLoss,
+    BPTTLoss,
+    HoveringEnv,
+    SHACLoss,
+    TrustRegion,
+    differentiable_rollout,
+    make_actor,
+    make_qvalue,
+    make_value,
+)
+from torchrl_quad.objectives.action_gradients import MedianClip, action_gradient
+
+LOSSES = {
+    "bptt": lambda env, actor, **options: BPTTLoss(actor, **options),
+    "shac": lambda env, actor, **options: SHACLoss(actor, make_value(env), **options),
+    "abpt": lambda env, actor, **options: ABPTLoss(actor, make_qvalue(env), **options),
+}
+FAR = 1e9  # medians: so long is no gradient
+
+
+@pytest.fixture(scope="module")
+def envs():
+    """An eager and a compiled environment whose episodes end inside a horizon."""
+    options = {"num_envs": 4, "dtype": torch.float64, "max_episode_steps": 6}
+    return {"eager": HoveringEnv(**options), "compiled": HoveringEnv(**options, compile=True)}
+
+
+def flight(env, actor, steps=9):
+    env.set_seed(0)
+    torch.manual_seed(0)
+    return differentiable_rollout(env, actor, None, steps)[0]
+
+
+def gradient(loss, rollout):
+    torch.manual_seed(1)
+    value = loss.loss_actor(rollout)[0]
+    return value, torch.autograd.grad(value, [x for x in loss.actor_network_params.parameters() if x.requires_grad])
+
+
+@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("way", ["eager", "compiled"])
+def test_a_clip_that_never_clips_changes_no_gradient(envs, name, way):
+    env = envs[way]
+    actor = make_actor(env)
+    clipped, plain = (LOSSES[name](env, actor, clip_action_gradient=clip) for clip in (FAR, None))
+    clipped.load_state_dict({**clipped.state_dict(), **plain.state_dict()})
+    rollout = flight(env, actor)
+    (value, found), (expected_value, expected) = gradient(clipped, rollout), gradient(plain, rollout)
+    torch.testing.assert_close(value, expected_value)
+    if name == "abpt":  # the actions after its last states are sampled anew each time
+        assert torch.cosine_similarity(*(torch.cat([g.flatten() for g in x]) for x in (found, expected)), 0) > 0.999
+    else:
+        torch.testing.assert_close(found, expected)
+
+
+def test_the_gradient_of_an_action_is_that_of_all_that_follows(envs):
+    env = envs["eager"]
+    actor = make_actor(env)
+    weight = torch.linspace(0.5, 1.5, 9, dtype=env.dtype).view(1, 9, 1)
+
+    def objective(rollout):
+        return (weight * rollout["next", "reward"]).sum() + rollout["loc"].square().sum()
+
+    found = []
+    for way in envs.values():
+        rollout = flight(way, actor)
+        found.append(action_gradient(objective(rollout), rollout["action"]))
+        again = torch.autograd.grad(objective(rollout), list(actor.parameters()))  # the graph is still whole
+        assert all(g.isfinite().all() for g in again)
+    torch.testing.assert_close(*found)
+
+    def with_push(size):
+        """The objective with all of a policy's actions, but one is pushed, and the policy goes on from there."""
+        env.set_seed(0)
+        torch.manual_seed(0)
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            policy, count = actor, iter(range(100))
+
+            def push(td):
+                td = policy(td)
+                if next(count) == 2:
+                    td["action"][1, 2] += size
+                return td
+
+            rollout = EnvBase.rollout(env, 9, push, auto_cast_to_device=False, break_when_any_done=False)
+        return objective(rollout)
+
+    numeric = (with_push(1e-5) - with_push(-1e-5)) / 2e-5
+    torch.testing.assert_close(found[0][1, 2, 2], numeric, rtol=1e-6, atol=1e-9)
+
+
+def test_in_torchrls_loop_actions_have_the_same_gradients(envs):
+    env = envs["eager"]
+    actor = make_actor(env)
+    rollout = flight(env, actor)
+    expected = action_gradient(rollout["next", "reward"].sum(), rollout["action"])
+    env.set_seed(0)
+    torch.manual_seed(0)
+    with set_exploration_type(ExplorationType.RANDOM):
+        slow = EnvBase.rollout(env, 9, actor, break_when_any_done=False)
+    torch.testing.assert_close(action_gradient(slow["next", "reward"].sum(), slow["action"]), expected)
+
+
+def test_a_long_gradient_is_shortened_to_so_many_medians():
+    clip = MedianClip(2.0, decay=0.5)
+    grad = torch.tensor([1.0, -1.0, 1.0, 1.0, 30.0, 0.0]).view(2, 3, 1)
+    shorter, fraction = clip(grad)
+    assert shorter.flatten().tolist() == [1.0, -1.0, 1.0, 1.0, 2.0, 0.0]
+    assert fraction == pytest.approx(1 / 6)
+    clip(3.0 * grad)
+    assert clip.median == 2.0  # half way from 1 to 3
+    assert "median" in clip.state_dict()
+    clip(torch.zeros(2, 3, 1))
+    assert clip.median == 2.0
+
+
+def test_one_drone_with_a_steep_return_no_longer_outweighs_the_others(envs):
+    env = envs["eager"]
+    actor = make_actor(env)
+    rollout = flight(env, actor)
+    steep = torch.tensor([100.0, 1.0, 1.0, 1.0], dtype=env.dtype).view(4, 1, 1)
+    rollout["next", "reward"] = steep * rollout["next", "reward"]
+    length = {}
+    for clip in (FAR, 3.0):
+        loss = BPTTLoss(actor, clip_action_gradient=clip)
+        _, metadata = loss.loss_actor(rollout)
+        grad, _ = loss.clip(action_gradient(rollout["next", "reward"].sum(), rollout["action"]))
+        length[clip] = grad[0].norm() / grad[1:].norm()
+        assert (metadata["clipped"] > 0) == (clip == 3.0)
+    assert length[FAR] > 20 and length[3.0] < 4
+
+
+def test_with_a_clip_the_entropy_bonus_counts_at_the_states_visited(envs):
+    env = envs["eager"]
+    actor = make_actor(env, return_log_prob=True)
+    loss = BPTTLoss(actor, alpha=0.3, clip_action_gradient=FAR)
+    rollout = flight(env, actor)
+    loss_actor, metadata = loss.loss_actor(rollout)
+    torch.testing.assert_close(metadata["entropy"], -rollout["action_log_prob"].mean().detach())
+    reward = BPTTLoss(actor, clip_action_gradient=FAR).loss_actor(rollout)[0]
+    (scale_grad,) = torch.autograd.grad(reward - loss_actor, actor[0].module.mlp[-1].bias)
+    assert (scale_grad[4:] > 0).all()  # more noise, more entropy
+
+
+def test_what_cannot_be_clipped_is_refused(envs):
+    env = envs["eager"]
+    actor = make_actor(env)
+    for bad in (0.0, -1.0, float("inf")):
+        with pytest.raises(ValueError, match="clip_action_gradient must be None or a positive number of medians"):
+            BPTTLoss(actor, clip_action_gradient=bad)
+    rollout = flight(env, actor)
+    loss = BPTTLoss(actor, clip_action_gradient=5.0)
+    with pytest.raises(ValueError, match="needs the rollout as differentiable_rollout returned it, whole"):
+        loss.loss_actor(rollout[:2])
+    other = TensorDictSequential(actor)
+    with pytest.raises(NotImplementedError, match="need a policy as make_actor builds it"):
+        BPTTLoss(other, clip_action_gradient=5.0).loss_actor(flight(env, other))
+
+
+def test_an_update_is_shortened_to_the_bound():
+    env = HoveringEnv(num_envs=64)
+    actor = make_actor(env)
+    rollout = env.rollout(8, actor, break_when_any_done=False)
+    trust_region = TrustRegion(actor, max_kl=0.02)
+
+    def update(length):
+        before = [x.detach().clone() for x in actor.parameters()]
+        torch.manual_seed(0)
+        with trust_region.around(rollout), torch.no_grad():
+            for x in actor.parameters():
+                x += length * torch.randn_like(x)
+        moved = torch.cat([(x.detach() - y).flatten() for x, y in zip(actor.parameters(), before, strict=True)])
+        kl = trust_region.divergence(rollout)
+        with torch.no_grad():
+            for x, y in zip(actor.parameters(), before, strict=True):
+                x.copy_(y)
+        return moved.norm().item(), kl.item(), trust_region.metrics["kl"].item()
+
+    short = update(1e-4)
+    assert short[1] == pytest.approx(short[2]) and short[1] < 0.02
+    long = update(1e-2)
+    assert long[2] > 0.1 and 0.5 * 0.02 < long[1] < 1.5 * 0.02
+    assert long[0] < 100 * short[0]
+
+
+def test_a_trust_region_knows_what_it_needs(env):
+    actor = make_actor(env)
+    with pytest.raises(ValueError, match="max_kl must be None or positive and finite, got 0"):
+        TrustRegion(actor, 0.0)
+    free = TrustRegion(actor, None)
+    with free.around(env.reset()):
+        pass
+    assert free.metrics == {}
+    trust_region = TrustRegion(actor, 0.1)
+    with (
+        pytest.raises(ValueError, match="reads loc and scale, which are not in the rollout"),
+        trust_region.around(env.reset()),
+    ):
+        raise AssertionError("It is refused before the block runs.")

@@ -1,0 +1,96 @@
+"""Gradients in the actions of a rollout, step by step, and how a policy learns from them."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch.autograd.graph import GradientEdge
+
+from torchrl_quad.objectives.calls import rows
+
+
+def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
+    """The gradient of an objective in each action of a rollout, with all that follows from it, the policy included.
+
+    Args:
+        objective: a scalar.
+        action: ``rollout["action"]`` (*, horizon, k) as it was flown, with its graph, which is kept.
+
+    Raises:
+        ValueError: the action is a copy or a part of the rollout's, whose steps cannot be told apart.
+    """
+    node = action.grad_fn
+    if hasattr(node, "actions"):  # a compiled horizon
+        node.learns = False
+        try:
+            (grad,) = torch.autograd.grad(objective, node.actions, retain_graph=True)
+        finally:
+            node.learns = True
+        return grad.movedim(0, -2)
+    if node is None or node.name() != "StackBackward0" or len(node.next_functions) != action.shape[-2]:
+        raise ValueError(
+            "The gradient of each action needs the rollout as differentiable_rollout returned it, whole and with its "
+            "graph; this one was copied, reshaped or cut. Give the rollout itself to the loss."
+        )
+    edges = [GradientEdge(*edge) for edge in node.next_functions]
+    grads = torch.autograd.grad(objective, edges, retain_graph=True, allow_unused=True)
+    return torch.stack([torch.zeros_like(action[..., 0, :]) if g is None else g for g in grads], -2)
+
+
+def act_again(
+    actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase, action_key: NestedKey = "action"
+) -> dict[NestedKey, Tensor]:
+    """What a policy of ``make_actor`` writes in the states of a rollout with the noise of the rollout.
+
+    Its values are those of the rollout as long as the policy has not changed. Its gradients reach the policy's
+    parameters alone: neither do earlier states move with them, nor does the noise.
+
+    Args:
+        actor: the policy that flew the rollout.
+        params: its parameters.
+        tensordict: the rollout (*), with ``loc`` and ``scale``.
+        action_key: of the actions.
+
+    Raises:
+        NotImplementedError: the policy is another one than ``make_actor`` builds, whose noise is not known.
+    """
+    with params.to_module(actor):
+        plain = actor.plain() if hasattr(actor, "plain") else None
+        if not hasattr(plain, "noise"):
+            raise NotImplementedError(
+                "Gradients that are clipped in each step need a policy as make_actor builds it, whose noise follows "
+                "from its actions. Build it so, without hooks or changed parts, or leave clip_action_gradient=None."
+            )
+        inputs = [rows(tensordict[key].detach()) for key in plain.in_keys]
+        noise = plain.noise(*(rows(tensordict[key].detach()) for key in (action_key, "loc", "scale")))
+        _, written = plain.forward(plain.weights, inputs, noise)
+    return {key: x.view(*tensordict.shape, *x.shape[1:]) for key, x in written.items()}
+
+
+class MedianClip(nn.Module):
+    """Shortens gradients (*, k) that are longer than ``factor`` times the running median of their lengths.
+
+    One drone that tumbles has gradients many times as long as those of all others, and would be all of their mean.
+
+    Args:
+        factor: of the median; 1 to 5 are usual.
+        decay: of the running median, for each call.
+    """
+
+    def __init__(self, factor: float, decay: float = 0.9) -> None:
+        super().__init__()
+        self.factor, self.decay = factor, decay
+        self.register_buffer("median", torch.zeros(()))
+        self.median: Tensor
+
+    @torch.no_grad()
+    def forward(self, grad: Tensor) -> tuple[Tensor, Tensor]:
+        """The gradients, and the fraction of them that was shortened; gradients of zero do not count."""
+        length = grad.norm(dim=-1, keepdim=True)
+        median = length[length > 0].median() if (length > 0).any() else self.median
+        self.median = torch.where(self.median > 0, torch.lerp(median.to(self.median), self.median, self.decay), median)
+        factor = (self.factor * self.median / length.clamp_min(1e-30)).clamp_max(1.0)
+        return grad * factor, (factor < 1).to(grad.dtype).mean()

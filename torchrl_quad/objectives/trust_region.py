@@ -1,0 +1,75 @@
+"""A bound on how far one update may move a policy."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor
+from torch.distributions import Normal, kl_divergence
+
+
+class TrustRegion:
+    """Shortens an update that would move a Gaussian policy beyond a bound on the Kullback-Leibler divergence.
+
+    A gradient through a simulator can be so coherent that one step of Adam at a usual rate makes another policy. The
+    divergence KL(before || after), summed over the entries of the action and averaged over the states of a rollout,
+    grows with the square of the step, so a step that is too long is shortened by the root of its excess.
+
+    .. code-block:: python
+
+        trust_region = TrustRegion(actor, max_kl=0.05)
+        with trust_region.around(rollout):
+            optimizer.step()
+
+    Args:
+        actor: the policy, which writes ``loc`` and ``scale`` as those of :func:`~torchrl_quad.make_actor` do. The bound
+            is on these normal distributions, before the tanh.
+        max_kl: the bound, positive; None for no bound, which measures nothing.
+        average: of a scalar over the processes that train together, if there are several.
+
+    Attributes:
+        metrics: ``kl``, the divergence of the last update before it was shortened; empty without a bound.
+
+    Raises:
+        ValueError: the bound is not positive; (in use) the rollout has no ``loc`` and ``scale``.
+    """
+
+    def __init__(
+        self,
+        actor: ProbabilisticTensorDictSequential,
+        max_kl: float | None,
+        *,
+        average: Callable[[Tensor], Tensor] = lambda x: x,
+    ) -> None:
+        if max_kl is not None and not 0 < max_kl < math.inf:
+            raise ValueError(f"max_kl must be None or positive and finite, got {max_kl}; 0.01 to 0.1 are usual.")
+        self.actor, self.max_kl, self.average = actor, max_kl, average
+        self.metrics: dict[str, Tensor] = {}
+
+    @contextlib.contextmanager
+    def around(self, rollout: TensorDictBase) -> Iterator[None]:
+        """Bound what the block does to the policy that flew the rollout, and wrote its ``loc`` and ``scale``."""
+        if self.max_kl is None:
+            yield
+            return
+        if "loc" not in rollout or "scale" not in rollout:
+            raise ValueError("TrustRegion reads loc and scale, which are not in the rollout. Give what was flown.")
+        parameters = list(self.actor.parameters())
+        before = [x.detach().clone() for x in parameters]
+        yield
+        with torch.no_grad():
+            kl = self.average(self.divergence(rollout))
+            self.metrics = {"kl": kl}
+            if kl > self.max_kl:
+                torch._foreach_lerp_(parameters, before, 1.0 - (self.max_kl / kl.item()) ** 0.5)
+
+    def divergence(self, rollout: TensorDictBase) -> Tensor:
+        """KL(policy that flew the rollout || policy as it is now), a scalar."""
+        now = self.actor.get_dist_params(rollout.select(*self.actor.in_keys).detach())
+        old, new = (Normal(td["loc"].detach(), td["scale"].detach()) for td in (rollout, now))
+        return kl_divergence(old, new).sum(-1).mean()

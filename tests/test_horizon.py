@@ -279,7 +279,7 @@ def test_a_policy_on_plain_tensors_is_the_policy(env64, options, kind):
         inputs = [td[key].requires_grad_() for key in plain.in_keys]
         written = actor(td.copy()).select(*plain.out_keys)
         torch.manual_seed(3)
-        drawn = plain.drawn(1, 4)[0]
+        drawn = plain.drawn(1, 4, {})[0]
     kept, mine = plain.forward(plain.weights, inputs, drawn)
     torch.testing.assert_close(mine, dict(written.items()))
     grads = {key: torch.randn_like(x) for key, x in mine.items()}
@@ -296,7 +296,7 @@ def test_a_saturated_policy_keeps_the_gradient_that_torchrl_gives(env):
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         plain, td = actor.plain(), env.reset()
         written, weights = actor(td.copy()), list(plain.weights)
-        mine = plain.forward(plain.weights, [td["observation"]], plain.drawn(1, 4)[0])[1]
+        mine = plain.forward(plain.weights, [td["observation"]], plain.drawn(1, 4, {})[0])[1]
     assert (written["action"] > 0.999).all()
     for key in ("action", "action_log_prob"):
         torch.testing.assert_close(mine[key], written[key])

@@ -80,7 +80,7 @@ def test_a_normalized_policy_on_plain_tensors_is_the_policy():
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         plain, written = policy.plain(), policy(td.copy())
         inputs = [td["state", "velocity"], td["observation"]]
-        _, mine = plain.forward(plain.weights, inputs, plain.drawn(1, 4)[0])
+        _, mine = plain.forward(plain.weights, inputs, plain.drawn(1, 4, {})[0])
     torch.testing.assert_close(mine["action"], written["action"])
     expected, found = (torch.autograd.grad(x["action"].sum(), list(actor.parameters())) for x in (written, mine))
     torch.testing.assert_close(found, expected)

@@ -27,14 +27,18 @@ class Source(Protocol):
 
 
 def can_fly(stepper: Stepper, policy: Any, tensordict: TensorDictBase) -> bool:
-    """Whether :func:`fly` gives what TorchRL's own loop does: the policy reads nothing but observation and state."""
+    """Whether :func:`fly` gives what TorchRL's own loop does.
+
+    So it is if the policy reads nothing but observation, state, and what it has written itself in the step before.
+    """
     if not isinstance(policy, TensorDictModuleBase) or "_" in policy.out_keys:
         return False
     state = {flat_key("state", *_path(key)) for key in stepper.layout.place}
     needed = {"observation", *stepper.output_layout.place} - {"reward"}
     writes, reads = ({flat_key(*_path(key)) for key in keys} for keys in (policy.out_keys, policy.in_keys))
     given = set(tensordict.keys(True, True))
-    return reads <= state | {"observation"} and "action" in writes and needed <= given <= state | needed | writes
+    knows = reads <= state | {"observation"} | writes and "action" in writes
+    return knows and needed <= given <= state | needed | writes
 
 
 def flies_inside(stepper: Stepper, policy: Any) -> bool:
@@ -57,12 +61,15 @@ def fly(
     """
     state, valid = stepper.simulation.guard(state)
     plain = _plain(stepper, policy)
+    before = {key: tensordict.get(key) for key in policy.out_keys if key in tensordict and key != "action"}
     if not stepper.is_compiled:
-        roots, ends, written = _fly_eager(stepper, source, policy, state, tensordict, valid, steps)
+        roots, ends, written = _fly_eager(stepper, source, policy, state, tensordict, valid, steps, before)
     elif plain is None:
-        roots, ends, written = _call(stepper, source, policy, _record(stepper, state, tensordict), valid, steps)
+        start = _record(stepper, state, tensordict)
+        roots, ends, written = _call(stepper, source, policy, start, valid, steps, before)
     else:
-        roots, ends, written = _fly_inside(stepper, source, plain, _record(stepper, state, tensordict), valid, steps)
+        start = _record(stepper, state, tensordict)
+        roots, ends, written = _fly_inside(stepper, source, plain, start, valid, steps, before)
     rollout = {**roots, **ends, **{flat_key(*_path(key)): x for key, x in written.items()}}
     rollout.pop("reward", None)  # there is none before the first step
     return TensorDict(nested(rollout), (len(tensordict), steps), tensordict.device, names=[None, "time"])
@@ -80,7 +87,13 @@ def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | GivenActions | None:
 
 
 def _fly_inside(
-    stepper: Stepper, source: Source, policy: PlainPolicy | GivenActions, start: Record, valid: Tensor, steps: int
+    stepper: Stepper,
+    source: Source,
+    policy: PlainPolicy | GivenActions,
+    start: Record,
+    valid: Tensor,
+    steps: int,
+    before: dict[Any, Tensor],
 ) -> tuple[dict[Key, Tensor], ...]:
     """The entries of all roots and of all ends, and what the policy wrote, of one compiled horizon."""
     kind, done_row, _ = stepper.output_layout.place["done"]
@@ -89,7 +102,7 @@ def _fly_inside(
         done = end.outputs[kind][done_row]
         return (_restarted(stepper, source, end, done), done[0]) if _may_restart(done) else None
 
-    flight = stepper.fly(policy, start, valid, steps, source.noise, restarted)
+    flight = stepper.fly(policy, start, valid, steps, source.noise, restarted, before)
     leaves = [[*record.state, *record.outputs, record.observation] for record in (start, flight.ends)]
     again = [(t, [*fresh.state, *fresh.outputs, fresh.observation], done) for t, fresh, done in flight.restarts]
     roots = [
@@ -109,7 +122,13 @@ def _roots(start: Tensor, ends: Tensor, again: list[tuple[int, Tensor, Tensor]],
 
 
 def _call(
-    stepper: Stepper, source: Source, policy: TensorDictModuleBase, start: Record, valid: Tensor, steps: int
+    stepper: Stepper,
+    source: Source,
+    policy: TensorDictModuleBase,
+    start: Record,
+    valid: Tensor,
+    steps: int,
+    before: dict[Any, Tensor],
 ) -> tuple[dict[Key, Tensor], ...]:
     """The same for a policy that is called before each compiled step."""
     roots = [start]
@@ -118,8 +137,8 @@ def _call(
     kind, done_row, _ = stepper.output_layout.place["done"]
     for t in range(steps):
         root = roots[-1]
-        action, entries = _act(stepper, policy, root.observation, stepper.layout.unpack(root.state))
-        written.append(entries)
+        action, before = _act(stepper, policy, root.observation, stepper.layout.unpack(root.state), before)
+        written.append(before)
         end = stepper.step_rows(root.state, valid, action, source.noise())
         ends.append(end)
         if t == 0:
@@ -138,13 +157,14 @@ def _fly_eager(
     tensordict: TensorDictBase,
     valid: Tensor,
     steps: int,
+    before: dict[Any, Tensor],
 ) -> tuple[dict[Key, Tensor], ...]:
     """The same without a compiler, on entries: each is a tensor of its own anyway."""
     outputs = {key: tensordict.get(key) for key in ("observation", *stepper.output_layout.place) if key != "reward"}
     roots, ends, written = [_of_state(state) | outputs], [], []
     for t in range(steps):
-        action, entries = _act(stepper, policy, roots[-1]["observation"], state)
-        written.append(entries)
+        action, before = _act(stepper, policy, roots[-1]["observation"], state, before)
+        written.append(before)
         state, outputs = stepper.step(state, valid, action, source.noise())
         ends.append(_of_state(state) | flat(outputs))
         if t == 0:
@@ -165,10 +185,11 @@ def _fly_eager(
 
 
 def _act(
-    stepper: Stepper, policy: TensorDictModuleBase, observation: Tensor, state: State
-) -> tuple[Tensor, dict[Key, Tensor]]:
-    """The action of a policy that is called, and all that it writes."""
-    td = TensorDict({"observation": observation}, [len(observation)], observation.device)
+    stepper: Stepper, policy: TensorDictModuleBase, observation: Tensor, state: State, before: dict[Any, Tensor]
+) -> tuple[Tensor, dict[Any, Tensor]]:
+    """The action of a policy that is called, and all that it writes; it sees what it wrote in the step before."""
+    handed_on = {key: x for key, x in before.items() if key != "action"}
+    td = TensorDict({**handed_on, "observation": observation}, [len(observation)], observation.device)
     if any(flat_key(*_path(key)) != "observation" for key in policy.in_keys):
         td["state"] = nested(state)
     td = policy(td)

@@ -45,7 +45,7 @@ def fly_horizon(horizon: Horizon, drawn: Tensor) -> Flight:
     start, policy, parameters = horizon.start, horizon.policy, horizon.step.simulation.parameters
     tensors = start.state.floats, start.observation, drawn, *policy.weights, *parameters
     keeps = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
-    actions = drawn.new_zeros(()).expand(drawn.shape).requires_grad_(keeps)
+    actions = drawn.new_zeros(()).expand(drawn[..., : policy.size].shape).requires_grad_(keeps)
     restarts: list[tuple[int, Record, Tensor]] = []
     leaves = _Horizon.apply(horizon, keeps, restarts, actions, *tensors)
     if keeps:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, Protocol
 
 from tensordict import TensorDictBase
@@ -32,8 +32,14 @@ class PlainPolicy(Protocol):
     def fits(self, inputs: Sequence[Tensor]) -> bool:
         """Whether it can read inputs of this width, precision and device; otherwise it is called, and can complain."""
 
-    def drawn(self, steps: int, n: int) -> Tensor:
-        """What changes from step to step and does not depend on the state, such as noise: (steps, n, k)."""
+    size: int
+    """The entries of an action."""
+
+    def drawn(self, steps: int, n: int, before: Mapping[Any, Tensor]) -> Tensor:
+        """What changes from step to step and does not depend on the state, such as noise: (steps, n, at least size).
+
+        ``before`` holds what the policy has written in the step before the first one, if it was there.
+        """
 
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
@@ -57,7 +63,7 @@ class PlainPolicy(Protocol):
 class GivenActions:
     """Actions that are known beforehand, whatever the state; also those of a policy that can only be called."""
 
-    in_keys, out_keys, weights = (), ("action",), ()
+    in_keys, out_keys, weights, size = (), ("action",), (), None
 
     def __init__(self, take: Callable[[int], Tensor]) -> None:
         self.take = take  # from a number of steps to their actions (steps, n, k)
@@ -66,7 +72,7 @@ class GivenActions:
         """It reads nothing."""
         return True
 
-    def drawn(self, steps: int, n: int) -> Tensor:
+    def drawn(self, steps: int, n: int, before: Mapping[Any, Tensor]) -> Tensor:
         """The actions of the next steps."""
         return self.take(steps)
 

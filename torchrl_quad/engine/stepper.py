@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any
 
 from torch import Tensor
@@ -69,6 +69,7 @@ class Stepper:
         steps: int,
         noise: Callable[[], dict[str, Tensor]],
         restarted: Callable[[Record], tuple[Record, Tensor] | None] = lambda end: None,
+        before: Mapping[Any, Tensor] | None = None,
     ) -> Flight:
         """A compiled horizon with its graph, as one node.
 
@@ -79,9 +80,10 @@ class Stepper:
             steps: at least one.
             noise: gives what each disturbance has drawn for the next step, by name.
             restarted: from the end of a step where to go on, and who begins anew, bool (n); None if nobody does.
+            before: what the policy has written in the step before.
         """
-        drawn = policy.drawn(steps, len(valid))
-        self.simulation.check_action(drawn[0])
+        drawn = policy.drawn(steps, len(valid), before or {})
+        self.simulation.check_action(drawn[0, :, : policy.size])
         count = len(self.simulation.parameters)
         if count not in self.steps:
             self.steps[count] = StepProgram(self.simulation, self.layout, self.output_layout, self.options)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor
 from tensordict.nn.utils import biased_softplus
 from torch import Tensor, nn
@@ -29,8 +30,35 @@ class Network(nn.Module):
         self.mlp, self.scales, self.widths, self.head = mlp, tuple(scales), tuple(widths), nn.Identity()
 
     def forward(self, *inputs: Tensor) -> Any:
-        """The head's output for inputs (*, k_i); the head receives (*, out_features)."""
-        return self.head(self.mlp(_concatenated(inputs, self.scales)))
+        """The head's output for inputs (*, k_i); the head receives (*, out_features), and the further inputs."""
+        own = len(self.scales)
+        return self.head(self.mlp(_concatenated(inputs[:own], self.scales)), *inputs[own:])
+
+
+class CorrelatedHead(NormalParamExtractor):
+    """The normal distribution of an action whose noise e is correlated in time, given the noise of the step before.
+
+    With e_t = rho e_(t-1) + sqrt(1 - rho^2) xi_t the action mu + sigma e_t has mean mu + rho sigma e_(t-1) and standard
+    deviation sigma sqrt(1 - rho^2). Every e_t for itself is standard normal, so the noise is as large as without
+    correlation.
+
+    Args:
+        rho: the correlation of the noise of two steps that follow each other.
+        scale_mapping: as for NormalParamExtractor.
+    """
+
+    def __init__(self, rho: float, scale_mapping: str) -> None:
+        super().__init__(scale_mapping=scale_mapping)
+        self.rho, self.rest = rho, math.sqrt(1.0 - rho**2)
+
+    def forward(self, raw: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """loc and scale (*, k) from what the network returns (*, 2k) and the noise of the step before (*, k)."""
+        loc, scale = super().forward(raw)
+        return loc + self.rho * scale * before, self.rest * scale
+
+    def next(self, before: Tensor, xi: Tensor) -> Tensor:
+        """The noise of this step."""
+        return self.rho * before + self.rest * xi
 
 
 class Critic(ValueOperator):
@@ -73,20 +101,42 @@ class Critic(ValueOperator):
 class TanhGaussianActor(ProbabilisticActor):
     """What :func:`~torchrl_quad.make_actor` builds: a tanh-Gaussian policy that environments can fly as pure functions.
 
-    It computes the same either way.
+    It computes the same either way. Noise that is correlated in time stands in ``noise``, and that of the step before
+    in ``noise_before``; a flight hands ``noise`` on from step to step. Where there is none yet, it is drawn.
     """
+
+    @property
+    def head(self) -> CorrelatedHead | None:
+        """The head that correlates the noise in time, if it does."""
+        head = getattr(getattr(self[0], "module", None), "head", None)
+        return head if isinstance(head, CorrelatedHead) else None
+
+    def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
+        """Write loc, scale, action, and what else was asked for."""
+        if self.head is None:
+            return super().forward(tensordict, **kwargs)
+        before = tensordict.get("noise", None)
+        if before is None:
+            like, size = tensordict.get(self[0].in_keys[0]), self[0].module.mlp[-1].out_features // 2
+            before = _first_noise(like.new_empty(*like.shape[:-1], size), _is_random(self))
+        tensordict = super().forward(tensordict.set("noise_before", before), **kwargs)
+        read = (tensordict.get(key) for key in ("action", "loc", "scale"))
+        xi = _innovation(*read, *_bounds(self)).detach()
+        return tensordict.set("noise", self.head.next(before, xi))
 
     def plain(self) -> PlainTanhGaussian | None:
         """The policy as pure functions of its present weights; None if somebody has changed its parts, or hooks it."""
-        kind = exploration_type() or self[1].default_interaction_type
+        is_random = _is_random(self)
         network = getattr(self[0], "module", None)
-        is_known = kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC) and type(self) is TanhGaussianActor
+        is_known = is_random is not None and type(self) is TanhGaussianActor
         if not is_known or type(network) is not Network or _is_hooked(self) or len(self.module) != 2:
             return None
         if len(set(map(str, self[0].in_keys))) < len(self[0].in_keys):
             return None
         mapping = getattr(network.head, "scale_mapping", None)
-        parts = (network.head, NormalParamExtractor), (mapping, biased_softplus), (network.mlp, MLP)
+        parts = (mapping, biased_softplus), (network.mlp, MLP)
+        if type(network.head) not in (NormalParamExtractor, CorrelatedHead):
+            return None
         if any(type(x) is not cls for x, cls in parts) or self[1].distribution_class is not TanhNormal:
             return None
         layers, activations = list(network.mlp)[::2], list(network.mlp)[1::2]
@@ -94,7 +144,7 @@ class TanhGaussianActor(ProbabilisticActor):
             return None
         if len(activations) != len(layers) - 1 or not all(map(_is_pointwise, activations)):
             return None
-        return PlainTanhGaussian(self, layers, activations, kind is ExplorationType.RANDOM)
+        return PlainTanhGaussian(self, layers, activations, is_random)
 
 
 class PlainTanhGaussian:
@@ -104,18 +154,19 @@ class PlainTanhGaussian:
         self, actor: TanhGaussianActor, layers: list[nn.Linear], activations: list[nn.Module], is_random: bool
     ) -> None:
         network, sample = actor[0].module, actor[1]
-        self.in_keys, self.out_keys, self.scales = list(actor[0].in_keys), list(actor.out_keys), network.scales
-        self.widths = network.widths
+        self.scales, self.widths = network.scales, network.widths
+        self.in_keys, self.out_keys = list(actor[0].in_keys)[: len(self.scales)], list(actor.out_keys)
+        self.rho = actor.head.rho if actor.head else None
         self.head, self.activations, self.is_random = network.head, activations, is_random
         self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
         self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
-        self.width = layers[-1].out_features // 2
-        bounds, mapping = sample.distribution_kwargs, self.head.scale_mapping
-        self.low, self.high = (bounds[name].tolist() if bounds else None for name in ("low", "high"))
+        self.size = layers[-1].out_features // 2
+        self.low, self.high = (x if x is None else x.tolist() for x in _bounds(actor))
+        mapping = self.head.scale_mapping
         self.signature = (
             *map(str, (self.in_keys, self.out_keys, self.scales, self.activations, self.low, self.high)),
             *(tuple(x.shape) for x in self.weights),
-            (self.head.scale_lb, mapping.bias, mapping.min_val),
+            (self.head.scale_lb, mapping.bias, mapping.min_val, self.rho),
         )
 
     def normalize(self, key: Any, loc: Tensor, scale: Tensor) -> None:
@@ -131,21 +182,31 @@ class PlainTanhGaussian:
         x, weight = torch.cat([x[:1] for x in inputs], -1), self.weights[0]
         return (x.shape[-1], x.dtype, x.device) == (weight.shape[1], weight.dtype, weight.device)
 
-    def drawn(self, steps: int, n: int) -> Tensor:
-        """Standard normal noise, as the distribution would draw it step by step; zeros for the mode."""
-        like = self.weights[0]
-        noise = torch.zeros((steps, n, self.width), device=like.device, dtype=like.dtype)
-        for x in noise if self.is_random else ():
-            x.normal_()
-        return noise
+    def drawn(self, steps: int, n: int, before: Mapping[Any, Tensor]) -> Tensor:
+        """Standard normal noise, as the distribution would draw it step by step; zeros for the mode.
 
-    def noise(self, action: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
-        """The noise that led to actions (n, k)."""
-        if self.low is not None:
-            low, high = (action.new_tensor(bound) for bound in (self.low, self.high))
-            action = (2.0 * action - (high + low)) / (high - low)
-        limit = 1.0 - torch.finfo(action.dtype).resolution
-        return (torch.atanh(action.clamp(-limit, limit)) - loc) / scale
+        Noise that is correlated in time comes with that of the step before, (steps, n, 2 size).
+        """
+        like = self.weights[0]
+        noise = like.new_zeros((steps, n, self.size))
+        if self.rho is None:
+            for x in noise if self.is_random else ():
+                x.normal_()
+            return noise
+        last = before["noise"] if "noise" in before else _first_noise(torch.zeros_like(noise[0]), self.is_random)
+        earlier = []
+        for x in noise:
+            earlier.append(last)
+            last = self.head.next(last, x.normal_() if self.is_random else x)
+        return torch.cat((noise, torch.stack(earlier)), -1)
+
+    def drawn_again(self, tensordict: TensorDictBase) -> Tensor:
+        """What was drawn for the actions of a rollout (*), as rows (n, k)."""
+        action, loc, scale = (tensordict[key].detach() for key in ("action", "loc", "scale"))
+        low, high = (None if x is None else action.new_tensor(x) for x in (self.low, self.high))
+        noise = [_innovation(action, loc, scale, low, high)]
+        noise += [tensordict["noise_before"].detach()] if self.rho is not None else []
+        return torch.cat(noise, -1).flatten(0, -2)
 
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
@@ -185,8 +246,9 @@ class PlainTanhGaussian:
         pairs = zip(traces[:count], traces[count:], strict=True)
         return [g for x, grad in pairs for g in (grad.t() @ x, grad.sum(0))]
 
-    def _sample(self, raw: Tensor, noise: Tensor) -> dict[Any, Tensor]:
-        loc, scale = self.head(raw)
+    def _sample(self, raw: Tensor, drawn: Tensor) -> dict[Any, Tensor]:
+        noise, *before = drawn.split(self.size, -1)
+        loc, scale = self.head(raw, *before)
         x = loc + scale * noise
         limit = 1.0 - torch.finfo(x.dtype).resolution
         squashed = torch.tanh(x)
@@ -197,6 +259,8 @@ class PlainTanhGaussian:
             low, high = (raw.new_tensor(bound) for bound in (self.low, self.high))
             action = (high + low) / 2 + (high - low) / 2 * squashed
         written = {"loc": loc, "scale": scale, "action": action}
+        if before:
+            written |= {"noise_before": before[0], "noise": self.head.next(before[0], noise)}
         if self.log_prob_key is not None:
             x = x + (torch.atanh(squashed) - x).detach()
             density = -((x - loc) ** 2) / (2 * scale**2) - scale.log() - 0.5 * math.log(2 * math.pi)
@@ -204,7 +268,32 @@ class PlainTanhGaussian:
             if self.low is not None:
                 slope = slope + ((high - low) / 2).log()
             written[self.log_prob_key] = (density - slope).sum(-1)
-        return written
+        return {key: written[key] for key in self.out_keys}
+
+
+def _is_random(actor: ProbabilisticActor) -> bool | None:
+    """Whether it samples, or takes the mode; None where it is asked for something else."""
+    kind = exploration_type() or actor[1].default_interaction_type
+    return {ExplorationType.RANDOM: True, ExplorationType.DETERMINISTIC: False}.get(kind)
+
+
+def _bounds(actor: ProbabilisticActor) -> tuple[Tensor | None, Tensor | None]:
+    """The least and the greatest action, each (k); None for -1 and 1."""
+    bounds = actor[1].distribution_kwargs
+    return (bounds["low"], bounds["high"]) if bounds else (None, None)
+
+
+def _first_noise(x: Tensor, is_random: bool | None) -> Tensor:
+    """Noise before the first step, into a tensor (*, k)."""
+    return x.normal_() if is_random else x.zero_()
+
+
+def _innovation(action: Tensor, loc: Tensor, scale: Tensor, low: Tensor | None, high: Tensor | None) -> Tensor:
+    """The standard normal numbers that led to actions (*, k) of a tanh-Gaussian."""
+    if low is not None:
+        action = (2.0 * action - (high + low)) / (high - low)
+    limit = 1.0 - torch.finfo(action.dtype).resolution
+    return (torch.atanh(action.clamp(-limit, limit)) - loc) / scale
 
 
 def _concatenated(inputs: Sequence[Tensor], scales: Sequence[float]) -> Tensor:

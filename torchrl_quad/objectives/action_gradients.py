@@ -40,9 +40,7 @@ def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
     return torch.stack([torch.zeros_like(action[..., 0, :]) if g is None else g for g in grads], -2)
 
 
-def act_again(
-    actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase, action_key: NestedKey = "action"
-) -> dict[NestedKey, Tensor]:
+def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
     """What a policy of ``make_actor`` writes in the states of a rollout with the noise of the rollout.
 
     Its values are those of the rollout as long as the policy has not changed. Its gradients reach the policy's
@@ -51,22 +49,20 @@ def act_again(
     Args:
         actor: the policy that flew the rollout.
         params: its parameters.
-        tensordict: the rollout (*), with ``loc`` and ``scale``.
-        action_key: of the actions.
+        tensordict: the rollout (*), with all that the policy wrote.
 
     Raises:
         NotImplementedError: the policy is another one than ``make_actor`` builds, whose noise is not known.
     """
     with params.to_module(actor):
         plain = actor.plain() if hasattr(actor, "plain") else None
-        if not hasattr(plain, "noise"):
+        if not hasattr(plain, "drawn_again"):
             raise NotImplementedError(
                 "Gradients that are clipped in each step need a policy as make_actor builds it, whose noise follows "
                 "from its actions. Build it so, without hooks or changed parts, or leave clip_action_gradient=None."
             )
         inputs = [rows(tensordict[key].detach()) for key in plain.in_keys]
-        noise = plain.noise(*(rows(tensordict[key].detach()) for key in (action_key, "loc", "scale")))
-        _, written = plain.forward(plain.weights, inputs, noise)
+        _, written = plain.forward(plain.weights, inputs, plain.drawn_again(tensordict))
     return {key: x.view(*tensordict.shape, *x.shape[1:]) for key, x in written.items()}
 
 

@@ -26,7 +26,7 @@ def sample_action(actor: TensorDictModule, params: TensorDictParams, tensordict:
         if plain is None:
             return actor(tensordict)
         inputs = [rows(tensordict[key]) for key in plain.in_keys]
-        _, written = plain.forward(plain.weights, inputs, plain.drawn(1, len(inputs[0]))[0])
+        _, written = plain.forward(plain.weights, inputs, plain.drawn(1, len(inputs[0]), {})[0])
     return tensordict.update({key: x.view(*tensordict.shape, *x.shape[1:]) for key, x in written.items()})
 
 

@@ -119,7 +119,8 @@ class PathwiseCriticLoss(PathwiseLoss):
 
     def _critic_inputs(self) -> set[NestedKey]:
         """The entries of a state that the critic, and the actor before it, read."""
-        names = set(self.actor_network.in_keys) | set(getattr(self, self.critic_name).in_keys)
+        actor = self.actor_network
+        names = set(actor.in_keys) - set(actor.out_keys) | set(getattr(self, self.critic_name).in_keys)
         return names - {self.tensor_keys.action}
 
     def _require_rollout(self, tensordict: TensorDictBase) -> None:

@@ -232,7 +232,7 @@ class PathwiseLoss(LossModule):
         objective, metadata = self._objective(tensordict)
         if self.clip is not None:
             grad, metadata["clipped"] = self.clip(self._action_gradient(objective, tensordict))
-            written = act_again(self.actor_network, self.actor_network_params, tensordict, self.tensor_keys.action)
+            written = act_again(self.actor_network, self.actor_network_params, tensordict)
             learned = (grad * written[self.tensor_keys.action]).sum((-2, -1)) + self._beside_actions(tensordict)
             objective = objective.detach() + learned - learned.detach()
             tensordict = tensordict.copy().update(written)

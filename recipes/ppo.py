@@ -10,6 +10,7 @@ from torchrl.objectives.value import GAE
 from training.building import iterations, make_optimizer, network, set_up, shuffled, update_normalizer
 from training.launch import recipe
 from training.loop import Run
+from training.processes import mean_of_all
 
 from torchrl_quad import differentiable_rollout, make_value
 
@@ -29,13 +30,21 @@ def main(cfg: DictConfig) -> None:
         with torch.no_grad():
             data, run.carry = differentiable_rollout(env, actor, run.carry, cfg.horizon)
             advantage(data)
-        read = data.select(*loss.in_keys, loss.tensor_keys.advantage, loss.tensor_keys.value_target)
-        for _ in range(cfg.epochs):
-            for batch in shuffled(read, cfg.batch_size):
+
+        read = data.select(*loss.in_keys, loss.tensor_keys.advantage, loss.tensor_keys.value_target, strict=False)
+        moved = 0.0  # how far the policy is from the one that flew
+        for batch in shuffled(read, cfg.batch_size, cfg.epochs):
+            if cfg.actor.max_kl is None or moved < cfg.actor.max_kl:
                 losses = loss(batch)
-                loss_actor = losses["loss_objective"] + losses.get("loss_entropy", 0.0)
+                moved = mean_of_all(losses["kl_approx"])
+                loss_actor, loss_critic = (
+                    losses["loss_objective"] + losses.get("loss_entropy", 0.0),
+                    losses["loss_critic"],
+                )
                 run.optimise("actor", actor_optimizer, loss_actor, cfg.actor.max_grad_norm)
-                run.optimise("critic", critic_optimizer, losses["loss_critic"], cfg.critic.max_grad_norm)
+            else:
+                loss_critic = loss.loss_critic(batch)[0].mean()
+            run.optimise("critic", critic_optimizer, loss_critic, cfg.critic.max_grad_norm)
 
         update_normalizer(env, data)
         actor_schedule.step()

@@ -18,7 +18,7 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import ObservationNormalizer, TrustRegion, make_actor, make_env
 from torchrl_quad.objectives import PathwiseLoss
-from training.processes import cat_all, rank, world_size
+from training.processes import cat_all, mean_of_all, rank, world_size
 
 SEEDS_PER_RUN = 10_000  # the process of rank r draws from seed + r * this
 
@@ -49,7 +49,8 @@ def build_env(cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = Fals
 def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModuleBase:
     """Build the policy of a configuration; it writes log-probabilities if the loss needs them."""
     log_prob = cfg.algorithm == "ppo" or cfg.loss.alpha != 0
-    return make_actor(env, **network(cfg, "actor"), scale_init=cfg.actor.scale_init, return_log_prob=log_prob)
+    noise = {"scale_init": cfg.actor.scale_init, "noise_correlation": cfg.actor.noise_correlation}
+    return make_actor(env, **network(cfg, "actor"), **noise, return_log_prob=log_prob)
 
 
 def network(cfg: DictConfig, name: str) -> dict[str, Any]:
@@ -97,7 +98,7 @@ class TargetUpdate(SoftUpdate):
 
 def trust_region(cfg: DictConfig, actor: TensorDictModuleBase) -> TrustRegion:
     """The bound of a configuration on what an update does to the policy; all processes shorten alike."""
-    return TrustRegion(actor, cfg.actor.max_kl, average=lambda x: cat_all(x.view(1)).mean())
+    return TrustRegion(actor, cfg.actor.max_kl, average=mean_of_all)
 
 
 def update_normalizer(env: EnvBase, rollout: TensorDictBase) -> None:
@@ -114,7 +115,8 @@ def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDict
         yield steps[torch.randint(len(steps), (cfg.batch_size,), device=steps.device)]
 
 
-def shuffled(rollout: TensorDictBase, batch_size: int) -> Iterable[TensorDictBase]:
-    """All steps of a rollout once, in random batches."""
+def shuffled(rollout: TensorDictBase, batch_size: int, epochs: int) -> Iterator[TensorDictBase]:
+    """All steps of a rollout ``epochs`` times, in random batches."""
     steps = rollout.reshape(-1)
-    return steps[torch.randperm(len(steps), device=steps.device)].split(batch_size)
+    for _ in range(epochs):
+        yield from steps[torch.randperm(len(steps), device=steps.device)].split(batch_size)

@@ -74,6 +74,11 @@ def cat_all(x: Tensor) -> Tensor:
     return torch.cat(parts)
 
 
+def mean_of_all(x: Tensor) -> Tensor:
+    """The mean of a scalar over the processes."""
+    return cat_all(x.detach().view(1)).mean()
+
+
 def backward(loss: Tensor, optimizer: torch.optim.Optimizer, max_grad_norm: float) -> tuple[Tensor, Tensor]:
     """Compute the gradient of a loss, average it over the processes, and clip it.
 

@@ -108,11 +108,14 @@ class Actor(Optimised):
     """The policy."""
 
     scale_init: Positive = Field(description="The standard deviation of the policy's noise at the start.")
+    noise_correlation: Annotated[Real, Field(ge=0, lt=1)] = Field(
+        description="Of the policy's noise in two steps that follow each other; 0 is white noise."
+    )
     max_kl: Positive | None = Field(description="How far one update may move the policy; null for no bound.")
 
 
 class Critic(Optimised):
-    """The critic; PPO has no target network and no updates of its own."""
+    """The critic; that of PPO has no target network."""
 
     lmbda: Fraction = Field(description="The lambda of the TD(lambda) targets; 0.95 is usual.")
     updates: int | None = Field(None, ge=1, le=100_000, description="Gradient steps of the critic per iteration.")

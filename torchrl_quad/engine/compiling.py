@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import types
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -59,7 +61,8 @@ class Compiled:
         """Check everything, and call."""
         self.direct = None
         try:
-            outputs = self.checked(*inputs)
+            with _no_collection():
+                outputs = self.checked(*inputs)
             self.direct = None if self.last is None else _Direct.of(self.last, inputs, outputs)
         finally:
             self.last = None  # it holds tensors
@@ -116,6 +119,18 @@ class _Direct:
                 values[i] = x
         outputs = self.function(*values)
         return tuple([outputs[i] for i in self.results])
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Without the garbage collector: an eighth of a compilation went by finding that its graphs are in use."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def _own(method: types.MethodType) -> types.MethodType:

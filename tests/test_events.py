@@ -147,7 +147,6 @@ def test_gradients_in_actions_and_start_are_those_of_the_return_in_continuous_ti
                 along[step] = reference(values)[part]
             expected = (8.0 * (along[1] - along[-1]) - (along[2] - along[-2])) / (12.0 * size)
             slope = (grad.flatten(1) * direction).sum(1)
-            print(task, i, part, ((slope - expected).abs() / expected.abs()).max().item())
             torch.testing.assert_close(slope, expected, rtol=1e-6, atol=1e-12)
 
 

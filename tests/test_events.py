@@ -8,7 +8,7 @@ from flying import fly
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
-from torchrl_quad import ActionSequence, LandingEnv, RacingEnv, make_env
+from torchrl_quad import ActionSequence, LandingEnv, RacingEnv, audit_reward, make_env
 from torchrl_quad.envs import Event, ball_entry, level_crossing
 from torchrl_quad.envs.events import time_terms
 
@@ -169,6 +169,18 @@ def test_values_and_all_other_terms_and_their_gradients_are_the_same_with_the_op
     assert not terms.pop(TIMED[task]).any()
     for key, x in flights[1].items(True, True):
         assert torch.equal(flights[0][key], x), key
+
+
+@pytest.mark.parametrize("task", STARTS)
+def test_the_audit_says_that_a_term_has_a_gradient_in_time_only(task):
+    env, state = STARTS[task](event_discount=GAMMA)
+    actions = actions_of(env, task).requires_grad_()
+    audit = audit_reward(flight(env, state, actions), actions, gamma=GAMMA)
+    timed = audit[TIMED[task]]
+    assert timed.verdict == "gradient in time only" and audit[PAID[task]].verdict == "no gradient"
+    assert timed.return_share == 0.0 and timed.gradient_share > 0.0
+    (row,) = (line for line in str(audit).splitlines() if line.startswith(TIMED[task]))
+    assert row.split()[1] == "0" and row.endswith("%  gradient in time only")
 
 
 @pytest.mark.parametrize(

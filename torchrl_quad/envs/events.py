@@ -12,8 +12,9 @@ from torch import Tensor
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.terms import norm
 
-STEEPEST = 0.3  # least share of the way that counts as across the surface: grazing passes have a bounded derivative
-SLOWEST = 1e-4  # least way across the surface in a control step, in the unit of the quantity: so do those who stand
+# Derivatives of passes that graze a surface, and of those who stand before it, would have no bound. The way across the
+# surface counts as at least this share of the whole way, and as at least so much in the unit of the quantity.
+GRAZING, SLOW = 0.3, 1e-4
 
 
 class Event(NamedTuple):
@@ -46,7 +47,7 @@ def ball_entry(start: Tensor, end: Tensor, centre: Tensor | float, radius: float
     time = (outside / (inwards + root).clamp_min(1e-12)).clamp(0.0, 1.0)  # this form divides by no length of the way
     normal = first + time * way
     normal = normal / norm(normal).clamp_min(1e-12)
-    speed = torch.maximum(-(normal * way).sum(-1, keepdim=True), STEEPEST * norm(way)).clamp_min(SLOWEST)
+    speed = torch.maximum(-(normal * way).sum(-1, keepdim=True), GRAZING * norm(way)).clamp_min(SLOW)
     late = (normal * _moved(start, end, centre, time)).sum(-1, keepdim=True) / speed
     return time + torch.where(outside > 0.0, late, 0.0)
 
@@ -65,7 +66,7 @@ def level_crossing(start: Tensor, end: Tensor, level: float) -> Tensor:
     """
     above, drop = start.detach() - level, (start - end).detach()
     time = (above / drop.clamp_min(1e-12)).clamp(0.0, 1.0)
-    late = _moved(start, end, level, time) / drop.clamp_min(SLOWEST)
+    late = _moved(start, end, level, time) / drop.clamp_min(SLOW)
     return time + torch.where(above > 0.0, late, 0.0)
 
 

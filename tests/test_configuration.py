@@ -56,6 +56,7 @@ REFUSED = [  # of ABPT, unless a recipe is named
     ("num_envs=100000000", "num_envs=100000000: it must be at most 10000000. .* fit into no memory"),
     ("env.action_delay=1000000", "env.action_delay=1000000: it must be at most 1000"),
     ("env.dt=0", "env.dt=0: it must be greater than 0"),
+    ("env.event_discount=0", "env.event_discount=0.*: it must be greater than 0. .* null: no gradient in it"),
     ("env.dynamics=point", "env.dynamics=point: it must be 'quadrotor' or 'point_mass'"),
     ("env=3", "env=3: it must be a section with settings of its own"),
     ("loss.alpha=never", "loss.alpha=never: it must be a number. .* or auto to learn it"),
@@ -103,7 +104,7 @@ def test_every_configuration_that_ships_passes_the_schema_with_its_tuned_values(
         tuned = yaml.safe_load((CONFIG / f"tuned/{recipe}_{task}.yaml").read_text())
         assert contains(OmegaConf.to_container(cfg), tuned)
     assert composed(recipe, "task=racing", "horizon=7").horizon == 7
-    check(composed(recipe, "env.weights={velocity: 0}", "env.wind={gust: 0.5}"))
+    check(composed(recipe, "env.weights={velocity: 0}", "env.wind={gust: 0.5}", "env.event_discount=0.99"))
 
 
 def contains(whole, part):

@@ -15,6 +15,7 @@ from torchrl_quad import (
     make_actor,
     make_env,
 )
+from torchrl_quad.envs import Event
 
 nan = float("nan")
 visfly = load_drone("visfly")
@@ -27,6 +28,11 @@ def flight(env):
 
 def linear(inputs, outputs, in_key="observation", out_key="action", **kwargs):
     return TensorDictModule(nn.Linear(inputs, outputs, **kwargs), in_keys=[in_key], out_keys=[out_key])
+
+
+def near(state, **other):
+    """An event, with some of it wrong."""
+    return Event(**{"happened": state["step"] > 0, "time": state["position"][:, :1], "amount": 1.0, **other})
 
 
 # -- options -----------------------------------------------------------------------------------------------------------
@@ -87,6 +93,9 @@ def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them(task,
         ({"weights": {"velocity": "much"}}, "weights: velocity must be a finite number, got 'much'"),
         ({"weights": {"velocity": torch.ones(3)}}, "weights: velocity must be a finite number, got tensor"),
         ({"weights": {"velocity": torch.tensor(nan)}}, "weights: velocity must be a finite number, got tensor"),
+        *(({"event_discount": x}, f"event_discount must be above 0 and at most 1, .* got {x}") for x in (0, 1.01, nan)),
+        ({"event_discount": True}, "event_discount must be above 0 and at most 1, such as the discount of the loss"),
+        ({"event_discount": "gamma"}, "or None for events without a gradient; got 'gamma'"),
         ({"drone": visfly.replace(mass=460.0)}, r"to hover, its rotors would have to turn at .* Check mass \[kg\]"),
         ({"drone": visfly.replace(max_thrust_to_weight=0.8)}, "max_thrust_to_weight .* must be above 1 to hover; got"),
         (
@@ -155,6 +164,11 @@ def test_a_gate_needs_a_finite_radius():
             "advance must return the whole state, and 'target'",
         ),
         ("advance", lambda _, p, s: {**s, "target": s["target"].double()}, "float32.; got .* torch.float64"),
+        ("events", lambda _, p, s: {"near": 0.5}, r"\['near'\] must be an Event; got float"),
+        ("events", lambda _, p, s: {"near": near(s, happened=s["step"])}, r"\.happened must be .* torch.bool; got"),
+        ("events", lambda _, p, s: {"near": near(s, time=s["position"])}, r"\.time must be a tensor \(4, 1\), .* got"),
+        ("events", lambda _, p, s: {"near": near(s, amount=None)}, r"\.amount must be a tensor \(4, 1\), .* NoneType"),
+        ("events", lambda _, p, s: {"near": near(s, term="gate")}, "term must be one of survival, .*; got 'gate'"),
         (
             "initial_state",
             lambda self, n: {**HoveringEnv.initial_state(self, n), "legs": torch.zeros(n)},
@@ -165,6 +179,15 @@ def test_a_gate_needs_a_finite_radius():
 def test_a_task_of_another_form_is_refused_by_the_name_of_its_method(method, wrong, message):
     with pytest.raises(ValueError, match="OwnEnv." + (message if message.startswith(method) else ".*" + message)):
         type("OwnEnv", (HoveringEnv,), {method: wrong})(num_envs=4)
+
+
+def test_an_event_whose_term_has_a_name_that_is_taken_is_refused():
+    methods = {
+        "events": lambda _, previous, state: {"near": near(state)},
+        "reward_terms": lambda _, state: {"near_time": state["position"][:, :1]},
+    }
+    with pytest.raises(ValueError, match="gives the term 'near_time', which the reward has already: rename one"):
+        type("OwnEnv", (HoveringEnv,), methods)(num_envs=4)
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ EVERYTHING = {
     "wind": {"mean": [1.0, 0.0, 0.0], "gust": 0.5},
     "randomize": {"mass": {"scale": [0.8, 1.2]}, "rotor_positions": {"scale": [0.9, 1.1]}},
     "random_start": {"tilt": 0.3, "velocity": 0.5},
+    "event_discount": 0.99,
 }
 
 

@@ -24,15 +24,16 @@ Inputs = nn.Module | Tensor | Iterable[Tensor]
 class TermAudit:
     """The contribution of one reward term to the return of a rollout and to its gradient.
 
-    ================  ================================================================================================
-    verdict           meaning
-    ================  ================================================================================================
-    differentiable    its gradient is not zero
-    no gradient       it was paid, and its gradient is exactly zero: a first-order method does not climb it
-    constant          every step pays the same: only the length of the episode changes its return
-    not seen          this rollout never paid it, which leaves its gradient unknown
-    not finite        its gradient is NaN or infinite
-    ================  ================================================================================================
+    =====================  ===========================================================================================
+    verdict                meaning
+    =====================  ===========================================================================================
+    differentiable         its gradient is not zero
+    gradient in time only  its value is zero in every step, and its gradient is not: that of an event's time
+    no gradient            it was paid, and its gradient is exactly zero: a first-order method does not climb it
+    constant               every step pays the same: only the length of the episode changes its return
+    not seen               this rollout never paid it, which leaves its gradient unknown
+    not finite             its gradient is NaN or infinite
+    =====================  ===========================================================================================
     """
 
     mean_return: float  #: over environments, with its sign
@@ -279,7 +280,7 @@ def _verdict(term: Tensor, gradient_norm: float) -> str:
     if not math.isfinite(gradient_norm):
         return "not finite"
     if gradient_norm > 0.0:
-        return "differentiable"
+        return "differentiable" if term.any() else "gradient in time only"
     if not term.any():
         return "not seen"
     return "constant" if term.min() == term.max() else "no gradient"

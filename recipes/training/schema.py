@@ -77,6 +77,9 @@ class Env(Section):
     observation_delay: int = Field(ge=0, le=1000, description="Control steps by which observations lag behind.")
     max_episode_steps: Size = Field(description="Control steps after which an episode is truncated.")
     observe_last_action: bool
+    event_discount: Annotated[Real, Field(gt=0, le=1)] | None = Field(
+        None, description="The discount per control step by which the time of an event counts; null: no gradient in it."
+    )
 
 
 class Optimised(Section):

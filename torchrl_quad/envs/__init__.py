@@ -4,6 +4,7 @@ from typing import Any
 
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.disturbances import Disturbance
+from torchrl_quad.envs.events import Event, ball_entry, level_crossing
 from torchrl_quad.envs.hovering import HoveringEnv
 from torchrl_quad.envs.landing import LandingEnv
 from torchrl_quad.envs.racing import RacingEnv, load_track
@@ -13,12 +14,15 @@ from torchrl_quad.envs.tracking import TrackingEnv
 __all__ = [
     "TASKS",
     "Disturbance",
+    "Event",
     "HoveringEnv",
     "LandingEnv",
     "QuadrotorEnv",
     "RacingEnv",
     "Task",
     "TrackingEnv",
+    "ball_entry",
+    "level_crossing",
     "load_track",
     "make_env",
 ]

@@ -58,6 +58,7 @@ class QuadrotorEnv(Task, EnvBase):
             :class:`~torchrl_quad.envs.disturbances.Sensors`, or one of these.
         observation_delay: control steps by which the observation of the drone lags behind.
         weights: other weights of reward terms, by name: ``{"velocity": 0.0}``.
+        event_discount: discount per control step by which the time of an event counts; None: events have no gradient.
         randomize: distributions of parameters for another drone in each episode, a mapping or a YAML file; see
             :class:`~torchrl_quad.envs.disturbances.DroneRandomization`.
         wind: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.Wind`, or one of these.
@@ -92,6 +93,7 @@ class QuadrotorEnv(Task, EnvBase):
         observation_noise: Mapping[str, float] | Disturbance | None = None,
         observation_delay: int = 0,
         weights: Mapping[str, float] | None = None,
+        event_discount: float | None = None,
         randomize: str | Path | Mapping | None = None,
         wind: Mapping[str, Any] | Disturbance | None = None,
         random_start: Mapping[str, float] | Disturbance | None = None,
@@ -101,16 +103,16 @@ class QuadrotorEnv(Task, EnvBase):
         checks.refuse_unknown(type(self), unknown)
         substeps = checks.check_arguments(
             num_envs, dtype, seed, dynamics, dt, control_dt, action_delay, integrator, max_episode_steps,
-            observe_last_action,
+            observe_last_action, event_discount,
         )  # fmt: skip
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.num_envs, self.dtype, self.control_dt, self.action_delay = num_envs, dtype, control_dt, action_delay
         self.max_episode_steps, self.observe_last_action = max_episode_steps, observe_last_action
+        self.event_discount = event_discount
         self.initial_state_source: Callable[[int], TensorDictBase] | None = None
         params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone)
         params = checks.checked_params(params.to(device=self.device, dtype=dtype), num_envs)
-        model = {"dt": dt, "substeps": substeps, "integrator": integrator}
-        self._make_dynamics = functools.partial(DYNAMICS[dynamics], **model)
+        self._make_dynamics = functools.partial(DYNAMICS[dynamics], dt=dt, substeps=substeps, integrator=integrator)
         self.dynamics: Dynamics = self._make_dynamics(params)
         self._params = params if params.requires_grad else self.nominal
         self.weights = {**self.weights, **checks.checked_weights(weights or {}, self.weights)}

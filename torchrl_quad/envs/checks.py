@@ -16,6 +16,7 @@ from torch import Tensor
 from torchrl_quad.dynamics import DYNAMICS, INTEGRATORS, QuadrotorParams
 from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine.simulation import State
+from torchrl_quad.envs.events import Event
 
 # Beyond these an environment would not fit into memory, or take for ever to build.
 MAX_ENVS, MAX_DELAY, MAX_STEPS = 10_000_000, 1_000, 2**31
@@ -54,6 +55,7 @@ def check_arguments(
     integrator: Any,
     max_episode_steps: Any,
     observe_last_action: Any,
+    event_discount: Any,
 ) -> int:
     """Refuse arguments of an environment that are out of range; return the physics steps in a control step."""
     require_count("num_envs", num_envs, 1, MAX_ENVS)
@@ -77,6 +79,12 @@ def check_arguments(
     require(
         action_delay > 0 or not observe_last_action,
         "observe_last_action shows the commands that are on their way; with action_delay=0 there are none.",
+    )
+    is_number = isinstance(event_discount, numbers.Real) and not isinstance(event_discount, bool)
+    require(
+        event_discount is None or (is_number and 0 < event_discount <= 1),
+        "event_discount must be above 0 and at most 1, such as the discount of the loss, 0.99, or None for events "
+        f"without a gradient; got {event_discount!r}.",
     )
     return substeps
 
@@ -169,9 +177,21 @@ def check_task(env: Any, state: State) -> None:
             fields = env.dynamics.plant_fields
             require(key[1] in fields, f"Entry {key!r} changes no parameter of the drone. Choose from: {names(fields)}.")
     check("observe(state)", env.observe(state), env.dtype, None)
-    for name, term in named("reward_terms(state)", env.reward_terms(state)).items():
+    terms = named("reward_terms(state)", env.reward_terms(state))
+    for name, term in terms.items():
         hint = " Sum a vector over its components: .sum(-1, keepdim=True)."
         check(f"reward_terms(state)[{name!r}]", term, env.dtype, hint=hint)
+    for name, event in named("events(previous, state)", env.events(state, state)).items():
+        method = f"events(previous, state)[{name!r}]"
+        require(isinstance(event, Event), f"{task}.{method} must be an Event; got {type(event).__name__}.")
+        check(f"{method}.happened", event.happened, torch.bool)
+        check(f"{method}.time", event.time, env.dtype)
+        if not isinstance(event.amount, numbers.Real) and getattr(event.amount, "numel", lambda: 0)() != 1:
+            check(f"{method}.amount", event.amount, env.dtype)
+        taken = f"{task}.{method} gives the term '{name}_time', which the reward has already: rename one of them."
+        require(f"{name}_time" not in terms, taken)
+        unknown = f"{task}.{method}.term must be one of {names(terms)}, or None; got {event.term!r}."
+        require(event.term is None or event.term in terms, unknown)
     for name, metric in named("metrics(state)", env.metrics(state)).items():
         check(f"metrics(state)[{name!r}]", metric, None)
     for method in ("is_crash", "is_success"):

@@ -7,6 +7,7 @@ from torch import Tensor
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.episodes import at_episode_end
+from torchrl_quad.envs.events import Event, ball_entry, level_crossing
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric
 from torchrl_quad.envs.terms import body_observation, norm, outside
 
@@ -29,7 +30,7 @@ class LandingEnv(QuadrotorEnv):
     - descent: 0.1 (e^x - 1) / (e - 1), where x = v_d / c below v_d = c, and x = 5 - 4 v_d / c above: best is to fall at
       c metres per second;
     - approach: 0.1 (e^(1 - d / (2 c)) - 1) / (e - 1);
-    - success: 20, once; crash: -0.1. These two carry no gradient.
+    - success: 20, once; crash: -0.1. These two carry no gradient; with ``event_discount`` the time of touchdown does.
 
     The paper prints an error of the velocity instead of x; the form above is the published one.
 
@@ -91,6 +92,18 @@ class LandingEnv(QuadrotorEnv):
         sideways = (state["position"] - state["target"])[..., :2].abs().amax(-1, keepdim=True)
         slow = norm(state["velocity"]) <= self.success_speed
         return (state["position"][..., 2:] <= self.success_height) & (sideways <= self.success_radius) & slow
+
+    def events(self, previous: State, state: State) -> dict[str, Event]:
+        """``touchdown``: the last condition of success becomes true."""
+        start, end = ((x["position"] - x["target"])[..., :2] for x in (previous, state))
+        side = torch.where(start.detach() < 0.0, -1.0, 1.0)  # from which it comes nearer
+        conditions = (
+            level_crossing(previous["position"][..., 2:], state["position"][..., 2:], self.success_height),
+            level_crossing(side * start, side * end, self.success_radius),
+            ball_entry(previous["velocity"], state["velocity"], 0.0, self.success_speed),
+        )
+        time = torch.cat(conditions, -1).amax(-1, keepdim=True)
+        return {"touchdown": Event(self.is_success(state), time, self.weights["success"], term="success")}
 
     def metrics(self, state: State) -> State:
         return {"position_error": self.horizontal_distance(state), "landing_speed": norm(state["velocity"])}

@@ -14,6 +14,7 @@ from torchrl_quad.dynamics import presets
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.envs.events import Event, ball_entry
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
 from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, norm, outside, target_reward
 
@@ -41,8 +42,9 @@ class RacingEnv(QuadrotorEnv):
     Reward "velocity": 0.02 min(v_t, 15) - 0.02 |v_a| / (d + 1) - 0.001 |w|, and a gate bonus of 5, where v_t is the
     velocity towards the next gate, v_a the part of the velocity across that direction, and d the distance to the gate
     [m]. Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. The binary bonus
-    is paid in the step that passes a gate and carries no gradient. Two relaxations replace it by a bonus in each step:
-    "log", -5 log(d + 0.01), and "reciprocal", 1 / (d + 0.05).
+    is paid in the step that passes a gate and carries no gradient; with ``event_discount`` the time at which the drone
+    enters the gate's sphere does. Two relaxations replace the bonus by one in each step: "log", -5 log(d + 0.01), and
+    "reciprocal", 1 / (d + 0.05).
 
     A gate is passed when the straight line that the drone flew in a control step comes within 0.3 m of its centre. The
     reward of that step is already about the gate after it.
@@ -157,6 +159,14 @@ class RacingEnv(QuadrotorEnv):
             along = ((point - start) * line).sum(-1, keepdim=True)
             fraction = (along / line.square().sum(-1, keepdim=True).clamp_min(1e-12)).clamp(0.0, 1.0)
             return norm(start + fraction * line - point)
+
+    def events(self, previous: State, state: State) -> dict[str, Event]:
+        """``gate``: the drone enters the sphere of the gate that it passes in this step."""
+        if self.gate_bonus != "binary":
+            return {}
+        ends = previous["position"], state["position"]
+        time = ball_entry(*ends, previous["target"], self.track["gate_radius"])
+        return {"gate": Event(state["gate_passed"], time, self.weights["gate"])}
 
     def observe(self, state: State) -> Tensor:
         after = self.gates[(state["gate"][:, 0] + 1) % len(self.gates)]

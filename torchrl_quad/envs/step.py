@@ -14,6 +14,7 @@ from torchrl_quad.engine import Transition, nested
 from torchrl_quad.engine.packing import like
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.checks import check_action, restore_state
+from torchrl_quad.envs.events import time_terms
 from torchrl_quad.envs.guard import MAX_VALUE, Containment, Guard, is_true
 from torchrl_quad.envs.task import Task
 
@@ -32,6 +33,7 @@ class ControlStep:
         self.env, self.dynamics, self.substeps = env, env.dynamics, env.dynamics.substeps
         self.safe_state, self.guard = safe_state, Guard(safe_state, env.dynamics, env.task_entries)
         self.task_advances = type(env).advance is not Task.advance
+        self.event_names = list(env.events(safe_state, safe_state)) if env.event_discount is not None else []
         self.drawn = [key[1] for key in safe_state if isinstance(key, tuple) and key[0] == "drone"]
 
     def __call__(self, state: State, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Transition:
@@ -84,10 +86,12 @@ class ControlStep:
                 new = advanced[key]
                 state[key] = new if everywhere else torch.where(like(keep, new), new, state[key])
         terms = env.reward_terms(state)
-        if not everywhere:
-            terms = {name: torch.where(keep, term, 0.0) for name, term in terms.items()}
         crash, success = env.is_crash(state) | ~keep, env.is_success(state) & keep
         terminated = crash | success if env.ends_on_success else crash
+        if self.event_names:
+            terms = {**terms, **self.event_terms(before, state, terms, terminated)}
+        if not everywhere:
+            terms = {name: torch.where(keep, term, 0.0) for name, term in terms.items()}
         truncated = state["step"] >= env.max_episode_steps
         outputs = {
             **self.measure(state),
@@ -100,6 +104,13 @@ class ControlStep:
             "done": terminated | truncated,
         }
         return Transition(state, outputs, valid)
+
+    def event_terms(self, before: State, state: State, terms: State, terminated: Tensor) -> State:
+        """The reward terms that carry the gradients in the times of events; their values are zero."""
+        env = self.env
+        old = {key: before[key] if key in env.task_entries else x for key, x in state.items()}
+        old_terms = env.reward_terms({key: x.detach() for key, x in old.items()})
+        return time_terms(env.events(before, state), env.event_discount, terms, old_terms, terminated)
 
     def measure(self, state: State) -> dict[str, Any]:
         """The outputs that any state has, also the first of an episode."""
@@ -122,6 +133,7 @@ class ControlStep:
         no = torch.zeros_like(state["step"], dtype=torch.bool)
         flags = {name: no.clone() for name in ("crash", "terminated", "truncated", "done")}
         terms = {name: torch.zeros_like(term) for name, term in self.env.reward_terms(state).items()}
+        terms |= {f"{name}_time": torch.zeros_like(state["position"][:, :1]) for name in self.event_names}
         return {**self.measure(state), "reward_terms": terms, "success": self.env.is_success(state), **flags}
 
     def reset(self, state: State) -> dict[str, Any]:

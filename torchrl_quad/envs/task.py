@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl_quad.dynamics import Dynamics, QuadrotorParams
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.episodes import summarise_episodes
+from torchrl_quad.envs.events import Event
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
 
@@ -74,6 +75,15 @@ class Task(abc.ABC):
     def advance(self, previous: State, state: State) -> State:
         """The state with the task's own entries brought from the previous step to this one; the drone has flown."""
         return state
+
+    def events(self, previous: State, state: State) -> dict[str, Event]:
+        """What pays at an instant within a step, by name: the same names in each step.
+
+        With ``event_discount``, the return gets its derivative in the time of each event; see
+        :class:`~torchrl_quad.envs.Event`. ``previous`` is the state at the start of the control step, ``state`` the one
+        at its end, with the task's own entries advanced.
+        """
+        return {}
 
     def metrics(self, state: State) -> State:
         """Measurements beside the reward, by name, each (num_envs, 1), without gradient."""

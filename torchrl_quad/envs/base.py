@@ -186,9 +186,8 @@ class QuadrotorEnv(Task, EnvBase):
         return self
 
     def flies_inside(self, policy: Any) -> bool:
-        """Whether :meth:`rollout` flies a policy inside the compiled step, as it does those of ``make_actor``, which is
-        fastest, or calls it before each step; the numbers are the same. Under transforms it is called, except that
-        ``differentiable_rollout`` flies it inside under an ObservationNormalizer alone."""
+        """Whether :meth:`rollout` flies a policy inside the compiled step, as those of ``make_actor``, which is fastest,
+        or calls it before each step, as under transforms (but for ``differentiable_rollout`` under a normaliser)."""
         return flies_inside(self._stepper, policy)
 
     def eager(self) -> QuadrotorEnv:

@@ -186,7 +186,7 @@ class QuadrotorEnv(Task, EnvBase):
         return self
 
     def flies_inside(self, policy: Any) -> bool:
-        """Whether :meth:`rollout` flies a policy inside the compiled step, as those of ``make_actor``, which is fastest,
+        """Whether :meth:`rollout` flies a policy inside the compiled step, as those of ``make_actor``, the fastest way,
         or calls it before each step, as under transforms (but for ``differentiable_rollout`` under a normaliser)."""
         return flies_inside(self._stepper, policy)
 

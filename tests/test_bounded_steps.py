@@ -192,8 +192,21 @@ def test_an_update_is_shortened_to_the_bound():
     assert long[0] < 100 * short[0]
 
 
+def test_a_policy_without_noise_may_still_move():
+    env = HoveringEnv(num_envs=64)
+    actor = make_actor(env, scale_init=1e-3)
+    rollout = env.rollout(8, actor, break_when_any_done=False)
+    with torch.no_grad():
+        actor[0].module.mlp[-1].bias[0] += 0.01
+    found = [TrustRegion(actor, 1.0, min_scale=x).divergence(rollout).item() for x in (0.0, 0.1)]
+    expected = [0.01**2 / (2 * scale**2) for scale in (0.01, 0.1)]  # NormalParamExtractor gives no less than 0.01
+    assert found == pytest.approx(expected, rel=1e-3)
+
+
 def test_a_trust_region_knows_what_it_needs(env):
     actor = make_actor(env)
+    with pytest.raises(ValueError, match="min_scale must be a finite number that is not negative, got -1"):
+        TrustRegion(actor, 0.1, min_scale=-1)
     with pytest.raises(ValueError, match="max_kl must be None or positive and finite, got 0"):
         TrustRegion(actor, 0.0)
     free = TrustRegion(actor, None)

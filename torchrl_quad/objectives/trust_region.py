@@ -30,13 +30,15 @@ class TrustRegion:
         actor: the policy, which writes ``loc`` and ``scale`` as those of :func:`~torchrl_quad.make_actor` do. The bound
             is on these normal distributions, before the tanh.
         max_kl: the bound, positive; None for no bound, which measures nothing.
+        min_scale: the divergence is that of distributions of at least this standard deviation. A gradient through a
+            simulator takes the noise away, and a policy without noise could not move at all within a bound.
         average: of a scalar over the processes that train together, if there are several.
 
     Attributes:
         metrics: ``kl``, the divergence of the last update before it was shortened; empty without a bound.
 
     Raises:
-        ValueError: the bound is not positive; (in use) the rollout has no ``loc`` and ``scale``.
+        ValueError: a number is out of its range; (in use) the rollout has no ``loc`` and ``scale``.
     """
 
     def __init__(
@@ -44,11 +46,14 @@ class TrustRegion:
         actor: ProbabilisticTensorDictSequential,
         max_kl: float | None,
         *,
+        min_scale: float = 0.1,
         average: Callable[[Tensor], Tensor] = lambda x: x,
     ) -> None:
         if max_kl is not None and not 0 < max_kl < math.inf:
             raise ValueError(f"max_kl must be None or positive and finite, got {max_kl}; 0.01 to 0.1 are usual.")
-        self.actor, self.max_kl, self.average = actor, max_kl, average
+        if not 0 <= min_scale < math.inf:
+            raise ValueError(f"min_scale must be a finite number that is not negative, got {min_scale}.")
+        self.actor, self.max_kl, self.min_scale, self.average = actor, max_kl, min_scale, average
         self.metrics: dict[str, Tensor] = {}
 
     @contextlib.contextmanager
@@ -71,5 +76,5 @@ class TrustRegion:
     def divergence(self, rollout: TensorDictBase) -> Tensor:
         """KL(policy that flew the rollout || policy as it is now), a scalar."""
         now = self.actor.get_dist_params(rollout.select(*self.actor.in_keys).detach())
-        old, new = (Normal(td["loc"].detach(), td["scale"].detach()) for td in (rollout, now))
+        old, new = (Normal(td["loc"].detach(), td["scale"].detach().clamp_min(self.min_scale)) for td in (rollout, now))
         return kl_divergence(old, new).sum(-1).mean()

@@ -14,7 +14,7 @@ import claims
 import matrix
 import reproduce
 import results
-import tables
+import shipped
 from claims import Claim, try_claim
 from evidence import Part, Results, bootstrap, gap, mean, probability, roughness
 
@@ -169,7 +169,6 @@ def test_the_page_is_made_of_the_results_and_what_is_written_by_hand_stays(monke
     synthetic(tmp_path, strong=True)
     monkeypatch.setattr(results, "FIGURES", {"main": results.FIGURES["main"]})
     run_main(monkeypatch, results, "--data", tmp_path)
-    assert "| hovering | 90%, " in (tmp_path / "summary.md").read_text()
     assert (tmp_path / "results/main.png").read_bytes().startswith(b"\x89PNG")
     text = (tmp_path / "results.md").read_text()
     assert all(f"| {claim.id} | {claim.text} |" in text for claim in claims.CLAIMS)
@@ -193,15 +192,14 @@ def test_other_results_leave_the_page_of_the_project_alone(monkeypatch, tmp_path
     monkeypatch.setattr(results, "draw", lambda *_: None)
     run_main(monkeypatch, results, "--data", tmp_path)
     run_main(monkeypatch, results)
-    assert filled[:2] == [tmp_path / "results.md", tmp_path / "summary.md"]
-    assert filled[2:] == [PROJECT / "docs/results.md", PROJECT / "README.md"]
+    assert filled == [tmp_path / "results.md", PROJECT / "docs/results.md"]
 
 
 def test_the_page_of_the_project_shows_what_its_data_hold():
     page, readme = ((PROJECT / name).read_text() for name in ("docs/results.md", "README.md"))
     for name, block in results.blocks(reproduce.DATA).items():
         assert f"{results.MARKER.format(name)}\n\n{block}\n\n{results.END}" in page, f"{name}: {RENEW}"
-    assert tables.summary_table(Results(reproduce.DATA)) in readme, RENEW
+    assert shipped.summary_table(reproduce.DATA) in readme, "run: python recipes/trial/shipped.py"
     assert page.count("<!-- generated") == page.count(results.END)
 
 

@@ -151,12 +151,11 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the results; the page of another is in it")
     data = parser.parse_args().data
     shipped = data.resolve() == DATA.resolve()
-    docs, readme = (DATA.parents[1], DATA.parents[2] / "README.md") if shipped else (data, data / "summary.md")
+    docs = DATA.parents[1] if shipped else data
     results = Results(data)
     for name, figure in FIGURES.items():
         draw(results, docs / f"results/{name}.png", *figure)
     fill(docs / "results.md", blocks(data))
-    fill(readme, {"summary": tables.summary_table(results)})
 
 
 if __name__ == "__main__":

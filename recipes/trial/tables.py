@@ -22,12 +22,6 @@ COLUMNS = {  # of the tables of ends: heading, column of the curves, factor, dig
     "gates": ("gates_passed", 1, 1),
     "error [cm]": ("position_error", 100, 1),
 }
-SUMMARY = {  # of the README, beside the solved episodes: column of the final evaluations, factor, digits, unit
-    "hovering": ("position_error", 100, 1, "cm"),
-    "tracking": ("tracking_rmse", 100, 1, "cm"),
-    "landing": ("landing_speed", 1, 2, "m/s"),
-    "racing": ("gates_passed", 1, 1, "gates"),
-}
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -178,28 +172,6 @@ def ranking(results: Results) -> str:
             cells.append(", ".join(VARIANTS[m].label + (" (never)" if math.isinf(times[m]) else "") for m in order))
         rows.append([task, *(cells or ["", ""])])
     return table(["task", "by steps", "by seconds"], rows)
-
-
-def summary_table(results: Results) -> str:
-    """Show what the best policies reach, and in how many seconds: the mean of solved episodes, medians of the rest."""
-    shown = ("abpt", "abpt-no-0-step", *(method for method in METHODS if method != "abpt"))
-    rows = []
-    for task, ending in (*((task, "") for task in TASKS), ("racing", "-velocity")):
-        column, factor, digits, unit = SUMMARY[task]
-        cells = []
-        for variant in shown:
-            try:
-                solved, *others = (results.final(task, variant + ending, x) for x in ("solved", column, "seconds"))
-                metric, seconds = map(np.median, others)
-                cells.append(f"{solved.mean():.0%}, {factor * metric:.{digits}f} {unit}, {seconds:.0f} s")
-            except NotRunError:
-                cells.append("")
-        reward = {"racing": ", position reward", "racing-velocity": ", velocity reward"}.get(task + ending, "")
-        rows.append([task + reward, *cells])
-    return table(["", *(VARIANTS[variant].label for variant in shown)], rows)
-
-
-# -- claims ------------------------------------------------------------------------------------------------------------
 
 
 def verdicts_table(verdicts: list[Verdict], published: list[Verdict]) -> str:

@@ -1,0 +1,99 @@
+"""Fly every recipe on every task as it ships, over ten seeds, and fill in the table of the README.
+
+python recipes/trial/shipped.py --cores 2
+
+It may be stopped at any moment. Started again, it skips what is in docs/results/data/shipped.csv, and resumes what was
+cut off. The README shows each method on each task: the episodes solved over all seeds, and by the worst of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import signal
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+from evidence import read
+from reproduce import DATA, QUICK, RECIPES, run, stop, write
+from results import fill
+from tables import table
+
+from torchrl_quad.files import machine
+
+SEEDS = tuple(range(10))
+METHODS = {"bptt": "BPTT", "shac": "SHAC", "abpt": "ABPT", "ppo": "PPO"}
+ROWS = {  # of the table: the overrides of a task, and what is shown beside the solved episodes: factor, digits, unit
+    "hovering": (["task=hovering"], "position_error", (100, 1, "cm")),
+    "tracking": (["task=tracking"], "tracking_rmse", (100, 1, "cm")),
+    "landing": (["task=landing"], "landing_speed", (1, 2, "m/s")),
+    "racing": (["task=racing"], "gates_passed", (1, 1, "gates")),
+    "racing, position reward": (["task=racing", "env.reward=position"], "gates_passed", (1, 1, "gates")),
+}
+ADDING = Lock()
+
+
+def fly(row: str, method: str, seed: int, output: Path, data: Path, quick: bool) -> None:
+    """Train once, and add the final evaluation to the results."""
+    folder = output / row.replace(", ", "-").replace(" ", "-") / method / f"seed{seed}"
+    own = [*ROWS[row][0], f"seed={seed}", *(QUICK if quick else ()), "resume=auto", f"hydra.run.dir={folder}"]
+    run([sys.executable, str(RECIPES / f"{method}.py"), *own], folder)
+    end = folder / "summary.json"
+    summary = json.loads(end.read_text()) if end.exists() else {"solved": 0.0, "crash": 1.0}  # it diverged
+    seconds = read(folder / "metrics.csv")[-1]["time/processor_seconds"]
+    flown = datetime.date.today().isoformat()
+    about = {"row": row, "method": method, "seed": seed, "machine": machine(), "flown": flown, "seconds": seconds}
+    summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}
+    with ADDING:
+        others = read(data / "shipped.csv")
+        write(data / "shipped.csv", [*others, about | {k: v for k, v in summary.items() if k not in about}])
+
+
+def cell(rows: list[dict[str, str]], metric: str, factor: float, digits: int, unit: str) -> str:
+    """Write what the seeds of a method reach: solved episodes, their least, and the medians of the rest."""
+    if not rows:
+        return ""
+    solved = [float(row["solved"]) for row in rows]
+    shown, seconds = (np.nanmedian([float(row.get(key) or "nan") for row in rows]) for key in (metric, "seconds"))
+    return f"{np.mean(solved):.0%} ({min(solved):.0%}), {factor * shown:.{digits}f} {unit}, {seconds:.0f} s"
+
+
+def summary_table(data: Path) -> str:
+    """Show what the recipes reach as they ship."""
+    runs, lines = read(data / "shipped.csv"), []
+    for row, (_, metric, how) in ROWS.items():
+        groups = ([x for x in runs if (x["row"], x["method"]) == (row, method)] for method in METHODS)
+        lines.append([row, *(cell(group, metric, *how) for group in groups)])
+    return table(["", *METHODS.values()], lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cores", type=int, default=os.cpu_count(), help="runs at the same time")
+    parser.add_argument("--rows", nargs="+", default=list(ROWS), choices=list(ROWS))
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
+    parser.add_argument("--output", type=Path, default=Path("outputs/shipped"), help="folder of the runs")
+    parser.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
+    args = parser.parse_args()
+    if args.quick and args.data == DATA:
+        parser.error("--quick gives no results to keep: name another folder with --data.")
+    kept = {(x["row"], x["method"], int(x["seed"])) for x in read(args.data / "shipped.csv")}
+    todo = [(row, method, seed) for seed in args.seeds for row in args.rows for method in args.methods]
+    with ThreadPoolExecutor(args.cores) as pool:
+        waiting = [pool.submit(fly, *job, args.output, args.data, args.quick) for job in todo if job not in kept]
+        for future in waiting:
+            future.result()
+    page = DATA.parents[2] / "README.md" if args.data.resolve() == DATA.resolve() else args.data / "summary.md"
+    fill(page, {"summary": summary_table(args.data)})
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, stop)
+    main()

@@ -13,6 +13,8 @@ EVERYTHING = [  # that draws random numbers or keeps a memory
     "env.observation_noise={position: 0.01}",
     "env.observation_delay=1",
     "env.randomize={mass: {scale: [0.8, 1.2]}}",
+    "actor.noise_correlation=0.9",
+    "actor.max_kl=0.05",
 ]
 
 

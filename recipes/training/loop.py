@@ -87,7 +87,7 @@ class Run:
         self.starts: list[Tensor] = []  # positions in which the horizons since the last row have started
         self.rows: list[dict[str, float]] = []  # of metrics.csv
         self.done, self.seconds, self.processor_seconds, self.skipped = 0, 0.0, 0.0, 0
-        self.best: dict[str, Any] = {"return": -math.inf}
+        self.best: dict[str, Any] = {"solved": -math.inf, "return": -math.inf}
         self.folder = Path(HydraConfig.get().runtime.output_dir)
         self.saved: Path | None = None  # the last checkpoint known to be intact
         self.revision = revision()
@@ -222,10 +222,13 @@ class Run:
         if every and len(self.rows) % every == 0 and self.done < self.iterations:  # at the end the best one is drawn
             drawing.draw_flight(flight, self.folder / "flight", self.env)
             self.logs.show_flight(steps)
-        if metrics["eval/return"] >= self.best["return"]:
+        score = {name: metrics[f"eval/{name}"] for name in ("solved", "return")}
+        # A checkpoint from before knows the return alone.
+        record = self.best.get("solved", -math.inf), self.best["return"]
+        if math.isfinite(score["return"]) and tuple(score.values()) >= record:
             policy = {"actor": self.actor, **({"normalizer": self.env.transform} if self.cfg.normalize else {})}
             weights = {name: copy.deepcopy(module.state_dict()) for name, module in policy.items()}
-            self.best = {"return": metrics["eval/return"], "steps": steps, **weights}
+            self.best = {**score, "steps": steps, **weights}
         return metrics
 
     def _diagnose(self) -> dict[str, float]:

@@ -45,7 +45,8 @@ class Run:
 
     Evaluates every ``eval.interval`` iterations, and each time writes a row of metrics and a checkpoint. The checkpoint
     holds all that the run needs to go on exactly as if it had not stopped (``resume=PATH``), and the best policy so
-    far: the one with the greatest return in these evaluations, which is flown at the end from other starts.
+    far, which is flown at the end from other starts: the one that solved most episodes in these evaluations, and of
+    those the one with the greatest return.
 
     Leaves in the run's folder: ``config.yaml``, ``metrics.csv``, ``checkpoint.pt`` and the one before it,
     ``summary.json``, ``learning_curve.png``, and the flight as ``flight.png``, ``flight.gif``, ``flight.html`` and

@@ -220,19 +220,19 @@ def test_without_visited_states_every_horizon_goes_on_where_the_last_one_ended()
 
 
 def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(monkeypatch, tmp_path):
-    wanted = ["--rows", "racing, position reward", "hovering", "--methods", "ppo", "--seeds", "0", "--cores", "2"]
+    wanted = ["--tasks", "racing", "hovering", "--methods", "ppo", "--seeds", "0", "--cores", "2"]
     arguments = [*wanted, "--data", tmp_path, "--output", tmp_path / "runs", "--quick"]
     run_main(monkeypatch, shipped, *arguments[:-1], "--quick")
     rows = reproduce.read(tmp_path / "shipped.csv")
     assert len(rows) == 2 and {row["task"] for row in rows} == {"hovering", "racing"}
     assert all(row["steps"] == "64" and row["machine"] and float(row["seconds"]) > 0 for row in rows)
     page = (tmp_path / "summary.md").read_text()
-    assert "| racing, position reward |  |  |  | 0% (0%), 0.0 gates, " in page
+    assert "| racing |  |  |  | 0.0% (0.0%), 0.0 gates, " in page
     monkeypatch.setattr(shipped, "run", lambda *_: pytest.fail("It has been flown."))
     run_main(monkeypatch, shipped, *arguments)
     assert (tmp_path / "summary.md").read_text() == page
     values = [("0.5", "0.02", "9"), ("1.0", "0.01", "5"), ("1.0", "", "7")]
     group = [dict(zip(("solved", "position_error", "seconds"), x, strict=True)) for x in values]
-    assert shipped.cell(group, "position_error", 100, 1, "cm") == "83% (50%), 1.5 cm, 7 s"
+    assert shipped.cell(group, "position_error", 100, 1, "cm") == "83.3% (50.0%), 1.5 cm, 7 s, 3 seeds"
     with pytest.raises(SystemExit):
         run_main(monkeypatch, shipped, "--quick")

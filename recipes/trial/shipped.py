@@ -28,54 +28,54 @@ from torchrl_quad.files import machine
 
 SEEDS = tuple(range(10))
 METHODS = {"bptt": "BPTT", "shac": "SHAC", "abpt": "ABPT", "ppo": "PPO"}
-ROWS = {  # of the table: the overrides of a task, and what is shown beside the solved episodes: factor, digits, unit
-    "hovering": (["task=hovering"], "position_error", (100, 1, "cm")),
-    "tracking": (["task=tracking"], "tracking_rmse", (100, 1, "cm")),
-    "landing": (["task=landing"], "landing_speed", (1, 2, "m/s")),
-    "racing": (["task=racing"], "gates_passed", (1, 1, "gates")),
-    "racing, position reward": (["task=racing", "env.reward=position"], "gates_passed", (1, 1, "gates")),
+TASKS = {  # what is shown of each beside the solved episodes: column, factor, digits, unit
+    "hovering": ("position_error", 100, 1, "cm"),
+    "tracking": ("tracking_rmse", 100, 1, "cm"),
+    "landing": ("landing_speed", 1, 2, "m/s"),
+    "racing": ("gates_passed", 1, 1, "gates"),
 }
 ADDING = Lock()
 
 
-def fly(row: str, method: str, seed: int, output: Path, data: Path, quick: bool) -> None:
+def fly(task: str, method: str, seed: int, output: Path, data: Path, quick: bool) -> None:
     """Train once, and add the final evaluation to the results."""
-    folder = output / row.replace(", ", "-").replace(" ", "-") / method / f"seed{seed}"
-    own = [*ROWS[row][0], f"seed={seed}", *(QUICK if quick else ()), "resume=auto", f"hydra.run.dir={folder}"]
+    folder = output / task / method / f"seed{seed}"
+    own = [f"task={task}", f"seed={seed}", *(QUICK if quick else ()), "resume=auto", f"hydra.run.dir={folder}"]
     run([sys.executable, str(RECIPES / f"{method}.py"), *own], folder)
     end = folder / "summary.json"
     summary = json.loads(end.read_text()) if end.exists() else {"solved": 0.0, "crash": 1.0}  # it diverged
     seconds = read(folder / "metrics.csv")[-1]["time/processor_seconds"]
     flown = datetime.date.today().isoformat()
-    about = {"row": row, "method": method, "seed": seed, "machine": machine(), "flown": flown, "seconds": seconds}
+    about = {"task": task, "algorithm": method, "seed": seed, "machine": machine(), "flown": flown, "seconds": seconds}
     summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}
     with ADDING:
         others = read(data / "shipped.csv")
         write(data / "shipped.csv", [*others, about | {k: v for k, v in summary.items() if k not in about}])
 
 
-def cell(rows: list[dict[str, str]], metric: str, factor: float, digits: int, unit: str) -> str:
+def cell(runs: list[dict[str, str]], metric: str, factor: float, digits: int, unit: str) -> str:
     """Write what the seeds of a method reach: solved episodes, their least, and the medians of the rest."""
-    if not rows:
+    if not runs:
         return ""
-    solved = [float(row["solved"]) for row in rows]
-    shown, seconds = (np.nanmedian([float(row.get(key) or "nan") for row in rows]) for key in (metric, "seconds"))
-    return f"{np.mean(solved):.0%} ({min(solved):.0%}), {factor * shown:.{digits}f} {unit}, {seconds:.0f} s"
+    solved = [float(run["solved"]) for run in runs]
+    shown, seconds = (np.nanmedian([float(run.get(key) or "nan") for run in runs]) for key in (metric, "seconds"))
+    some = "" if len(runs) == len(SEEDS) else f", {len(runs)} seeds"
+    return f"{np.mean(solved):.1%} ({min(solved):.1%}), {factor * shown:.{digits}f} {unit}, {seconds:.0f} s{some}"
 
 
 def summary_table(data: Path) -> str:
     """Show what the recipes reach as they ship."""
     runs, lines = read(data / "shipped.csv"), []
-    for row, (_, metric, how) in ROWS.items():
-        groups = ([x for x in runs if (x["row"], x["method"]) == (row, method)] for method in METHODS)
-        lines.append([row, *(cell(group, metric, *how) for group in groups)])
+    for task, shown in TASKS.items():
+        groups = ([x for x in runs if (x["task"], x["algorithm"]) == (task, method)] for method in METHODS)
+        lines.append([task, *(cell(group, *shown) for group in groups)])
     return table(["", *METHODS.values()], lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cores", type=int, default=os.cpu_count(), help="runs at the same time")
-    parser.add_argument("--rows", nargs="+", default=list(ROWS), choices=list(ROWS))
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=list(TASKS))
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
@@ -84,8 +84,8 @@ def main() -> None:
     args = parser.parse_args()
     if args.quick and args.data == DATA:
         parser.error("--quick gives no results to keep: name another folder with --data.")
-    kept = {(x["row"], x["method"], int(x["seed"])) for x in read(args.data / "shipped.csv")}
-    todo = [(row, method, seed) for seed in args.seeds for row in args.rows for method in args.methods]
+    kept = {(x["task"], x["algorithm"], int(x["seed"])) for x in read(args.data / "shipped.csv")}
+    todo = [(task, method, seed) for seed in args.seeds for task in args.tasks for method in args.methods]
     with ThreadPoolExecutor(args.cores) as pool:
         waiting = [pool.submit(fly, *job, args.output, args.data, args.quick) for job in todo if job not in kept]
         for future in waiting:

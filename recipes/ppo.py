@@ -37,14 +37,11 @@ def main(cfg: DictConfig) -> None:
             if cfg.actor.max_kl is None or moved < cfg.actor.max_kl:
                 losses = loss(batch)
                 moved = mean_of_all(losses["kl_approx"])
-                loss_actor, loss_critic = (
-                    losses["loss_objective"] + losses.get("loss_entropy", 0.0),
-                    losses["loss_critic"],
-                )
+                loss_actor = losses["loss_objective"] + losses.get("loss_entropy", 0.0)
                 run.optimise("actor", actor_optimizer, loss_actor, cfg.actor.max_grad_norm)
             else:
-                loss_critic = loss.loss_critic(batch)[0].mean()
-            run.optimise("critic", critic_optimizer, loss_critic, cfg.critic.max_grad_norm)
+                losses["loss_critic"] = loss.loss_critic(batch)[0].mean()
+            run.optimise("critic", critic_optimizer, losses["loss_critic"], cfg.critic.max_grad_norm)
 
         update_normalizer(env, data)
         actor_schedule.step()

@@ -24,9 +24,11 @@ def env64():
 
 
 def test_the_noise_is_standard_normal_in_every_step_and_correlated_over_time():
-    env = HoveringEnv(num_envs=512)
+    env = HoveringEnv(num_envs=512, max_episode_steps=90)
     actor = make_actor(env, noise_correlation=RHO, scale_init=0.2)
-    rollout, carry = differentiable_rollout(env, actor, None, 60)
+    start = env.reset()
+    start["state", "step"][::2] = 30  # these end with the horizon
+    rollout, carry = differentiable_rollout(env, actor, env.reset(start, set_state=True), 60)
     noise = rollout["noise"].double()
     assert noise.mean().abs() < 0.05  # four standard errors, as below
     for part in (noise[:, 0], noise[:, 30], noise[:, -1]):
@@ -37,8 +39,8 @@ def test_the_noise_is_standard_normal_in_every_step_and_correlated_over_time():
     mean = torch.atanh(rollout["action"]) - 0.2 * rollout["noise"]  # mu + sigma e, with mu nearly constant at the start
     assert mean.std(1).max() < 0.1
     more, _ = differentiable_rollout(env, actor, carry, 3)
-    goes_on = ~rollout["next", "done"][:, -1]  # TorchRL zeroes what it does not know of the others
-    assert torch.equal(more["noise_before"][:, 0] * goes_on, rollout["noise"][:, -1] * goes_on)
+    assert torch.equal(more["noise_before"][:, 0], rollout["noise"][:, -1])  # also over resets
+    assert 0 < rollout["next", "done"][:, -1].sum() < 512
 
 
 def test_loc_scale_and_log_probability_are_those_given_the_noise_of_the_step_before(env64):
@@ -82,6 +84,37 @@ def test_every_way_to_fly_gives_the_same_noise_values_and_gradients(env64):
     rollout, _ = differentiable_rollout(env64, actor, None, 6)
     grads = [torch.autograd.grad(x.loss_actor(rollout)[0], list(x.actor_network_params.parameters())) for x in loss]
     torch.testing.assert_close(*grads)
+
+
+@pytest.mark.parametrize("bias", [0.3, 10.0])  # and far beyond where the tanh tells numbers apart
+def test_called_or_not_the_noise_is_the_same_also_where_the_action_is_saturated(env64, bias):
+    actor = make_actor(env64, noise_correlation=RHO, scale_init=0.3, return_log_prob=True)
+    actor[0].module.mlp[-1].bias.data[:4] = bias
+    td = env64.reset()
+    for kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
+        torch.manual_seed(3)
+        with set_exploration_type(kind):
+            written, plain = actor(td.copy()), actor.plain()
+        torch.manual_seed(3)
+        drawn = plain.drawn(1, 4, {})[0]
+        mine = plain.forward(plain.weights, [td["observation"]], drawn)[1]
+        torch.testing.assert_close({key: written[key] for key in mine}, mine)
+        torch.testing.assert_close(plain.drawn_again(written), drawn)
+        assert written["noise"].abs().max() < 5 and written["noise"].any() == (kind is ExplorationType.RANDOM)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):  # also after a random flight
+        again = actor(td.copy().set("noise", torch.ones(4, 4, dtype=env64.dtype)))
+    torch.testing.assert_close(again["action"], written["action"])
+
+
+def test_an_actor_can_be_called_with_its_entries(env):
+    observation = env.reset()["observation"]
+    for rho in (0.0, RHO):
+        actor = make_actor(env, noise_correlation=rho, in_keys=["observation"])
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            expected = actor(env.reset().set("observation", observation))["action"]
+            before = {"noise_before": torch.zeros(4, 4)} if rho else {}
+            written = actor(observation=observation, **before)
+        torch.testing.assert_close(written[2], expected)
 
 
 def test_ppo_s_ratio_is_that_of_the_new_part_of_the_noise():

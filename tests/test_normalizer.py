@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv, VecNormV2, check_env_specs
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -69,6 +70,15 @@ def test_under_the_normalizer_alone_the_environment_inside_flies_with_the_same_n
     assert (plain is None) == is_called
     monkeypatch.setattr("torchrl_quad.data.rollout.ObservationNormalizer", type(None))
     torch.testing.assert_close(inside, fly())
+
+
+def test_under_the_normalizer_errors_and_unwanted_outputs_stay_as_they_are():
+    base = HoveringEnv(num_envs=4)
+    env = TransformedEnv(base, ObservationNormalizer(base))
+    with pytest.raises(ValueError, match="The actor reads 'observation', which is not in the tensordict"):
+        differentiable_rollout(env, make_actor(env), env.reset().exclude("observation"), 2)
+    policy = TensorDictModule(lambda x: (x, x[:, :4].tanh()), in_keys=["observation"], out_keys=["_", "action"])
+    assert differentiable_rollout(env, policy, None, 3)[0].shape == (4, 3)
 
 
 def test_a_normalized_policy_on_plain_tensors_is_the_policy():

@@ -114,7 +114,9 @@ class Actor(Optimised):
     noise_correlation: Annotated[Real, Field(ge=0, lt=1)] = Field(
         description="Of the policy's noise in two steps that follow each other; 0 is white noise."
     )
-    max_kl: Positive | None = Field(description="How far one update may move the policy; null for no bound.")
+    max_kl: Positive | None = Field(
+        description="How far an update, or PPO's iteration, may move the policy; null for none."
+    )
 
 
 class Critic(Optimised):
@@ -136,7 +138,7 @@ class Loss(Section):
         None, description="The coefficient of the entropy bonus: a number, 0 for none, or auto to learn it."
     )
     clip_action_gradient: Positive | None = Field(
-        None, description="So many medians long may the gradient in one action be; null for no bound."
+        None, description="The longest gradient in one action, in running medians; null for no bound."
     )
     terminal_gradient: bool | None = None
     target_bootstrap: bool | None = None

@@ -174,7 +174,7 @@ def main() -> None:
     parser.add_argument("--collect", action="store_true", help="add finished runs in --output to the results, and stop")
     parser.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
     args = parser.parse_args()
-    if args.quick and args.data == DATA:
+    if args.quick and args.data.resolve() == DATA.resolve():
         parser.error("--quick gives no results to keep: name another folder with --data.")
 
     rates = LEARNING_RATES[1:2] if args.quick else LEARNING_RATES

@@ -82,7 +82,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("outputs/shipped"), help="folder of the runs")
     parser.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
     args = parser.parse_args()
-    if args.quick and args.data == DATA:
+    if args.quick and args.data.resolve() == DATA.resolve():
         parser.error("--quick gives no results to keep: name another folder with --data.")
     kept = {(x["task"], x["algorithm"], int(x["seed"])) for x in read(args.data / "shipped.csv")}
     todo = [(task, method, seed) for seed in args.seeds for task in args.tasks for method in args.methods]

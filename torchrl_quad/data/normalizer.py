@@ -91,8 +91,10 @@ class NormalizedPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the policy writes, and leave the observation as it is."""
         (key,) = self.normalizer.in_keys
-        seen = tensordict.copy().set(key, self.normalizer.normalize(tensordict.get(key)))
-        return tensordict.update(self.policy(seen).select(*self.out_keys))
+        seen = tensordict.copy()
+        if key in seen:  # otherwise the policy complains, if it reads it
+            seen.set(key, self.normalizer.normalize(seen.get(key)))
+        return tensordict.update(self.policy(seen).select(*self.out_keys, strict=False))
 
     def plain(self) -> Any:
         """The same on plain tensors, where the policy gives itself so and can normalise; None elsewhere."""

@@ -69,7 +69,9 @@ def differentiable_rollout(
     for buffer in env.buffers():
         if not buffer.is_leaf:
             buffer.detach_()
-    return rollout, env.maybe_reset(env.step_mdp(rollout[..., -1]).detach().clone())
+    end = env.step_mdp(rollout[..., -1]).detach().clone()
+    written = end.select(*(key for key in actor.out_keys if key != "action"), strict=False).clone()
+    return rollout, env.maybe_reset(end).update(written)  # a reset keeps nothing that it does not know, such as noise
 
 
 def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> TensorDictBase:
@@ -83,7 +85,8 @@ def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, h
         return env.rollout(horizon, actor, tensordict=start, **options)
     normalizer = env.transform
     (key,) = normalizer.in_keys
-    start = start.set(key, normalizer.undo(start.get(key)))
+    if key in start:  # otherwise the environment complains
+        start.set(key, normalizer.undo(start.get(key)))
     rollout = env.base_env.rollout(horizon, NormalizedPolicy(actor, normalizer), tensordict=start, **options)
     for name in (key, ("next", key)):
         rollout.set(name, normalizer.normalize(rollout.get(name)))

@@ -32,8 +32,8 @@ class PlainPolicy(Protocol):
     def fits(self, inputs: Sequence[Tensor]) -> bool:
         """Whether it can read inputs of this width, precision and device; otherwise it is called, and can complain."""
 
-    size: int
-    """The entries of an action."""
+    size: int | None
+    """The entries of an action, of those drawn; None for all of them."""
 
     def drawn(self, steps: int, n: int, before: Mapping[Any, Tensor]) -> Tensor:
         """What changes from step to step and does not depend on the state, such as noise: (steps, n, at least size).

@@ -16,7 +16,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_quad.data.unwrap import base_env
-from torchrl_quad.modules.plain import CorrelatedHead, Critic, Network, TanhGaussianActor
+from torchrl_quad.modules.plain import CorrelatedActor, CorrelatedHead, Critic, Network, TanhGaussianActor
 
 OBSERVATION = ("observation",)
 
@@ -90,7 +90,7 @@ def make_actor(
         net.head = NormalParamExtractor(scale_mapping=mapping)
     params = TensorDictModule(net, in_keys=read, out_keys=["loc", "scale"])
     bounds = {} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high}
-    actor = TanhGaussianActor(
+    actor = (CorrelatedActor if noise_correlation else TanhGaussianActor)(
         params,
         in_keys=["loc", "scale"],
         spec=spec,

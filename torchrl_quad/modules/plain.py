@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import NormalParamExtractor
+from tensordict.nn import NormalParamExtractor, dispatch
 from tensordict.nn.utils import biased_softplus
 from torch import Tensor, nn
 from torch.func import vjp
@@ -57,8 +57,12 @@ class CorrelatedHead(NormalParamExtractor):
         return loc + self.rho * scale * before, self.rest * scale
 
     def next(self, before: Tensor, xi: Tensor) -> Tensor:
-        """The noise of this step."""
+        """The noise of this step, from that of the step before and what is new in it."""
         return self.rho * before + self.rest * xi
+
+    def innovation(self, before: Tensor, noise: Tensor) -> Tensor:
+        """What is new in the noise of this step."""
+        return (noise - self.rho * before) / self.rest
 
 
 class Critic(ValueOperator):
@@ -101,34 +105,14 @@ class Critic(ValueOperator):
 class TanhGaussianActor(ProbabilisticActor):
     """What :func:`~torchrl_quad.make_actor` builds: a tanh-Gaussian policy that environments can fly as pure functions.
 
-    It computes the same either way. Noise that is correlated in time stands in ``noise``, and that of the step before
-    in ``noise_before``; a flight hands ``noise`` on from step to step. Where there is none yet, it is drawn.
+    It computes the same either way.
     """
-
-    @property
-    def head(self) -> CorrelatedHead | None:
-        """The head that correlates the noise in time, if it does."""
-        head = getattr(getattr(self[0], "module", None), "head", None)
-        return head if isinstance(head, CorrelatedHead) else None
-
-    def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
-        """Write loc, scale, action, and what else was asked for."""
-        if self.head is None:
-            return super().forward(tensordict, **kwargs)
-        before = tensordict.get("noise", None)
-        if before is None:
-            like, size = tensordict.get(self[0].in_keys[0]), self[0].module.mlp[-1].out_features // 2
-            before = _first_noise(like.new_empty(*like.shape[:-1], size), _is_random(self))
-        tensordict = super().forward(tensordict.set("noise_before", before), **kwargs)
-        read = (tensordict.get(key) for key in ("action", "loc", "scale"))
-        xi = _innovation(*read, *_bounds(self)).detach()
-        return tensordict.set("noise", self.head.next(before, xi))
 
     def plain(self) -> PlainTanhGaussian | None:
         """The policy as pure functions of its present weights; None if somebody has changed its parts, or hooks it."""
         is_random = _is_random(self)
         network = getattr(self[0], "module", None)
-        is_known = is_random is not None and type(self) is TanhGaussianActor
+        is_known = is_random is not None and type(self) in (TanhGaussianActor, CorrelatedActor)
         if not is_known or type(network) is not Network or _is_hooked(self) or len(self.module) != 2:
             return None
         if len(set(map(str, self[0].in_keys))) < len(self[0].in_keys):
@@ -147,6 +131,30 @@ class TanhGaussianActor(ProbabilisticActor):
         return PlainTanhGaussian(self, layers, activations, is_random)
 
 
+class CorrelatedActor(TanhGaussianActor):
+    """A tanh-Gaussian policy whose noise is correlated in time.
+
+    ``noise`` is that of the step, and ``noise_before`` that of the step before. A flight hands ``noise`` on from step
+    to step. Where there is none yet it is drawn. A deterministic flight has none.
+    """
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
+        """Write loc, scale, action, noise and noise_before, and the log-probability if wanted."""
+        is_random, weight = _is_random(self), self[0].module.mlp[-1].weight
+        shape, before = (*tensordict.batch_size, len(weight) // 2), tensordict.get("noise", None)
+        if before is None or not is_random:
+            before = _first_noise(weight.new_zeros(shape), is_random)
+        tensordict.set("noise_before", before)
+        if is_random is None:
+            return super().forward(tensordict, **kwargs).set("noise", before)
+        loc, scale = (self[0](tensordict).get(key) for key in ("loc", "scale"))
+        xi = _first_noise(torch.zeros_like(loc.detach()), is_random)
+        log_prob_key = self[1].log_prob_key if self[1].return_log_prob else None
+        written = _tanh_gaussian(loc, scale, xi, *_bounds(self), log_prob_key)
+        return tensordict.update(written).set("noise", self[0].module.head.next(before, xi))
+
+
 class PlainTanhGaussian:
     """A tanh-Gaussian policy on plain tensors; see the engine's ``PlainPolicy``."""
 
@@ -156,7 +164,7 @@ class PlainTanhGaussian:
         network, sample = actor[0].module, actor[1]
         self.scales, self.widths = network.scales, network.widths
         self.in_keys, self.out_keys = list(actor[0].in_keys)[: len(self.scales)], list(actor.out_keys)
-        self.rho = actor.head.rho if actor.head else None
+        self.rho = network.head.rho if type(network.head) is CorrelatedHead else None
         self.head, self.activations, self.is_random = network.head, activations, is_random
         self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
         self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
@@ -193,7 +201,8 @@ class PlainTanhGaussian:
             for x in noise if self.is_random else ():
                 x.normal_()
             return noise
-        last = before["noise"] if "noise" in before else _first_noise(torch.zeros_like(noise[0]), self.is_random)
+        last = before.get("noise") if self.is_random else None
+        last = _first_noise(torch.zeros_like(noise[0]), self.is_random) if last is None else last
         earlier = []
         for x in noise:
             earlier.append(last)
@@ -202,11 +211,15 @@ class PlainTanhGaussian:
 
     def drawn_again(self, tensordict: TensorDictBase) -> Tensor:
         """What was drawn for the actions of a rollout (*), as rows (n, k)."""
+        if self.rho is not None:
+            noise, before = (tensordict[key].detach() for key in ("noise", "noise_before"))
+            return torch.cat((self.head.innovation(before, noise), before), -1).flatten(0, -2)
         action, loc, scale = (tensordict[key].detach() for key in ("action", "loc", "scale"))
-        low, high = (None if x is None else action.new_tensor(x) for x in (self.low, self.high))
-        noise = [_innovation(action, loc, scale, low, high)]
-        noise += [tensordict["noise_before"].detach()] if self.rho is not None else []
-        return torch.cat(noise, -1).flatten(0, -2)
+        if self.low is not None:
+            low, high = (action.new_tensor(x) for x in (self.low, self.high))
+            action = (2.0 * action - (high + low)) / (high - low)
+        limit = 1.0 - torch.finfo(action.dtype).resolution
+        return ((torch.atanh(action.clamp(-limit, limit)) - loc) / scale).flatten(0, -2)
 
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
@@ -247,28 +260,34 @@ class PlainTanhGaussian:
         return [g for x, grad in pairs for g in (grad.t() @ x, grad.sum(0))]
 
     def _sample(self, raw: Tensor, drawn: Tensor) -> dict[Any, Tensor]:
-        noise, *before = drawn.split(self.size, -1)
+        xi, *before = drawn.split(self.size, -1)
         loc, scale = self.head(raw, *before)
-        x = loc + scale * noise
-        limit = 1.0 - torch.finfo(x.dtype).resolution
-        squashed = torch.tanh(x)
-        # Clipped as in TorchRL's TanhNormal, which keeps the derivative where it clips.
-        squashed = squashed + (squashed.clamp(-limit, limit) - squashed).detach()
-        action = squashed
-        if self.low is not None:
-            low, high = (raw.new_tensor(bound) for bound in (self.low, self.high))
-            action = (high + low) / 2 + (high - low) / 2 * squashed
-        written = {"loc": loc, "scale": scale, "action": action}
+        low, high = (None if bound is None else raw.new_tensor(bound) for bound in (self.low, self.high))
+        written = _tanh_gaussian(loc, scale, xi, low, high, self.log_prob_key)
         if before:
-            written |= {"noise_before": before[0], "noise": self.head.next(before[0], noise)}
-        if self.log_prob_key is not None:
-            x = x + (torch.atanh(squashed) - x).detach()
-            density = -((x - loc) ** 2) / (2 * scale**2) - scale.log() - 0.5 * math.log(2 * math.pi)
-            slope = 2.0 * (math.log(2.0) - x - nn.functional.softplus(-2.0 * x))
-            if self.low is not None:
-                slope = slope + ((high - low) / 2).log()
-            written[self.log_prob_key] = (density - slope).sum(-1)
+            written |= {"noise_before": before[0], "noise": self.head.next(before[0], xi)}
         return {key: written[key] for key in self.out_keys}
+
+
+def _tanh_gaussian(
+    loc: Tensor, scale: Tensor, noise: Tensor, low: Tensor | None, high: Tensor | None, log_prob_key: Any
+) -> dict[Any, Tensor]:
+    """loc, scale, the action (*, k) that standard normal noise makes of them, and its log-probability (*) if wanted."""
+    x = loc + scale * noise
+    limit = 1.0 - torch.finfo(x.dtype).resolution
+    squashed = torch.tanh(x)
+    # Clipped as in TorchRL's TanhNormal, which keeps the derivative where it clips.
+    squashed = squashed + (squashed.clamp(-limit, limit) - squashed).detach()
+    action = squashed if low is None else (high + low) / 2 + (high - low) / 2 * squashed
+    written = {"loc": loc, "scale": scale, "action": action}
+    if log_prob_key is not None:
+        x = x + (torch.atanh(squashed) - x).detach()
+        density = -((x - loc) ** 2) / (2 * scale**2) - scale.log() - 0.5 * math.log(2 * math.pi)
+        slope = 2.0 * (math.log(2.0) - x - nn.functional.softplus(-2.0 * x))
+        if low is not None:
+            slope = slope + ((high - low) / 2).log()
+        written[log_prob_key] = (density - slope).sum(-1)
+    return written
 
 
 def _is_random(actor: ProbabilisticActor) -> bool | None:
@@ -284,16 +303,8 @@ def _bounds(actor: ProbabilisticActor) -> tuple[Tensor | None, Tensor | None]:
 
 
 def _first_noise(x: Tensor, is_random: bool | None) -> Tensor:
-    """Noise before the first step, into a tensor (*, k)."""
-    return x.normal_() if is_random else x.zero_()
-
-
-def _innovation(action: Tensor, loc: Tensor, scale: Tensor, low: Tensor | None, high: Tensor | None) -> Tensor:
-    """The standard normal numbers that led to actions (*, k) of a tanh-Gaussian."""
-    if low is not None:
-        action = (2.0 * action - (high + low)) / (high - low)
-    limit = 1.0 - torch.finfo(action.dtype).resolution
-    return (torch.atanh(action.clamp(-limit, limit)) - loc) / scale
+    """Standard normal numbers into zeros (*, k), or the zeros where nothing is random."""
+    return x.normal_() if is_random else x
 
 
 def _concatenated(inputs: Sequence[Tensor], scales: Sequence[float]) -> Tensor:

@@ -30,9 +30,9 @@ def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
         finally:
             node.learns = True
         return grad.movedim(0, -2)
-    if node is None or node.name() != "StackBackward0" or len(node.next_functions) != action.shape[-2]:
+    if not _is_stack_of_steps(action):
         raise ValueError(
-            "The gradient of each action needs the rollout as differentiable_rollout returned it, whole and with its "
+            "The gradient of each action needs one rollout as differentiable_rollout returned it, whole and with its "
             "graph; this one was copied, reshaped or cut. Give the rollout itself to the loss."
         )
     edges = [GradientEdge(*edge) for edge in node.next_functions]
@@ -49,7 +49,8 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
     Args:
         actor: the policy that flew the rollout.
         params: its parameters.
-        tensordict: the rollout (*), with all that the policy wrote.
+        tensordict: the rollout (*), with all that the policy wrote. The noise of an action follows from it, but for
+            actions within 1e-6 of a bound: they count as if they were that far from it.
 
     Raises:
         NotImplementedError: the policy is another one than ``make_actor`` builds, whose noise is not known.
@@ -59,7 +60,8 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
         if not hasattr(plain, "drawn_again"):
             raise NotImplementedError(
                 "Gradients that are clipped in each step need a policy as make_actor builds it, whose noise follows "
-                "from its actions. Build it so, without hooks or changed parts, or leave clip_action_gradient=None."
+                "from its actions, and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed parts, "
+                "or leave clip_action_gradient=None."
             )
         inputs = [rows(tensordict[key].detach()) for key in plain.in_keys]
         _, written = plain.forward(plain.weights, inputs, plain.drawn_again(tensordict))
@@ -84,9 +86,21 @@ class MedianClip(nn.Module):
 
     @torch.no_grad()
     def forward(self, grad: Tensor) -> tuple[Tensor, Tensor]:
-        """The gradients, and the fraction of them that was shortened; gradients of zero do not count."""
+        """The gradients, and the fraction that was shortened of those that are not zero; infinite ones become zero."""
         length = grad.norm(dim=-1, keepdim=True)
-        median = length[length > 0].median() if (length > 0).any() else self.median
-        self.median = torch.where(self.median > 0, torch.lerp(median.to(self.median), self.median, self.decay), median)
+        counts = length > 0
+        median = torch.where(counts, length, torch.nan).nanmedian()  # NaN where nothing counts
+        running = torch.where(self.median > 0, torch.lerp(median, self.median.to(median), self.decay), median)
+        self.median = torch.where(median.isnan(), self.median.to(median), running)
         factor = (self.factor * self.median / length.clamp_min(1e-30)).clamp_max(1.0)
-        return grad * factor, (factor < 1).to(grad.dtype).mean()
+        clipped = (counts & (factor < 1)).sum() / counts.sum().clamp_min(1)
+        return torch.where(length.isinf(), 0.0, grad) * factor, clipped
+
+
+def _is_stack_of_steps(action: Tensor) -> bool:
+    """Whether the actions (*, horizon, k) of single steps were stacked, and nothing was done to them since."""
+    node = action.grad_fn
+    if node is None or node.name() != "StackBackward0" or len(node.next_functions) != action.shape[-2]:
+        return False
+    dim = node._saved_dim if node._saved_dim < 2**63 else node._saved_dim - 2**64  # it is kept without its sign
+    return dim % action.ndim == action.ndim - 2

@@ -149,6 +149,8 @@ class PathwiseLoss(LossModule):
             names |= {("next", key) for key in (keys.reward, keys.done, keys.terminated)}
             if self.has_entropy_bonus:
                 names.add(keys.sample_log_prob)
+            if self.clip is not None:
+                names |= {"loc", "scale", *(set(self.actor_network.out_keys) & {"noise", "noise_before"})}
             self._in_keys = sorted((unravel_key(name) for name in names), key=str)
         return self._in_keys
 
@@ -230,7 +232,9 @@ class PathwiseLoss(LossModule):
             the loss, and its metadata by name; with an automatic alpha this includes ``loss_alpha``.
         """
         objective, metadata = self._objective(tensordict)
-        if self.clip is not None:
+        if self.clip is not None and not torch.is_grad_enabled():
+            metadata["clipped"] = torch.full_like(self.clip.median, math.nan)
+        elif self.clip is not None:
             grad, metadata["clipped"] = self.clip(self._action_gradient(objective, tensordict))
             written = act_again(self.actor_network, self.actor_network_params, tensordict)
             learned = (grad * written[self.tensor_keys.action]).sum((-2, -1)) + self._beside_actions(tensordict)

@@ -17,8 +17,9 @@ class TrustRegion:
     """Shortens an update that would move a Gaussian policy beyond a bound on the Kullback-Leibler divergence.
 
     A gradient through a simulator can be so coherent that one step of Adam at a usual rate makes another policy. The
-    divergence KL(before || after), summed over the entries of the action and averaged over the states of a rollout,
-    grows with the square of the step, so a step that is too long is shortened by the root of its excess.
+    divergence KL(before || after) is summed over the entries of the action and averaged over the states of a rollout.
+    For short steps it grows with the square of the step, so a step that is too long is shortened by the root of its
+    excess until it keeps the bound. An update to numbers that are not finite is undone.
 
     .. code-block:: python
 
@@ -70,8 +71,14 @@ class TrustRegion:
         with torch.no_grad():
             kl = self.average(self.divergence(rollout))
             self.metrics = {"kl": kl}
-            if kl > self.max_kl:
+            for _ in range(20):
+                if kl <= self.max_kl:
+                    return
+                if not kl.isfinite():
+                    break
                 torch._foreach_lerp_(parameters, before, 1.0 - (self.max_kl / kl.item()) ** 0.5)
+                kl = self.average(self.divergence(rollout))
+            torch._foreach_copy_(parameters, before)
 
     def divergence(self, rollout: TensorDictBase) -> Tensor:
         """KL(policy that flew the rollout || policy as it is now), a scalar."""

@@ -158,8 +158,8 @@ def compare_gradients(loss: PathwiseLoss, rollout: TensorDictBase) -> GradientCo
     With ABPT they are the gradients of the N-step and of the 0-step return, with SHAC those of the rewards of the
     horizon and of the terminal value. Both carry their weights in the objective, so that their sum is its gradient, and
     both are means over environments. BPTT has no value gradient: its cosine and norm are NaN, as they are where ABPT
-    has one of its returns switched off. ABPT samples actions for this, as its loss does. ``clip_action_gradient`` has no
-    part in it. No ``.grad`` changes.
+    has one of its returns switched off. ABPT samples actions for this, as its loss does. ``clip_action_gradient``
+    has no part in it. No ``.grad`` changes.
 
     Args:
         loss: a loss of the actor that flew the rollout.

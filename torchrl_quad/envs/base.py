@@ -186,8 +186,8 @@ class QuadrotorEnv(Task, EnvBase):
         return self
 
     def flies_inside(self, policy: Any) -> bool:
-        """Whether :meth:`rollout` flies a policy inside the compiled step, the fastest way; otherwise it calls it before
-        each step. Transforms do not count: under them, but for an ObservationNormalizer alone, policies are called."""
+        """Whether :meth:`rollout` flies a policy inside the compiled step, which is fastest, or calls it before each
+        step. It knows of no transforms: under them, but for an ObservationNormalizer alone, policies are called."""
         return flies_inside(self._stepper, policy)
 
     def eager(self) -> QuadrotorEnv:

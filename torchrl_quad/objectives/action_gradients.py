@@ -60,8 +60,8 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
         if not hasattr(plain, "drawn_again"):
             raise NotImplementedError(
                 "Gradients that are clipped in each step need a policy as make_actor builds it, whose noise follows "
-                "from its actions, and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed parts, "
-                "or leave clip_action_gradient=None."
+                "from its actions, and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed "
+                "parts, or leave clip_action_gradient=None."
             )
         inputs = [rows(tensordict[key].detach()) for key in plain.in_keys]
         _, written = plain.forward(plain.weights, inputs, plain.drawn_again(tensordict))

@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import ActionSequence, HoveringEnv, RacingEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad import ActionSequence, BPTTLoss, HoveringEnv, RacingEnv, differentiable_rollout, make_actor, make_env
 from torchrl_quad.envs import TASKS
 
 EVERYTHING = {
@@ -128,22 +128,26 @@ def losses_of(flight):
 
 
 def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
-    options = {**EVERYTHING, "gate_bonus": "log", "reward": "position"}
+    options = {**EVERYTHING, "reward": "position"}
     env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, **options)
     drag = env.nominal.linear_drag.clone().requires_grad_()
     env.params = env.nominal.replace(linear_drag=drag)
     actor = make_actor(env, in_keys=["observation", ("state", "velocity")], return_log_prob=True)
     called = TensorDictSequential(actor)
+    explorer = make_actor(env, in_keys=actor.in_keys, return_log_prob=True, noise_correlation=0.9)
 
     def train(policy):
         """Two horizons, through the ends of episodes, from a start that wants a gradient."""
         env.set_seed(0)
         torch.manual_seed(0)
         start = env.reset()
+        start["state", "position"][:2] = start["state", "target"][:2] - torch.tensor([0.5, 0.0, 0.0])
+        start["state", "velocity"][:2, 0] = 3.0  # through the gate, which is an event
         start["state", "velocity"].requires_grad_()
         flight, carry = differentiable_rollout(env, policy, start, 50)
+        assert flight["next", "state", "gate_passed"].any()
         more, _ = differentiable_rollout(env, policy, carry, 7)
-        wanted = [drag, start["state", "velocity"], *actor.parameters()]
+        wanted = [drag, start["state", "velocity"], *policy.parameters()]
         return flight, torch.autograd.grad(losses_of(flight) + losses_of(more), wanted)
 
     def train_in_torchrls_loop():
@@ -157,17 +161,25 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
         torch.testing.assert_close(flight["action"], actions.transpose(0, 1))
         return flight, torch.autograd.grad(losses_of(flight), actions)
 
+    def train_with_clipped_gradients():
+        env.set_seed(0)
+        torch.manual_seed(0)
+        flight, _ = differentiable_rollout(env, actor, None, 50)
+        loss = BPTTLoss(actor, clip_action_gradient=2.0).loss_actor(flight)[0]
+        return flight, torch.autograd.grad(loss, list(actor.parameters()))
+
     def as_on_an_accelerator():
         with monkeypatch.context() as patch:
             look_at_nothing(patch)
             return train(actor)
 
     def all_ways():
-        return train(actor), train(called), train_in_torchrls_loop(), optimise_actions(), as_on_an_accelerator()
+        more = train_in_torchrls_loop(), optimise_actions(), as_on_an_accelerator(), train_with_clipped_gradients()
+        return train(actor), train(called), train(explorer), *more
 
     eager = all_ways()
     env.compile()
-    assert env.flies_inside(actor) and not env.flies_inside(called)
+    assert env.flies_inside(actor) and env.flies_inside(explorer) and not env.flies_inside(called)
     all_ways()
     compiled_so_far = counters["stats"]["unique_graphs"]
     compiled = all_ways()

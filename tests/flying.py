@@ -1,6 +1,7 @@
 """Flights by hand, a step at a time."""
 
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 
 def fly(env, td, actions):
@@ -17,3 +18,13 @@ def look_at_nothing(patch):
     """Let the code believe that its tensors are on an accelerator, which it must not wait for."""
     for name in ("engine.horizon", "envs.randomness", "envs.guard"):
         patch.setattr(f"torchrl_quad.{name}.looks_are_free", lambda device: False)
+
+
+class Looks(TorchDispatchMode):
+    """Counts how often a value of a tensor is read."""
+
+    count = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.count += function is torch.ops.aten._local_scalar_dense.default
+        return function(*args, **(kwargs or {}))

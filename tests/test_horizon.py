@@ -2,11 +2,10 @@
 
 import pytest
 import torch
-from flying import look_at_nothing
+from flying import Looks, look_at_nothing
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torch._dynamo.utils import counters
-from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -92,16 +91,6 @@ def test_a_step_of_one_s_own_is_flown_and_an_output_that_nobody_wants_does_no_ha
     assert (env.rollout(3, actor, break_when_any_done=False)["next", "reward"] == 7.0).all()
     policy = TensorDictModule(lambda x: (x[:, :4].tanh(), x), in_keys=["observation"], out_keys=["action", "_"])
     assert HoveringEnv(num_envs=2).rollout(3, policy, break_when_any_done=False).shape == (2, 3)
-
-
-class Looks(TorchDispatchMode):
-    """Counts how often a value of a tensor is read."""
-
-    count = 0
-
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        self.count += function is torch.ops.aten._local_scalar_dense.default
-        return function(*args, **(kwargs or {}))
 
 
 def test_an_accelerator_is_not_waited_for_inside_a_horizon(monkeypatch):

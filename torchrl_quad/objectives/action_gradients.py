@@ -9,7 +9,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.autograd.graph import GradientEdge
 
-from torchrl_quad.objectives.calls import rows
+from torchrl_quad.objectives.calls import act
 
 
 def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
@@ -63,9 +63,7 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
                 "from its actions, and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed "
                 "parts, or leave clip_action_gradient=None."
             )
-        inputs = [rows(tensordict[key].detach()) for key in plain.in_keys]
-        _, written = plain.forward(plain.weights, inputs, plain.drawn_again(tensordict))
-    return {key: x.view(*tensordict.shape, *x.shape[1:]) for key, x in written.items()}
+        return act(plain, tensordict.select(*plain.in_keys).detach(), plain.drawn_again(tensordict))
 
 
 class MedianClip(nn.Module):

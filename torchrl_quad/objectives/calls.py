@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
@@ -25,9 +27,8 @@ def sample_action(actor: TensorDictModule, params: TensorDictParams, tensordict:
         plain = actor.plain() if hasattr(actor, "plain") else None
         if plain is None:
             return actor(tensordict)
-        inputs = [rows(tensordict[key]) for key in plain.in_keys]
-        _, written = plain.forward(plain.weights, inputs, plain.drawn(1, len(inputs[0]), {})[0])
-    return tensordict.update({key: x.view(*tensordict.shape, *x.shape[1:]) for key, x in written.items()})
+        written = act(plain, tensordict, plain.drawn(1, tensordict.numel(), {})[0])
+    return tensordict.update(written)
 
 
 def predict(
@@ -64,6 +65,8 @@ def predict(
     return stack([plain(dict(zip(weights, own, strict=True)), inputs) for own in copies])
 
 
-def rows(x: Tensor) -> Tensor:
-    """An entry (*, k) as (n, k)."""
-    return x.reshape(-1, x.shape[-1])
+def act(plain: Any, tensordict: TensorDictBase, drawn: Tensor) -> dict[NestedKey, Tensor]:
+    """What a plain policy writes in states (*), from what was drawn for each of them, (n, k)."""
+    inputs = [tensordict[key].reshape(-1, tensordict[key].shape[-1]) for key in plain.in_keys]
+    _, written = plain.forward(plain.weights, inputs, drawn)
+    return {key: x.view(*tensordict.shape, *x.shape[1:]) for key, x in written.items()}

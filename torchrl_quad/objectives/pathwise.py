@@ -235,7 +235,8 @@ class PathwiseLoss(LossModule):
         if self.clip is not None and not torch.is_grad_enabled():
             metadata["clipped"] = torch.full_like(self.clip.median, math.nan)
         elif self.clip is not None:
-            grad, metadata["clipped"] = self.clip(self._action_gradient(objective, tensordict))
+            action = tensordict.get(self.tensor_keys.action)
+            grad, metadata["clipped"] = self.clip(action_gradient(objective.sum(), action))
             written = act_again(self.actor_network, self.actor_network_params, tensordict)
             learned = (grad * written[self.tensor_keys.action]).sum((-2, -1)) + self._beside_actions(tensordict)
             objective = objective.detach() + learned - learned.detach()
@@ -267,10 +268,6 @@ class PathwiseLoss(LossModule):
         """J of each environment, (*), and its metadata."""
         objective = sum(self.objective_parts(tensordict).values())
         return objective, {"n_step_return": objective.detach().mean()}
-
-    def _action_gradient(self, objective: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """The gradient of J (*) of each environment in each of its actions: (*, horizon, k)."""
-        return action_gradient(objective.sum(), tensordict.get(self.tensor_keys.action))
 
     def _beside_actions(self, tensordict: TensorDictBase) -> Tensor | float:
         """What of J depends on the policy beside the actions that were flown, at fixed states: (*)."""

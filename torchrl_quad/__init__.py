@@ -8,7 +8,7 @@ from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
 from torchrl_quad.engine import ActionSequence
 from torchrl_quad.envs import TASKS, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
 from torchrl_quad.modules import make_actor, make_qvalue, make_value
-from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss, TrustRegion
+from torchrl_quad.objectives import ABPTLoss, BPTTLoss, HybridLoss, SHACLoss, TrustRegion
 
 __version__ = "0.1.0"
 
@@ -17,6 +17,7 @@ __all__ = [
     "ActionSequence",
     "BPTTLoss",
     "HoveringEnv",
+    "HybridLoss",
     "LandingEnv",
     "ObservationNormalizer",
     "QuadrotorEnv",

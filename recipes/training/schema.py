@@ -111,6 +111,7 @@ class Actor(Optimised):
     """The policy."""
 
     scale_init: Positive = Field(description="The standard deviation of the policy's noise at the start.")
+    learn_scale: bool = Field(description="Whether this noise changes with the state and in training.")
     noise_correlation: Annotated[Real, Field(ge=0, lt=1)] = Field(
         description="Of the policy's noise in two steps that follow each other; 0 is white noise."
     )
@@ -144,6 +145,9 @@ class Loss(Section):
     target_bootstrap: bool | None = None
     average_over_horizon: bool | None = None
     num_qvalue_nets: int | None = Field(None, ge=1, le=64, description="Critics whose smallest value counts.")
+    gradient_lmbda: Annotated[Real, Field(gt=0, le=1)] | None = Field(
+        None, description="The lambda of the return that the pathwise gradient differentiates; 0.9 is usual."
+    )
     clip_epsilon: Annotated[Real, Field(gt=0, lt=1)] | None = Field(
         None, description="How far the ratio of probabilities may move from 1; 0.2 is usual."
     )

@@ -7,7 +7,7 @@ import numbers
 from collections.abc import Sequence
 
 import torch
-from tensordict.nn import NormalParamExtractor, TensorDictModule
+from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
@@ -16,7 +16,14 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_quad.data.unwrap import base_env
-from torchrl_quad.modules.plain import CorrelatedActor, CorrelatedHead, Critic, Network, TanhGaussianActor
+from torchrl_quad.modules.plain import (
+    CorrelatedActor,
+    CorrelatedHead,
+    Critic,
+    GaussianHead,
+    Network,
+    TanhGaussianActor,
+)
 
 OBSERVATION = ("observation",)
 
@@ -30,6 +37,7 @@ def make_actor(
     input_scale: float | Sequence[float] = 1.0,
     action_init: Tensor | None = None,
     scale_init: float = 0.1,
+    learn_scale: bool = True,
     noise_correlation: float = 0.0,
     return_log_prob: bool = False,
 ) -> ProbabilisticActor:
@@ -49,6 +57,8 @@ def make_actor(
             ``env.neutral_action``, averaged over environments, where the environment has one (see
             :mod:`torchrl_quad.data`; a drone's is to hover), and the middle of the range elsewhere.
         scale_init: standard deviation at the start.
+        learn_scale: whether the network returns the standard deviation, too. Otherwise it stays what it is, and
+            neither a gradient through the simulator nor a KL bound takes the exploration away.
         noise_correlation: of the noise of two steps that follow each other, from 0 to below 1. Correlated noise moves a
             drone where independent noise averages out; try 0.9 at 50 Hz. Then loc, scale and the log-probability are
             those of the action given the noise of the step before, which is written to ``noise_before``; ``noise`` is
@@ -77,17 +87,18 @@ def make_actor(
         raise ValueError(f"scale_init must be positive and finite, got {scale_init}.")
     if not 0 <= noise_correlation < 1:
         raise ValueError(f"noise_correlation must lie from 0 to below 1, got {noise_correlation}.")
-    net = _network(env, in_keys, 2 * spec.shape[-1], num_cells, activation, input_scale)
+    size = spec.shape[-1]
+    net = _network(env, in_keys, 2 * size if learn_scale else size, num_cells, activation, input_scale)
     with torch.no_grad():
         net.mlp[-1].weight.mul_(0.01)
         net.mlp[-1].bias.zero_()
-        net.mlp[-1].bias[: spec.shape[-1]] = torch.atanh((action_init - middle) / (0.5 * (high - low)))
+        net.mlp[-1].bias[:size] = torch.atanh((action_init - middle) / (0.5 * (high - low)))
     mapping, read = f"biased_softplus_{scale_init}", list(in_keys)
     if noise_correlation:
-        net.head = CorrelatedHead(noise_correlation, mapping)
+        net.head = CorrelatedHead(noise_correlation, size, mapping)
         read.append("noise_before")
     else:
-        net.head = NormalParamExtractor(scale_mapping=mapping)
+        net.head = GaussianHead(size, mapping)
     params = TensorDictModule(net, in_keys=read, out_keys=["loc", "scale"])
     bounds = {} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high}
     actor = (CorrelatedActor if noise_correlation else TanhGaussianActor)(

@@ -35,7 +35,24 @@ class Network(nn.Module):
         return self.head(self.mlp(_concatenated(inputs[:own], self.scales)), *inputs[own:])
 
 
-class CorrelatedHead(NormalParamExtractor):
+class GaussianHead(NormalParamExtractor):
+    """The normal distribution of an action of ``size`` entries, from what a network returns.
+
+    Args:
+        size: of the action, k.
+        scale_mapping: as for NormalParamExtractor.
+    """
+
+    def __init__(self, size: int, scale_mapping: str) -> None:
+        super().__init__(scale_mapping=scale_mapping)
+        self.size = size
+
+    def forward(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        """loc and scale (*, k), from both (*, 2k), or from loc alone (*, k): the scale stays what it starts as."""
+        return super().forward(raw if raw.shape[-1] > self.size else torch.cat((raw, torch.zeros_like(raw)), -1))
+
+
+class CorrelatedHead(GaussianHead):
     """The normal distribution of an action whose noise e is correlated in time, given the noise of the step before.
 
     With e_t = rho e_(t-1) + sqrt(1 - rho^2) xi_t the action mu + sigma e_t has mean mu + rho sigma e_(t-1) and standard
@@ -44,15 +61,15 @@ class CorrelatedHead(NormalParamExtractor):
 
     Args:
         rho: the correlation of the noise of two steps that follow each other.
-        scale_mapping: as for NormalParamExtractor.
+        size, scale_mapping: as for GaussianHead.
     """
 
-    def __init__(self, rho: float, scale_mapping: str) -> None:
-        super().__init__(scale_mapping=scale_mapping)
+    def __init__(self, rho: float, size: int, scale_mapping: str) -> None:
+        super().__init__(size, scale_mapping)
         self.rho, self.rest = rho, math.sqrt(1.0 - rho**2)
 
     def forward(self, raw: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
-        """loc and scale (*, k) from what the network returns (*, 2k) and the noise of the step before (*, k)."""
+        """loc and scale (*, k) from what the network returns, and the noise of the step before (*, k)."""
         loc, scale = super().forward(raw)
         return loc + self.rho * scale * before, self.rest * scale
 
@@ -119,7 +136,7 @@ class TanhGaussianActor(ProbabilisticActor):
             return None
         mapping = getattr(network.head, "scale_mapping", None)
         parts = (mapping, biased_softplus), (network.mlp, MLP)
-        if type(network.head) not in (NormalParamExtractor, CorrelatedHead):
+        if type(network.head) not in (GaussianHead, CorrelatedHead):
             return None
         if any(type(x) is not cls for x, cls in parts) or self[1].distribution_class is not TanhNormal:
             return None
@@ -141,10 +158,10 @@ class CorrelatedActor(TanhGaussianActor):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write loc, scale, action, noise and noise_before, and the log-probability if wanted."""
-        is_random, weight = _is_random(self), self[0].module.mlp[-1].weight
-        shape, before = (*tensordict.batch_size, len(weight) // 2), tensordict.get("noise", None)
+        is_random, network = _is_random(self), self[0].module
+        shape, before = (*tensordict.batch_size, network.head.size), tensordict.get("noise", None)
         if before is None or not is_random:
-            before = _first_noise(weight.new_zeros(shape), is_random)
+            before = _first_noise(network.mlp[-1].weight.new_zeros(shape), is_random)
         tensordict.set("noise_before", before)
         if is_random is None:
             return super().forward(tensordict, **kwargs).set("noise", before)
@@ -152,7 +169,7 @@ class CorrelatedActor(TanhGaussianActor):
         xi = _first_noise(torch.zeros_like(loc.detach()), is_random)
         log_prob_key = self[1].log_prob_key if self[1].return_log_prob else None
         written = _tanh_gaussian(loc, scale, xi, *_bounds(self), log_prob_key)
-        return tensordict.update(written).set("noise", self[0].module.head.next(before, xi))
+        return tensordict.update(written).set("noise", network.head.next(before, xi))
 
 
 class PlainTanhGaussian:
@@ -168,7 +185,7 @@ class PlainTanhGaussian:
         self.head, self.activations, self.is_random = network.head, activations, is_random
         self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
         self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
-        self.size = layers[-1].out_features // 2
+        self.size = self.head.size
         self.low, self.high = (x if x is None else x.tolist() for x in _bounds(actor))
         mapping = self.head.scale_mapping
         self.signature = (
@@ -259,11 +276,18 @@ class PlainTanhGaussian:
         pairs = zip(traces[:count], traces[count:], strict=True)
         return [g for x, grad in pairs for g in (grad.t() @ x, grad.sum(0))]
 
+    def action(self, loc: Tensor, scale: Tensor, xi: Tensor) -> Tensor:
+        """The action (*, k) of a normal distribution and the noise in it, each (*, k)."""
+        return self._squash(loc, scale, xi, None)["action"]
+
+    def _squash(self, loc: Tensor, scale: Tensor, xi: Tensor, log_prob_key: Any) -> dict[Any, Tensor]:
+        low, high = (None if bound is None else loc.new_tensor(bound) for bound in (self.low, self.high))
+        return _tanh_gaussian(loc, scale, xi, low, high, log_prob_key)
+
     def _sample(self, raw: Tensor, drawn: Tensor) -> dict[Any, Tensor]:
         xi, *before = drawn.split(self.size, -1)
         loc, scale = self.head(raw, *before)
-        low, high = (None if bound is None else raw.new_tensor(bound) for bound in (self.low, self.high))
-        written = _tanh_gaussian(loc, scale, xi, low, high, self.log_prob_key)
+        written = self._squash(loc, scale, xi, self.log_prob_key)
         if before:
             written |= {"noise_before": before[0], "noise": self.head.next(before[0], xi)}
         return {key: written[key] for key in self.out_keys}

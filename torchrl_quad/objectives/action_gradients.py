@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule
@@ -56,14 +58,62 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
         NotImplementedError: the policy is another one than ``make_actor`` builds, whose noise is not known.
     """
     with params.to_module(actor):
-        plain = actor.plain() if hasattr(actor, "plain") else None
-        if not hasattr(plain, "drawn_again"):
-            raise NotImplementedError(
-                "Gradients that are clipped in each step need a policy as make_actor builds it, whose noise follows "
-                "from its actions, and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed "
-                "parts, or leave clip_action_gradient=None."
-            )
+        plain = _plain(actor)
         return act(plain, tensordict.select(*plain.in_keys).detach(), plain.drawn_again(tensordict))
+
+
+def location_gradient(
+    actor: TensorDictModule,
+    params: TensorDictParams,
+    tensordict: TensorDictBase,
+    grad: Tensor,
+    done: Tensor,
+    discount: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """The gradient in the mean of each action's normal distribution, before the tanh, from that in the action.
+
+    The noise of an action goes on in later ones if it is correlated in time. The gradient then takes these in, up to
+    the end of the episode: it is that in what is new in the noise, divided by its scale.
+
+    Args:
+        actor: the policy that flew the rollout.
+        params: its parameters.
+        tensordict: the rollout (*, horizon), with all that the policy wrote.
+        grad: the gradient in its actions, (*, horizon, k).
+        done: where episodes end, (*, horizon, 1).
+        discount: of the gradient in the next action, for each step; a scalar.
+
+    Returns:
+        the gradient, and the action before the tanh, both (*, horizon, k).
+
+    Raises:
+        NotImplementedError: as for :func:`act_again`.
+    """
+    with params.to_module(actor):
+        plain = _plain(actor)
+        xi = plain.drawn_again(tensordict)[:, : plain.size].view_as(grad)
+        scale = tensordict["scale"].detach()
+        loc = tensordict["loc"].detach().requires_grad_()
+        with torch.enable_grad():
+            (grad,) = torch.autograd.grad((plain.action(loc, scale, xi) * grad).sum(), loc)
+    if plain.rho is not None:
+        in_noise, steps = torch.zeros_like(grad[..., 0, :]), []
+        for g, s, end in zip(*(x.unbind(-2)[::-1] for x in (grad, scale, done)), strict=True):
+            in_noise = g * s + plain.rho * discount * torch.where(end, 0.0, in_noise)
+            steps.append(in_noise / s)
+        grad = torch.stack(steps[::-1], -2)
+    return grad, (loc + scale * xi).detach()
+
+
+def _plain(actor: TensorDictModule) -> Any:
+    plain = actor.plain() if hasattr(actor, "plain") else None
+    if not hasattr(plain, "drawn_again"):
+        raise NotImplementedError(
+            "Gradients of single actions need a policy as make_actor builds it, whose noise follows from its actions, "
+            "and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed parts, or leave "
+            "clip_action_gradient=None."
+        )
+    return plain
 
 
 class MedianClip(nn.Module):

@@ -1,0 +1,227 @@
+"""The hybrid loss: the pathwise gradient where it explains what actions do, and the score function for the rest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torch.distributions import Normal, kl_divergence
+
+from torchrl_quad.objectives.action_gradients import act_again, action_gradient, location_gradient
+from torchrl_quad.objectives.critic import PathwiseCriticLoss
+from torchrl_quad.objectives.pathwise import discounts, segments
+
+
+class HybridLoss(PathwiseCriticLoss):
+    r"""Hybrid of pathwise and score-function gradient, each weighted by what a rollout says of it.
+
+    The simulator's derivative gives p_t, the gradient of an action's own lambda-return in the mean of that action.
+    The flight itself gives A_t, the advantage of the same action. If p_t is right, then A_t is p_t . (u_t - loc_t) plus
+    what does not depend on this action, where u_t is the action before the tanh. The loss therefore regresses A on
+    p . (u - loc). The slope is the ``pathwise_weight`` b: near 1 where the derivative tells the
+    truth, and near 0 where it does not, as before a bonus that nobody has got yet. The pathwise term is
+
+        - b mean_t p_t . loc(s_t)
+
+    and the score function takes the rest of the advantage, A'_t = A_t - b p_t . (u_t - loc_t), in the clipped surrogate
+    of PPO. Where b p is right, A' holds nothing but the luck of other steps. How far its gradients from two halves of
+    the environments agree, 2 g_1 . g_2 / (|g_1|^2 + |g_2|^2), is the ``score_weight`` w that multiplies it: the factor
+    of a Wiener filter. Both weights are running means over rollouts, and clamped to [0, 1]. On smooth tasks b goes to 1
+    and w towards 0, and the loss becomes first order by itself.
+
+    The pair is a control variate as that of Q-Prop (Gu et al. 2017), with the derivative of a simulated flight in
+    place of a critic's. The lambda-return of p_t bootstraps with V at every step, and each p_t is not discounted from
+    the start of the horizon. With noise that is correlated in time, an action's noise goes on in later actions, and
+    p_t + c p_(t+1) + c^2 p_(t+2) + ... takes the place of p_t, as it does in A_t: c = rho gamma lambda.
+
+    One rollout serves several epochs of minibatches: :meth:`write_targets` reads the graph once.
+
+    .. code-block:: python
+
+        rollout, carry = differentiable_rollout(env, actor, carry, 32)
+        data = loss.write_targets(rollout)
+        for batch in minibatches(data):
+            losses = loss(batch)
+            (losses["loss_actor"] + losses["loss_value"]).backward()
+
+    Args:
+        actor_network: the policy that flew the rollout, as ``make_actor`` builds it.
+        value_network: the critic V(s).
+        gradient_lmbda: lambda of the return that p_t differentiates, in (0, 1]. That of the advantage and of the
+            critic's targets is ``make_value_estimator(lmbda=...)``.
+        clip_epsilon: how far the ratio of probabilities may move from 1.
+        clip_action_gradient: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
+        decay: of the running weights, for each rollout.
+        average: of a scalar over the processes that train together, if there are several.
+        reduction: "mean", "sum" or "none" over samples.
+
+    Raises:
+        ValueError: an option is out of its range; (in use) as for every pathwise loss.
+        NotImplementedError: (in use) the policy is another one than ``make_actor`` builds.
+    """
+
+    @dataclass
+    class _AcceptedKeys(PathwiseCriticLoss._AcceptedKeys):
+        """As for every pathwise loss with a critic, and the keys under which :meth:`HybridLoss.write_targets` writes.
+
+        ``advantage`` is A' and ``location_gradient`` b p, both divided by the standard deviation of A; ``latent`` is
+        the action before the tanh.
+        """
+
+        value: NestedKey = "state_value"
+        advantage: NestedKey = "advantage"
+        location_gradient: NestedKey = "location_gradient"
+        latent: NestedKey = "latent"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    critic_name = "value_network"
+    critic_loss_key = "loss_value"
+    prediction_key = "value"
+    out_keys = [
+        *("loss_actor", "loss_value", "pathwise_weight", "score_weight", "kl"),
+        *("pred_value", "target_value", "explained_variance"),
+    ]
+
+    value_network: TensorDictModule
+    value_network_params: TensorDictModule
+    target_value_network_params: TensorDictModule
+    pathwise_weight: Tensor
+    score_weight: Tensor
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        value_network: TensorDictModule,
+        *,
+        gradient_lmbda: float = 0.9,
+        clip_epsilon: float = 0.2,
+        clip_action_gradient: float | None = 2.0,
+        decay: float = 0.9,
+        average: Callable[[Tensor], Tensor] = lambda x: x,
+        reduction: str = "mean",
+    ) -> None:
+        if not 0 < gradient_lmbda <= 1:
+            raise ValueError(f"gradient_lmbda must lie in (0, 1], got {gradient_lmbda}; 0.9 is usual.")
+        if not 0 < clip_epsilon < 1:
+            raise ValueError(f"clip_epsilon must lie between 0 and 1, got {clip_epsilon}; 0.2 is usual.")
+        if not 0 <= decay < 1:
+            raise ValueError(f"decay must lie in [0, 1), got {decay}.")
+        super().__init__(actor_network, clip_action_gradient=clip_action_gradient, reduction=reduction)
+        self.gradient_lmbda, self.clip_epsilon, self.decay, self.average = gradient_lmbda, clip_epsilon, decay, average
+        self.convert_to_functional(value_network, "value_network", create_target_params=False)
+        for name in ("pathwise_weight", "score_weight"):
+            self.register_buffer(name, torch.full((), math.nan, device=self._default_device, dtype=self._precision))
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The losses and their metadata, the ``out_keys``.
+
+        Args:
+            tensordict: samples (*) of what :meth:`write_targets` returned, or a rollout (*, horizon) with its graph.
+        """
+        if self.tensor_keys.advantage not in tensordict:
+            tensordict = self.write_targets(tensordict)
+        loss_actor, metadata = self.loss_actor(tensordict)
+        loss_value, critic_metadata = self.loss_value(tensordict)
+        return TensorDict({"loss_actor": loss_actor, "loss_value": loss_value, **metadata, **critic_metadata}, [])
+
+    def write_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Differentiate a rollout (*, horizon), update the weights, and write what the minibatches read.
+
+        Returns:
+            the rollout without its graph, and with ``advantage``, ``location_gradient``, ``latent`` and
+            ``value_target``, each under its tensor key.
+        """
+        self._require_rollout(tensordict)
+        keys = self.tensor_keys
+        grad = self._own_gradient(tensordict)
+        data = self.write_value_target(tensordict.detach())
+        done, discount = data.get(("next", keys.done)), self.value_estimator.gamma * self.value_estimator.lmbda
+        grad, latent = location_gradient(self.actor_network, self.actor_network_params, data, grad, done, discount)
+        with torch.no_grad():
+            advantage = data.get(keys.value_target) - self._value(data, target=False)
+            deviation = advantage.std().clamp_min(1e-12)
+            advantage, grad = (advantage - advantage.mean()) / deviation, grad / deviation
+            predicted = (grad * (latent - data.get("loc"))).sum(-1, keepdim=True)
+            predicted = predicted - predicted.mean()
+            covariance, variance = (predicted * advantage).mean(), predicted.square().mean()
+            slope = self.average(covariance) / self.average(variance).clamp_min(1e-12)
+            weight = self._update("pathwise_weight", slope)
+        data.set(keys.advantage, advantage - weight * predicted)
+        data.set(keys.location_gradient, weight * grad)
+        data.set(keys.latent, latent)
+        self._update("score_weight", self.average(self._agreement(data)))
+        return data
+
+    def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The actor's loss, and its metadata: the two weights, and KL(policy that flew || policy).
+
+        Args:
+            tensordict: samples (*) of what :meth:`write_targets` returned.
+        """
+        keys = self.tensor_keys
+        new, old = self._distributions(tensordict)
+        advantage = tensordict.get(keys.advantage)
+        ratio = self._ratio(new, old, tensordict)
+        clipped = ratio.clamp(1.0 - self.clip_epsilon, 1.0 + self.clip_epsilon)
+        score = torch.minimum(ratio * advantage, clipped * advantage).squeeze(-1)
+        pathwise = (tensordict.get(keys.location_gradient) * (new.loc - old.loc)).sum(-1)
+        weights = {name: getattr(self, name).clamp(0.0, 1.0) for name in ("pathwise_weight", "score_weight")}
+        kl = kl_divergence(old, new).sum(-1).mean().detach()
+        return self._reduce_loss(-(weights["score_weight"] * score + pathwise)), {**weights, "kl": kl}
+
+    def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The critic's loss on samples (*) of what :meth:`write_targets` returned, and its metadata."""
+        return self._critic_loss(tensordict)
+
+    def _own_gradient(self, tensordict: TensorDictBase) -> Tensor:
+        """The gradient of each action's own lambda-return in that action: (*, horizon, k)."""
+        keys, estimator = self.tensor_keys, self.value_estimator
+        done, terminated = (tensordict.get(("next", key)) for key in (keys.done, keys.terminated))
+        reward = tensordict.get(("next", keys.reward))
+        self._require_graph(reward, ("next", keys.reward))
+        gamma = estimator.gamma.to(reward.dtype)
+        value = self._value(tensordict.get("next").select(*self._critic_inputs()), target=False)
+        _, end = segments(done)
+        bootstrap = torch.where(terminated, 0.0, torch.where(end, 1.0, 1.0 - self.gradient_lmbda) * value)
+        discount = discounts(done, gamma * self.gradient_lmbda)
+        objective = (discount * (reward + gamma * bootstrap)).sum()
+        grad = action_gradient(objective, tensordict.get(keys.action)) / discount
+        return grad if self.clip is None else self.clip(grad)[0]
+
+    def _agreement(self, data: TensorDictBase) -> Tensor:
+        """How far the score function's gradients from two halves of the environments agree, a scalar from -1 to 1."""
+        parameters, grads = list(self.actor_network_params.values(True, True)), []
+        for half in data.reshape(-1, data.shape[-1]).chunk(2):
+            with torch.enable_grad():
+                new, old = self._distributions(half)
+                surrogate = (self._ratio(new, old, half) * half.get(self.tensor_keys.advantage)).mean()
+            grad = torch.autograd.grad(surrogate, parameters, allow_unused=True)
+            grads.append(torch.cat([x.flatten() for x in grad if x is not None]))
+        if len(grads) < 2:  # a single flight
+            return torch.ones_like(self.score_weight)
+        product, size = grads[0] @ grads[1], grads[0].square().sum() + grads[1].square().sum()
+        return 2.0 * product / size.clamp_min(1e-30)
+
+    def _distributions(self, tensordict: TensorDictBase) -> tuple[Normal, Normal]:
+        """The normal distribution of the policy as it is, and as it flew."""
+        new = act_again(self.actor_network, self.actor_network_params, tensordict)
+        return Normal(new["loc"], new["scale"]), Normal(tensordict.get("loc"), tensordict.get("scale"))
+
+    def _ratio(self, new: Normal, old: Normal, tensordict: TensorDictBase) -> Tensor:
+        """The ratio of the probabilities of the action that was flown: (*, 1)."""
+        latent = tensordict.get(self.tensor_keys.latent)
+        return (new.log_prob(latent) - old.log_prob(latent)).sum(-1, keepdim=True).exp()
+
+    def _update(self, name: str, measured: Tensor) -> Tensor:
+        """Update the running mean of a weight; it may leave [0, 1], so that noise around 0 averages to 0."""
+        running = getattr(self, name)
+        running.copy_(torch.where(running.isnan(), measured, torch.lerp(measured, running, self.decay)))
+        return running.clamp(0.0, 1.0)

@@ -197,8 +197,11 @@ class Run:
         ):
             rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, min(self.cfg.horizon, 2))
             if pathwise:
+                buffers = [(x, x.clone()) for x in self.loss.buffers()]  # such as running means
                 self.loss.loss_actor(rollout)[0].backward()
                 self.loss.zero_grad()
+                for x, before in buffers:
+                    x.copy_(before)
 
     def _evaluate(self) -> dict[str, float]:
         """Fly the policy as it is, and log the result with everything recorded since the last time."""

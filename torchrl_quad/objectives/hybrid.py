@@ -126,8 +126,7 @@ class HybridLoss(PathwiseCriticLoss):
         Args:
             tensordict: samples (*) of what :meth:`write_targets` returned, or a rollout (*, horizon) with its graph.
         """
-        if self.tensor_keys.advantage not in tensordict:
-            tensordict = self.write_targets(tensordict)
+        tensordict = self._with_targets(tensordict)
         loss_actor, metadata = self.loss_actor(tensordict)
         loss_value, critic_metadata = self.loss_value(tensordict)
         return TensorDict({"loss_actor": loss_actor, "loss_value": loss_value, **metadata, **critic_metadata}, [])
@@ -164,9 +163,9 @@ class HybridLoss(PathwiseCriticLoss):
         """The actor's loss, and its metadata: the two weights, and KL(policy that flew || policy).
 
         Args:
-            tensordict: samples (*) of what :meth:`write_targets` returned.
+            tensordict: as for :meth:`forward`.
         """
-        keys = self.tensor_keys
+        keys, tensordict = self.tensor_keys, self._with_targets(tensordict)
         new, old = self._distributions(tensordict)
         advantage = tensordict.get(keys.advantage)
         ratio = self._ratio(new, old, tensordict)
@@ -180,6 +179,9 @@ class HybridLoss(PathwiseCriticLoss):
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The critic's loss on samples (*) of what :meth:`write_targets` returned, and its metadata."""
         return self._critic_loss(tensordict)
+
+    def _with_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict if self.tensor_keys.advantage in tensordict else self.write_targets(tensordict)
 
     def _own_gradient(self, tensordict: TensorDictBase) -> Tensor:
         """The gradient of each action's own lambda-return in that action: (*, horizon, k)."""

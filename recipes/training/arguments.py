@@ -30,12 +30,12 @@ def _rewritten(value: str) -> str:
     for read in (ast.literal_eval, json.loads):
         try:
             content = read(value.strip())
+            if isinstance(content, tuple):
+                return ",".join(map(_written, content))
+            if isinstance(content, dict | list | None):
+                return _written(content)
         except (ValueError, SyntaxError, RecursionError, MemoryError):
             continue
-        if isinstance(content, tuple):
-            return ",".join(map(_written, content))
-        if isinstance(content, dict | list | None):
-            return _written(content)
     return value
 
 

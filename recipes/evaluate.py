@@ -9,7 +9,7 @@ import torch
 from omegaconf import DictConfig
 from training.building import build_env
 from training.drawing import draw_flight, publish_flight
-from training.evaluation import final_evaluation, load_policy, print_summary, write_summary
+from training.evaluation import final_evaluation, load_policy, print_summary, title, write_summary
 from training.launch import recipe
 
 
@@ -21,8 +21,8 @@ def main(cfg: DictConfig) -> None:
     folder, env = Path(cfg.checkpoint).parent, build_env(trained, 1, 0)
     write_summary(folder / "evaluation.json", summary)
     path = folder / "evaluation"
-    draw_flight(flight, path, env)
-    publish_flight(flight, path.with_suffix(".pdf"), path.with_suffix(".html"), env)
+    draw_flight(flight, path, env, title(summary))
+    publish_flight(flight, path.with_suffix(".pdf"), path.with_suffix(".html"), env, title(summary))
     print_summary(summary, env.metric_info, folder)
 
 

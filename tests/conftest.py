@@ -4,8 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from browsing import browser, open_page  # noqa: F401, fixtures
 
 from torchrl_quad import HoveringEnv
+from torchrl_quad.envs.scenery import Scenery
+from torchrl_quad.envs.shapes import Shape
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 sys.path.insert(0, str(RECIPES))
@@ -39,6 +42,24 @@ def crashing():
         return env.rollout(steps, tensordict=start, auto_reset=False, break_when_any_done=False)
 
     return fly
+
+
+@pytest.fixture
+def own_scenery():
+    """A task of one's own, whose scenery names everything that there is."""
+
+    class Window(HoveringEnv):
+        """To a point behind a window."""
+
+        def scenery(self):
+            wall = Shape.box((0.2, -1.0, 0.0), (0.3, -0.4, 2.5), name="wall")
+            ball = Shape.sphere((1.5, 0.8, 1.0), 0.2, name="ball", color="#c8452f")
+            tree = Shape.cylinder((0.8, -0.8, 0.0), 0.1, 1.8, name="tree", color="#3a9a5b")
+            rope = Shape.line([(0, 0, 1), (1, 0, 2), (2, 1, 1)], name="rope")
+            targets = {"places": [(2.0, 0.0, 1.5)], "curve": [(0, 0, 1.5), (1, 0, 1.5)]}
+            return Scenery(gates=[(0.25, 0.0, 1.5)], gate_radius=0.4, shapes=[wall, ball, tree, rope], **targets)
+
+    return Window
 
 
 @pytest.fixture

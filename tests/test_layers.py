@@ -33,7 +33,7 @@ LIBRARIES = {
     "dynamics": {"torch", "numpy", "yaml"},
     "engine": {"torch", "tensordict"},
     "envs": TORCHRL | {"numpy"},
-    "render": TORCHRL | {"matplotlib", "mpl_toolkits", "plotly", "PIL", "numpy"},
+    "render": TORCHRL | {"matplotlib", "mpl_toolkits", "plotly", "PIL", "imageio_ffmpeg", "numpy"},
     "modules": TORCHRL,
     "objectives": TORCHRL,
     "data": TORCHRL,

@@ -13,42 +13,61 @@ from training import loop
 from training.checkpoints import read_checkpoint, revision
 
 
-def test_wandb_gets_configuration_metrics_pictures_films_replay_and_checkpoint(launch, tmp_path):
+def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(launch, tmp_path):
     small = [*SMALL, f"hydra.run.dir={tmp_path}"]
-    launch("bptt", *small, "logger.backend=wandb", "logger.flight_every=3")
-    launch("bptt", *small, "resume=auto", "total_steps=240")
+    (tmp_path / "bundle").mkdir()  # what has been exported lies beside the checkpoint
+    (tmp_path / "bundle/policy.txt").write_text("exported")
+    launch("bptt", *small, "seed=3", "actor.lr=0.01", "logger.backend=wandb", "logger.flight_every=3")
+    launch("bptt", *small, "seed=3", "actor.lr=0.01", "resume=auto", "total_steps=240")
     resumed = read_checkpoint(tmp_path / "checkpoint.pt")
     logs = sorted(tmp_path.glob("wandb/offline-run-*/*.wandb"))
     assert len(logs) == 2 and len({log.stem for log in logs}) == 1  # one run, of two parts
     first, second = (wandb_records(log) for log in logs)
 
-    config = {item.key: json.loads(item.value_json) for item in first["run"][0].run.config.update}
+    run = first["run"][0].run
+    assert run.display_name == second["run"][0].run.display_name
+    assert run.display_name.startswith("hovering_bptt_seed3 num_envs=4 horizon=6 ")
+    assert run.display_name.endswith(" compile=false actor.lr=0.01")
+    assert list(run.tags) == ["hovering", "bptt", "visfly"] and run.job_type == "train"
+    changes = [*run.config.update, *(item for record in first.get("config", []) for item in record.config.update)]
+    config = {item.key: json.loads(item.value_json) for item in changes if item.key}  # the last of each counts
     assert config["task"] == "hovering" and config["env"]["dt"] == 0.005
     assert config["revision"] == revision() != "unknown"
+    axes = {(x.metric.glob_name or x.metric.name): x.metric.step_metric for x in first["metric"]}
+    assert axes.pop("*") == "steps" and set(axes.values()) <= {"", "steps"}
+
     history = [logged(record) for record in first["history"]]
+    assert all("steps" in row for row in history) and not any(name.endswith("/step") for row in history for name in row)
     curves = [row for row in history if "eval/return" in row]
-    assert [row["eval/step"] for row in curves] == [48, 96, 144, 192]
+    assert [row["steps"] for row in curves] == [48, 96, 144, 192]
     names = {name for name in rows(tmp_path)[0] if "/" in name} | {
         f"time/{name}" for name in ("seconds", "processor_seconds", "steps_per_second")
     }
     assert names <= set(curves[0])
     assert {name.split("/")[0] for name in names} == {"train", "eval", "reward", "grad", "time"}
     assert [row["eval/return"] for row in curves] == [row["eval/return"] for row in resumed["rows"][:4]]
+    final, best = json.loads((tmp_path / "summary.json").read_text()), logged(second["history"][-1])
+    assert min(x for x in names | set(best) if "/" in x).startswith("best/")  # wandb sorts by name
+    assert [best[f"best/{x}"] for x in ("solved", "return")] == [final[x] for x in ("solved", "return")]
+    assert best["best/steps"] == final["best_steps"] and best["steps"] == 240
     # The third evaluation and the final one draw the flight; the page comes with the final one alone.
     items = [item for record in first["history"] for item in record.history.item]
     media = [(item.nested_key[0], json.loads(item.value_json)) for item in items if item.nested_key[1:] == ["path"]]
     kinds = {
         "eval/flight": (2, b"\x89PNG"),
-        "eval/film": (2, b"GIF89a"),
+        "eval/film": (2, b"\0\0\0 ftyp"),
         "eval/learning_curve": (1, b"\x89PNG"),
         "eval/replay": (1, b"<!doctype html>"),
     }
     assert Counter(name for name, path in media) == {name: count for name, (count, _) in kinds.items()}
     for name, path in media:
         assert (logs[0].parent / "files" / path).read_bytes().startswith(kinds[name][1]), name
-    assert first["artifact"][0].artifact.type == "model"
-    assert [entry.path for entry in first["artifact"][0].artifact.manifest.contents] == ["checkpoint.pt"]
-    assert [logged(r)["eval/step"] for r in second["history"] if "eval/return" in logged(r)] == [240]
+    artifact = first["artifact"][0].artifact
+    assert artifact.type == "model" and list(artifact.aliases) == ["best", "latest"]
+    contents = {entry.path for entry in artifact.manifest.contents}
+    assert contents == {"checkpoint.pt", "config.yaml", "summary.json", "bundle/policy.txt"}
+    assert json.loads(second["artifact"][0].artifact.metadata)["return"] == final["return"]
+    assert [logged(r)["steps"] for r in second["history"] if "eval/return" in logged(r)] == [240]
 
 
 def wandb_records(path):
@@ -148,7 +167,7 @@ def test_too_many_of_them_stop_the_run_and_leave_the_state(refused, no_pictures,
 
 def test_a_run_draws_no_flight_twice(launch, no_pictures, monkeypatch, tmp_path):
     drawn = []
-    monkeypatch.setattr(loop.drawing, "draw_flight", lambda flight, path, env: drawn.append(len(flight)))
+    monkeypatch.setattr(loop.drawing, "draw_flight", lambda flight, path, env, title: drawn.append(len(flight)))
     small = [*SMALL, "total_steps=48", "eval.interval=1", f"hydra.run.dir={tmp_path}"]
     launch("bptt", *small, "logger.flight_every=1")
     assert drawn == [4, 256]  # after the first iteration, and the best policy at the end

@@ -69,7 +69,7 @@ def test_every_recipe_trains_on_every_task_and_leaves_what_it_promises(launch, r
         if recipe == "abpt":
             for picture in ("learning_curve.png", "flight.png"):
                 assert (folder / picture).read_bytes().startswith(b"\x89PNG")
-            assert (folder / "flight.gif").read_bytes().startswith(b"GIF89a")
+            assert (folder / "flight.mp4").read_bytes()[4:8] == b"ftyp"
             assert (folder / "episode.pdf").read_bytes().startswith(b"%PDF")
             assert (folder / "flight.html").read_text().startswith("<!doctype html>")
         summary = json.loads((folder / "summary.json").read_text())
@@ -94,7 +94,7 @@ def test_evaluation_repeats_the_summary_of_the_run_also_with_a_normalizer(train,
     assert all(summary[name] == value for name, value in evaluation.items())
     for flown, again in (("flight.png", "evaluation.png"), ("flight.html", "evaluation.html")):  # the same flight
         assert (tmp_path / flown).read_bytes() == (tmp_path / again).read_bytes()
-    assert (tmp_path / "evaluation.gif").read_bytes().startswith(b"GIF89a")
+    assert (tmp_path / "evaluation.mp4").read_bytes()[4:8] == b"ftyp"
     assert (tmp_path / "evaluation.pdf").read_bytes().startswith(b"%PDF")
 
 
@@ -137,5 +137,5 @@ def test_the_entropy_bonus_is_an_option_and_its_coefficient_can_be_learned(train
 def test_make_train_trains_and_leaves_its_results(tmp_path):
     printed = run("make", "train", f"ARGS={' '.join(SMALL)} hydra.run.dir={tmp_path}")
     assert "abpt on hovering, seed 0, 256 fresh episodes" in printed
-    pictures = {"learning_curve.png", "flight.png", "flight.gif", "flight.html", "episode.pdf"}
+    pictures = {"learning_curve.png", "flight.png", "flight.mp4", "flight.html", "episode.pdf"}
     assert {"checkpoint.pt", "metrics.csv", *pictures} <= {path.name for path in tmp_path.iterdir()}

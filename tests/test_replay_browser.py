@@ -1,8 +1,5 @@
 """Replays in a browser without a network."""
 
-import os
-import shutil
-
 import numpy as np
 import pytest
 import torch
@@ -12,95 +9,7 @@ from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.render import write_replay
 
-TIMEOUT = 120_000  # [ms]; the machine may be busy with other tests
 NUM_ENVS, STEPS = 3, 1000
-
-
-@pytest.fixture(scope="module")
-def browser():
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        message = "Replays are tested in a browser, and there is no chromium (Debian: apt install chromium)."
-        if os.environ.get("REQUIRE_BROWSER") == "1":
-            pytest.fail(message)
-        pytest.skip(message)
-    from playwright.sync_api import sync_playwright
-
-    webgl_on_the_cpu = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", *webgl_on_the_cpu])
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
-def open_page(browser):
-    """Opens a replay offline; a request that leaves the machine, and any error, fails the test that closes it."""
-
-    class Replay:
-        def __init__(self, path):
-            self.context = browser.new_context(offline=True, viewport={"width": 900, "height": 480})
-            self.page = self.context.new_page()
-            self.page.set_default_timeout(TIMEOUT)
-            self.wrong = []
-            self.page.on("console", lambda m: self.wrong.append(m.text) if m.type == "error" else None)
-            self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
-            self.page.on("request", lambda r: None if r.url.startswith("file://") else self.wrong.append(r.url))
-            self.page.goto(path.as_uri())
-            self.page.wait_for_selector("body[data-ready]")
-
-        def trace(self, name, of="space"):
-            """The points (n, k) of a trace as they are plotted: x, y and, in space, z."""
-            script = """([of, name]) => {
-                const trace = document.getElementById(of).data.find((trace) => trace.name === name);
-                return ["x", "y", "z"].filter((key) => trace[key])
-                    .map((key) => Array.from(trace[key], (value) => Number.isFinite(value) ? value : null));
-            }"""
-            return np.array(self.page.evaluate(script, [of, name]), dtype=float).T
-
-        def bodies(self):
-            """The points of each body (num_envs, points, 3); the first is the centre of the drone."""
-            points = self.trace("body")
-            return points.reshape(self.page.locator("#environment option").count() - 1, -1, 3)
-
-        def picture(self):
-            return self.page.locator("#space").screenshot(timeout=TIMEOUT)
-
-        def scrub(self, frame):
-            self.page.locator("#time").fill(str(frame))
-
-        def step(self):
-            return int(self.page.locator("#time").input_value())
-
-        def wait(self, condition):
-            """Waits until a condition on the ``step`` of the slider holds."""
-            # Not page.wait_for_function, which evaluates a string in the page: its policy does not allow that.
-            done = self.page.evaluate(
-                """(deadline) => new Promise((done) => {
-                    deadline += performance.now();
-                    requestAnimationFrame(function look() {
-                        const step = Number(document.getElementById("time").value);
-                        const holds = CONDITION;
-                        if (holds || performance.now() > deadline) done(holds);
-                        else requestAnimationFrame(look);
-                    });
-                })""".replace("CONDITION", condition),
-                TIMEOUT,
-            )
-            assert done, f"{condition} did not become true"
-
-        def series(self):
-            """The names of the curves, and of the panels."""
-            return self.page.evaluate(
-                "() => { const {data, layout} = document.getElementById('series');"
-                "return [data.map((t) => t.name), layout.annotations.map((a) => a.text.replace(/<[^>]*>/g, ''))]; }"
-            )
-
-        def close(self):
-            self.context.close()
-            assert not self.wrong
-
-    return Replay
 
 
 @pytest.fixture(scope="module")
@@ -141,8 +50,13 @@ def test_a_flight_of_every_task_opens_offline_without_errors(task, open_page, tm
     assert type(env).__name__ in replay.page.title()
     np.testing.assert_allclose(replay.bodies()[:, 0], rollout["state", "position"][:, 0], atol=1e-6)
     distance = f"distance to the {'next gate' if task == 'racing' else 'target'} [m]"
-    panels = ["reward, sum", "action [-1, 1], thrust", "speed [m/s]", distance]
+    success = "  dashed: success below it" if task in ("hovering", "tracking") else ""
+    panels = ["reward, sum", "action [-1, 1], thrust", "speed [m/s]", distance + success]
     assert replay.series()[1] == panels
+    assert replay.layout("yaxis4.type") == ("linear" if task == "racing" else "log")
+    if success:
+        low, high = replay.layout("yaxis4.range")
+        assert low < -1 < high and replay.layout("shapes.0.y0") == pytest.approx(0.1)
     replay.close()
 
 
@@ -261,6 +175,12 @@ def test_the_cursor_is_in_step_and_a_click_goes_to_a_time(replay):
         box = replay.page.locator("#cursor").bounding_box()
         centre = box["x"] + box["width"] / 2
         assert centre == pytest.approx(np.interp(0.02 * frame, times, pixels), abs=1.5)
+    for axis, part in zip(
+        ("yaxis", "yaxis2", "yaxis3", "yaxis4"), replay.page.locator("#cursor div").all(), strict=True
+    ):
+        top, height = (replay.layout(f"{axis}.{name}") for name in ("_offset", "_length"))
+        part, around = part.bounding_box(), replay.page.locator("#series").bounding_box()
+        assert (part["y"] - around["y"], part["height"]) == pytest.approx((top, height), abs=1.5)  # not on the labels
     box = replay.page.locator("#series").bounding_box()
     x, y = np.interp(8.0, times, pixels), box["y"] + 0.6 * box["height"]
     replay.page.mouse.move(x - 5, y)
@@ -300,6 +220,22 @@ def test_keys_of_the_browser_are_left_to_it_and_those_of_the_page_work_after_a_c
     keyboard.down(" ")  # held, it repeats
     keyboard.up(" ")
     assert replay.page.inner_text("#play") == "Pause"
+
+
+def test_everything_that_the_scenery_of_a_task_names_is_drawn(open_page, own_scenery, tmp_path):
+    env = own_scenery(num_envs=2)
+    write_replay(env.rollout(6, break_when_any_done=False), tmp_path / "replay.html", env=env)
+    replay, scenery = open_page(tmp_path / "replay.html"), env.scenery()
+    np.testing.assert_allclose(replay.trace("gates")[:33], scenery.rings()[0], atol=1e-6)
+    np.testing.assert_allclose(replay.trace("places"), scenery.places, atol=1e-6)
+    np.testing.assert_allclose(replay.trace("path"), scenery.curve, atol=1e-6)
+    for shape in scenery.shapes:
+        np.testing.assert_allclose(replay.trace(shape.name), shape.points, atol=1e-6)
+    target = replay.trace("target")  # which is no gate
+    np.testing.assert_allclose(target, np.tile(env.target, (2, 1)), atol=1e-6)
+    replay.page.select_option("#environment", "1")
+    assert replay.page.locator("#size option").first.inner_text() == "to scale"
+    replay.close()
 
 
 def test_a_drone_is_seen_until_its_position_is_no_longer_finite(open_page, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
 from tensordict import TensorDictBase
@@ -11,18 +12,26 @@ from torchrl_quad.files import replacing
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, write_replay
 
 
-def draw_flight(flight: TensorDictBase, path: Path, env: EnvBase) -> None:
-    """Draw a flight as a picture and as a film: ``path`` with .png and .gif."""
-    for draw, suffix in ((plot_flight, ".png"), (animate_flight, ".gif")):
-        with replacing(path.with_suffix(suffix)) as temporary:
-            draw(flight, temporary, env=env)
+def draw_flight(flight: TensorDictBase, path: Path, env: EnvBase, title: str) -> None:
+    """Draw a flight as a picture and as a film: ``path`` with .png and, see :func:`film_of`, .mp4 or .gif."""
+    with replacing(path.with_suffix(".png")) as temporary:
+        plot_flight(flight, temporary, env=env, title=title)
+    film = film_of(path)
+    sharp = {"fps": 25, "size": 560} if film.suffix == ".mp4" else {}
+    with replacing(film) as temporary:
+        animate_flight(flight, temporary, env=env, **sharp)
 
 
-def publish_flight(flight: TensorDictBase, figure: Path, page: Path, env: EnvBase) -> None:
+def film_of(path: Path) -> Path:
+    """The film beside a picture: .mp4, or .gif where imageio-ffmpeg is not installed."""
+    return path.with_suffix(".mp4" if find_spec("imageio_ffmpeg") else ".gif")
+
+
+def publish_flight(flight: TensorDictBase, figure: Path, page: Path, env: EnvBase, title: str) -> None:
     """Draw the first episode of a flight as a figure for a paper, and write a page that plays the flight."""
     with replacing(figure) as temporary:
         plot_episode(flight, temporary, env=env)
-    write_replay(flight, page, env=env)
+    write_replay(flight, page, env=env, title=title)
 
 
 def draw_learning_curve(metrics: Path, path: Path, env: EnvBase) -> None:

@@ -19,7 +19,7 @@ from torchrl.envs.utils import ExplorationType
 
 from torchrl_quad import differentiable_rollout
 from torchrl_quad.envs.episodes import first_episode
-from torchrl_quad.envs.scenery import describe_metric
+from torchrl_quad.envs.scenery import EPISODE_METRICS, describe_metric
 from torchrl_quad.files import replacing
 from training.building import build_env, make_policy
 from training.checkpoints import read_checkpoint
@@ -106,11 +106,25 @@ def load_policy(
     return cfg, *best_policy(cfg, saved["best"], checkpoint)
 
 
-def write_summary(path: Path, summary: Mapping[str, Any]) -> None:
-    """Write a summary as JSON; what is not a number becomes null."""
+def as_json(summary: Mapping[str, Any]) -> str:
+    """A summary as JSON; what is not a number becomes null."""
     content = {key: None if isinstance(x, float) and math.isnan(x) else x for key, x in summary.items()}
+    return json.dumps(content, indent=2, allow_nan=False) + "\n"
+
+
+def write_summary(path: Path, summary: Mapping[str, Any]) -> None:
+    """Write a summary as JSON."""
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+        temporary.write_text(as_json(summary))
+
+
+def title(summary: Mapping[str, Any]) -> str:
+    """A summary in one line: "abpt on hovering, seed 0: 100 % of 256 episodes solved"."""
+    solved = EPISODE_METRICS["solved"].format(summary["solved"])
+    return (
+        f"{summary['algorithm']} on {summary['task']}, seed {summary['seed']}: {solved} of {summary['episodes']} "
+        "episodes solved"
+    )
 
 
 def print_summary(summary: Mapping[str, Any], metric_info: Mapping[str, Any], folder: Path) -> None:

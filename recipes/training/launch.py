@@ -23,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchrl_quad
 from torchrl_quad.dynamics import presets
+from training.arguments import hydra_argument
 from training.checkpoints import take_over
 from training.folders import own_folder
 from training.processes import from_the_first, joined, rank
@@ -87,6 +88,7 @@ def recipe(config: str) -> Callable[[Callable[[DictConfig], None]], Callable[[],
         def program() -> None:
             full = os.environ.get("HYDRA_FULL_ERROR", "0") not in ("", "0")
             os.environ["HYDRA_FULL_ERROR"] = "1"  # hydra then leaves all exceptions to us
+            sys.argv[1:] = map(hydra_argument, sys.argv[1:])
             try:
                 for path in sorted((RECIPES / "config").rglob("*.yaml")):
                     with _explained():

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import get_logger
 
 from torchrl_quad.files import replacing
+from training.drawing import film_of
+from training.evaluation import as_json
+
+ARTIFACT = ("checkpoint.pt", "config.yaml", "bundle")  # of a run's folder, where they are there; and summary.json
+NOT_IN_A_NAME = ("task=", "seed=", "resume=", "device=", "threads=", "logger.")
 
 
 class Logs:
@@ -41,14 +49,23 @@ class Logs:
         if not cfg.logger.backend:
             return
         config = {**OmegaConf.to_container(cfg, resolve=True), "revision": revision}
-        wandb = {"mode": cfg.logger.mode, "project": cfg.logger.project, "group": cfg.logger.group, "config": config}
-        wandb |= {"reinit": "finish_previous"}  # one that a failed run has left in this process
+        name = f"{cfg.task}_{cfg.algorithm}_seed{cfg.seed}"
+        self.name = (saved or {}).get("name") or run_name(name, HydraConfig.get().overrides.task)
+        wandb = {
+            **{key: cfg.logger[key] for key in ("mode", "project", "group")},
+            "name": self.name,
+            "tags": tags(cfg),
+            "job_type": "train",
+            "config": config,
+            "log_env_packages": False,  # would take the place of the configuration's own section env
+            "reinit": "finish_previous",  # one that a failed run has left in this process
+        }
         if saved:
             wandb["id"] = saved["local"]["id"]
-        name = f"{cfg.task}_{cfg.algorithm}_seed{cfg.seed}"
         self.backend = get_logger(cfg.logger.backend, str(folder), name, wandb_kwargs=wandb)
-        if saved and cfg.logger.backend == "wandb":
-            self.backend.load_state_dict(saved)
+        if cfg.logger.backend == "wandb":
+            self.backend.experiment.define_metric("steps", hidden=True)
+            self.backend.experiment.define_metric("*", step_metric="steps")
         if steps and cfg.logger.backend == "tensorboard":
             self.backend.experiment.close()
             writer = type(self.backend.experiment)
@@ -58,36 +75,48 @@ class Logs:
         """Log a row, and write metrics.csv anew: after a resume it ends where the checkpoint does."""
         self.rows.append(row)
         self._write()
-        if self.backend is not None:
-            self.backend.log_metrics({key: x for key, x in row.items() if "/" in key}, step=row["steps"])
+        metrics = {key: x for key, x in row.items() if "/" in key}
+        if self.cfg.logger.backend == "wandb":
+            self.backend.experiment.log({"steps": row["steps"], **metrics})
+        elif self.backend is not None:
+            self.backend.log_metrics(metrics, step=row["steps"])
 
     def show_flight(self, steps: int) -> None:
-        """Log flight.png and flight.gif."""
+        """Log flight.png and the film."""
         if self.cfg.logger.backend == "wandb":
             import wandb
 
-            picture, film = wandb.Image(str(self.folder / "flight.png")), wandb.Video(str(self.folder / "flight.gif"))
-            self.backend.experiment.log({"eval/flight": picture, "eval/film": film, "eval/step": steps})
+            picture, film = wandb.Image(str(self.folder / "flight.png")), film_of(self.folder / "flight")
+            video = wandb.Video(str(film), format=film.suffix[1:])
+            self.backend.experiment.log({"steps": steps, "eval/flight": picture, "eval/film": video})
 
     def finish(self, summary: dict[str, Any]) -> None:
-        """Log the summary, the learning curve, the replay and the checkpoint, and close the logger."""
+        """Log the summary, the learning curve, the replay, and what to keep of the run, and close the logger."""
         if self.cfg.logger.backend == "wandb":
             import wandb
 
             experiment = self.backend.experiment
             curve = wandb.Image(str(self.folder / "learning_curve.png"))
             page = wandb.Html(str(self.folder / "flight.html"), inject=False)  # as it is
-            experiment.log({"eval/learning_curve": curve, "eval/replay": page})
-            experiment.summary.update({f"final/{name}": value for name, value in summary.items()})
-            checkpoint = wandb.Artifact(f"{self.cfg.task}_{self.cfg.algorithm}_{experiment.id}", type="model")
-            checkpoint.add_file(str(self.folder / "checkpoint.pt"))
-            experiment.log_artifact(checkpoint)
+            numbers = {x: y for x, y in summary.items() if isinstance(y, float) and x != "seconds"}
+            best = {f"best/{x}": y for x, y in {**numbers, "steps": summary["best_steps"]}.items()}
+            experiment.log({"steps": summary["steps"], "eval/learning_curve": curve, "eval/replay": page, **best})
+            name = f"{self.cfg.task}_{self.cfg.algorithm}_{experiment.id}"
+            artifact = wandb.Artifact(name, type="model", metadata=json.loads(as_json(summary)))
+            for path in map(self.folder.joinpath, ARTIFACT):
+                if path.is_dir():
+                    artifact.add_dir(str(path), name=path.name)
+                elif path.exists():
+                    artifact.add_file(str(path))
+            with artifact.new_file("summary.json") as file:
+                file.write(as_json(summary))
+            experiment.log_artifact(artifact, aliases=["best", "latest"])
         if self.backend is not None:
             self.backend.shutdown()
 
     def state_dict(self) -> dict[str, Any] | None:
         """What a run that goes on needs to log into the same wandb run."""
-        return self.backend.state_dict() if self.cfg.logger.backend == "wandb" else None
+        return {**self.backend.state_dict(), "name": self.name} if self.cfg.logger.backend == "wandb" else None
 
     def _write(self) -> None:
         names = list(dict.fromkeys(name for row in self.rows for name in row))
@@ -95,3 +124,17 @@ class Logs:
             writer = csv.DictWriter(file, names, restval=math.nan)
             writer.writeheader()
             writer.writerows(self.rows)
+
+
+def run_name(name: str, overrides: Iterable[str]) -> str:
+    """The name of a run in wandb, at most 128 characters: with what was asked for beside task and seed."""
+    given = [x.lstrip("+") for x in overrides if not x.lstrip("+~").startswith(NOT_IN_A_NAME)]
+    name = " ".join([name, *given])
+    return name if len(name) <= 128 else f"{name[:127]}…"
+
+
+def tags(cfg: DictConfig) -> list[str]:
+    """Task, algorithm and drone."""
+    drone = cfg.env.get("drone")
+    drone = Path(drone).stem if isinstance(drone, str) else "own drone"
+    return [str(tag)[:64] for tag in (cfg.task, cfg.algorithm, drone)]

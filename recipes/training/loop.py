@@ -33,7 +33,15 @@ from torchrl_quad.objectives import PathwiseLoss
 from training import drawing
 from training.building import iterations, own_seed
 from training.checkpoints import read_checkpoint, revision, write_checkpoint
-from training.evaluation import best_policy, drawing_from, evaluate, final_evaluation, print_summary, write_summary
+from training.evaluation import (
+    best_policy,
+    drawing_from,
+    evaluate,
+    final_evaluation,
+    print_summary,
+    title,
+    write_summary,
+)
 from training.logs import Logs
 from training.processes import backward, gather, rank, wait_for_all, world_size
 
@@ -49,8 +57,8 @@ class Run:
     those the one with the greatest return.
 
     Leaves in the run's folder: ``config.yaml``, ``metrics.csv``, ``checkpoint.pt`` and the one before it,
-    ``summary.json``, ``learning_curve.png``, and the flight as ``flight.png``, ``flight.gif``, ``flight.html`` and
-    ``episode.pdf``.
+    ``summary.json``, ``learning_curve.png``, and the flight as ``flight.png``, ``flight.mp4`` or .gif,
+    ``flight.html`` and ``episode.pdf``.
 
     The seconds are those of the loop alone, without set-up, compilation, evaluations and checkpoints. Processor seconds
     count the time in which the threads of this process computed. Of several processes the first evaluates, logs and
@@ -224,7 +232,8 @@ class Run:
         self.logs.add(row)
         every = self.cfg.logger.flight_every
         if every and len(self.rows) % every == 0 and self.done < self.iterations:  # at the end the best one is drawn
-            drawing.draw_flight(flight, self.folder / "flight", self.env)
+            now = {**self.cfg, "episodes": len(flight), "solved": metrics["eval/solved"]}
+            drawing.draw_flight(flight, self.folder / "flight", self.env, title(now))
             self.logs.show_flight(steps)
         score = {name: metrics[f"eval/{name}"] for name in ("solved", "return")}
         # A checkpoint from before knows the return alone.
@@ -253,8 +262,9 @@ class Run:
         steps = self.iterations * self.steps_per_iteration
         summary |= {"steps": steps, "best_steps": self.best["steps"], "seconds": round(self.seconds, 2)}
         summary |= {"revision": self.revision}
-        drawing.draw_flight(flight, self.folder / "flight", self.env)
-        drawing.publish_flight(flight, self.folder / "episode.pdf", self.folder / "flight.html", self.env)
+        picture, figure, page = (self.folder / name for name in ("flight.png", "episode.pdf", "flight.html"))
+        drawing.draw_flight(flight, picture, self.env, title(summary))
+        drawing.publish_flight(flight, figure, page, self.env, title(summary))
         drawing.draw_learning_curve(self.folder / "metrics.csv", self.folder / "learning_curve.png", self.env)
         self.logs.show_flight(steps)
         self.logs.finish(summary)

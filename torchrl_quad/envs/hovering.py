@@ -7,7 +7,7 @@ from torch import Tensor
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.episodes import first_episode
-from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric
+from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
 from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, outside, target_reward
 
 
@@ -71,3 +71,6 @@ class HoveringEnv(QuadrotorEnv):
         error = ((error * last_second).sum(1) / last_second.sum(1)).squeeze(-1)
         solved = (error < self.success_radius) * (1 - metrics["crash"])
         return {**metrics, "solved": solved, "position_error": error}
+
+    def scenery(self) -> Scenery:
+        return Scenery(success=self.success_radius)

@@ -8,7 +8,8 @@ from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.episodes import at_episode_end
 from torchrl_quad.envs.events import Event, ball_entry, level_crossing
-from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric
+from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
+from torchrl_quad.envs.shapes import Shape
 from torchrl_quad.envs.terms import body_observation, norm, outside
 
 
@@ -118,3 +119,8 @@ class LandingEnv(QuadrotorEnv):
         height = at_episode_end(rollout, rollout["next", "state", "position"][..., 2:])
         came_down = height <= self.success_height
         return {**metrics, "landing_speed": torch.where(came_down, metrics["landing_speed"], torch.nan)}
+
+    def scenery(self) -> Scenery:
+        (x, y, _), reach = self.target, self.success_radius
+        zone = (x - reach, y - reach, 0.0), (x + reach, y + reach, self.success_height)
+        return Scenery(shapes=[Shape.box(*zone, name="landing zone")])

@@ -215,8 +215,8 @@ class RacingEnv(QuadrotorEnv):
         return {**metrics, "lap_time": lap_time, "time_near_gate": self.control_dt * near.sum((1, 2)).to(self.dtype)}
 
     def scenery(self) -> Scenery:
-        radius = self.track["gate_radius"]
-        return Scenery("next gate", gates=self.gates, gate_radius=radius, progress="gates_passed")
+        goal = {"progress": "gates_passed", "success": self.success_gates}
+        return Scenery("next gate", gates=self.gates, gate_radius=self.track["gate_radius"], **goal)
 
 
 def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from torchrl_quad.envs.shapes import Shape, along_the_course, as_points, rings
 
 
 @dataclass(frozen=True)
@@ -63,16 +65,47 @@ def describe_metric(name: str, metric_info: Mapping[str, Metric]) -> Metric:
 class Scenery:
     """The things that pictures show beside the drones; positions are in m, in the world frame.
 
-    Places, a curve or gates show where targets are. Without them, pictures show where the entry ``target``
-    (num_envs, 3) of the state has been in the flight.
+    Pictures show all of them. Without places, a curve, or gates that are the targets, they also show where the entry
+    ``target`` (num_envs, 3) of the state has been in the flight.
+
+    Raises:
+        ValueError: something has another shape.
     """
 
     target: str = "target"  #: the name of the target, as in "distance to the target"
     places: Tensor | None = None  #: targets that do not move (k, 3)
     curve: Tensor | None = None  #: a line (m, 3) along which the target moves
-    gates: Tensor | None = None  #: centres of gates (k, 3), in the order of flight; the target is one of them
-    gate_radius: float = 0.3  #: [m]
+    gates: Tensor | None = None  #: centres of gates (k, 3), in the order of flight
+    gate_radius: float | Tensor = 0.3  #: of all gates, or of each (k) [m]
+    gate_axes: Tensor | None = None  #: the direction (k, 3) in which each gate is flown; by default along the course
+    shapes: Sequence[Shape] = ()  #: objects of your own
     progress: str | None = None  #: the metric that best shows how a flight goes; by default the distance to the target
+    success: float | None = None  #: the value of the progress, in SI units, from which a state fulfils the task
+
+    def __post_init__(self) -> None:
+        for name in ("places", "curve", "gates", "gate_axes"):
+            if (points := getattr(self, name)) is not None:
+                object.__setattr__(self, name, as_points(f"Scenery: {name}", points))
+        count = 0 if self.gates is None else len(self.gates)
+        radius = torch.as_tensor(self.gate_radius).detach().cpu().float()
+        if radius.numel() not in (1, count) or not (radius > 0).all():
+            raise ValueError(f"Scenery: gate_radius must be positive [m], one for all {count} gates or one each.")
+        if self.gate_axes is not None and len(self.gate_axes) != count:
+            raise ValueError(f"Scenery: gate_axes has {len(self.gate_axes)} directions for {count} gates.")
+        if not all(isinstance(shape, Shape) for shape in self.shapes):
+            raise ValueError("Scenery: shapes must be a list of Shape, such as [Shape.sphere((0, 0, 2), 0.5)].")
+
+    def rings(self) -> Tensor | None:
+        """The rims of the gates (k, 33, 3), if there are any."""
+        if self.gates is None:
+            return None
+        axes = along_the_course(self.gates) if self.gate_axes is None else self.gate_axes
+        return rings(self.gates, axes, self.gate_radius)
+
+    def points(self) -> list[Tensor]:
+        """All points that pictures show, each (*, 3)."""
+        everything = (self.places, self.curve, self.rings(), *(shape.points for shape in self.shapes))
+        return [x for x in everything if x is not None]
 
 
 def visible_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:

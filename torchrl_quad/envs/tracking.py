@@ -171,7 +171,7 @@ class TrackingEnv(QuadrotorEnv):
 
     def scenery(self) -> Scenery:
         phase = torch.linspace(0, 2 * math.pi, 129, device=self.device, dtype=self.dtype)
-        return Scenery(curve=self.curve(phase))
+        return Scenery(curve=self.curve(phase), success=self.success_radius)
 
     @property
     def settling_steps(self) -> int:

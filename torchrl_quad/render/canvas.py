@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_quad.envs.scenery import Scenery
+
 INK, BLUE, RED = "#222222", "#2f6db5", "#c8452f"
 
 
@@ -67,6 +69,30 @@ def set_scale(axis: Any, log: bool) -> None:
         axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
         axis.yaxis.set_minor_formatter(NullFormatter())
     axis.yaxis.set_major_formatter("{x:g}")
+
+
+def draw_scenery(space: Any, scenery: Scenery, size: float = 12.0) -> None:
+    """Draw what a task shows beside its drones into three-dimensional axes, with names for a legend.
+
+    Args:
+        size: of the marks at targets [points].
+    """
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+    for shape in scenery.shapes:
+        if shape.faces is None:
+            space.plot(*shape.points.T.numpy(), color=shape.color, linewidth=1.5, zorder=2, label=shape.name or None)
+        else:
+            triangles = shape.points[shape.faces].numpy()
+            style = {"facecolors": shape.color, "alpha": shape.opacity, "linewidths": 0, "shade": True}
+            space.add_collection(Poly3DCollection(triangles, **style, zorder=2, label=shape.name or None))
+    if scenery.curve is not None:
+        space.plot(*scenery.curve.T.numpy(), color=RED, linestyle="--", linewidth=1.0, label=scenery.target, zorder=3)
+    if scenery.places is not None:
+        star = {"marker": "*", "color": RED, "s": size**2}
+        space.scatter(*scenery.places.T.numpy(), label=scenery.target, zorder=10, **star)
+    if (rings := scenery.rings()) is not None:
+        space.add_collection(Line3DCollection(list(rings.numpy()), color=RED, linewidth=1.8, zorder=10, label="gate"))
 
 
 def drone_colors(count: int) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,19 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_quad.envs.episodes import first_episode
-from torchrl_quad.envs.scenery import Scenery
-from torchrl_quad.render.canvas import BLUE, INK, RED, bounds, box, drone_colors, make_figure, set_box, set_scale
-from torchrl_quad.render.flights import Flight, action_names, check_rollout, scenery_points, state_keys
+from torchrl_quad.render.canvas import (
+    BLUE,
+    INK,
+    RED,
+    bounds,
+    box,
+    draw_scenery,
+    drone_colors,
+    make_figure,
+    set_box,
+    set_scale,
+)
+from torchrl_quad.render.flights import Flight, action_names, check_rollout, state_keys
 
 _PAPER = {  # for figures as wide as a page of two columns
     "font.size": 8,
@@ -34,6 +43,7 @@ _PAPER = {  # for figures as wide as a page of two columns
 }
 _WIDTH = 7.16  # [inches], of a page of two columns
 _BESIDE = {"left": 0.54, "right": 0.99, "top": 0.94, "bottom": 0.12, "hspace": 0.5}  # shares of a page
+_ABOVE = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.02), "ncols": 4}  # a legend
 _COLORS = INK, BLUE, RED, "#d99a1c"
 
 
@@ -44,11 +54,13 @@ def plot_flight(
     env: EnvBase | None = None,
     num_envs: int = 12,
     control_dt: float = 0.02,
+    title: str | None = None,
 ) -> None:
     """Draw the first episodes of a flight: their paths in space, and over time how well they go.
 
     The second panel shows the metric that the task names in its scenery, else the distance to the target, and for a
-    task without targets its first metric, or the reward.
+    task without targets its first metric, or the reward. A dashed line marks the value from which a state fulfils the
+    task, if the scenery names it.
 
     Args:
         rollout: (num_envs, time), of any task.
@@ -57,34 +69,37 @@ def plot_flight(
             of metrics; without it, the picture shows the targets in the rollout.
         num_envs: how many environments to draw, at most.
         control_dt: control step [s]; used only without ``env``.
+        title: of the picture; by default the name of the environment and the number of flights.
 
     Raises:
         TypeError: ``env`` is not a quadrotor environment.
         ValueError: the rollout has another shape, lacks the position or the reward, or ``num_envs`` is less than 1.
     """
     flight = Flight("plot_flight", rollout, env, control_dt, [*state_keys("position"), ("next", "reward")], num_envs)
-    position = flight.state("position").numpy()
-    label, log, values = flight.progress()
+    position = flight.state("position")
+    label, log, values, success = flight.progress()
 
     figure = make_figure(figsize=(11, 4.6))
-    from matplotlib.ticker import MaxNLocator
-
-    space = figure.add_axes((0.02, 0.03, 0.42, 0.9), projection="3d")
-    over_time = figure.add_axes((0.54, 0.12, 0.44, 0.83))
+    space = figure.add_axes((0.0, 0.02, 0.46, 0.9), projection="3d")
+    over_time = figure.add_axes((0.55, 0.12, 0.43, 0.77))
     for i, color in enumerate(drone_colors(len(flight))):
         flown = slice(int(flight.steps[i]) + 1)
-        space.plot(*position[i, flown].T, color=color, linewidth=1.2)
+        space.plot(*position[i, flown].T.numpy(), color=color, linewidth=1.2)
         space.scatter(*position[i, 0], color=color, s=14)
         over_time.plot(flight.times[flown], values[i, flown], color=color, linewidth=1.2)
-    _draw_scenery(space, flight.scenery)
-    if scenery_points(flight.scenery):
-        space.legend(loc="upper left", frameon=False)
-    space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="Flights from fresh starts")
-    for axis in (space.xaxis, space.yaxis, space.zaxis):
-        axis.set_major_locator(MaxNLocator(4))
+    draw_scenery(space, flight.scenery)
+    set_box(space, *box(*bounds(position, *flight.scenery.points())), zoom=0.9)
+    named = dict(zip(*reversed(space.get_legend_handles_labels()), strict=True))  # a name once
+    if named:
+        space.legend(named.values(), named.keys(), loc="upper left", frameon=False)
     over_time.set(xlabel="time [s]", ylabel=label)
     set_scale(over_time, log)
     over_time.grid(alpha=0.3)
+    if success is not None:
+        near = "" if flight.scenery.progress else "below "
+        over_time.axhline(success, color=RED, linestyle="--", linewidth=1.0, label=f"success: {near}{success:g}")
+        over_time.legend(loc="best", frameon=False)
+    figure.suptitle(flight.title if title is None else title, x=0.04, y=0.965, ha="left", fontsize=13)
     figure.savefig(path, dpi=130)
 
 
@@ -98,9 +113,10 @@ def plot_episode(
 ) -> None:
     """Draw the first episode of one drone as a figure for a paper, as wide as a page of two columns (7.16 inches).
 
-    Shows its path in space, coloured by speed, with targets or numbered gates. Shows over time the distance to the
-    target with the metrics that are lengths (without targets: all metrics, or the reward), the actions, and the rotor
-    speeds if the state holds them. Dotted lines mark the times at which the drone passes gates.
+    Shows its path in space, coloured by speed, with the task's scenery and numbers at its gates. Shows over time the
+    distance to the target with the metrics that are lengths (without targets: all metrics, or the reward), the actions,
+    and the rotor speeds if the state holds them. Dotted lines mark the times at which the drone passes gates, a dashed
+    line the distance from which a state fulfils the task, if the scenery names it.
 
     Args:
         rollout: (num_envs, time), of any task, with or without its graph.
@@ -135,6 +151,9 @@ def plot_episode(
         times = flight.times
         label, log, lines = flight.progress_lines()
         _draw_lines(axes[0], times, {name: x[0] for name, x in lines.items()}, label)
+        if flight.target is not None and (near := flight.near_enough) is not None:
+            axes[0].axhline(near, color=RED, linestyle="--", linewidth=0.6, label=f"success: below {near:g}")
+            axes[0].legend(**_ABOVE)
         set_scale(axes[0], log)
         actions = flight.rollout["action"][0].T.numpy()
         actions = np.concatenate((actions, actions[:, -1:]), 1)  # each lasts until the next instant
@@ -164,29 +183,16 @@ def _draw_path(space: Any, below: Any, flight: Flight) -> None:
     path.set_array(0.5 * (speed[:-1] + speed[1:]))
     space.add_collection(path)
     space.scatter(*position[0], color=INK, s=10, zorder=6)
-    scenery, gate = flight.scenery, flight.gate_index()
-    if gate is not None:  # draw only the gates to which the drone flies, with their numbers
-        visited = list(dict.fromkeys(gate[0].tolist()))
-        scenery = dataclasses.replace(scenery, gates=scenery.gates[visited])
+    scenery = flight.scenery
+    if scenery.gates is not None:
         halo = [withStroke(linewidth=2, foreground="white")]
-        for i, centre in zip(visited, scenery.gates.tolist(), strict=True):
-            space.text(*centre, f"   {i + 1}", color=RED, zorder=11, path_effects=halo)
-    _draw_scenery(space, scenery)
-    set_box(space, *box(*bounds(*points, *scenery_points(scenery))), zoom=0.86)
+        for i, centre in enumerate(scenery.gates.tolist(), 1):
+            space.text(*centre, f"   {i}", color=RED, zorder=11, path_effects=halo)
+    draw_scenery(space, scenery)
+    set_box(space, *box(*bounds(*points, *scenery.points())), zoom=0.86)
     bar = space.figure.colorbar(path, cax=below, orientation="horizontal")
     bar.set_label("speed [m/s]")
     bar.outline.set_linewidth(0.6)
-
-
-def _draw_scenery(space: Any, scenery: Scenery) -> None:
-    """Draw what the task shows beside its drones."""
-    if scenery.curve is not None:
-        space.plot(*scenery.curve.T.numpy(), color=RED, linestyle="--", linewidth=1.0, label=scenery.target, zorder=3)
-    if scenery.places is not None:
-        space.scatter(*scenery.places.T.numpy(), label=scenery.target, zorder=10, marker="*", color=RED, s=140)
-    if scenery.gates is not None:
-        ring = {"marker": "o", "facecolor": "none", "edgecolor": RED, "linewidth": 1.5, "depthshade": False, "s": 90}
-        space.scatter(*scenery.gates.T.numpy(), label="gate", zorder=10, **ring)
 
 
 def _draw_lines(axis: Any, time: np.ndarray, lines: dict[str, np.ndarray], label: str, **style: Any) -> None:
@@ -195,4 +201,4 @@ def _draw_lines(axis: Any, time: np.ndarray, lines: dict[str, np.ndarray], label
         axis.plot(time, x, color=color, label=name, linewidth=0.9, **style)
     axis.set_ylabel(label)
     axis.yaxis.set_label_coords(-0.13, 0.5, transform=axis.transAxes)  # in line with those of the other panels
-    axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.02), ncols=4)
+    axis.legend(**_ABOVE)

@@ -48,10 +48,18 @@ class Flight:
         self.metric_info = {} if env is None else self.env.metric_info
         self.steps = self._count_steps()  # of each first episode (num_envs)
         self.target = self.state("target")
-        self.scenery = self._find_scenery()
+        self.named = Scenery() if env is None else self.env.scenery()  # by the task
+        self.scenery = self.named
+        self._add_targets()
 
     def __len__(self) -> int:
         return len(self.rollout)
+
+    @property
+    def title(self) -> str:
+        """What is shown: "HoveringEnv, 12 flights"."""
+        name = "Flight" if self.env is None else type(self.env).__name__
+        return f"{name}, {len(self)} flight{'s' * (len(self) > 1)}"
 
     @property
     def times(self) -> np.ndarray:
@@ -87,17 +95,20 @@ class Flight:
             for name, x in values.items()
         }
 
-    def progress(self) -> tuple[str, bool, np.ndarray]:
-        """What best shows how the flight goes: the label of its axis, whether that is logarithmic, and the values.
+    def progress(self) -> tuple[str, bool, np.ndarray, float | None]:
+        """What best shows how the flight goes: the label of its axis, whether that is logarithmic, values, and success.
 
         That is the metric that the task names, else the distance to the target, else the first metric or the reward.
+        Success is the value from which a state fulfils the task, if the task says so.
         """
         outputs, name = self.outputs(), self.scenery.progress
         if name not in outputs and self.target is not None:
-            return f"distance to the {self.scenery.target} [m]", self.scenery.gates is None, self.distance
-        name = name if name in outputs else next(iter(outputs))
+            return f"distance to the {self.scenery.target} [m]", self.log_distance, self.distance, self.near_enough
+        known = name in outputs
+        name = name if known else next(iter(outputs))
         metric = describe_metric(name, self.metric_info)
-        return metric.axis_label, metric.log, metric.scale * outputs[name]
+        success = metric.scale * self.scenery.success if known and self.scenery.success is not None else None
+        return metric.axis_label, metric.log, metric.scale * outputs[name], success
 
     def progress_lines(self) -> tuple[str, bool, dict[str, np.ndarray]]:
         """All that shows how the flight goes: the label of the axis, whether it is logarithmic, and lines by name.
@@ -113,36 +124,43 @@ class Flight:
         for metric, x in outputs.items():
             if metric.is_length and not np.allclose(x[:, 1:], distance[:, 1:], atol=1e-5, equal_nan=True):
                 lines[metric.label] = x
-        return "distance [m]", self.scenery.gates is None, lines
+        return "distance [m]", self.log_distance, lines
+
+    @property
+    def log_distance(self) -> bool:
+        """Whether the axis of a distance is logarithmic; not on a course, where it jumps from gate to gate."""
+        return self.gate_index() is None
+
+    @property
+    def near_enough(self) -> float | None:
+        """The distance to the target from which a state fulfils the task [m], if the task says so."""
+        return self.scenery.success if self.scenery.progress is None else None
 
     def gate_index(self) -> Tensor | None:
-        """The index of the gate that each drone flies to (num_envs, time + 1), if the task has gates."""
+        """The index of the gate that each drone flies to (num_envs, time + 1), if the targets are gates."""
         if self.scenery.gates is None or self.target is None:
             return None
-        return (self.target.unsqueeze(-2) - self.scenery.gates).norm(dim=-1).argmin(-1)
+        gap, index = (self.target.unsqueeze(-2) - self.scenery.gates).norm(dim=-1).min(-1)
+        return index if gap.nan_to_num(0.0).max() < 1e-3 else None
 
     def _count_steps(self) -> Tensor:
         if ("next", "done") not in self.rollout.keys(include_nested=True):
             return torch.full(self.rollout.shape[:1], self.rollout.shape[1])
         return first_episode(self.rollout).sum((1, 2))
 
-    def _find_scenery(self) -> Scenery:
-        """What the task shows, or if it says nothing, where the targets of these episodes have been."""
-        scenery = Scenery() if self.env is None else self.env.scenery()
-        tensors = {name: getattr(scenery, name) for name in ("places", "curve", "gates")}
-        known = {name: x.detach().cpu().float() for name, x in tensors.items() if x is not None}
-        if not known and self.target is not None:
-            moving = (self.target.diff(dim=1).abs() > 0).any(-1).sum()
-            if 2 * moving > self.steps.sum():
-                known["curve"] = self.target[self.steps.argmax()]
-            else:
-                known["places"] = self.target.flatten(0, 1).mul(1e3).round().div(1e3).unique(dim=0)
-        return dataclasses.replace(scenery, **known)
-
-
-def scenery_points(scenery: Scenery) -> list[Tensor]:
-    """All points that a task shows, each (*, 3)."""
-    return [x for x in (scenery.places, scenery.curve, scenery.gates) if x is not None]
+    def _add_targets(self) -> None:
+        """Show where the targets of these episodes have been, if the task shows nothing of them."""
+        scenery = self.scenery
+        if self.target is None or scenery.places is not None or scenery.curve is not None:
+            return
+        if self.gate_index() is not None:
+            return
+        moving = (self.target.diff(dim=1).abs() > 0).any(-1).sum()
+        if 2 * moving > self.steps.sum():
+            known = {"curve": self.target[self.steps.argmax()]}
+        else:
+            known = {"places": self.target.flatten(0, 1).mul(1e3).round().div(1e3).unique(dim=0)}
+        self.scenery = dataclasses.replace(scenery, **known)
 
 
 def action_names(size: int) -> list[str]:

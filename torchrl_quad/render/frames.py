@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import numbers
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,10 @@ from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs.scenery import Scenery
-from torchrl_quad.render.canvas import INK, RED, bounds, box, drone_colors, make_figure, set_box
-from torchrl_quad.render.flights import Flight, scenery_points, state_keys
+from torchrl_quad.render.canvas import INK, RED, bounds, box, draw_scenery, drone_colors, make_figure, set_box
+from torchrl_quad.render.flights import Flight, state_keys
 
-_DOTS_PER_INCH = 80
+_INCHES = 4.2
 _ARMS = torch.tensor([[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [0.0, 0.0, 0.0], [1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]])
 
 
@@ -33,20 +34,16 @@ class Scene:
     """
 
     def __init__(self, points: Tensor, num_drones: int, size: int, scenery: Scenery) -> None:
-        shown = scenery_points(scenery)
-        low, high = bounds(points, *shown)
+        low, high = bounds(points, *scenery.points())
         low[2].clamp_(max=0.0)
         self.low, self.high = box(low, high)
         extent = self.high - self.low
         self.arms = (0.04 * extent.amax()).float() * _ARMS
 
-        self.figure = make_figure(figsize=(size / _DOTS_PER_INCH, size / _DOTS_PER_INCH), dpi=_DOTS_PER_INCH)
+        self.figure = make_figure(figsize=(_INCHES, _INCHES), dpi=(size + 0.01) / _INCHES)
         space = self.figure.add_axes((0.0, 0.02, 0.96, 0.98), projection="3d")
         set_box(space, self.low, self.high, zoom=0.82)
-        for x in shown:
-            line = x is scenery.curve
-            style = {"linestyle": "--", "linewidth": 1} if line else {"marker": "o", "linestyle": "none"}
-            space.plot(*_numpy(x).T, color=RED, markersize=11, fillstyle="none", **style)
+        draw_scenery(space, scenery, size=8)
         animated = {"animated": True}  # drawn onto the axes in each frame
         colors = drone_colors(num_drones)
         self.drones = [space.plot([], [], [], color=color, linewidth=2.5, **animated)[0] for color in colors]
@@ -98,35 +95,42 @@ def animate_flight(
     control_dt: float = 0.02,
     fps: int = 15,
     max_seconds: float = 12.0,
+    size: int = 336,
 ) -> None:
     """Film the first episodes of a flight in real time: drones with trails, their targets, and the task's scenery.
 
     Args:
         rollout: (num_envs, time), of any task.
-        path: the GIF file to write.
+        path: the film to write: GIF, or MP4 (H.264) with ``imageio-ffmpeg`` of the extra ``render``, by its suffix.
         env: the environment that flew, also under transforms. It provides the control step and the scenery; without
             it, the film shows the targets in the rollout.
         num_envs: how many environments to show, at most.
         control_dt: control step [s]; used only without ``env``.
         fps: frames per second, at least; up to 50, and rounded up so that a frame lasts whole control steps.
         max_seconds: the length of the film, at most.
+        size: width and height [pixels], rounded up to an even number.
 
     Raises:
+        ImportError: ``path`` is an MP4, and ``imageio-ffmpeg`` is not installed.
         TypeError: ``env`` is not a quadrotor environment.
-        ValueError: the rollout has another shape or lacks the position or the quaternion, or a number is not positive.
+        ValueError: the rollout has another shape or lacks the position or the quaternion, a number is not positive, or
+            the suffix is another.
     """
-    for name, value in (("control_dt", control_dt), ("fps", fps), ("max_seconds", max_seconds)):
+    write = {".gif": _write_gif, ".mp4": _write_mp4}.get(Path(path).suffix.lower())
+    if write is None:
+        raise ValueError(f"animate_flight writes .gif and .mp4, got {Path(path).name}.")
+    for name, value in (("control_dt", control_dt), ("fps", fps), ("max_seconds", max_seconds), ("size", size)):
         if not value > 0:
             raise ValueError(f"animate_flight: {name} must be positive, got {value!r}.")
     flight = Flight("animate_flight", rollout, env, control_dt, state_keys("position", "quaternion"), num_envs)
     control_dt, target = flight.control_dt, flight.target
     last = min(max(round(max_seconds / control_dt), 1), rollout.shape[1])  # step
     position, attitude = flight.state("position"), flight.state("quaternion")
-    scene = Scene(position[:, : last + 1], len(flight), 336, flight.scenery)
+    scene = Scene(position[:, : last + 1], len(flight), size + size % 2, flight.scenery)
     trail = max(round(1.0 / control_dt), 1)
     stride = max(int(1.0 / (min(fps, 50) * control_dt) + 1e-6), 1)
     instants = np.append(np.arange(0, last, stride), last)
-    frames = [
+    frames = (
         scene.draw(
             position[:, t],
             attitude[:, t],
@@ -135,13 +139,41 @@ def animate_flight(
             text=f"{control_dt * t:.1f} s",
         )
         for t in instants
-    ]
+    )
+    write(Path(path), frames, control_dt * np.append(instants, instants[-1] + stride))
+
+
+def _write_gif(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> None:
+    """Write frames, each shown from its time [s] to the next; the last of the times is the end."""
     from PIL import Image
 
     # A GIF counts in 10 ms: rounded instants keep step with the clock where rounded intervals would not.
-    durations = 10 * np.diff(np.round(100 * control_dt * np.append(instants, instants[-1] + stride)))
+    durations = 10 * np.diff(np.round(100 * times))
     first, *rest = map(Image.fromarray, frames)
     first.save(path, save_all=True, append_images=rest, duration=durations.tolist(), loop=0)
+
+
+def _write_mp4(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> None:
+    """The same in equal intervals: the last frame, of the end, may come later than its time by less than one."""
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ImportError("Films in MP4 need imageio-ffmpeg: pip install 'torchrl_quad[render]'.") from error
+    first, rate = next(frames), 1.0 / (times[-1] - times[-2])
+    writer = imageio_ffmpeg.write_frames(
+        str(path),
+        first.shape[1::-1],
+        fps=rate,
+        codec="libx264",
+        quality=None,  # the one below instead
+        macro_block_size=2,
+        output_params=["-crf", "20", "-movflags", "+faststart"],
+        ffmpeg_log_level="error",
+    )
+    writer.send(None)
+    for frame in itertools.chain([first], frames):
+        writer.send(frame)
+    writer.close()
 
 
 # The views of each environment, by number of drones and size. They are kept outside the environment, which can be
@@ -166,7 +198,7 @@ def draw_frame(env: EnvBase, drones: Sequence[int] | None, size: int) -> np.ndar
     scene = scenes.get((len(chosen), size))
     if scene is None:  # half a metre of room around all drones, their targets and the scenery
         everything = [x for key, x in env.render_state.items() if key != "quaternion"]
-        low, high = bounds(*everything, *scenery_points(env.scenery()))
+        low, high = bounds(*everything, *env.scenery().points())
         low, high = low - torch.tensor([0.5, 0.5, 0.0]), high + 0.5
     else:  # a side that has become too near moves out by half of the view, so that it need not at every step
         low, high = bounds(*points, scene.low, scene.high)

@@ -5,8 +5,9 @@ const decoded = (text) => text && new Float32Array(Uint8Array.from(atob(text), (
 
 const flight = JSON.parse(element("flight").textContent);
 const { environments, frames, ended, endings } = flight;
-const [position, attitude, lift, target, gate, rings, rotors] = ["position", "quaternion", "lift", "target", "gate",
-  "gates", "rotors"].map((name) => decoded(flight[name]));
+const [position, attitude, lift, target, gate, rings, places, path, rotors] = ["position", "quaternion", "lift", "target",
+  "gate", "gates", "places", "curve", "rotors"].map((name) => decoded(flight[name]));
+const shapes = flight.shapes.map((shape) => ({ ...shape, points: decoded(shape.points), faces: decoded(shape.faces) }));
 const times = Float64Array.from({ length: frames }, (_, k) => flight.start + k * flight.control_dt);
 
 const RED = "#c8452f", ORANGE = "#e8912d", INK = "#222222", PALE = "#dcdfe3";
@@ -120,7 +121,7 @@ function moving() {
       }
     }
   }
-  if (rings) drawNextGates(pens.next);
+  if (gate) drawNextGates(pens.next);
   return pens;
 }
 
@@ -132,9 +133,10 @@ const trailColors = () => each(TRAIL + 3, (i) => (shown().includes(i) ? colors[i
 
 // -- space ------------------------------------------------------------------------------------------------------------
 
-const MOVING = ["shadow", "trail", "body", "nose", ...(lift ? ["thrust"] : []), ...(target && !rings ? ["target"] : []),
-  ...(rings ? ["next"] : []), "crash"];
-const [low, high] = bounds(position, ...(target ? [target] : []), ...(rings ? [rings] : []));
+const MOVING = ["shadow", "trail", "body", "nose", ...(lift ? ["thrust"] : []), ...(target && !gate ? ["target"] : []),
+  ...(gate ? ["next"] : []), "crash"];
+const [low, high] = bounds(...[position, target, rings, places, path].filter(Boolean),
+  ...shapes.map((shape) => shape.points));
 const extent = Math.max(...high.map((value, j) => value - low[j]), 1);
 const grounded = low[2] < 2 * extent; // otherwise the ground is too far below to be shown
 
@@ -177,15 +179,46 @@ function markers(name, { x, y, z }, color, symbol, markerSize) {
     hoverinfo: "skip" };
 }
 
-function gates() {
-  const pen = new Pen(), count = rings.length / (3 * RING), labels = { x: [], y: [], z: [] };
-  for (let g = 0; g < count; g++) {
-    drawRing(pen, g);
-    const [[x0, y0, z0], [x1, y1, z1]] = bounds(rings.subarray(3 * g * RING, 3 * (g + 1) * RING));
-    labels.x.push((x0 + x1) / 2); labels.y.push((y0 + y1) / 2); labels.z.push(z1 + 0.3 * (z1 - z0));
+// A pen that has gone through the points of an array.
+function through(array) {
+  const pen = new Pen();
+  for (let k = 0; k < array.length; k += 3) pen.to(array.subarray(k, k + 3));
+  return pen;
+}
+
+// Words above objects, each of them an array of points.
+function labels(name, words, objects) {
+  const pen = new Pen();
+  for (const [[x0, y0, z0], [x1, y1, z1]] of objects.map((points) => bounds(points))) {
+    pen.to([(x0 + x1) / 2, (y0 + y1) / 2, z1 + Math.max(0.15 * (z1 - z0), 0.02 * extent)]);
   }
-  return [line("gates", pen, "#9aa3ad", 5), { name: "labels", type: "scatter3d", mode: "text", ...labels,
-    text: labels.x.map((_, g) => `${g + 1}`), textfont: { color: "#777", size: 12 }, hoverinfo: "skip" }];
+  return { name, type: "scatter3d", mode: "text", x: pen.x, y: pen.y, z: pen.z, text: words,
+    textfont: { color: "#777", size: 12 }, hoverinfo: "skip" };
+}
+
+function gates() {
+  const pen = new Pen(), each = Array.from({ length: rings.length / (3 * RING) }, (_, g) => g);
+  for (const g of each) drawRing(pen, g);
+  const objects = each.map((g) => rings.subarray(3 * g * RING, 3 * (g + 1) * RING));
+  return [line("gates", pen, "#9aa3ad", 5), labels("labels", each.map((g) => `${g + 1}`), objects)];
+}
+
+// A line, or a surface of triangles.
+function object({ name, points, faces, color, opacity }) {
+  const pen = through(points);
+  if (!faces) return line(name, pen, color, 4);
+  const [i, j, k] = [0, 1, 2].map((corner) => faces.filter((_, index) => index % 3 === corner));
+  return { name, type: "mesh3d", x: pen.x, y: pen.y, z: pen.z, i, j, k, color, opacity, flatshading: true,
+    lighting: { ambient: 0.75, diffuse: 0.5, specular: 0.05 }, hoverinfo: "skip" };
+}
+
+// What the task's scenery names.
+function scenery() {
+  const named = shapes.filter((shape) => shape.name);
+  return [...shapes.map(object),
+    ...(named.length ? [labels("names", named.map((shape) => shape.name), named.map((shape) => shape.points))] : []),
+    ...(rings ? gates() : []), ...(places ? [markers("places", through(places), "#e9b8ae", "diamond", 5)] : []),
+    ...(path ? [line("path", through(path), "#e9b8ae", 2)] : target && !gate ? [course()] : [])];
 }
 
 // The way of a target that moves, of the environment that is followed or else of the first.
@@ -212,7 +245,7 @@ function drawSpace() {
   };
   const axis = (title, j) => ({ title: { text: title }, range: spaceRange(j), showgrid: false, zeroline: false,
     showbackground: false, showspikes: false, color: "#777", nticks: 6 });
-  const still = [ground(), ...(rings ? gates() : []), ...(target && !rings ? [course()] : [])];
+  const still = [ground(), ...scenery()];
   const sides = [0, 1, 2].map((j) => spaceRange(j)[1] - spaceRange(j)[0]), scale = Math.hypot(...sides) / 1.65;
   return Plotly.newPlot("space", [...still, ...MOVING.map((name) => traces[name]())], {
     scene: { xaxis: axis("x [m]", 0), yaxis: axis("y [m]", 1), zaxis: axis("z [m]", 2), aspectmode: "manual",
@@ -229,6 +262,12 @@ const indexOf = (name) => element("space").data.findIndex((trace) => trace.name 
 const MARGIN = { l: 52, r: 14, t: 26, b: 40 }, GAP = 0.06; // around the panels [pixels], and between them
 const panels = flight.panels.map((panel) => ({ ...panel, values: decoded(panel.values) }));
 
+// Where a panel is, as shares of the height of them all.
+function domain(p) {
+  const height = (1 + GAP) / panels.length, top = 1 - p * height;
+  return [Math.max(top - height + GAP, 0), top];
+}
+
 function curve(panel, i, j) {
   const k = panel.names.length;
   return Float32Array.from({ length: frames }, (_, index) => panel.values[(i * frames + index) * k + j]);
@@ -242,15 +281,23 @@ function range(curves) {
   return high > low ? { range: [from - 0.1 * (to - from), to + 0.1 * (to - from)] } : {};
 }
 
+// A logarithmic axis around all that is positive, with ticks at 1, 2, 5, or where it is long at each power of ten.
+function logarithmic(curves, success) {
+  const powers = [...curves.flatMap((y) => Array.from(y.filter((value) => value > 0))), ...(success ? [success] : [])]
+    .map(Math.log10);
+  const [from, to] = [Math.min(...powers) - 0.1, Math.max(...powers) + 0.1];
+  return powers.length ? { type: "log", range: [from, to], dtick: to - from > 1.6 ? 1 : "D2", tickformat: "~g" } : {};
+}
+
 function drawSeries() {
   const traces = [], layout = {
     xaxis: { title: { text: "time [s]" }, range: [0, times[frames - 1]], anchor: `y${panels.length}`, gridcolor: "#eee",
       zeroline: false },
-    margin: MARGIN, font: { size: 11, color: "#555" }, showlegend: false, annotations: [],
+    margin: MARGIN, font: { size: 11, color: "#555" }, showlegend: false, annotations: [], shapes: [],
     hovermode: "x unified", hoverdistance: -1,
   };
   panels.forEach((panel, p) => {
-    const axis = p ? `y${p + 1}` : "y", height = (1 + GAP) / panels.length, top = 1 - p * height;
+    const axis = p ? `y${p + 1}` : "y", [bottom, top] = domain(p);
     const curves = chosen === null ? everyone.map((i) => [curve(panel, i, 0), colors[i], `${i}`])
       : panel.names.map((name, j) => [curve(panel, chosen, j), panel.names.length > 1 ? CURVES[j % CURVES.length]
         : colors[chosen], name]);
@@ -258,17 +305,30 @@ function drawSeries() {
       traces.push({ x: times, y, yaxis: axis, name, mode: "lines", type: "scatter", meta: panel.label,
         line: { color, width: 1.3, shape: panel.held ? "hv" : "linear" }, hovertemplate: "%{y:.4g}" });
     }
-    layout[axis.replace("y", "yaxis")] = { domain: [Math.max(top - height + GAP, 0), top], gridcolor: "#eee", zerolinecolor: "#ddd",
-      nticks: 5, ...(panel.peaks ? range(curves.map(([y]) => y)) : {}) };
+    layout[axis.replace("y", "yaxis")] = { domain: [bottom, top], gridcolor: "#eee", zerolinecolor: "#ddd",
+      ...(panel.log ? logarithmic(curves.map(([y]) => y), panel.success) : { nticks: 5 }),
+      ...(panel.peaks ? range(curves.map(([y]) => y)) : {}) };
+    if (panel.success != null) {
+      layout.shapes.push({ type: "line", xref: "paper", x0: 0, x1: 1, yref: axis, y0: panel.success, y1: panel.success,
+        line: { color: RED, width: 1, dash: "dash" } });
+    }
     const names = panel.names.length === 1 ? "" : chosen === null ? `, ${panel.names[0]}` : ": " + curves
       .map(([, color, name]) => `<span style="color:${color}">${name.replaceAll("_", " ")}</span>`).join("  ");
-    layout.annotations.push({ text: panel.label + names, xref: "paper", yref: "paper", x: 0, y: top, xanchor: "left",
+    const success = panel.success == null ? "" : `  <span style="color:${RED}">dashed: success below it</span>`;
+    layout.annotations.push({ text: panel.label + names + success, xref: "paper", yref: "paper", x: 0, y: top, xanchor: "left",
       yanchor: "bottom", showarrow: false, font: { size: 11.5, color: INK } });
   });
   return Plotly.react("series", traces, layout, { responsive: true, displayModeBar: false });
 }
 
-// A line over the plot: a shape of Plotly's would have all curves drawn again for each frame.
+// A line over each panel: a shape of Plotly's would have all curves drawn again for each frame.
+element("cursor").style.inset = `${MARGIN.t}px auto ${MARGIN.b}px -0.75px`;
+element("cursor").append(...panels.map((_, p) => {
+  const part = document.createElement("div"), [bottom, top] = domain(p);
+  Object.assign(part.style, { top: `${100 * (1 - top)}%`, height: `${100 * (top - bottom)}%` });
+  return part;
+}));
+
 function moveCursor() {
   const [from, to] = element("series").layout.xaxis.range, share = (now() - from) / (to - from);
   element("cursor").style.transform = `translateX(${MARGIN.l + share * plotWidth()}px)`;
@@ -351,10 +411,10 @@ function options(id, values, label, value, change) {
 const sizes = [1, 2, 3, 5, 10, 20, 50];
 size = sizes.find((factor) => 2 * arm * factor > 0.05 * extent) ?? 50;
 element("time").max = frames - 1;
-options("speed", [0.1, 0.25, 0.5, 1, 2, 4], (v) => `${v}x`, 1, (v) => { speed = Number(v); });
+options("speed", [0.1, 0.25, 0.5, 1, 2, 4], (v) => (v === 1 ? "real time" : `${v}x`), 1, (v) => { speed = Number(v); });
 options("environment", [null, ...everyone], (i) => i === null ? "all" : `${i}${endings[i] && `: ${endings[i]} at ${
   seconds(ended[i])}`}`, null, (v) => choose(v === "all" ? null : Number(v)));
-options("size", sizes, (v) => (v === 1 ? "true" : `${v}x`), size, (v) => { size = Number(v); show(); });
+options("size", sizes, (v) => (v === 1 ? "to scale" : `${v}x`), size, (v) => { size = Number(v); show(); });
 element("note").textContent = (flight.knows_drone
   ? "The line up from each rotor is its thrust: as long as an arm where the drone hovers. "
   : "The frame of the drone is a guess, as no environment was given; the line up from each rotor is its squared speed. ")

@@ -20,7 +20,6 @@ from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.dynamics.parameters import RawParams
 from torchrl_quad.dynamics.rotors import Rotors
 from torchrl_quad.envs.episodes import at_episode_end
-from torchrl_quad.envs.terms import norm
 from torchrl_quad.files import replacing
 from torchrl_quad.render.flights import Flight, action_names
 
@@ -34,13 +33,14 @@ def write_replay(
     env: EnvBase | None = None,
     num_envs: int = 12,
     control_dt: float = 0.02,
+    title: str | None = None,
 ) -> None:
     """Write the first episodes of a flight as an HTML page to play, pause, scrub and turn in a browser.
 
-    The page shows the drones with attitude and rotor thrust, gates, targets and trails, and over time the reward terms,
-    the actions, the speed, and the distance to the target (or the height). It is one file of about 5 MB, most of it
-    plotly.js, and needs no network. A drone stays where its episode ended, and the page says how it ended: "success"
-    if the last state fulfils the task.
+    The page shows the drones with attitude and rotor thrust, trails, and the task's scenery, and over time the reward
+    terms, the actions, the speed, and the distance to the target (or the height). It is one file of about 5 MB, most
+    of it plotly.js, and needs no network. A drone stays where its episode ended, and the page says how it ended:
+    "success" if the last state fulfils the task.
 
     Args:
         rollout: (num_envs, time), of any task. It must hold ``("next", "state", "position")`` and ``("next", "state",
@@ -51,6 +51,7 @@ def write_replay(
             each rotor.
         num_envs: how many environments to show, at most.
         control_dt: control step [s]; used only without ``env``.
+        title: of the page; by default the name of the environment and the number of flights.
 
     Raises:
         ImportError: plotly is not installed.
@@ -61,9 +62,8 @@ def write_replay(
     plotlyjs = _plotlyjs()
     needed = [("next", "state", name) for name in ("position", "quaternion")]
     flight = Flight("write_replay", rollout, env, control_dt, needed, num_envs)
-    name = "Flight" if env is None else type(flight.env).__name__
     page = {
-        "title": html.escape(f"{name}, {len(flight)} environments"),
+        "title": html.escape(flight.title if title is None else title),
         "flight": json.dumps(_content(flight)).replace("<", "\\u003c"),  # "<" could close the script
         "plotly": plotlyjs,
         "script": _asset("replay.js"),
@@ -102,16 +102,29 @@ def _content(flight: Flight) -> dict[str, Any]:
         "lift": None if lift is None else _encoded(lift),
         "target": None if target is None else _encoded(target),
     }
-    if (gate := flight.gate_index()) is not None:
-        rings = _rings(flight.scenery.gates, flight.scenery.gate_radius)
-        content |= {"gate": _encoded(gate[:, first:]), "gates": _encoded(rings)}
+    scenery = flight.named
+    content |= {
+        "gates": None if scenery.gates is None else _encoded(scenery.rings()),
+        "gate": None if (gate := flight.gate_index()) is None else _encoded(gate[:, first:].float()),
+        "places": None if scenery.places is None else _encoded(scenery.places),
+        "curve": None if scenery.curve is None else _encoded(scenery.curve),
+        "shapes": [
+            {
+                "points": _encoded(shape.points),
+                "faces": None if shape.faces is None else _encoded(shape.faces.float()),
+                **{key: getattr(shape, key) for key in ("name", "color", "opacity")},
+            }
+            for shape in scenery.shapes
+        ],
+    }
 
     series = _rewards_and_actions(flight)
     if velocity is not None:
         series.append(("speed [m/s]", {"speed": flight.state("velocity").norm(dim=-1)}, {}))
     if target is not None:
         distance = torch.from_numpy(flight.distance)
-        series.append((f"distance to the {flight.scenery.target} [m]", {"distance": distance}, {}))
+        options = {"log": flight.log_distance, "success": flight.near_enough}
+        series.append((f"distance to the {scenery.target} [m]", {"distance": distance}, options))
     else:
         series.append(("height [m]", {"height": flight.state("position")[..., 2]}, {}))
     ended = torch.arange(time + 1) > steps[:, None]  # panels show nothing after the end of the episode
@@ -127,7 +140,7 @@ def _content(flight: Flight) -> dict[str, Any]:
     return {**content, "panels": panels}
 
 
-def _rewards_and_actions(flight: Flight) -> list[tuple[str, dict[str, Tensor], dict[str, bool]]]:
+def _rewards_and_actions(flight: Flight) -> list[tuple[str, dict[str, Tensor], dict[str, Any]]]:
     """The labels of the first panels, their lines (num_envs, time + 1) by name, and how to draw them."""
     rollout, panels = flight.rollout, []
     nothing = torch.full((len(rollout), 1), math.nan)
@@ -199,20 +212,6 @@ def _rotors(flight: Flight, speed: Tensor | None) -> tuple[Tensor, Tensor | None
     params = RawParams(**fields)  # each (num_envs or 1, 1, ...)
     lift = None if speed is None else Rotors(params).thrust(speed) * 4.0 / (params.mass * params.gravity)
     return params.rotor_positions[:, 0].expand(n, 4, 2), lift
-
-
-def _rings(gates: Tensor, radius: float, points: int = 33) -> Tensor:
-    """Circles (gates, points, 3) around gates (k, 3), each facing along the course."""
-    ahead, behind = (torch.nn.functional.normalize(gates.roll(-k, 0) - gates, dim=-1) for k in (1, -1))
-    along = ahead - behind
-    along = torch.where(norm(along) > 1e-3, along, ahead)  # the course turns back
-    up = torch.tensor([0.0, 0.0, 1.0]).expand_as(gates)
-    side = torch.linalg.cross(along.float(), up)
-    side = torch.where(norm(side) > 1e-3, side, torch.tensor([0.0, 1.0, 0.0]))  # the course climbs straight
-    side = torch.nn.functional.normalize(side, dim=-1)
-    upright = torch.nn.functional.normalize(torch.linalg.cross(side, along.float()), dim=-1)
-    angle = torch.linspace(0, 2 * math.pi, points)[:, None]
-    return gates[:, None].float() + radius * (angle.cos() * side[:, None] + angle.sin() * upright[:, None])
 
 
 def _encoded(value: Tensor) -> str:

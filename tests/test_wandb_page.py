@@ -1,0 +1,74 @@
+"""What wandb's own programs make of our files: its agent of the sweep, its builder of workspaces of the view."""
+
+import csv
+import json
+
+import pytest
+import yaml
+from conftest import RECIPES
+from omegaconf import OmegaConf
+from training.arguments import hydra_argument
+
+
+@pytest.mark.parametrize("style", ["args", "args_no_hyphens"])
+def test_a_sweep_hands_over_mappings_and_null_as_people_write_them(train, tmp_path, style):
+    from wandb.sdk.launch.sweeps.utils import create_sweep_command_args
+
+    text = (RECIPES / "sweep.yaml").read_text().split("\n", 1)[1]
+    assert text in (RECIPES.parent / "docs/wandb.md").read_text()  # the page shows the file
+    sweep = yaml.safe_load(text)
+    assert sweep["program"] == "recipes/abpt.py" and sweep["metric"] == {"name": "best/return", "goal": "maximize"}
+    last = -1 if style == "args" else 0
+    values = {
+        name: x["values"][last] if "values" in x else x.get("value", 0.01) for name, x in sweep["parameters"].items()
+    }
+    arguments = create_sweep_command_args({"args": {name: {"value": value} for name, value in values.items()}})[style]
+    checkpoint = train("abpt", tmp_path, *arguments, "total_steps=24", "horizon=6", "--logger.backend=None")
+    cfg = OmegaConf.create(checkpoint["config"])
+    assert cfg.env.wind == {"mean": [1.0, 0.0, 0.0], "gust": 0.5} and cfg.actor.lr == 0.01
+    assert cfg.env.randomize == values["env.randomize"] == (None if last == 0 else {"mass": {"scale": [0.8, 1.2]}})
+
+
+@pytest.mark.parametrize(
+    ("written", "read"),
+    [
+        ('env.wind={"mean": [1, 0.5, -1e-05], "gust": null}', "env.wind={mean: [1, 0.5, -1e-05], gust: null}"),
+        ("+a={'b c': \"it's\", 'd': True}", r"+a={b\ c: 'it\'s', d: true}"),
+        ("a=None,{'b': (1, 2)}", "a=null,{b: [1, 2]}"),  # a sweep of hydra's
+        ("--actor.num_cells=[32, 32]", "actor.num_cells=[32, 32]"),
+        ("env.wind={mean: [1, 0, 0]}", "env.wind={mean: [1, 0, 0]}"),
+        ("env.drone=None_of_them", "env.drone=None_of_them"),
+        ("--config-name=abpt", "--config-name=abpt"),
+        ("--cfg=job", "--cfg=job"),
+        ("--multirun", "--multirun"),
+        ("~env.wind", "~env.wind"),
+    ],
+)
+def test_arguments_come_in_the_grammar_of_hydra(written, read):
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    assert hydra_argument(written) == read == hydra_argument(read)
+    if not read.startswith("--"):
+        OverridesParser.create().parse_override(read)
+
+
+# wandb-workspaces uses pydantic's old decorators.
+@pytest.mark.filterwarnings("ignore:Pydantic V1 style:DeprecationWarning")
+def test_the_workspace_is_built_and_shows_what_runs_log(train, tmp_path, monkeypatch):
+    from wandb_workspaces.workspaces import internal
+
+    monkeypatch.syspath_prepend(RECIPES)
+    from workspace import workspace
+
+    saved = []
+    answer = {"upsertView": {"view": {"name": "view", "id": "id"}}}
+    monkeypatch.setattr(internal, "upsert_view2", lambda view: saved.append(view) or answer)
+    monkeypatch.setattr("wandb_workspaces.workspaces.interface.Workspace.url", "https://wandb.ai")
+    workspace("owner", "project").save()
+    sections = json.loads(saved[0].spec.model_dump_json(by_alias=True))["section"]["panelBankConfig"]["sections"]
+    shown = [metric for x in sections for panel in x["panels"] for metric in panel["config"].get("metrics") or ()]
+    train("abpt", tmp_path, "total_steps=48")
+    with open(tmp_path / "metrics.csv", newline="") as file:
+        logged = set(next(csv.reader(file)))
+    assert len(shown) > 10 and set(shown) - logged == {"eval/tracking_rmse", "eval/gates_passed"}  # of other tasks
+    assert next(x["name"] for x in sections if x["isOpen"]) == "How well it flies"

@@ -1,10 +1,10 @@
-"""Hybrid of pathwise and score-function gradient: each where a rollout says that it is good.
+"""Hybrid of pathwise and score-function gradient, each weighted by what the flights say of it.
 
 python recipes/hybrid.py task=racing seed=0
 """
 
 from omegaconf import DictConfig
-from training.building import iterations, make_optimizer, network, set_up, shuffled, trust_region, update_normalizer
+from training.building import AdaptiveRate, iterations, make_optimizer, network, set_up, shuffled, update_normalizer
 from training.launch import recipe
 from training.loop import Run
 from training.processes import mean_of_all
@@ -17,28 +17,31 @@ def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
     loss = HybridLoss(actor, make_value(env, **network(cfg, "critic")), average=mean_of_all, **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
-    actor_parameters = loss.actor_network_params.parameters()
-    actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters, iterations(cfg))
+    actor_optimizer, _ = make_optimizer(cfg.actor, loss.actor_network_params.parameters(), iterations(cfg))
+    rate = AdaptiveRate(actor_optimizer, cfg.actor.max_kl, iterations(cfg))
     critic_parameters = loss.value_network_params.parameters()
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
-    stateful = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
-    bound = trust_region(cfg, actor)
-    run = Run(cfg, env, actor, loss, stateful)
+    run = Run(cfg, env, actor, loss, [actor_optimizer, rate, critic_optimizer, critic_schedule])
     for _ in run:
+        # Both gradients of one horizon, and what they are worth.
         rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         data = loss.write_targets(rollout)
-        with bound.around(data):
-            for batch in shuffled(data, cfg.batch_size, cfg.epochs):
-                losses = loss(batch)
+
+        # Several passes over it, until the policy has moved far enough.
+        moved = 0.0
+        for batch in shuffled(data, cfg.batch_size, cfg.epochs):
+            losses = loss(batch)
+            if moved < rate.limit:
+                moved = max(moved, mean_of_all(losses["kl"]).item())
                 run.optimise("actor", actor_optimizer, losses["loss_actor"], cfg.actor.max_grad_norm)
-                run.optimise("critic", critic_optimizer, losses["loss_value"], cfg.critic.max_grad_norm)
+            run.optimise("critic", critic_optimizer, losses["loss_value"], cfg.critic.max_grad_norm)
 
         update_normalizer(env, data)
         run.carry = restart(env, end, cfg.restart_fraction)
-        actor_schedule.step()
+        rate.step(moved)
         critic_schedule.step()
-        run.record(**losses, **{f"{name}_before_bound": x for name, x in bound.metrics.items()})
+        run.record(**losses)
 
 
 if __name__ == "__main__":

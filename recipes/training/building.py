@@ -86,6 +86,47 @@ def make_optimizer(
     return optimizer, lr_scheduler.LambdaLR(optimizer, lambda iteration: factor(min(iteration / last, 1.0)))
 
 
+class AdaptiveRate:
+    """The learning rate of a policy that a horizon moves by about ``max_kl``, which falls to nothing over the run.
+
+    A horizon that moves it beyond 1.5 of the bound divides the rate by 1.2, and one that stays below 2/3 of it
+    multiplies it. The rate keeps between 1e-6 and 20 times the first one.
+
+    Args:
+        optimizer: of the policy.
+        max_kl: the KL divergence.
+        iterations: of the run.
+    """
+
+    def __init__(self, optimizer: torch.optim.Optimizer, max_kl: float, iterations: int) -> None:
+        self.optimizer, self.max_kl, self.iterations = optimizer, max_kl, iterations
+        self.bounds = (1e-6, 20.0 * optimizer.param_groups[0]["lr"])
+        self.done = 0
+
+    @property
+    def limit(self) -> float:
+        """How far this horizon may move the policy."""
+        return 1.5 * self.max_kl * max(1.0 - self.done / self.iterations, 0.02)
+
+    def step(self, moved: float) -> None:
+        """Adapt the rate to how far the horizon has moved the policy."""
+        low, high = self.bounds
+        for group in self.optimizer.param_groups:
+            if moved > self.limit:
+                group["lr"] = max(group["lr"] / 1.2, low)
+            elif moved < self.limit / 2.25:
+                group["lr"] = min(group["lr"] * 1.2, high)
+        self.done += 1
+
+    def state_dict(self) -> dict[str, int]:
+        """What a checkpoint keeps; the rate itself is in the optimiser's."""
+        return {"done": self.done}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Go on from a checkpoint."""
+        self.done = state["done"]
+
+
 class TargetUpdate(SoftUpdate):
     """TorchRL's soft update of a loss's target critic, with all its parameters in one call."""
 

@@ -49,7 +49,7 @@ def some_actions(steps, num_envs, seed=0):
 # -- registration ------------------------------------------------------------------------------------------------------
 
 
-def test_gymnasium_imports_the_package_by_its_prefix_and_the_environments_only_when_they_are_made():
+def test_gymnasium_imports_the_package_by_its_prefix_environments_when_they_are_made_and_what_draws_not_before():
     program = (
         "import contextlib, sys, gymnasium\n"
         "with contextlib.suppress(gymnasium.error.Error):\n"
@@ -58,6 +58,7 @@ def test_gymnasium_imports_the_package_by_its_prefix_and_the_environments_only_w
         "assert 'torchrl_quad.gym' not in sys.modules\n"
         f"gymnasium.make('torchrl_quad:{HOVERING}').reset()\n"
         f"gymnasium.make_vec('torchrl_quad:{HOVERING}', num_envs=2).reset()\n"
+        "assert not {'torchrl_quad.render', 'matplotlib'} & set(sys.modules)\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

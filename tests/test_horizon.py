@@ -116,6 +116,18 @@ def losses_of(flight):
     return sum((x * torch.linspace(0.5, 1.5, x.numel(), dtype=x.dtype).view_as(x)).sum() for x in parts)
 
 
+def break_drones(env, parameter):
+    """One step, and its gradients: the state of drone 0 is not finite, and drone 2 turns too fast."""
+    env.set_seed(0)
+    td = env.reset()
+    td["state", "velocity"][0] = torch.nan
+    td["state", "angular_velocity"][2] = 99.0  # within the bounds, until it flies
+    action = (env.hover_action + 0.1).repeat(env.num_envs, 1).requires_grad_()
+    end = env.step(td.set("action", action))["next"]
+    total = end["observation"].sum() + end["reward"].sum() + end["state", "rotor_speed"].sum()
+    return end, torch.autograd.grad(total, (action, parameter))
+
+
 def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
     options = {**EVERYTHING, "reward": "position"}
     env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, **options)
@@ -166,12 +178,12 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
         more = train_in_torchrls_loop(), optimise_actions(), as_on_an_accelerator(), train_with_clipped_gradients()
         return train(actor), train(called), train(explorer), *more
 
-    eager = all_ways()
+    eager, (broken, broken_grads) = all_ways(), break_drones(env, drag)
     env.compile()
     assert env.flies_inside(actor) and env.flies_inside(explorer) and not env.flies_inside(called)
     all_ways()
     compiled_so_far = counters["stats"]["unique_graphs"]
-    compiled = all_ways()
+    compiled, (end, end_grads) = all_ways(), break_drones(env, drag)
     with torch.no_grad():
         train_free = env.rollout(11, actor, break_when_any_done=False)
         env.rollout(3, actor)
@@ -185,6 +197,10 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
         assert not flight["next", "metrics"].requires_grad and not expected["next", "metrics"].requires_grad
         assert flight["next", "done"].any()
     torch.testing.assert_close(compiled[0], compiled[1])
+    torch.testing.assert_close(entries(end), entries(broken))
+    torch.testing.assert_close(end_grads, broken_grads)
+    assert end["crash"].flatten().tolist() == [True, False, True, False]
+    assert (end_grads[0][[0, 2]] == 0).all() and (end_grads[0][[1, 3]] != 0).any() and (end_grads[1] != 0).all()
     loss = differentiable_rollout(env, actor, None, 5)[0]["next", "reward"].sum()
     with pytest.raises(RuntimeError, match="first derivatives only"):
         torch.autograd.grad(loss, list(actor.parameters()), create_graph=True)
@@ -194,20 +210,9 @@ def test_drones_that_break_crash_alone_in_a_compiled_step():
     env = HoveringEnv(num_envs=3, integrator="rk4", action_delay=0, dt=0.02)
     mass = env.nominal.mass.clone().requires_grad_()
     env.params = env.nominal.replace(mass=mass)
-
-    def step():
-        env.set_seed(0)
-        td = env.reset()
-        td["state", "velocity"][0] = torch.nan
-        td["state", "angular_velocity"][2] = 99.0  # within the bounds, until it flies
-        action = (env.hover_action + 0.1).repeat(3, 1).requires_grad_()
-        end = env.step(td.set("action", action))["next"]
-        total = end["observation"].sum() + end["reward"].sum() + end["state", "rotor_speed"].sum()
-        return end, torch.autograd.grad(total, (action, mass))
-
-    expected, expected_grads = step()
-    env.compile()
-    end, grads = step()
+    expected, expected_grads = break_drones(env, mass)
+    env.compile(backend="eager")  # the code that is generated breaks drones in the test above
+    end, grads = break_drones(env, mass)
     assert end["crash"].flatten().tolist() == [True, False, True]
     assert end["state"].isfinite().all() and end["observation"].isfinite().all()
     torch.testing.assert_close(entries(end), entries(expected))

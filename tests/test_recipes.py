@@ -17,7 +17,7 @@ from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.scenery import EPISODE_METRICS
 
 ROOT = Path(__file__).parent.parent
-SMALL = ["num_envs=4", "horizon=6", "total_steps=96", "eval.interval=2", "env.max_episode_steps=60", "compile=false"]
+SMALL = ["num_envs=4", "horizon=6", "total_steps=96", "eval.interval=2", "env.max_episode_steps=30", "compile=false"]
 RECIPES = ["abpt", "bptt", "shac", "ppo"]
 FIRST_ORDER = ["abpt", "bptt", "shac"]
 
@@ -52,7 +52,7 @@ def test_a_compiled_run_learns_what_an_eager_one_does(train, no_pictures, tmp_pa
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_every_recipe_trains_on_every_task_and_leaves_what_it_promises(launch, recipe, tmp_path, request):
-    if recipe != "abpt":  # the others draw the same pictures, and do so in other tests
+    if recipe != "abpt":  # the others draw by the same functions
         request.getfixturevalue("no_pictures")
     sweep = [f"task={','.join(TASKS)}", f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=${task}"]
     printed = launch(recipe, "--multirun", *SMALL, *sweep, "hydra/launcher=basic")
@@ -84,7 +84,9 @@ def test_every_recipe_trains_on_every_task_and_leaves_what_it_promises(launch, r
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_evaluation_repeats_the_summary_of_the_run_also_with_a_normalizer(train, launch, recipe, tmp_path):
+def test_evaluation_repeats_the_summary_of_the_run_also_with_a_normalizer(train, launch, recipe, tmp_path, request):
+    if recipe != "abpt":  # the others draw by the same functions
+        request.getfixturevalue("no_pictures")
     train(recipe, tmp_path, "normalize=true", "env.wind={gust: 0.5}", "actor.schedule=exponential")
     checkpoint = read_checkpoint(tmp_path / "checkpoint.pt")
     assert checkpoint["stateful"][-1]["count"] == 96
@@ -92,6 +94,8 @@ def test_evaluation_repeats_the_summary_of_the_run_also_with_a_normalizer(train,
     summary = json.loads((tmp_path / "summary.json").read_text())
     evaluation = json.loads((tmp_path / "evaluation.json").read_text())
     assert all(summary[name] == value for name, value in evaluation.items())
+    if recipe != "abpt":
+        return
     for flown, again in (("flight.png", "evaluation.png"), ("flight.html", "evaluation.html")):  # the same flight
         assert (tmp_path / flown).read_bytes() == (tmp_path / again).read_bytes()
     assert (tmp_path / "evaluation.mp4").read_bytes()[4:8] == b"ftyp"

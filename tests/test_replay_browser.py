@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_quad import HoveringEnv, RacingEnv, make_env
+from torchrl_quad import HoveringEnv, RacingEnv, TrackingEnv, make_env
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.render import write_replay
@@ -22,9 +22,7 @@ def flight():
 @pytest.fixture(scope="module")
 def race(flight, open_page, tmp_path_factory):
     env, rollout = flight
-    path = tmp_path_factory.mktemp("replay") / "race.html"
-    write_replay(rollout, path, env=env)
-    replay = open_page(path)
+    replay = opened(open_page, tmp_path_factory.mktemp("replay"), env, rollout, "next gate")
     yield replay
     replay.close()
 
@@ -41,23 +39,26 @@ def replay(race):
     assert not race.wrong
 
 
-@pytest.mark.parametrize("task", ["hovering", "landing", "racing", "tracking"])
-def test_a_flight_of_every_task_opens_offline_without_errors(task, open_page, tmp_path):
-    env = make_env(task, num_envs=2)
-    rollout = env.rollout(12, break_when_any_done=False)
-    write_replay(rollout, tmp_path / "replay.html", env=env)
-    replay = open_page(tmp_path / "replay.html")
+def opened(open_page, folder, env, rollout, goal="target"):
+    """The replay of a flight whose environment is known, with what such a page shows at first."""
+    write_replay(rollout, folder / "replay.html", env=env)
+    replay = open_page(folder / "replay.html")
     assert type(env).__name__ in replay.page.title()
     np.testing.assert_allclose(replay.bodies()[:, 0], rollout["state", "position"][:, 0], atol=1e-6)
-    distance = f"distance to the {'next gate' if task == 'racing' else 'target'} [m]"
-    success = "  dashed: success below it" if task in ("hovering", "tracking") else ""
-    panels = ["reward, sum", "action [-1, 1], thrust", "speed [m/s]", distance + success]
+    success = "  dashed: success below it" if isinstance(env, HoveringEnv | TrackingEnv) else ""
+    panels = ["reward, sum", "action [-1, 1], thrust", "speed [m/s]", f"distance to the {goal} [m]{success}"]
     assert replay.series()[1] == panels
-    assert replay.layout("yaxis4.type") == ("linear" if task == "racing" else "log")
+    assert replay.layout("yaxis4.type") == ("linear" if goal == "next gate" else "log")
     if success:
         low, high = replay.layout("yaxis4.range")
         assert low < -1 < high and replay.layout("shapes.0.y0") == pytest.approx(0.1)
-    replay.close()
+    return replay
+
+
+@pytest.mark.parametrize("task", ["landing", "tracking"])  # other tests open pages of hovering and racing
+def test_a_flight_of_every_task_opens_offline_without_errors(task, open_page, tmp_path):
+    env = make_env(task, num_envs=2)
+    opened(open_page, tmp_path, env, env.rollout(12, break_when_any_done=False)).close()
 
 
 def test_a_flight_without_target_reward_terms_and_environment_opens(open_page, tmp_path):
@@ -270,8 +271,7 @@ def test_a_drone_stays_where_its_episode_has_ended_and_the_page_says_how(open_pa
     rollout = crashing(env, 50)
     end = rollout["next", "terminated"][1, :, 0].int().argmax()
     assert end < 10
-    write_replay(rollout, tmp_path / "replay.html", env=env)
-    replay = open_page(tmp_path / "replay.html")
+    replay = opened(open_page, tmp_path, env, rollout)
     assert replay.page.inner_text("#status") == "2 flying"
     replay.scrub(50)
     position = rollout["next", "state", "position"]

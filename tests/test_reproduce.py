@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -43,7 +44,25 @@ def run_main(monkeypatch, module, *arguments):
     module.main()
 
 
-def test_a_shrunken_matrix_runs_and_goes_on_where_it_was_stopped(monkeypatch, tmp_path):
+@pytest.fixture
+def run_here(launch, no_pictures):
+    """As ``reproduce.run``, but in this process, one after the other, and without pictures."""
+    alone = threading.Lock()
+
+    def run(command, folder):
+        with alone:
+            launch(Path(command[1]).stem, *command[2:])
+
+    return run
+
+
+def test_a_shrunken_matrix_runs_and_goes_on_where_it_was_stopped(run_here, monkeypatch, tmp_path):
+    in_own_process = reproduce.run  # of one of the runs; the others save the time to start
+
+    def run(command, folder):
+        (in_own_process if folder.parent.name == "abpt-now" else run_here)(command, folder)
+
+    monkeypatch.setattr(reproduce, "run", run)
     arguments = ["--quick", "--tasks", "hovering", "--experiments", "dynamics", "--seeds", "42", "--cores", "2"]
     folders = ["--data", tmp_path / "data", "--output", tmp_path / "runs"]
     run_main(monkeypatch, reproduce, *arguments, *folders)
@@ -219,7 +238,8 @@ def test_without_visited_states_every_horizon_goes_on_where_the_last_one_ended()
     assert all(f"| {label} |" in table for label in labels)
 
 
-def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(monkeypatch, tmp_path):
+def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(run_here, monkeypatch, tmp_path):
+    monkeypatch.setattr(shipped, "run", run_here)
     wanted = ["--tasks", "racing", "hovering", "--methods", "ppo", "--seeds", "0", "--cores", "2"]
     arguments = [*wanted, "--data", tmp_path, "--output", tmp_path / "runs", "--quick"]
     run_main(monkeypatch, shipped, *arguments[:-1], "--quick")

@@ -59,7 +59,9 @@ class Convention:
     xyzw: bool = False  #: whether their quaternions are (x, y, z, w)
     motors: tuple[int, int, int, int] | None = None  #: for each of their motors the index of ours
     rates: tuple[float, float, float] = (1.0, 1.0, 1.0)  #: their commanded rates for ours of 1 rad/s
-    thrust_range: tuple[float, float] | None = None  #: their command for no thrust and for all of it; None: newtons
+    thrust_range: tuple[float, float] | None = (
+        None  #: their commands for no and for full thrust; newtons where there are none
+    )
     thrust_limit: float = 1.0  #: the share of this range that may be commanded
 
     def to(self, quantities: Mapping[str, ArrayLike]) -> dict[str, Array]:

@@ -1,8 +1,10 @@
 """From policy to drone: what is exported flies as the policy did, says what it needs, and refuses what it cannot."""
 
 import ctypes
+import functools
 import io
 import json
+import shutil
 import subprocess
 
 import jsonschema
@@ -24,19 +26,25 @@ from torchrl_quad.deploy.network import ACTIVATIONS, Layer, write_onnx
 GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
 
 
-@pytest.fixture(scope="module", params=TASKS)
-def exported(request, tmp_path_factory):
-    torch.set_num_threads(1)
-    env, actor = build(request.param)
-    folder = export_policy(actor, env, tmp_path_factory.mktemp(request.param) / "policy")
-    return env, actor, folder
-
-
 @pytest.fixture(scope="module")
-def hovering(tmp_path_factory):
-    torch.set_num_threads(1)
-    env, actor = build("hovering")
-    return export_policy(actor, env, tmp_path_factory.mktemp("hovering") / "policy")
+def export_once(tmp_path_factory):
+    @functools.cache
+    def export_once(task):
+        torch.set_num_threads(1)
+        env, actor = build(task)
+        return env, actor, export_policy(actor, env, tmp_path_factory.mktemp(task) / "policy")
+
+    return export_once
+
+
+@pytest.fixture(params=TASKS)
+def exported(request, export_once):
+    return export_once(request.param)
+
+
+@pytest.fixture
+def hovering(export_once):
+    return export_once("hovering")[2]
 
 
 def compiled(folder, out):
@@ -142,8 +150,9 @@ def test_c_answers_nan_with_the_hover_action_and_decodes_commands(hovering, tmp_
 # -- the folder --------------------------------------------------------------------------------------------------------
 
 
-def test_the_same_policy_gives_the_same_bytes_and_leaves_the_environment_as_it_was(exported, tmp_path):
-    env, actor, folder = exported
+@pytest.mark.parametrize("task", ["landing", "tracking"])
+def test_the_same_policy_gives_the_same_bytes_and_leaves_the_environment_as_it_was(export_once, task, tmp_path):
+    env, actor, folder = export_once(task)
     base = getattr(env, "base_env", env)
     if base.disturbances:  # noise drawn ahead, and starts of a visited state, are handed on too
         base.rollout(3)
@@ -240,9 +249,9 @@ def test_another_runtime_that_computes_otherwise_is_found(hovering):
         bundle.check()
 
 
-def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(tmp_path, monkeypatch):
+def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_path, monkeypatch):
     env, actor = build("hovering")
-    folder = export_policy(actor, env, tmp_path / "policy")
+    folder = shutil.copytree(hovering, tmp_path / "policy")
     old = (folder / "contract.json").read_bytes()
     with torch.no_grad():
         actor[0].module.mlp[-1].bias.add_(0.1)

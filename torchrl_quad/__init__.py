@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
     from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
     from torchrl_quad.engine import ActionSequence
-    from torchrl_quad.envs import TASKS, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
+    from torchrl_quad.envs import HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
     from torchrl_quad.modules import make_actor, make_qvalue, make_value
     from torchrl_quad.objectives import ABPTLoss, BPTTLoss, HybridLoss, SHACLoss, TrustRegion
 

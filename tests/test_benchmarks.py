@@ -33,9 +33,22 @@ def test_a_benchmark_writes_a_table(name, arguments, rows, tmp_path, monkeypatch
     assert all(row["machine"] and row["torch"] for row in results)
 
 
+def test_the_benchmark_of_exported_policies_writes_a_table(tmp_path, monkeypatch):
+    """In this process, where it starts quicker."""
+    output = tmp_path / "results.csv"
+    arguments = ["--checkpoints", "racing", "--observations", "20", "--calls", "2", "--output", str(output)]
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    monkeypatch.setattr(sys, "argv", ["deployment.py", *arguments])
+    importlib.import_module("deployment").main()
+    with open(output, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["normalizer"] for row in rows] == ["False", "True"]
+    assert all(float(row[pair]) <= 1e-5 for row in rows for pair in ("torch - ONNX", "torch - C", "ONNX - C"))
+
+
 def test_the_results_that_are_published_name_their_machine():
     published = list((BENCHMARKS / "results").glob("*.csv"))
-    assert {path.stem for path in published} >= {"throughput", "memory", "time_to_solve", "profile"}
+    assert {path.stem for path in published} >= {"throughput", "memory", "time_to_solve", "profile", "deployment"}
     for path in published:
         with open(path, newline="") as file:
             assert all(row["machine"] for row in csv.DictReader(file))

@@ -20,7 +20,8 @@ from test_recipes import RECIPES, ROOT, SMALL, run
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
 PAGES += sorted(ROOT.glob("docs/*.md"))
-PARTS = ("data", "dynamics", "engine", "envs", "modules", "objectives", "render")
+PARTS = ("data", "deploy", "dynamics", "engine", "envs", "modules", "objectives", "render")
+AFTER_TRAINING = ("evaluate", "export")  # recipes that read a checkpoint
 PUBLIC = ["torchrl_quad", *(f"torchrl_quad.{part}" for part in PARTS)]
 # Blocks that are not run: text, data, and Sphinx's directives, except those that hold code.
 NOT_RUN = re.compile(r"(|text|yaml|\{(?!code|sourcecode)[\w-]+\}.*)")
@@ -160,7 +161,7 @@ def test_every_command_runs(command, launch, request, monkeypatch, capsys, tmp_p
         make(*words)  # what it does has tests of its own, and `make test` runs this one
     elif program == "pip":
         installs(words)
-    elif program in ("python", "torchrun") and Path(script).stem in (*RECIPES, "evaluate"):
+    elif program in ("python", "torchrun") and Path(script).stem in (*RECIPES, *AFTER_TRAINING):
         recipe(program, words, launch, tmp_path)
     elif program == "python" and script.startswith("examples/"):
         assert ROOT / script in EXAMPLES and words == [script]  # which have a test of their own
@@ -204,8 +205,8 @@ def recipe(program, words, launch, folder):
         arguments = [re.sub(r"^(\w+=[^,]*),.*", r"\1", word) for word in arguments]
         launch(name, "--multirun", *arguments, *SMALL, f"hydra.sweep.dir={folder}", "hydra/launcher=basic")
     elif "checkpoint.pt" in " ".join(words):
-        launch("abpt" if name == "evaluate" else name, *SMALL, "total_steps=48", f"hydra.run.dir={folder}")
+        launch("abpt" if name in AFTER_TRAINING else name, *SMALL, "total_steps=48", f"hydra.run.dir={folder}")
         arguments = [re.sub("=outputs/.*checkpoint.pt", f"={folder}/checkpoint.pt", word) for word in arguments]
-        launch(name, *arguments, *([] if name == "evaluate" else ["total_steps=96"]))
+        launch(name, *arguments, *([] if name in AFTER_TRAINING else ["total_steps=96"]))
     else:
         launch(name, *arguments, *SMALL, f"hydra.run.dir={folder}")

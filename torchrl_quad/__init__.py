@@ -1,14 +1,16 @@
 """Differentiable quadrotor tasks and first-order policy losses for TorchRL."""
 
-import gymnasium
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from torchrl_quad.data import ObservationNormalizer, VisitedStateBuffer, differentiable_rollout, restart
-from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
-from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
-from torchrl_quad.engine import ActionSequence
-from torchrl_quad.envs import TASKS, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
-from torchrl_quad.modules import make_actor, make_qvalue, make_value
-from torchrl_quad.objectives import ABPTLoss, BPTTLoss, HybridLoss, SHACLoss, TrustRegion
+if TYPE_CHECKING:
+    from torchrl_quad.data import ObservationNormalizer, VisitedStateBuffer, differentiable_rollout, restart
+    from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
+    from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
+    from torchrl_quad.engine import ActionSequence
+    from torchrl_quad.envs import HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
+    from torchrl_quad.modules import make_actor, make_qvalue, make_value
+    from torchrl_quad.objectives import ABPTLoss, BPTTLoss, HybridLoss, SHACLoss, TrustRegion
 
 __version__ = "0.1.0"
 
@@ -44,13 +46,38 @@ __all__ = [
 ]
 
 
+_PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "diagnostics")
+_TASKS = ("hovering", "landing", "racing", "tracking")  # the names of ``envs.TASKS``, which need no torch
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for when it is asked for: :mod:`torchrl_quad.deploy` flies where there is no torch."""
+    if name in _PARTS:
+        return importlib.import_module(f"{__name__}.{name}")
+    for part in _PARTS if name in __all__ else ():
+        module = importlib.import_module(f"{__name__}.{part}")
+        if hasattr(module, name):
+            return globals().setdefault(name, getattr(module, name))
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *_PARTS})
+
+
 def register_envs() -> None:
     """Register the tasks with gymnasium, as ``torchrl_quad/Hovering-v0`` and so on; importing the package does it."""
-    for task in TASKS:
+    import gymnasium
+
+    for task in _TASKS:
         name = f"torchrl_quad/{task.capitalize()}-v0"
         if name not in gymnasium.registry:
             classes = {"entry_point": "torchrl_quad.gym:GymEnv", "vector_entry_point": "torchrl_quad.gym:GymVectorEnv"}
             gymnasium.register(name, **classes, kwargs={"task": task})
 
 
-register_envs()
+try:
+    register_envs()
+except ModuleNotFoundError as error:
+    if error.name != "gymnasium":  # which a machine that only flies exported policies does not need
+        raise

@@ -218,6 +218,15 @@ class Flying(Section):
     device: Device
 
 
+class Exporting(Section):
+    """The configuration of export.py."""
+
+    checkpoint: str
+    folder: str | None = Field(description="The folder to write; null: policy, beside the checkpoint.")
+    episodes: Size = Field(description="Fresh episodes to fly, side by side.")
+    threads: Threads
+
+
 # -- the check ---------------------------------------------------------------------------------------------------------
 
 
@@ -233,7 +242,7 @@ def check(cfg: DictConfig) -> None:
     except MissingMandatoryValue as error:
         name = error.full_key or "a setting"
         raise ValueError(f"{name} is missing: write {name}=... on the command line.") from None
-    schema = Flying if "checkpoint" in values else Training
+    schema = Exporting if "folder" in values else Flying if "checkpoint" in values else Training
     try:
         schema.model_validate(values)
     except ValidationError as error:

@@ -1,0 +1,129 @@
+"""How far torch, ONNX and C differ on what a policy has visited, and how long a call takes.
+
+python benchmarks/deployment.py --checkpoints outputs/.../checkpoint.pt ...
+
+Each policy is exported as it is, and once more as the same policy behind an ObservationNormalizer. Fresh flights, other
+than those of the export, give the observations. A time is the median over single calls from Python. That of C holds
+what ctypes takes, and the bundle's everything from the named quantities to newtons and radians per second. Without
+checkpoints, the policies are untrained. Writes ``benchmarks/results/deployment.csv``.
+"""
+
+import argparse
+import ctypes
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from report import RESULTS, save
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import ExplorationType
+from tqdm import tqdm
+
+from torchrl_quad import ObservationNormalizer, differentiable_rollout, make_actor, make_env
+from torchrl_quad.deploy import export_policy, load_bundle
+from torchrl_quad.envs import TASKS
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
+GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
+ENVS = 64
+
+
+def build(source: str) -> tuple[EnvBase, TensorDictModuleBase]:
+    """The environment and the policy of a checkpoint, or of a task, untrained."""
+    if source in TASKS:
+        env = make_env(source, num_envs=ENVS, seed=7)
+        return env, make_actor(env)
+    from training.building import build_env
+    from training.evaluation import load_policy
+
+    cfg, actor, normalizer = load_policy(Path(source))
+    if normalizer is not None:
+        raise SystemExit(f"{source} has a normaliser already: give checkpoints without one.")
+    return build_env(cfg, ENVS, 7), actor
+
+
+@torch.no_grad()
+def normalized(env: EnvBase, actor: TensorDictModuleBase) -> EnvBase:
+    """The environment behind a normaliser; the first layer of the policy changes so that it does the same as before."""
+    env = TransformedEnv(env, ObservationNormalizer(env))
+    env.transform.update(fly(env.base_env, actor))
+    network, normalizer = actor[0].module, env.transform
+    first = network.mlp[0]
+    first.bias.add_(first.weight @ (network.scales[0] * normalizer.loc))
+    first.weight.mul_(normalizer.scale)
+    return env
+
+
+@torch.no_grad()
+def fly(env: EnvBase, actor: TensorDictModuleBase) -> Any:
+    """Deterministic flights from fresh starts (num_envs, time)."""
+    steps = env.max_episode_steps
+    return differentiable_rollout(env, actor, None, steps, exploration_type=ExplorationType.DETERMINISTIC)[0]
+
+
+def median_us(call: Callable[[], Any], calls: int) -> float:
+    """The median duration of a call [us]."""
+    durations = []
+    for _ in range(calls):
+        begin = time.perf_counter()
+        call()
+        durations.append(time.perf_counter() - begin)
+    return round(1e6 * float(np.median(durations)), 2)
+
+
+def measure(source: str, with_normalizer: bool, count: int, calls: int) -> dict[str, Any]:
+    """Differences and times of one policy."""
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    env, actor = build(source)
+    env = normalized(env, actor) if with_normalizer else env
+    flight = fly(env, actor)
+    at = torch.linspace(0, flight.numel() - 1, count).long()
+    visited, expected = (flight[key].flatten(0, 1)[at] for key in ("observation", "action"))
+    raw = (env.transform.undo(visited) if with_normalizer else visited).numpy()
+    with tempfile.TemporaryDirectory() as name:
+        folder = export_policy(actor, env, Path(name) / "policy")
+        bundle = load_bundle(folder)
+        library = Path(name) / "policy.so"
+        subprocess.run([*GCC, str(folder / "policy.c"), "-o", str(library), "-lm"], check=True)
+        policy = ctypes.CDLL(str(library)).policy_action
+    by_onnx = bundle._session.run(None, {"observation": raw})[0]
+    by_c, pointer = np.empty((count, 4), np.float32), ctypes.POINTER(ctypes.c_float)
+    for x, y in zip(raw, by_c, strict=True):
+        policy(x.ctypes.data_as(pointer), y.ctypes.data_as(pointer))
+    ends = [x.ctypes.data_as(pointer) for x in (raw[0], by_c[0])]
+    still = {"position": [1.0, 0.0, 1.4], "quaternion": [1.0, 0, 0, 0], "velocity": np.zeros(3)}
+    state = {**still, "angular_velocity": np.zeros(3), "age": 0.0}
+    return {
+        "task": bundle.contract["task"]["name"],
+        "policy": "untrained" if source in TASKS else "trained",
+        "normalizer": with_normalizer,
+        "observations": count,
+        "torch - ONNX": f"{np.abs(expected.numpy() - by_onnx).max():.1e}",
+        "torch - C": f"{np.abs(expected.numpy() - by_c).max():.1e}",
+        "ONNX - C": f"{np.abs(by_onnx - by_c).max():.1e}",
+        "C [us]": median_us(lambda: policy(*ends), calls),
+        "bundle [us]": median_us(lambda: bundle(state), calls),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--checkpoints", nargs="+", default=list(TASKS), help="paths, or names of tasks")
+    parser.add_argument("--observations", type=int, default=10_000)
+    parser.add_argument("--calls", type=int, default=10_000)
+    parser.add_argument("--output", type=Path, default=RESULTS / "deployment.csv")
+    args = parser.parse_args()
+    cases = [(source, normalizer) for source in args.checkpoints for normalizer in (False, True)]
+    save(args.output, [measure(*case, args.observations, args.calls) for case in tqdm(cases)])
+
+
+if __name__ == "__main__":
+    main()

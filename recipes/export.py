@@ -1,0 +1,38 @@
+"""Export the best policy of a training run: a folder that flies without torch.
+
+python recipes/export.py checkpoint=outputs/.../checkpoint.pt
+"""
+
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+from training.building import build_env
+from training.checkpoints import read_checkpoint
+from training.evaluation import load_policy
+from training.launch import recipe
+
+from torchrl_quad.deploy import export_policy, load_bundle
+from torchrl_quad.deploy.contract import sha256
+from torchrl_quad.deploy.export import STARTS
+
+
+@recipe("export")
+def main(cfg: DictConfig) -> None:
+    torch.set_num_threads(cfg.threads)
+    checkpoint = Path(cfg.checkpoint)
+    trained, actor, normalizer = load_policy(checkpoint)
+    env = build_env(trained, cfg.episodes, STARTS)
+    if normalizer is not None:
+        env.transform.load_state_dict(normalizer)
+    origin = {
+        "revision": read_checkpoint(checkpoint)["revision"],
+        "checkpoint_sha256": sha256(checkpoint.read_bytes()),
+    }
+    folder = export_policy(actor, env, cfg.folder or checkpoint.parent / "policy", origin=origin)
+    bundle = load_bundle(folder)
+    print(f"{folder}: flies {bundle.contract['task']['name']}; its actions differ by at most {bundle.check():.1e}")
+
+
+if __name__ == "__main__":
+    main()

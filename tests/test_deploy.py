@@ -1,0 +1,265 @@
+"""From policy to drone: what is exported flies as the policy did, says what it needs, and refuses what it cannot."""
+
+import ctypes
+import functools
+import io
+import json
+import shutil
+import subprocess
+
+import jsonschema
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from deploying import TASKS, build, resting
+from flying import fly
+from torch import nn
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_quad import HoveringEnv
+from torchrl_quad.deploy import TamperedBundle as Tampered
+from torchrl_quad.deploy import UnknownContract, WrongActions, contract, export_policy, load_bundle
+from torchrl_quad.deploy.network import ACTIVATIONS, Layer, write_onnx
+
+GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
+
+
+@pytest.fixture(scope="module")
+def export_once(tmp_path_factory):
+    @functools.cache
+    def export_once(task):
+        torch.set_num_threads(1)
+        env, actor = build(task)
+        return env, actor, export_policy(actor, env, tmp_path_factory.mktemp(task) / "policy")
+
+    return export_once
+
+
+@pytest.fixture(params=TASKS)
+def exported(request, export_once):
+    return export_once(request.param)
+
+
+@pytest.fixture
+def hovering(export_once):
+    return export_once("hovering")[2]
+
+
+def compiled(folder, out):
+    subprocess.run([*GCC, str(folder / "policy.c"), "-o", str(out), "-lm"], check=True)
+    return ctypes.CDLL(str(out))
+
+
+def run_c(library, observation):
+    pointer, action = ctypes.POINTER(ctypes.c_float), np.zeros(4, np.float32)
+    rows = []
+    for x in np.ascontiguousarray(observation):
+        assert library.policy_action(x.ctypes.data_as(pointer), action.ctypes.data_as(pointer)) == 0
+        rows.append(action.copy())
+    return np.stack(rows)
+
+
+# -- the same policy ---------------------------------------------------------------------------------------------------
+
+
+def test_torch_onnx_and_c_agree_and_the_contract_fits_its_schema(exported, tmp_path):
+    env, actor, folder = exported
+    vectors = np.load(folder / "vectors.npz")
+    observation, expected = vectors["observation"], vectors["action"]
+    assert len(observation) >= 1000 and np.abs(expected - expected.mean(0)).max() > 0.1
+    seen = torch.from_numpy(observation)
+    seen = env.transform.normalize(seen) if isinstance(env, TransformedEnv) else seen
+    with torch.no_grad():
+        action = torch.tanh(actor[0].module.mlp(seen)[:, :4])  # the mean, by hand
+    np.testing.assert_allclose(action, expected, rtol=0, atol=1e-5)
+    assert load_bundle(folder).check() <= 1e-5
+    library = compiled(folder, tmp_path / "policy.so")
+    library.policy_self_test.restype = ctypes.c_float
+    assert 0.0 < library.policy_self_test() <= 1e-5
+    np.testing.assert_allclose(run_c(library, observation), expected, rtol=0, atol=1e-5)
+    jsonschema.validate(json.loads((folder / "contract.json").read_text()), contract.schema())
+
+
+def test_a_bundle_flies_the_environment_as_the_actor_does(exported):
+    """From named quantities, with quaternions of any sign; it commands what the environment decodes."""
+    env, actor, folder = exported
+    base, bundle, draw = getattr(env, "base_env", env), load_bundle(folder), np.random.default_rng(0)
+    start = env.reset()
+    td, entry = start, {"tracking": "phase", "racing": "gate"}.get(bundle.contract["task"]["name"], "target")
+    begin = td["state", entry][0].numpy()
+    bundle.reset(**{entry: begin if begin.size > 1 else begin.item()})
+    actions = []
+    for _ in range(40):
+        seen = {key: td["state", key] for key in base.control_step.safe_state}
+        for disturbance in base.disturbances.values():
+            seen = disturbance.observe(seen)
+        state = {k: seen[k][0].numpy() for k in ("position", "quaternion", "velocity", "angular_velocity")}
+        state["quaternion"] = state["quaternion"] * draw.choice([-1.0, 1.0]) * (1 + 1e-4)
+        thrust, rates = bundle(state | {"age": 0.001})
+        with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+            td = actor(td)
+        actions.append(td["action"])
+        np.testing.assert_allclose(bundle.action, td["action"][0], rtol=0, atol=2e-3)
+        command = base.dynamics.controller.setpoint(torch.from_numpy(bundle.action))
+        np.testing.assert_allclose([thrust, *rates], torch.cat(command).numpy(), rtol=1e-5, atol=1e-6)
+        td = env.step_mdp(env.step(td))
+    assert (torch.stack(actions).std(0) > 1e-3).any()
+
+
+def test_a_drone_that_turns_round_keeps_the_sign_of_its_quaternion(hovering):
+    bundle = load_bundle(hovering)
+    for angle in np.linspace(0.0, 4 * np.pi, 200):
+        half = 0.5 * angle
+        q = np.array([np.cos(half), 0.0, 0.0, np.sin(half)])
+        bundle(resting(quaternion=q if q[0] >= 0 else -q))  # as an estimator writes it
+        np.testing.assert_allclose(bundle.observation[3:7], 10 * q, atol=1e-5)
+    bundle.reset()
+    bundle(resting(quaternion=[-1, 0, 0, 0]))
+    assert bundle.observation[3] == 10.0
+
+
+def test_every_activation_is_written_alike_as_onnx_and_c(tmp_path):
+    x = np.linspace(-30, 30, 601, dtype=np.float32)
+    one, small, zero = np.ones((1, 1), np.float32), np.full((1, 1), 0.02, np.float32), np.zeros(1, np.float32)
+    functions = "\n".join(f"float {name}_of(float x) {{ return {c}; }}" for name, (_, c) in ACTIVATIONS.items())
+    (tmp_path / "policy.c").write_text("#include <math.h>\n" + functions)
+    library = compiled(tmp_path, tmp_path / "policy.so")
+    for name in ACTIVATIONS:
+        expected = getattr(nn, name)()(torch.from_numpy(x))
+        content = write_onnx([Layer(one, zero, name), Layer(small, zero, "Tanh")])
+        session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+        found = session.run(None, {"observation": x[:, None]})[0][:, 0]
+        np.testing.assert_allclose(found, torch.tanh(0.02 * expected), rtol=0, atol=1e-6, err_msg=name)
+        function = getattr(library, f"{name}_of")
+        function.argtypes, function.restype = [ctypes.c_float], ctypes.c_float
+        np.testing.assert_allclose([function(v) for v in x], expected, rtol=2e-6, atol=1e-6, err_msg=name)
+
+
+def test_c_answers_nan_with_the_hover_action_and_decodes_commands(hovering, tmp_path):
+    library = compiled(hovering, tmp_path / "policy.so")
+    observation, action = (ctypes.c_float * 13)(*[float("nan")] * 13), (ctypes.c_float * 4)()
+    assert library.policy_action(observation, action) == 1
+    assert list(action) == pytest.approx([-1 / 3, 0, 0, 0])
+    thrust, rates = ctypes.c_float(), (ctypes.c_float * 3)()
+    library.policy_command((ctypes.c_float * 4)(-1 / 3, 0.5, -1.0, 0.25), ctypes.byref(thrust), rates)
+    assert [thrust.value, *rates] == pytest.approx([0.46 * 9.81, 1.0, -2.0, 0.5])
+
+
+# -- the folder --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", ["landing", "tracking"])
+def test_the_same_policy_gives_the_same_bytes_and_leaves_the_environment_as_it_was(export_once, task, tmp_path):
+    env, actor, folder = export_once(task)
+    base = getattr(env, "base_env", env)
+    if base.disturbances:  # noise drawn ahead, and starts of a visited state, are handed on too
+        base.rollout(3)
+    before = base.randomness.generator.get_state()
+    again = export_policy(actor, env, tmp_path / "again")
+    assert torch.equal(before, base.randomness.generator.get_state())
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == sorted([*contract.FILES, "contract.json"])
+    for name in names:
+        assert (folder / name).read_bytes() == (again / name).read_bytes(), name
+
+
+def test_a_contract_says_what_the_environment_is(hovering):
+    about = json.loads((hovering / "contract.json").read_text())
+    keys = ("name", "start", "stop", "unit", "frame", "scale")
+    assert [tuple(x[k] for k in keys) for x in about["inputs"]] == [
+        ("to_target", 0, 3, "m", "world", 1.0),
+        ("quaternion", 3, 7, "1", "body to world", 10.0),
+        ("velocity", 7, 10, "m/s", "world", 1.0),
+        ("angular_velocity", 10, 13, "rad/s", "body", 1.0),
+    ]
+    assert about["inputs"][1]["seen"]["greatest"][0] == 1.0
+    assert about["output"]["thrust"]["range"] == pytest.approx([0, 3 * 0.46 * 9.81])
+    assert about["output"]["body_rate"]["range"] == [[-2, 2]] * 3
+    assert about["output"]["hover_action"] == pytest.approx([-1 / 3, 0, 0, 0])
+    assert (about["control_dt"], about["action_delay"], about["drone"]["mass"]) == (0.02, 1, 0.46)
+    assert about["safety"]["position"] == {"low": [-4, -5, 0], "high": [6, 5, 6]}
+    assert "(action + 1) / 2 x 13.5378 N" in (hovering / "README.md").read_text()
+
+
+def test_the_rate_loop_of_a_contract_is_that_of_the_simulator(hovering):
+    """A small step of the roll rate about hover, beside the second-order system that the contract states."""
+    loop = json.loads((hovering / "contract.json").read_text())["rate_loop"]
+    env = HoveringEnv(num_envs=1, dtype=torch.float64, dt=0.001, control_dt=0.001, action_delay=0)
+    action = env.hover_action.clone().repeat(1, 1)
+    action[0, 1:] = 0.02
+    rate = torch.stack(
+        [td["next", "state", "angular_velocity"] for td in fly(env, env.reset(), [action] * 150).unbind(1)]
+    )
+    t = 0.001 * np.arange(1, 151)
+    for axis, found in enumerate(rate[:, 0].T.numpy() / 0.04):
+        w, z = loop["natural_frequency"][axis], loop["damping_ratio"][axis]
+        damped = w * np.sqrt(1 - z * z)
+        expected = 1 - np.exp(-z * w * t) * (np.cos(damped * t) + z * w / damped * np.sin(damped * t))
+        np.testing.assert_allclose(found, expected, atol=0.03)
+        s = 1j * loop["bandwidth"][axis]
+        assert abs(w * w / (s * s + 2 * z * w * s + w * w)) == pytest.approx(0.5**0.5, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", [*contract.FILES, "contract.json"])
+def test_a_file_that_was_changed_or_is_missing_is_named(hovering, tmp_path, name):
+    folder = tmp_path / "policy"
+    folder.mkdir()
+    for path in hovering.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    assert load_bundle(folder).check() <= 1e-5
+    content = (folder / name).read_bytes()
+    damaged = content.replace(b"0.46", b"0.45") if name == "contract.json" else content[:-3] + b"abc"
+    (folder / name).write_bytes(damaged)
+    with pytest.raises(Tampered, match=f"{name} was changed after the export: its checksum does not fit"):
+        load_bundle(folder)
+    (folder / name).unlink()
+    with pytest.raises((Tampered, FileNotFoundError), match=f"{name} cannot be read|No bundle at .* has no contract"):
+        load_bundle(folder)
+
+
+def test_a_contract_of_another_version_is_refused(hovering, tmp_path):
+    about = json.loads((hovering / "contract.json").read_text())
+    path = tmp_path / "contract.json"
+    for text in ("[]", "{", "{}"):
+        path.write_text(text)
+        with pytest.raises(Tampered, match="is no contract of a policy"):
+            load_bundle(tmp_path)
+    path.write_text(json.dumps(about | {"version": 2}))
+    with pytest.raises(
+        UnknownContract, match="has version 2, and this torchrl_quad reads version 1. It was written by"
+    ):
+        load_bundle(tmp_path)
+    about["task"]["rule"] = "dance"  # of a later package, with checksums that fit
+    path.write_text(json.dumps(about | {"digest": contract.digest(about)}))
+    for name in contract.FILES:
+        (tmp_path / name).write_bytes((hovering / name).read_bytes())
+    with pytest.raises(UnknownContract, match="follows the rule 'dance'; this torchrl_quad knows target, curve, gates"):
+        load_bundle(tmp_path)
+
+
+def test_another_runtime_that_computes_otherwise_is_found(hovering):
+    bundle = load_bundle(hovering)
+    vectors = dict(np.load(io.BytesIO(bundle._vectors)))
+    buffer = io.BytesIO()
+    np.savez(buffer, observation=vectors["observation"], action=vectors["action"] + np.float32(1e-3))
+    bundle._vectors = buffer.getvalue()
+    with pytest.raises(WrongActions, match="differs by 0.001"):
+        bundle.check()
+
+
+def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_path, monkeypatch):
+    env, actor = build("hovering")
+    folder = shutil.copytree(hovering, tmp_path / "policy")
+    old = (folder / "contract.json").read_bytes()
+    with torch.no_grad():
+        actor[0].module.mlp[-1].bias.add_(0.1)
+    with monkeypatch.context() as patch:
+        patch.setattr("torchrl_quad.deploy.export._require_the_same_flight", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            export_policy(actor, env, folder)
+    assert (folder / "contract.json").read_bytes() == old
+    export_policy(actor, env, folder)
+    assert (folder / "contract.json").read_bytes() != old
+    assert [path.name for path in tmp_path.iterdir()] == ["policy"]

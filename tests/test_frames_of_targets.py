@@ -1,0 +1,168 @@
+"""Conventions of autopilots and simulators: round trips, and cases worked by hand that a wrong sign fails."""
+
+import numpy as np
+import pytest
+
+from torchrl_quad.deploy import frames
+
+S = np.sqrt(0.5)
+# Ours for a quarter turn: roll right, nose down, turn left.
+ROLL, NOSE_DOWN, LEFT = (S, S, 0, 0), (S, 0, S, 0), (S, 0, 0, S)
+TARGETS = [
+    frames.px4(),
+    frames.px4("nwu"),
+    frames.ardupilot(),
+    frames.ardupilot("nwu"),
+    frames.betaflight(),
+    frames.betaflight(sitl=True),
+    frames.crazyflie(),
+    frames.crazyflie(manual=True),
+    frames.mavros(),
+    frames.mavros("nwu"),
+    frames.mujoco(),
+    frames.rotorpy(),
+    frames.crazyflow(),
+]
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda x: getattr(x, "name", ""))
+def test_there_and_back_gives_the_same(target):
+    draw = np.random.default_rng(0)
+    quaternion = draw.normal(size=(2, 50, 4))
+    quantities = {
+        **{name: draw.normal(size=(2, 50, 3)) for name in ("position", "velocity", "angular_velocity", "body_rate")},
+        "quaternion": quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True),
+        **({"motors": draw.normal(size=(2, 50, 4))} if target.motors else {}),
+    }
+    theirs = target.to(quantities)
+    for one, other in ((target.back(theirs), quantities), (target.to(target.back(quantities)), quantities)):
+        for name, x in other.items():
+            np.testing.assert_allclose(one[name], x, rtol=0, atol=1e-12, err_msg=name)
+    newtons = np.linspace(0.0, 8.0, 7)
+    for factor in (0.0, 0.4, 1.0):
+        command = target.thrust(newtons, 10.0, factor)
+        np.testing.assert_allclose(target.newtons(command, 10.0, factor), newtons, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda x: getattr(x, "name", ""))
+def test_an_attitude_turns_vectors_as_the_target_would(target):
+    """Body to world in their frames is the same arrow as in ours."""
+    draw = np.random.default_rng(1)
+    q, arrow = draw.normal(size=4), draw.normal(size=3)
+    q /= np.linalg.norm(q)
+    theirs = target.to({"quaternion": q, "angular_velocity": arrow, "velocity": turned(q, arrow)})
+    quaternion = np.roll(theirs["quaternion"], 1) if target.xyzw else theirs["quaternion"]
+    np.testing.assert_allclose(turned(quaternion, theirs["angular_velocity"]), theirs["velocity"], atol=1e-12)
+
+
+def turned(q, v):
+    """v turned by the unit quaternion (w, x, y, z), from the textbook's matrix."""
+    w, x, y, z = q
+    matrix = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(matrix) @ v
+
+
+def assert_to(target, name, ours, theirs):
+    found = target.to({name: ours})[name]
+    if name == "quaternion" and np.dot(found, theirs) < 0:
+        found = -found
+    np.testing.assert_allclose(found, theirs, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("make", [frames.px4, frames.ardupilot])
+def test_aerospace_frames_by_hand(make):
+    enu, nwu = make("enu"), make("nwu")
+    # 1 m east, 2 m north, 3 m up.
+    assert_to(enu, "position", (1, 2, 3), (2, 1, -3))
+    assert_to(nwu, "position", (2, -1, 3), (2, 1, -3))
+    assert_to(enu, "velocity", (0, 0, -1), (0, 0, 1))  # falling is positive
+    # Level, nose to the east: in NED a quarter turn to the right from north.
+    assert_to(enu, "quaternion", (1, 0, 0, 0), (S, 0, 0, S))
+    assert_to(enu, "quaternion", LEFT, (1, 0, 0, 0))  # then to the left: north
+    assert_to(nwu, "quaternion", (1, 0, 0, 0), (1, 0, 0, 0))
+    # Aerospace: roll right is +x, nose up is +y, turning right is +z.
+    assert_to(nwu, "quaternion", ROLL, (S, S, 0, 0))
+    assert_to(nwu, "quaternion", NOSE_DOWN, (S, 0, -S, 0))
+    assert_to(nwu, "quaternion", LEFT, (S, 0, 0, -S))
+    for name in ("angular_velocity", "body_rate"):
+        assert_to(enu, name, (1, 0, 0), (1, 0, 0))
+        assert_to(enu, name, (0, 1, 0), (0, -1, 0))
+        assert_to(enu, name, (0, 0, 1), (0, 0, -1))
+
+
+@pytest.mark.parametrize("target", [frames.betaflight(), frames.crazyflie()], ids=lambda x: getattr(x, "name", ""))
+def test_sticks_by_hand(target):
+    """Roll right, nose down and turning right are positive, in degrees; so is what cflib's send_setpoint takes."""
+    assert_to(target, "body_rate", (np.pi, 0, 0), (180, 0, 0))
+    assert_to(target, "body_rate", (0, np.pi, 0), (0, 180, 0))
+    assert_to(target, "body_rate", (0, 0, np.pi), (0, 0, -180))
+
+
+def test_rates_that_keep_our_signs():
+    assert_to(frames.crazyflie(manual=True), "body_rate", (0, np.pi, np.pi), (0, 180, 180))
+    for target in (frames.mavros(), frames.mujoco(), frames.rotorpy(), frames.crazyflow()):
+        assert_to(target, "body_rate", (1, 2, 3), (1, 2, 3))
+
+
+def test_worlds_with_z_up_by_hand():
+    for target in (frames.crazyflie(), frames.mavros(), frames.rotorpy(), frames.crazyflow()):
+        assert_to(target, "quaternion", ROLL, (S, 0, 0, S))
+        assert_to(target, "quaternion", NOSE_DOWN, (0, S, 0, S))
+        assert_to(target, "quaternion", LEFT, (0, 0, S, S))
+        assert_to(target, "position", (1, 2, 3), (1, 2, 3))
+    for q in (ROLL, NOSE_DOWN, LEFT):
+        assert_to(frames.mujoco(), "quaternion", q, q)
+    assert_to(frames.mavros("nwu"), "position", (2, -1, 3), (1, 2, 3))  # 1 m east, 2 m north
+    assert_to(frames.mavros("nwu"), "quaternion", (1, 0, 0, 0), (0, 0, S, S))  # north is a quarter left of east
+
+
+# The motors of each target by their places, as its own pages number them.
+FL, BL, BR, FR = range(4)
+
+
+@pytest.mark.parametrize(
+    ("target", "places"),
+    [
+        (frames.px4(), (FR, BL, FL, BR)),
+        (frames.ardupilot(), (FR, BL, FL, BR)),
+        (frames.betaflight(), (BR, FR, BL, FL)),
+        (frames.betaflight(sitl=True), (FR, BL, FL, BR)),
+        (frames.crazyflie(), (FR, BR, BL, FL)),
+        (frames.rotorpy(), (FL, FR, BR, BL)),
+        (frames.crazyflow(), (FR, BR, BL, FL)),
+    ],
+    ids=lambda x: getattr(x, "name", ""),
+)
+def test_one_motor_alone_lands_at_its_place(target, places):
+    for place in (FL, BL, BR, FR):
+        assert target.to({"motors": np.eye(4)[place]})["motors"].tolist() == [float(p == place) for p in places]
+
+
+def test_thrust_by_hand():
+    weight = 4.0
+    assert frames.px4().thrust(weight, full_thrust=weight / 0.4) == pytest.approx(-0.4)  # hovers at MPC_THR_HOVER
+    assert frames.px4().thrust(100.0, 10.0) == -1.0
+    assert frames.ardupilot().thrust(2 * weight, full_thrust=weight / 0.4) == pytest.approx(0.8)
+    assert frames.mavros().thrust(weight, full_thrust=1 / 0.05) == pytest.approx(0.2)
+    assert frames.betaflight().thrust(2.5, 10.0) == pytest.approx(1250.0)
+    assert frames.betaflight().thrust(2.5, 10.0, model_factor=1.0) == pytest.approx(1500.0)  # thrust = signal squared
+    assert frames.crazyflie().thrust(0.3, 4 * 0.15) == pytest.approx(32767.5)
+    assert frames.crazyflie().thrust(0.6, 4 * 0.15) == pytest.approx(60000)
+    assert frames.crazyflie_percentage([10001, 60000]).tolist() == [0.0, 100.0]
+    assert frames.mujoco().thrust(1.25) == 1.25
+    assert frames.motor_thrust(0.5, 0.4) == pytest.approx(0.4 * 0.25 + 0.6 * 0.5)
+
+
+def test_what_has_no_meaning_is_refused():
+    with pytest.raises(ValueError, match="Unknown world 'ned'"):
+        frames.px4("ned")
+    with pytest.raises(ValueError, match="Unknown quantity 'speed'. Choose from: position"):
+        frames.px4().to({"speed": 1.0})
+    with pytest.raises(ValueError, match=r"quaternion must have shape \(..., 4\), got \(3,\)"):
+        frames.px4().back({"quaternion": [1, 0, 0]})
+    with pytest.raises(ValueError, match="MuJoCo has no order of motors"):
+        frames.mujoco().to({"motors": [1, 2, 3, 4]})

@@ -1,0 +1,223 @@
+"""An exported policy in flight, without torch: numpy and onnxruntime run it."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import math
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_quad.deploy import contract as contracts
+from torchrl_quad.deploy.contract import (
+    Fault,
+    MissingQuantity,
+    NotFinite,
+    NotUnitQuaternion,
+    StaleState,
+    UnknownContract,
+    WrongActions,
+)
+from torchrl_quad.deploy.tasks import RULES
+
+QUANTITIES = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}  # that each state must have
+START = np.array([1.0, 0.0, 0.0, 0.0])  # the quaternion that the first one of a flight takes its sign from
+
+
+class Bundle:
+    """A policy in flight: call it once in each control step. :func:`load_bundle` builds it.
+
+    .. code-block:: python
+
+        bundle = load_bundle("outputs/policy")
+        bundle.check()
+        bundle.reset()
+        thrust, rates = bundle({"position": p, "quaternion": q, "velocity": v, "angular_velocity": w, "age": 0.004})
+
+    It keeps what the network does not: the commands on their way, the sign of the quaternion, and the task's progress.
+    ``rule`` is the progress (:mod:`~torchrl_quad.deploy.tasks`): ``bundle.rule.gate``, for example.
+
+    Attributes:
+        contract: the content of ``contract.json``.
+        observation: what the network read last, float32 (k).
+        action: what it answered, or the hover action after a fault; float32 (4).
+        queue: the last commands, oldest first, float32 (action_delay, 4).
+        faults: how many faults of each kind there were since the bundle was loaded, by the name of the error.
+        last_fault: the last of them, or None.
+    """
+
+    def __init__(
+        self, contract: dict[str, Any], files: Mapping[str, bytes], on_fault: Literal["raise", "hover"]
+    ) -> None:
+        if on_fault not in ("raise", "hover"):
+            raise ValueError(f'on_fault must be "raise" or "hover", got {on_fault!r}.')
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise ImportError("A bundle flies with onnxruntime: pip install 'torchrl_quad[deploy]'") from error
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        provider = ["CPUExecutionProvider"]
+        self._session = onnxruntime.InferenceSession(files["policy.onnx"], options, providers=provider)
+        self._vectors = files["vectors.npz"]
+        self.contract, self.on_fault = contract, on_fault
+        self.faults: Counter[str] = Counter()
+        self.last_fault: Fault | None = None
+        output, limits = contract["output"], contract["limits"]
+        self._half_thrust = 0.5 * output["thrust"]["range"][1]
+        self._max_rates = np.array(output["body_rate"]["range"])[:, 1]
+        self._hover = np.array(output["hover_action"], np.float32)
+        self._max_age, self._norm_error = limits["max_state_age"], limits["quaternion_norm_error"]
+        self._max_value = limits["max_value"]
+        self._shows_queue = contract["action_queue"]["observed"]
+        scales = [np.full(x["stop"] - x["start"], x["scale"]) for x in contract["inputs"]]
+        self._scale = np.concatenate(scales)
+        if contract["task"]["rule"] not in RULES:
+            raise UnknownContract(
+                f"The contract's task follows the rule {contract['task']['rule']!r}; this torchrl_quad knows "
+                f"{', '.join(RULES)}. Use the one that exported it: {contract['origin']['package']}."
+            )
+        self.rule = RULES[contract["task"]["rule"]](contract["task"] | {"control_dt": contract["control_dt"]})
+        self.reset()
+
+    def reset(self, **progress: Any) -> None:
+        """Start a new flight; the counts of faults go on.
+
+        Args:
+            progress: where the flight starts in the task: ``target`` (3) [m] in hovering and landing, by default the
+                contract's; ``phase`` [rad] in tracking, by default 0; ``gate``, the index of the first, in racing, by
+                default 0.
+        """
+        known = inspect.signature(self.rule.reset).parameters
+        for name in progress:
+            if name not in known:
+                task = self.contract["task"]["name"]
+                raise TypeError(f"reset: {task} has no {name!r}. Choose from: {', '.join(known)}.")
+        self.rule.reset(**progress)
+        self.queue = np.tile(self._hover, (self.contract["action_delay"], 1))
+        self.action = self._hover.copy()
+        self.observation: NDArray[np.float32] | None = None
+        self._quaternion, self._position = START, None
+        self._begun = False
+
+    def __call__(self, state: Mapping[str, Any]) -> tuple[float, NDArray[np.float64]]:
+        """The command for this control step.
+
+        Args:
+            state: by name ``position`` (3) [m] and ``velocity`` (3) [m/s] in the world frame, ``quaternion`` (4)
+                (w, x, y, z), body to world, of either sign, ``angular_velocity`` (3) [rad/s] in the body frame, and
+                ``age`` [s], the time since they were measured. Other entries are ignored.
+
+        Returns:
+            the collective thrust [N] and the body rates (3) [rad/s].
+
+        Raises:
+            Fault: the policy cannot fly from this state; the bundle is as before the call. With ``on_fault="hover"``
+                the command is to hover instead, the time goes on, and :attr:`faults` counts it.
+        """
+        try:
+            position = self._read(state)
+        except Fault as fault:
+            self.faults[type(fault).__name__] += 1
+            self.last_fault = fault
+            if self.on_fault == "raise":
+                raise
+            action = self._hover
+            if self._begun:
+                self.rule.advance(None, None)
+            position = None
+        else:
+            action = self._action
+        self.action, self._begun = action, True
+        self._position = position
+        if len(self.queue):
+            self.queue = np.concatenate((self.queue[1:], action[None]))
+        return self._half_thrust * (float(action[0]) + 1.0), self._max_rates * action[1:]
+
+    def check(self, tolerance: float = 1e-5) -> float:
+        """Run the policy on all observations that came with it.
+
+        Returns:
+            the greatest difference from the actions that came with them.
+
+        Raises:
+            WrongActions: the difference is above the tolerance.
+        """
+        with np.load(io.BytesIO(self._vectors)) as vectors:
+            observation, expected = vectors["observation"], vectors["action"]
+        action = self._session.run(None, {"observation": observation})[0]
+        error = float(np.abs(action - expected).max())
+        if not error <= tolerance:
+            raise WrongActions(
+                f"The policy differs by {error:.3g} from what it did when it was exported, allowed are {tolerance:g}. "
+                "This onnxruntime computes otherwise: do not fly with it."
+            )
+        return error
+
+    def _read(self, state: Mapping[str, Any]) -> NDArray[np.float64]:
+        """Compute the action from a state; the position in it. Nothing of the bundle changes before a fault."""
+        parts = []
+        for name, size in QUANTITIES.items():
+            try:
+                part = np.asarray(state[name], float)
+            except KeyError:
+                raise MissingQuantity(f"The state lacks {name!r}: give {', '.join(QUANTITIES)} and age.") from None
+            except (TypeError, ValueError):
+                raise MissingQuantity(f"{name} must be {size} numbers, got {state[name]!r}.") from None
+            if part.shape != (size,):
+                raise MissingQuantity(f"{name} must have shape ({size},), got {part.shape}.")
+            parts.append(part)
+        try:
+            age = float(state["age"])
+        except KeyError:
+            raise MissingQuantity("The state lacks 'age', the time since it was measured [s].") from None
+        except (TypeError, ValueError):
+            raise MissingQuantity(f"age must be a number [s], got {state['age']!r}.") from None
+        if not (math.isfinite(age) and np.abs(np.concatenate(parts)).max() <= self._max_value):
+            names = [name for name, part in zip(QUANTITIES, parts, strict=True) if not self._is_sane(part)]
+            raise NotFinite(f"Not finite, or beyond {self._max_value:g}: {', '.join(names) or 'age'}.")
+        if not 0.0 <= age <= self._max_age:
+            raise StaleState(f"The state is {age:g} s old; the contract allows 0 to {self._max_age:g} s.")
+        position, quaternion, velocity, angular_velocity = parts
+        norm = math.sqrt(float(quaternion @ quaternion))
+        if not abs(norm - 1.0) <= self._norm_error:
+            raise NotUnitQuaternion(f"The quaternion has norm {norm:.6g}; it must be 1 to {self._norm_error:g}.")
+        quaternion = quaternion / (norm if float(quaternion @ self._quaternion) >= 0.0 else -norm)
+        saved = vars(self.rule).copy()
+        if self._begun:
+            self.rule.advance(self._position, position)
+        queue = [self.queue.ravel()] if self._shows_queue else []
+        entries = (self.rule.relative(position), quaternion, velocity, angular_velocity, *queue)
+        observation = (self._scale * np.concatenate(entries)).astype(np.float32)
+        action = self._session.run(None, {"observation": observation[None]})[0][0]
+        if not math.isfinite(float(action.sum())):
+            vars(self.rule).update(saved)
+            raise NotFinite("The action is not finite: the policy, or what runs it, is broken.")
+        self.observation, self._action, self._quaternion = observation, action, quaternion
+        return position
+
+    def _is_sane(self, x: NDArray[np.float64]) -> bool:
+        return bool((np.abs(x) <= self._max_value).all())
+
+
+def load_bundle(folder: str | Path, on_fault: Literal["raise", "hover"] = "raise") -> Bundle:
+    """Load what :func:`~torchrl_quad.deploy.export_policy` wrote, and check that nobody changed it since.
+
+    Args:
+        folder: with ``contract.json`` in it.
+        on_fault: what a state does that the policy cannot fly from: "raise" an error, or "hover": command to hover, and
+            count it.
+
+    Raises:
+        FileNotFoundError: there is no bundle.
+        TamperedBundle: a file is missing or was changed.
+        UnknownContract: the contract is of another version.
+        ImportError: onnxruntime is missing.
+    """
+    return Bundle(*contracts.read(Path(folder)), on_fault)

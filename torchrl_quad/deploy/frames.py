@@ -1,0 +1,232 @@
+"""Conventions of autopilots and simulators: our quantities in their frames, orders, signs and units, and back.
+
+.. code-block:: python
+
+    px4 = frames.px4(world="enu")
+    state = px4.back({"position": ned, "velocity": v_ned, "quaternion": q, "angular_velocity": w_frd})
+    thrust, rates = bundle({**state, "age": age})
+    rates_frd = px4.to({"body_rate": rates})["body_rate"]
+    thrust_z = px4.thrust(thrust, full_thrust=weight / hover_thrust)
+
+Ours: a world with z up, in which x and y may point anywhere; body x forward, y left, z up (FLU); quaternions
+(w, x, y, z) from body to world; rotors front left, back left, back right, front right. Where a target knows north, say
+where our x and y point: ``world="enu"``, x east and y north, or ``world="nwu"``, x north and y west.
+
+Everything broadcasts over leading dimensions. The facts come from the sources of the targets as of 2025; check them
+against the version that you fly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Quaternion = tuple[float, float, float, float]
+
+_HALF = 0.5**0.5
+SAME: Quaternion = (1.0, 0.0, 0.0, 0.0)
+# Turn the components of a vector in one frame into those in another; the right-handed frames differ by a rotation.
+ENU_TO_NED: Quaternion = (0.0, _HALF, _HALF, 0.0)  # (x, y, z) -> (y, x, -z)
+NWU_TO_NED: Quaternion = (0.0, 1.0, 0.0, 0.0)  # (x, y, z) -> (x, -y, -z)
+NWU_TO_ENU: Quaternion = (_HALF, 0.0, 0.0, _HALF)  # (x, y, z) -> (-y, x, z)
+FLU_TO_FRD: Quaternion = (0.0, 1.0, 0.0, 0.0)  # (x, y, z) -> (x, -y, -z)
+DEGREES = 180.0 / np.pi
+
+
+@dataclass(frozen=True)
+class Convention:
+    """The conventions of one target. :meth:`to` and :meth:`back` translate quantities by name:
+
+    ====================  =====  ===================================================================================
+    quantity              size   meaning
+    ====================  =====  ===================================================================================
+    ``position``          3      [m], world frame
+    ``velocity``          3      [m/s], world frame
+    ``quaternion``        4      attitude; ours w x y z
+    ``angular_velocity``  3      [rad/s], as measured, body frame
+    ``body_rate``         3      as commanded: ours [rad/s], body frame; theirs in ``rates``, see below
+    ``motors``            4      anything that belongs to a motor each
+    ====================  =====  ===================================================================================
+    """
+
+    name: str
+    world: Quaternion = SAME  #: from our world frame to theirs
+    body: Quaternion = SAME  #: from our body frame to theirs
+    xyzw: bool = False  #: whether their quaternions are (x, y, z, w)
+    motors: tuple[int, int, int, int] | None = None  #: for each of their motors the index of ours
+    rates: tuple[float, float, float] = (1.0, 1.0, 1.0)  #: their commanded rates for ours of 1 rad/s
+    thrust_range: tuple[float, float] | None = (
+        None  #: their commands for no and for full thrust; newtons where there are none
+    )
+    thrust_limit: float = 1.0  #: the share of this range that may be commanded
+
+    def to(self, quantities: Mapping[str, ArrayLike]) -> dict[str, Array]:
+        """Our quantities as theirs.
+
+        Raises:
+            ValueError: a quantity is unknown, has another size, or the target has no fixed order of motors.
+        """
+        return {name: self._translate(name, self._checked(name, x), False) for name, x in quantities.items()}
+
+    def back(self, quantities: Mapping[str, ArrayLike]) -> dict[str, Array]:
+        """Their quantities as ours; see :meth:`to`."""
+        return {name: self._translate(name, self._checked(name, x), True) for name, x in quantities.items()}
+
+    def thrust(self, newtons: ArrayLike, full_thrust: float = 1.0, model_factor: float = 0.0) -> Array:
+        """Their command for a collective thrust [N].
+
+        A command beyond their range is moved to its end. Where they take newtons, that is what they get.
+
+        Args:
+            newtons: our collective thrust.
+            full_thrust: the thrust [N] of their full command. From the command that hovers: weight / hover command. For
+                mavros 1 / thrust_scaling, for a Crazyflie 4 THRUST_MAX.
+            model_factor: f of the thrust curve f s^2 + (1 - f) s of the signal s, where the target does not undo it
+                itself. PX4 does, by THR_MDL_FAC, and ArduPilot, by MOT_THST_EXPO: leave it 0 there.
+        """
+        if self.thrust_range is None:
+            return np.asarray(newtons, float)
+        low, high = self.thrust_range
+        share = motor_signal(np.asarray(newtons, float) / full_thrust, model_factor)
+        return low + (high - low) * np.clip(share, 0.0, self.thrust_limit)
+
+    def newtons(self, command: ArrayLike, full_thrust: float = 1.0, model_factor: float = 0.0) -> Array:
+        """The collective thrust [N] of their command; see :meth:`thrust`."""
+        if self.thrust_range is None:
+            return np.asarray(command, float)
+        low, high = self.thrust_range
+        return full_thrust * motor_thrust((np.asarray(command, float) - low) / (high - low), model_factor)
+
+    def _checked(self, name: str, value: ArrayLike) -> Array:
+        if name not in _SIZES:
+            raise ValueError(f"Unknown quantity {name!r}. Choose from: {', '.join(_SIZES)}.")
+        if name == "motors" and self.motors is None:
+            raise ValueError(f"{self.name} has no order of motors of its own: name them by their places.")
+        x = np.asarray(value, float)
+        if x.shape[-1:] != (_SIZES[name],):
+            raise ValueError(f"{name} must have shape (..., {_SIZES[name]}), got {x.shape}.")
+        return x
+
+    def _translate(self, name: str, x: Array, back: bool) -> Array:
+        if name in ("position", "velocity", "angular_velocity"):
+            matrix = _matrix(self.body if name == "angular_velocity" else self.world)
+            return x @ (matrix if back else matrix.T)
+        if name == "body_rate":
+            return x / self.rates if back else x * self.rates
+        if name == "motors":
+            return x[..., np.argsort(self.motors) if back else list(self.motors)]
+        if not back:
+            q = _multiply(_multiply(np.array(self.world), x), _conjugate(self.body))
+            return np.roll(q, -1, -1) if self.xyzw else q
+        q = np.roll(x, 1, -1) if self.xyzw else x
+        return _multiply(_multiply(_conjugate(self.world), q), np.array(self.body))
+
+
+_SIZES = {"position": 3, "velocity": 3, "quaternion": 4, "angular_velocity": 3, "body_rate": 3, "motors": 4}
+
+
+def px4(world: str = "enu") -> Convention:
+    """PX4: NED and FRD, w x y z. Thrust is ``thrust_body[2]``, from 0 down to -1, of VehicleRatesSetpoint or
+    VehicleAttitudeSetpoint; ``MPC_THR_HOVER`` is the hover command without its sign. Motors of the quad X."""
+    return Convention("PX4", _to_ned(world), FLU_TO_FRD, False, (3, 1, 0, 2), (1.0, -1.0, -1.0), (0.0, -1.0))
+
+
+def ardupilot(world: str = "enu") -> Convention:
+    """ArduPilot Copter: NED and FRD, w x y z. SET_ATTITUDE_TARGET's thrust is one, from 0 to 1, only with 8 in
+    ``GUID_OPTIONS``, and a climb rate otherwise; ``MOT_THST_HOVER`` is the hover command. Motors of the quad X."""
+    return Convention("ArduPilot", _to_ned(world), FLU_TO_FRD, False, (3, 1, 0, 2), (1.0, -1.0, -1.0), (0.0, 1.0))
+
+
+def betaflight(sitl: bool = False) -> Convention:
+    """Betaflight: rates [deg/s] as its sticks count them, roll right, pitch forward, yaw right; throttle 1000 to 2000
+    us. It estimates no position. ``sitl``: the order of the motor packets of its simulator target, not of its
+    outputs."""
+    motors = (3, 1, 0, 2) if sitl else (2, 3, 1, 0)
+    return Convention("Betaflight", motors=motors, rates=(DEGREES, DEGREES, -DEGREES), thrust_range=(1000.0, 2000.0))
+
+
+def crazyflie(manual: bool = False) -> Convention:
+    """Crazyflie through cflib: z up and FLU, x y z w. Rates [deg/s] and thrust (0 to 65535, at most 60000) of
+    ``send_setpoint``, in rate mode; or, with ``manual``, of ``send_setpoint_manual(rate=True)``, whose yaw has the
+    other sign and whose thrust :func:`crazyflie_percentage` converts."""
+    rates = (DEGREES, DEGREES, DEGREES if manual else -DEGREES)
+    return Convention(
+        "Crazyflie",
+        xyzw=True,
+        motors=(3, 2, 1, 0),
+        rates=rates,
+        thrust_range=(0.0, 65535.0),
+        thrust_limit=60000 / 65535,
+    )
+
+
+def mavros(world: str = "enu") -> Convention:
+    """mavros (ROS): ENU and FLU, x y z w; it translates to the autopilot's frames itself. Thrust from 0 to 1."""
+    turn = {"enu": SAME, "nwu": NWU_TO_ENU}
+    return Convention("mavros", _choose(turn, world), xyzw=True, thrust_range=(0.0, 1.0))
+
+
+def mujoco() -> Convention:
+    """MuJoCo: z up, w x y z; the angular velocity in ``qvel`` of a free joint is in the body frame, the velocity in the
+    world frame. Thrust in N at a site for each rotor, in the order of the model."""
+    return Convention("MuJoCo")
+
+
+def rotorpy() -> Convention:
+    """RotorPy: z up and FLU, x y z w, body rates; ``cmd_ctbr`` in N and rad/s. Rotors in the order of its X frames."""
+    return Convention("RotorPy", xyzw=True, motors=(0, 3, 2, 1))
+
+
+def crazyflow() -> Convention:
+    """Crazyflow: z up and FLU, x y z w, body rates, thrust in N. Rotors in the order of a Crazyflie."""
+    return Convention("Crazyflow", xyzw=True, motors=(3, 2, 1, 0))
+
+
+def motor_signal(thrust: ArrayLike, model_factor: float) -> Array:
+    """The signal s, from 0 to 1, whose thrust f s^2 + (1 - f) s, a share of all thrust, is the one given."""
+    u, f = np.asarray(thrust, float), model_factor
+    root = np.sqrt((1.0 - f) ** 2 + 4.0 * f * np.maximum(u, 0.0))
+    return 2.0 * u / (1.0 - f + root) if f < 1.0 else np.sqrt(np.maximum(u, 0.0))
+
+
+def motor_thrust(signal: ArrayLike, model_factor: float) -> Array:
+    """The share of all thrust, f s^2 + (1 - f) s, of a signal s; PX4 calls f THR_MDL_FAC."""
+    s = np.asarray(signal, float)
+    return model_factor * s * s + (1.0 - model_factor) * s
+
+
+def crazyflie_percentage(command: ArrayLike) -> Array:
+    """The ``thrust_percentage`` of ``send_setpoint_manual`` that sends this thrust command; from 10001 to 60000."""
+    return np.clip((np.asarray(command, float) - 10001.0) / (60000.0 - 10001.0), 0.0, 1.0) * 100.0
+
+
+def _to_ned(world: str) -> Quaternion:
+    return _choose({"enu": ENU_TO_NED, "nwu": NWU_TO_NED}, world)
+
+
+def _choose(turns: Mapping[str, Quaternion], world: str) -> Quaternion:
+    if world not in turns:
+        raise ValueError(f'Unknown world {world!r}. Choose from: "enu", x east and y north; "nwu", x north and y west.')
+    return turns[world]
+
+
+def _multiply(p: Array, q: Array) -> Array:
+    """Hamilton product (..., 4)."""
+    pw, pv, qw, qv = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
+    scalar = pw * qw - (pv * qv).sum(-1, keepdims=True)
+    return np.concatenate((scalar, pw * qv + qw * pv + np.cross(pv, qv)), -1)
+
+
+def _conjugate(q: Quaternion) -> Array:
+    return np.array(q) * (1.0, -1.0, -1.0, -1.0)
+
+
+def _matrix(q: Quaternion) -> Array:
+    """The matrix of a turn between frames: its entries are 0, 1 and -1."""
+    w, x, y, z = q
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.round(np.eye(3) + 2.0 * w * skew + 2.0 * skew @ skew)

@@ -1,0 +1,127 @@
+"""What a task computes outside the network, for one drone, in numpy: where the target is, and how the flight goes on.
+
+A rule is built from the section ``task`` of a contract. :class:`~torchrl_quad.deploy.Bundle` resets it, advances it
+once in each control step after the first, and asks it for the first entries of the observation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Vector = NDArray[np.float64]
+
+
+class Rule(Protocol):
+    """The protocol of all rules. ``reset`` takes by name where a flight starts in the task."""
+
+    def reset(self) -> None:
+        """Start anew."""
+
+    def advance(self, before: Vector | None, position: Vector | None) -> None:
+        """One control step later; from where the drone was to where it is (3) [m], None where that is unknown."""
+
+    def relative(self, position: Vector) -> Vector:
+        """The entries of the observation that depend on the task, for a drone at a position (3) [m]."""
+
+
+class Target:
+    """A target that stays where it is: hovering and landing."""
+
+    def __init__(self, task: Mapping[str, Any]) -> None:
+        self.task = task
+        self.reset()
+
+    def reset(self, target: ArrayLike | None = None) -> None:
+        """Start anew, with a target (3) [m] of your own, or that of the contract."""
+        self.target = _point("target", self.task["target"] if target is None else target)
+
+    def advance(self, before: Vector | None, position: Vector | None) -> None:
+        """Nothing changes."""
+
+    def relative(self, position: Vector) -> Vector:
+        """target - position (3) [m]."""
+        return self.target - position
+
+
+class Curve:
+    """A point that moves along a periodic curve: tracking.
+
+    The curve is a sum of harmonics of the phase: offset + sum over k of cosine[k] cos(k phase) + sine[k] sin(k phase).
+    """
+
+    def __init__(self, task: Mapping[str, Any]) -> None:
+        self.offset = np.array(task["offset"], float)
+        self.amplitudes = np.concatenate((np.array(task["cosine"], float), np.array(task["sine"], float)))
+        self.harmonics = np.arange(1, len(task["cosine"]) + 1)
+        self.rate = 2 * math.pi / task["period"]
+        self.step = self.rate * task["control_dt"]
+        self.ahead = self.rate * task["lookahead_interval"] * np.arange(1, task["lookahead"] + 1)
+        self.reset()
+
+    def reset(self, phase: float = 0.0) -> None:
+        """Start anew, where the point has a phase [rad]."""
+        if not math.isfinite(phase):
+            raise ValueError(f"phase must be a finite number [rad], got {phase!r}.")
+        self.phase = float(phase) % (2 * math.pi)
+
+    def advance(self, before: Vector | None, position: Vector | None) -> None:
+        """The point moves on, whatever the drone does."""
+        self.phase = (self.phase + self.step) % (2 * math.pi)
+
+    def points(self, phase: Vector) -> Vector:
+        """The points (n, 3) [m] of the curve at phases (n) [rad]."""
+        angles = np.multiply.outer(phase, self.harmonics)
+        return self.offset + np.concatenate((np.cos(angles), np.sin(angles)), -1) @ self.amplitudes
+
+    def relative(self, position: Vector) -> Vector:
+        """The next points of the curve - position (3 n) [m], nearest first."""
+        return (self.points(self.phase + self.ahead) - position).ravel()
+
+
+class Gates:
+    """Gates that are passed in their order, round after round: racing.
+
+    A gate is passed when the straight line between the positions of two control steps comes nearer to its centre than
+    its radius.
+    """
+
+    def __init__(self, task: Mapping[str, Any]) -> None:
+        self.gates, self.radius = np.array(task["gates"], float), float(task["gate_radius"])
+        self.reset()
+
+    def reset(self, gate: int = 0) -> None:
+        """Start anew, with the index of the gate to pass first."""
+        if isinstance(gate, bool) or gate not in range(len(self.gates)):
+            raise ValueError(f"gate must be a whole number from 0 to {len(self.gates) - 1}, got {gate!r}.")
+        self.gate, self.passed = int(gate), 0
+
+    def advance(self, before: Vector | None, position: Vector | None) -> None:
+        """Count a gate that was passed on the way."""
+        if before is None or position is None:
+            return
+        line, centre = position - before, self.gates[self.gate]
+        length = max(float(line @ line), 1e-12)
+        fraction = min(max(float((centre - before) @ line) / length, 0.0), 1.0)
+        gap = before + fraction * line - centre
+        if float(gap @ gap) < self.radius**2:
+            self.gate, self.passed = (self.gate + 1) % len(self.gates), self.passed + 1
+
+    def relative(self, position: Vector) -> Vector:
+        """Next gate - position, and the gate after that - position (6) [m]."""
+        after = (self.gate + 1) % len(self.gates)
+        return np.concatenate((self.gates[self.gate] - position, self.gates[after] - position))
+
+
+RULES: dict[str, type[Target] | type[Curve] | type[Gates]] = {"target": Target, "curve": Curve, "gates": Gates}
+
+
+def _point(name: str, value: ArrayLike) -> Vector:
+    point = np.array(value, float)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise ValueError(f"{name} must be three finite numbers [m], got {value!r}.")
+    return point

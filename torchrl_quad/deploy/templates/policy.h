@@ -1,0 +1,33 @@
+/* The policy of the task "$task". Generated: change nothing here, export it again instead.
+ *
+ * contract.json says what each number means, in which unit, frame and order; README.md says how to fly it.
+ */
+#ifndef POLICY_H
+#define POLICY_H
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define POLICY_CONTRACT_VERSION $version
+#define POLICY_OBSERVATION $observation /* floats that the network reads */
+#define POLICY_ACTION 4 /* floats that it writes: thrust, roll rate, pitch rate, yaw rate, each in -1..1 */
+#define POLICY_CONTROL_DT $control_dt /* s, between two calls */
+#define POLICY_ACTION_DELAY $action_delay /* control steps between a call and its effect, as trained */
+
+extern const float policy_hover_action[POLICY_ACTION];
+
+/* The action for an observation. Returns 0; or 1, and writes the action that hovers, where the result is not finite. */
+int policy_action(const float observation[POLICY_OBSERVATION], float action[POLICY_ACTION]);
+
+/* What an action commands: collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up. */
+void policy_command(const float action[POLICY_ACTION], float *thrust, float body_rate[3]);
+
+/* The greatest error over the built-in vectors. Fly only if it is below 1e-5 on the processor that flies. */
+float policy_self_test(void);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -139,6 +139,17 @@ def checked_params(params: Any, num_envs: int) -> QuadrotorParams:
     return params
 
 
+def require_clear_reset(tensordict: Any, set_state: bool | None, select_reset_only: bool = False, **_: Any) -> None:
+    """Refuse a mask beside a state, unless it is said which counts: TorchRL 0.14 takes the state, 0.15 the mask."""
+    said = set_state is not None or select_reset_only or tensordict is None
+    unclear = not said and "_reset" in tensordict and "state" in tensordict
+    require(
+        not unclear,
+        'reset: the tensordict has a mask in "_reset" and a state. For fresh starts in the environments of the mask '
+        "write env.reset(tensordict, set_state=False); to set them to this state, set_state=True.",
+    )
+
+
 def check_source(source: Any) -> None:
     """Refuse a source of states that cannot be called."""
     require(

@@ -2,7 +2,13 @@
 
 import gymnasium
 
-from torchrl_quad.data import ObservationNormalizer, VisitedStateBuffer, differentiable_rollout, restart
+from torchrl_quad.data import (
+    DifferentiableCollector,
+    ObservationNormalizer,
+    VisitedStateBuffer,
+    differentiable_rollout,
+    restart,
+)
 from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
 from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
 from torchrl_quad.engine import ActionSequence
@@ -26,6 +32,7 @@ __all__ = [
     "ABPTLoss",
     "ActionSequence",
     "BPTTLoss",
+    "DifferentiableCollector",
     "HoveringEnv",
     "HybridLoss",
     "LandingEnv",

@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchrl_quad
 from torchrl_quad.dynamics import presets
-from torchrl_quad.envs import TASKS, task_class
+from torchrl_quad.envs import task_class
 from training.arguments import hydra_argument
 from training.checkpoints import take_over
 from training.folders import own_folder
@@ -76,7 +76,7 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
         @hydra.main(config_path=str(RECIPES / "config"), config_name=name, version_base=None)
         @functools.wraps(main)
         def job(cfg: DictConfig) -> None:
-            TASKS.update(registered)
+            torchrl_quad.envs.TASKS.update(registered)  # of this process, whatever has been copied into it
             try:
                 with _explained():
                     check(cfg)
@@ -98,7 +98,7 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
             sys.argv[1:] = map(hydra_argument, sys.argv[1:])
             if os.getcwd() not in sys.path:
                 sys.path.append(os.getcwd())  # where tasks of your own may be
-            registered.update(TASKS)
+            registered.update(torchrl_quad.envs.TASKS)
             try:
                 with _explained():
                     for path in sorted((RECIPES / "config").rglob("*.yaml")):

@@ -76,7 +76,8 @@ def own_recipe(config: str, settings: Mapping[str, Any]) -> str:
             f"{name!r}."
         )
     node = OmegaConf.load(CONFIG / f"{config}.yaml")
-    node.defaults.append(f"{name}_settings")  # last, after the task and what is tuned
+    overrides = [str(entry).startswith("{'override ") for entry in node.defaults]
+    node.defaults.insert(overrides.index(True), f"{name}_settings")  # after the task and what is tuned
     ConfigStore.instance().store(name=name, node=node)
     ConfigStore.instance().store(name=f"{name}_settings", node=dict(settings))
     return name

@@ -106,10 +106,10 @@ def full_signature(cls: type, base: type) -> inspect.Signature:
     for owner in cls.__mro__[: cls.__mro__.index(base)]:
         parameters = inspect.signature(vars(owner)["__init__"]).parameters if "__init__" in vars(owner) else {}
         for name, argument in parameters.items():
-            if name != "self" and argument.kind is not argument.VAR_KEYWORD:
+            if name != "self" and argument.kind not in (argument.VAR_KEYWORD, argument.VAR_POSITIONAL):
                 arguments.setdefault(name, argument)
     option = inspect.Parameter("compile", inspect.Parameter.KEYWORD_ONLY, default=False, annotation="bool | dict")
-    return inspect.Signature([*arguments.values(), option])
+    return inspect.Signature(sorted([*arguments.values(), option], key=lambda x: x.kind))
 
 
 def checked_weights(weights: Any, known: Mapping[str, float]) -> Mapping[str, float]:

@@ -331,7 +331,7 @@ def _refuse_entry(entries: Mapping[Any, Any], key: Any, safe_state: State, sourc
     require(
         not missing,
         f"{source}: the state lacks {names(missing)}. A state is restored whole: take it from a tensordict of this "
-        f"environment, which holds {names(safe_state)}.",
+        f"environment, which holds {names(safe_state)}. No transform may drop a part of it, as ExcludeTransform would.",
     )
     x, like = entries[key], safe_state[key]
     shape, expected = tuple(x.shape), tuple(like.shape)

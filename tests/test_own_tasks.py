@@ -130,13 +130,8 @@ def test_a_task_of_your_own_trains_resumes_and_is_evaluated_as_those_that_ship(t
     assert summary["corner_error"] == json.loads((tmp_path / "summary.json").read_text())["corner_error"]
 
 
-def test_a_recipe_outside_the_repository_is_short_and_takes_any_task(
-    importable,
-    tmp_path,
-    monkeypatch,
-    no_pictures,
-    capsys,  # noqa: F811
-):
+@pytest.mark.usefixtures("importable", "no_pictures")
+def test_a_recipe_outside_the_repository_is_short_and_takes_any_task(tmp_path, monkeypatch, capsys):
     """The programs of docs/writing.md, in files, as the page says."""
     assert all(len(content.splitlines()) < 60 for content in files(ROOT / "docs/writing.md").values())
     small = [

@@ -17,7 +17,7 @@ from torchrl_quad.envs.tracking import TrackingEnv
 
 GROUP = "torchrl_quad.tasks"  # the group of entry points by which an installed package offers its tasks
 
-#: The tasks that ship, and those that :func:`register_task` has added, by name.
+# The tasks that ship, and those that register_task has added.
 TASKS: dict[str, type[QuadrotorEnv]] = {
     "hovering": HoveringEnv,
     "landing": LandingEnv,

@@ -25,8 +25,8 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "diagnostics": {"data", "objectives"},
     "gym": {"envs"},
 }
-# Imports within a function, of what needs an optional package.
-EXCEPTIONS = {("torchrl_quad.envs.base", "torchrl_quad.render.frames")}
+# Imports within a function: of what needs an optional package, and of gymnasium's ids, which name all tasks.
+EXCEPTIONS = {("torchrl_quad.envs.base", "torchrl_quad.render.frames"), ("torchrl_quad.envs.registry", "torchrl_quad")}
 
 TORCHRL = {"torch", "torchrl", "tensordict"}
 LIBRARIES = {

@@ -3,6 +3,7 @@
 import csv
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -80,7 +81,7 @@ def test_a_shrunken_matrix_runs_and_goes_on_where_it_was_stopped(run_here, monke
     write(tmp_path / "data/final.csv", [row for row in finals if row["variant"] != "abpt-now"])
     started = []
     monkeypatch.setattr(reproduce, "run", lambda command, folder: started.append(folder))  # it had finished
-    monkeypatch.setattr(reproduce, "audit_tasks", lambda: audit)
+    monkeypatch.setattr(reproduce, "audit_tasks", lambda _: audit)
     run_main(monkeypatch, reproduce, *arguments, *folders)
     assert started == [tmp_path / "runs/hovering/abpt-now/seed42"]
     assert len(reproduce.read(tmp_path / "data/final.csv")) == 3
@@ -240,19 +241,28 @@ def test_without_visited_states_every_horizon_goes_on_where_the_last_one_ended()
 
 def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(run_here, monkeypatch, tmp_path):
     monkeypatch.setattr(shipped, "run", run_here)
-    wanted = ["--tasks", "racing", "hovering", "--methods", "ppo", "--seeds", "0", "--cores", "2"]
+    wanted = ["--tasks", "racing", "own_task.CornerEnv", "--methods", "ppo", "--seeds", "0", "--cores", "2"]
     arguments = [*wanted, "--data", tmp_path, "--output", tmp_path / "runs", "--quick"]
     run_main(monkeypatch, shipped, *arguments[:-1], "--quick")
     rows = reproduce.read(tmp_path / "shipped.csv")
-    assert len(rows) == 2 and {row["task"] for row in rows} == {"hovering", "racing"}
+    assert len(rows) == 2 and {row["task"] for row in rows} == {"own_task.CornerEnv", "racing"}
     assert all(row["steps"] == "64" and row["machine"] and float(row["seconds"]) > 0 for row in rows)
     page = (tmp_path / "summary.md").read_text()
     assert "| racing |  |  |  | 0.0% (0.0%), 0.0 gates, " in page
+    assert re.search(r"\| own_task.CornerEnv \|  \|  \|  \| 0.0% \(0.0%\), \d\.\d\d m, ", page)
     monkeypatch.setattr(shipped, "run", lambda *_: pytest.fail("It has been flown."))
     run_main(monkeypatch, shipped, *arguments)
     assert (tmp_path / "summary.md").read_text() == page
     values = [("0.5", "0.02", "9"), ("1.0", "0.01", "5"), ("1.0", "", "7")]
     group = [dict(zip(("solved", "position_error", "seconds"), x, strict=True)) for x in values]
     assert shipped.cell(group, "position_error", 100, 1, "cm") == "83.3% (50.0%), 1.5 cm, 7 s, 3 seeds"
-    with pytest.raises(SystemExit):
-        run_main(monkeypatch, shipped, "--quick")
+    for refused in (["--quick"], ["--tasks", "own_task.CornerEnv"], ["--tasks", "window"]):
+        with pytest.raises(SystemExit):
+            run_main(monkeypatch, shipped, *refused)
+
+
+def test_a_task_of_your_own_is_flown_with_all_that_the_paper_flies_on_each_of_its_tasks():
+    jobs = matrix.jobs(tuple(matrix.EXPERIMENTS), ("own_task.CornerEnv",), (42,))
+    assert {"abpt", "ppo", "bptt-episode", "abpt-no-0-step"} <= {job.variant for job in jobs}
+    cfg = reproduce.configuration(jobs[0], 1e-2)
+    assert (cfg.task, cfg.total_steps, cfg.env.reach) == ("own_task.CornerEnv", 491_520, 0.5)

@@ -1,14 +1,31 @@
 """Differentiable quadrotor tasks and first-order policy losses for TorchRL."""
 
 import importlib
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchrl_quad.data import ObservationNormalizer, VisitedStateBuffer, differentiable_rollout, restart
+    from torchrl_quad.data import (
+        DifferentiableCollector,
+        ObservationNormalizer,
+        VisitedStateBuffer,
+        differentiable_rollout,
+        restart,
+    )
     from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
     from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
     from torchrl_quad.engine import ActionSequence
-    from torchrl_quad.envs import HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
+    from torchrl_quad.envs import (
+        HoveringEnv,
+        LandingEnv,
+        QuadrotorEnv,
+        RacingEnv,
+        TrackingEnv,
+        available_tasks,
+        load_track,
+        make_env,
+        register_task,
+    )
     from torchrl_quad.modules import make_actor, make_qvalue, make_value
     from torchrl_quad.objectives import ABPTLoss, BPTTLoss, HybridLoss, SHACLoss, TrustRegion
 
@@ -18,6 +35,7 @@ __all__ = [
     "ABPTLoss",
     "ActionSequence",
     "BPTTLoss",
+    "DifferentiableCollector",
     "HoveringEnv",
     "HybridLoss",
     "LandingEnv",
@@ -31,6 +49,7 @@ __all__ = [
     "VisitedStateBuffer",
     "audit_reward",
     "available_drones",
+    "available_tasks",
     "compare_gradients",
     "differentiable_rollout",
     "gradient_by_horizon",
@@ -42,6 +61,7 @@ __all__ = [
     "make_qvalue",
     "make_value",
     "register_envs",
+    "register_task",
     "restart",
 ]
 
@@ -65,12 +85,18 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__, *_PARTS})
 
 
-def register_envs() -> None:
-    """Register the tasks with gymnasium, as ``torchrl_quad/Hovering-v0`` and so on; importing the package does it."""
+def register_envs(*tasks: str) -> None:
+    """Register tasks with gymnasium, as ``torchrl_quad/Hovering-v0`` and so on; importing the package does it.
+
+    A task of your own, ``register_task("fly_through", ...)``, is ``torchrl_quad/FlyThrough-v0``.
+
+    Args:
+        *tasks: their names; by default those that ship, and those of installed packages.
+    """
     import gymnasium
 
-    for task in _TASKS:
-        name = f"torchrl_quad/{task.capitalize()}-v0"
+    for task in tasks or (*_TASKS, *(point.name for point in entry_points(group="torchrl_quad.tasks"))):
+        name = f"torchrl_quad/{task.title().replace('_', '')}-v0"
         if name not in gymnasium.registry:
             classes = {"entry_point": "torchrl_quad.gym:GymEnv", "vector_entry_point": "torchrl_quad.gym:GymVectorEnv"}
             gymnasium.register(name, **classes, kwargs={"task": task})

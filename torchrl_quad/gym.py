@@ -1,6 +1,10 @@
 """The tasks as gymnasium environments: numpy arrays in and out, no gradient.
 
 Importing ``torchrl_quad`` registers them, and so does ``gymnasium.make("torchrl_quad:torchrl_quad/Hovering-v0")``.
+
+``AsyncVectorEnv`` and ``vectorization_mode="async"`` start processes that import your program anew: torchrl sets
+multiprocessing's start method to "spawn". Put what starts them under ``if __name__ == "__main__":``. ``make_vec`` alone
+flies all drones in one batch, and needs no processes.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ def build_env(cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = Fals
 
 def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModuleBase:
     """Build the policy of a configuration; it writes log-probabilities if the loss needs them."""
-    log_prob = cfg.algorithm == "ppo" or cfg.loss.get("alpha", 0) != 0
+    log_prob = "entropy_bonus" in cfg.loss or cfg.loss.get("alpha", 0) != 0  # of PPO, or of an entropy bonus
     noise = {name: cfg.actor[name] for name in ("scale_init", "learn_scale", "noise_correlation")}
     return make_actor(env, **network(cfg, "actor"), **noise, return_log_prob=log_prob)
 

@@ -15,7 +15,7 @@ from typing import Any
 import hydra
 import yaml
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, read_write
@@ -23,9 +23,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchrl_quad
 from torchrl_quad.dynamics import presets
+from torchrl_quad.envs import task_class
 from training.arguments import hydra_argument
 from training.checkpoints import take_over
 from training.folders import own_folder
+from training.own import offer_tasks, own_recipe
 from training.processes import from_the_first, joined, rank
 from training.schema import check
 
@@ -52,24 +54,29 @@ class CheckBeforeFolder(Callback):
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Refuse what the schema refuses."""
-        try:
+        with _explained():
             check(config)
-        except ValueError as error:
-            raise Refused(str(error)) from error
 
 
-def recipe(config: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
     """Make a program of ``main(cfg)``, with the configuration ``config/NAME.yaml`` and hydra's command line.
+
+    A recipe of your own, anywhere, takes the configuration that suits it best and says what differs:
+    ``@recipe("bptt", algorithm="smooth", loss={"smoothness": 0.1})``. ``algorithm`` names its runs.
 
     Errors that have an explanation end in one line and exit status 2, Ctrl-C in one line and 130; with
     ``HYDRA_FULL_ERROR=1`` in a traceback. While a training recipe runs, it alone writes into its folder,
     ``HydraConfig.get().runtime.output_dir``.
     """
 
+    name = own_recipe(config, settings) if settings else config
+    registered: dict[str, type] = {}  # travels along with the job into the processes of a sweep
+
     def decorate(main: Callable[[DictConfig], None]) -> Callable[[], None]:
-        @hydra.main(config_path=str(RECIPES / "config"), config_name=config, version_base=None)
+        @hydra.main(config_path=str(RECIPES / "config"), config_name=name, version_base=None)
         @functools.wraps(main)
         def job(cfg: DictConfig) -> None:
+            torchrl_quad.envs.TASKS.update(registered)  # of this process, whatever has been copied into it
             try:
                 with _explained():
                     check(cfg)
@@ -89,10 +96,14 @@ def recipe(config: str) -> Callable[[Callable[[DictConfig], None]], Callable[[],
             full = os.environ.get("HYDRA_FULL_ERROR", "0") not in ("", "0")
             os.environ["HYDRA_FULL_ERROR"] = "1"  # hydra then leaves all exceptions to us
             sys.argv[1:] = map(hydra_argument, sys.argv[1:])
+            if os.getcwd() not in sys.path:
+                sys.path.append(os.getcwd())  # where tasks of your own may be
+            registered.update(torchrl_quad.envs.TASKS)
             try:
-                for path in sorted((RECIPES / "config").rglob("*.yaml")):
-                    with _explained():
+                with _explained():
+                    for path in sorted((RECIPES / "config").rglob("*.yaml")):
                         presets.parse(path.read_bytes(), str(path))
+                    sys.argv[1:] = offer_tasks(sys.argv[1:])
                 job()
             except (Refused, RefusedInSweep, HydraException, RecursionError, yaml.YAMLError) as error:
                 _end(error, 2, full)
@@ -113,6 +124,11 @@ def _end(error: BaseException, status: int, full: bool) -> None:
     said = str(error).splitlines() or [repr(error)]
     if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
         said += str(error.__cause__).splitlines()[:1]
+    if isinstance(error, MissingConfigException) and str(error.missing_cfg_file).startswith("task/"):
+        try:
+            task_class(error.missing_cfg_file.removeprefix("task/"))
+        except ValueError as unknown:
+            said = [str(unknown)]
     if isinstance(error, RecursionError):
         said = ["the command line nests too many lists or mappings: give the path of a YAML file instead."]
     message = " ".join(line.strip() for line in said if line.strip())

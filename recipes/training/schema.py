@@ -7,13 +7,18 @@ loss themselves.
 
 from __future__ import annotations
 
+import inspect
 import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
 from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
+
+from torchrl_quad.envs import task_class
+from torchrl_quad.envs.checks import refuse_unknown
+from training.own import SET_BY_RECIPES, option_types
 
 
 def available_device(name: str) -> str:
@@ -231,10 +236,11 @@ class Exporting(Section):
 
 
 def check(cfg: DictConfig) -> None:
-    """Check a configuration against the schema.
+    """Check a configuration against the schema, and the options of its task against the signature of its class.
 
     Raises:
         ValueError: the first setting that has the wrong type or is out of its range, and what to write instead.
+        TypeError: the task has no such option.
     """
     try:
         settings = OmegaConf.masked_copy(cfg, [name for name in cfg if name != "hydra"])
@@ -242,11 +248,35 @@ def check(cfg: DictConfig) -> None:
     except MissingMandatoryValue as error:
         name = error.full_key or "a setting"
         raise ValueError(f"{name} is missing: write {name}=... on the command line.") from None
+    _refuse_none(values)
     schema = Exporting if "folder" in values else Flying if "checkpoint" in values else Training
+    if isinstance(values.get("task"), str) and isinstance(values.get("env"), dict):
+        schema = _with_options(values["task"], values["env"])
     try:
         schema.model_validate(values)
     except ValidationError as error:
         raise ValueError(_sentence(schema, error.errors()[0])) from None
+
+
+def _with_options(task: str, env: dict[str, Any]) -> type[Training]:
+    """The schema of a training run on this task."""
+    cls = task_class(task)
+    for name in env:
+        if name in SET_BY_RECIPES:
+            raise ValueError(f"env.{name}: recipes set it for all environments. Write {name}=..., without env.")
+    refuse_unknown(cls, sorted(set(env) - set(inspect.signature(cls).parameters)))
+    kinds = {name: (Real if kind is float else kind, None) for name, kind in option_types(cls).items()}
+    kinds = {name: kind for name, kind in kinds.items() if name not in Env.model_fields}
+    return create_model("Training", __base__=Training, env=(create_model("Env", __base__=Env, **kinds), ...))
+
+
+def _refuse_none(values: Any, name: str = "") -> None:
+    """Refuse the word None, which YAML reads as a string."""
+    if isinstance(values, dict):
+        for key, value in values.items():
+            _refuse_none(value, f"{name}.{key}" if name else str(key))
+    elif values in ("None", "none"):
+        raise ValueError(f"{name}={values}: it is the word {values!r} to YAML. For no value write {name}=null.")
 
 
 _TYPES = {  # pydantic's kinds of error in plain words

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict
 
 import torch
@@ -19,10 +20,12 @@ REWARDS = {  # task and name of a reward: options of the environment
 }
 
 
-def audit_tasks(num_envs: int = 64, horizon: int = 32, seed: int = 0) -> list[dict[str, object]]:
-    """Audit each reward under an untrained policy: a row for each term."""
+def audit_tasks(
+    own: Iterable[str] = (), num_envs: int = 64, horizon: int = 32, seed: int = 0
+) -> list[dict[str, object]]:
+    """Audit each reward, and those of tasks of your own, under an untrained policy: a row for each term."""
     rows = []
-    for (task, name), options in REWARDS.items():
+    for (task, name), options in {**REWARDS, **{(task, ""): {} for task in own}}.items():
         torch.manual_seed(seed)
         env = make_env(task, num_envs=num_envs, seed=seed, **options)
         td = env.reset()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 SEEDS = (42, 0, 1, 2, 3)  # reported; those from 100 up are for the search
 SEARCH_SEED = 100
 LEARNING_RATES = (1e-3, 3e-3, 1e-2, 3e-2)  # of the actor: the same four for every method on every task
+OWN_STEPS = 491_520, 3_932_160  # the same for a task of your own
 SEARCH_FRACTION = {"hovering": 1.0, "tracking": 1.0, "landing": 0.5, "racing": 0.25}  # of a run's steps
 EVALUATIONS = 40  # at most, along a run: the points of its curve
 DYNAMICS = "priority mixer"  # of runs that are flown now; final.csv names that of each run
@@ -141,12 +142,12 @@ class Job:
     def overrides(self, lr: float) -> list[str]:
         """Give the overrides of its recipe's configuration, with the learning rate that the search found."""
         variant = VARIANTS[self.variant]
-        steps = STEPS[self.task][variant.algorithm == "ppo"]
+        steps = STEPS.get(self.task, OWN_STEPS)[variant.algorithm == "ppo"]
         if self.lr is not None:
-            steps, lr = int(SEARCH_FRACTION[self.task] * steps), self.lr
+            steps, lr = int(SEARCH_FRACTION.get(self.task, 1.0) * steps), self.lr
         lr *= variant.rate
         racing = [x for x in RACING if variant.algorithm != "bptt" or "critic" not in x]
-        horizon = EPISODE[self.task] if variant.horizon == "episode" else variant.horizon
+        horizon = EPISODE.get(self.task, 256) if variant.horizon == "episode" else variant.horizon
         batch = 128 * 128 if self.task == "racing" else 64 * 64  # steps in an iteration of the first-order methods
         return [
             f"task={self.task}",
@@ -173,7 +174,10 @@ def search_jobs(tasks: tuple[str, ...], variants: set[str], rates: tuple[float, 
 
 
 def jobs(experiments: tuple[str, ...], tasks: tuple[str, ...], seeds: tuple[int, ...]) -> list[Job]:
-    """List the runs to report: three seeds of everything, before the others of anything."""
+    """List the runs to report: three seeds of everything, before the others of anything.
+
+    A task of your own gets what all the paper's tasks get.
+    """
     return [
         Job(task, variant, seed)
         for some in (seeds[:3], seeds[3:])
@@ -181,5 +185,5 @@ def jobs(experiments: tuple[str, ...], tasks: tuple[str, ...], seeds: tuple[int,
         for seed in some
         for task in tasks
         for variant, of in EXPERIMENTS[experiment].items()
-        if task in of
+        if task in of or (task not in TASKS and of == TASKS)
     ]

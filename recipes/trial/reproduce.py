@@ -29,9 +29,11 @@ from matrix import DYNAMICS, EVALUATIONS, EXPERIMENTS, LEARNING_RATES, SEEDS, TA
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from torchrl_quad.envs import task_class
 from torchrl_quad.files import machine, replacing
 
 RECIPES = Path(__file__).parents[1]
+sys.path += [str(RECIPES), os.getcwd()]  # the recipes' code, and tasks of your own
 DATA = RECIPES.parent / "docs/results/data"
 QUICK = ["num_envs=4", "horizon=4", "total_steps=64", "env.max_episode_steps=20", "compile=false", "eval.interval=1"]
 CURVE = {  # columns of a curve, and their names in metrics.csv
@@ -45,8 +47,18 @@ CURVE = {  # columns of a curve, and their names in metrics.csv
     "gates_passed": "eval/gates_passed",
     "start_cells": "train/start_cells",
 }
+OWN = "of the paper, or of your own: a registered name or the path of a class, such as mypackage.WindowEnv"
 RUNNING: set[subprocess.Popen] = set()
 STOPPED = threading.Event()
+
+
+def known_task(name: str) -> str:
+    """Refuse a task that no recipe would find."""
+    try:
+        task_class(name)
+    except (ValueError, TypeError) as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return name
 
 
 def stop(number: int, _: object) -> None:
@@ -69,6 +81,9 @@ def write(path: Path, rows: list[dict]) -> None:
 
 def configuration(job: Job, lr: float) -> DictConfig:
     """Compose the configuration of a job's recipe, with its overrides."""
+    from training.own import offer_tasks  # from the folder above
+
+    offer_tasks([f"task={job.task}"])
     with initialize_config_dir(str(RECIPES / "config"), version_base=None):
         return compose(VARIANTS[job.variant].algorithm, job.overrides(lr))
 
@@ -167,7 +182,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cores", type=int, default=os.cpu_count(), help="runs at the same time")
     parser.add_argument("--experiments", nargs="+", default=list(EXPERIMENTS), choices=list(EXPERIMENTS))
-    parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), type=known_task, help=OWN)
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
     parser.add_argument("--output", type=Path, default=Path("outputs/reproduce"), help="folder of the runs")
@@ -183,7 +198,7 @@ def main() -> None:
     waiting = [job for job in todo if not is_kept(job, args.data)]
     if args.collect:
         return collect(waiting, args.output, args.data)
-    write(args.data / "audit.csv", audit_tasks())
+    write(args.data / "audit.csv", audit_tasks([task for task in args.tasks if task not in TASKS]))
     running: dict[Future, Job] = {}
     failed: list[str] = []
 

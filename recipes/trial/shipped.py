@@ -1,6 +1,7 @@
 """Fly every recipe on every task as it ships, over ten seeds, and fill in the table of the README.
 
 python recipes/trial/shipped.py --cores 2
+python recipes/trial/shipped.py --tasks mypackage.WindowEnv --data FOLDER   # a task of your own; the table in FOLDER
 
 It may be stopped at any moment. Started again, it skips what is in docs/results/data/shipped.csv, and resumes what was
 cut off. The README shows each method on each task: the episodes solved over all seeds, and by the worst of them.
@@ -20,10 +21,12 @@ from threading import Lock
 
 import numpy as np
 from evidence import read
-from reproduce import DATA, QUICK, RECIPES, run, stop, write
+from reproduce import DATA, OWN, QUICK, RECIPES, known_task, run, stop, write
 from results import fill
 from tables import table
 
+from torchrl_quad.envs import task_class
+from torchrl_quad.envs.scenery import EPISODE_METRICS
 from torchrl_quad.files import machine
 
 SEEDS = tuple(range(10))
@@ -63,10 +66,18 @@ def cell(runs: list[dict[str, str]], metric: str, factor: float, digits: int, un
     return f"{np.mean(solved):.1%} ({min(solved):.1%}), {factor * shown:.{digits}f} {unit}, {seconds:.0f} s{some}"
 
 
+def first_metric(task: str) -> tuple[str, float, int, str]:
+    """Show of a task of your own the metric that its class names first; where it has none, the return."""
+    own = [x for x in task_class(task).metric_info.items() if x[0] not in EPISODE_METRICS]
+    name, metric = own[0] if own else ("return", EPISODE_METRICS["return"])
+    return name, metric.scale, 2, metric.unit or metric.label
+
+
 def summary_table(data: Path) -> str:
     """Show what the recipes reach as they ship."""
     runs, lines = read(data / "shipped.csv"), []
-    for task, shown in TASKS.items():
+    for task in dict.fromkeys([*TASKS, *(x["task"] for x in runs)]):
+        shown = TASKS.get(task) or first_metric(task)
         groups = ([x for x in runs if (x["task"], x["algorithm"]) == (task, method)] for method in METHODS)
         lines.append([task, *(cell(group, *shown) for group in groups)])
     return table(["", *METHODS.values()], lines)
@@ -75,7 +86,7 @@ def summary_table(data: Path) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cores", type=int, default=os.cpu_count(), help="runs at the same time")
-    parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=list(TASKS))
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), type=known_task, help=OWN)
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
@@ -84,6 +95,8 @@ def main() -> None:
     args = parser.parse_args()
     if args.quick and args.data.resolve() == DATA.resolve():
         parser.error("--quick gives no results to keep: name another folder with --data.")
+    if set(args.tasks) - set(TASKS) and args.data.resolve() == DATA.resolve():
+        parser.error("The results here are of the tasks that ship: name another folder with --data.")
     kept = {(x["task"], x["algorithm"], int(x["seed"])) for x in read(args.data / "shipped.csv")}
     todo = [(task, method, seed) for seed in args.seeds for task in args.tasks for method in args.methods]
     with ThreadPoolExecutor(args.cores) as pool:

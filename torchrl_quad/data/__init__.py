@@ -16,9 +16,17 @@ attribute           meaning
 ==================  ==================================================================================================
 """
 
+from torchrl_quad.data.collector import DifferentiableCollector
 from torchrl_quad.data.normalizer import ObservationNormalizer
 from torchrl_quad.data.rollout import differentiable_rollout
 from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.data.visited_states import VisitedStateBuffer, restart
 
-__all__ = ["ObservationNormalizer", "VisitedStateBuffer", "base_env", "differentiable_rollout", "restart"]
+__all__ = [
+    "DifferentiableCollector",
+    "ObservationNormalizer",
+    "VisitedStateBuffer",
+    "base_env",
+    "differentiable_rollout",
+    "restart",
+]

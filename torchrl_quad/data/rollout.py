@@ -53,12 +53,17 @@ def differentiable_rollout(
         raise TypeError(
             f"carry must be the tensordict to start from, or None to reset the environment; got {type(carry).__name__}."
         )
-    carry = env.reset() if carry is None else carry.copy()
     try:
+        carry = env.reset() if carry is None else carry.copy()
         with set_exploration_type(exploration_type):
             rollout = _rollout(env, actor, carry, horizon)
     except KeyError as error:
-        missing = [key for key in actor.in_keys if key not in carry]
+        if "not found in the environment outputs" in str(error):
+            raise ValueError(
+                f"ExcludeTransform: {error.args[0]} TorchRL's transform leaves out single entries, and no groups: name "
+                'each, such as ("reward_terms", "velocity"). Keep the state, from which the next step starts.'
+            ) from error
+        missing = [key for key in actor.in_keys if carry is not None and key not in carry]
         if not missing:
             raise
         raise ValueError(

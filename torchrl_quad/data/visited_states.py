@@ -163,7 +163,7 @@ def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictB
     """
     _require_fraction(fraction)
     keys = _state_keys(env)
-    missing = [key for key in keys if key not in carry]
+    missing = [key for key in base_env(env).state_keys if key not in carry]
     if missing:
         raise ValueError(f"restart needs the whole state, {keys}, and the carry lacks {missing[0]!r}.")
     fresh = _fresh(env, keys)

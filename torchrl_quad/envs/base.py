@@ -19,7 +19,7 @@ from torchrl_quad.envs import checks
 from torchrl_quad.envs.disturbances import Disturbance, choose_disturbances
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenery import merge_reset, visible_state
-from torchrl_quad.envs.specs import set_specs
+from torchrl_quad.envs.specs import describe, set_specs
 from torchrl_quad.envs.step import ControlStep, draw_start, sample_state
 from torchrl_quad.envs.task import Task
 
@@ -29,13 +29,13 @@ class QuadrotorEnv(Task, EnvBase):
 
     A step is a pure function of its tensordict. The complete Markov state is in ``"state"``, and gradients flow from
     every entry of ``"next"`` to the actions, to the state, and to ``env.params``. A task subclasses this and defines
-    what :class:`~torchrl_quad.envs.Task` asks for; :class:`~torchrl_quad.envs.HoveringEnv` is the pattern.
+    what :class:`~torchrl_quad.envs.Task` asks for, as :class:`~torchrl_quad.envs.HoveringEnv` does.
 
     Beside ``"observation"`` and ``"state"`` a step writes ``"success"``, ``"crash"``, ``("reward_terms", name)``, whose
     sum is the reward, and ``("metrics", name)``, what the task measures, without gradient.
 
-    ``env.params`` is the drone that flies, ``env.nominal`` the drone that its controller believes in. Assign
-    ``env.params = env.params.replace(mass=0.5)`` to change it. A parameter that requires grad can be fitted.
+    ``env.params`` is the drone that flies; ``env.params = env.params.replace(mass=0.5)`` changes it, and a parameter
+    that requires grad can be fitted. ``env.nominal`` is the drone that its controller believes in.
 
     The action is (4) in [-1, 1]: collective thrust (-1..1 maps to 0..max_thrust_to_weight times the nominal weight),
     then roll, pitch and yaw rate in units of the drone's max_body_rate.
@@ -64,16 +64,15 @@ class QuadrotorEnv(Task, EnvBase):
         wind: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.Wind`, or one of these.
         random_start: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.RandomStart`, or one of these.
         disturbances: disturbances of your own; see :class:`~torchrl_quad.envs.disturbances.Disturbance`.
-        compile: compile the step and its first derivative, which takes half a minute the first time; see
-            ``docs/performance.md``.
+        compile: compile the step and its first derivative: half a minute the first time; see ``docs/performance.md``.
 
     Raises:
         TypeError: an argument is unknown.
         ValueError: an argument is out of range. Of a step: action or state do not fit, or an action is not finite.
     """
 
-    batch_locked = True
-    _supports_set_state = True
+    batch_locked, _supports_set_state = True, True
+    __repr__ = describe
 
     def __init__(
         self,
@@ -108,7 +107,7 @@ class QuadrotorEnv(Task, EnvBase):
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.num_envs, self.dtype, self.control_dt, self.action_delay = num_envs, dtype, control_dt, action_delay
         self.max_episode_steps, self.observe_last_action = max_episode_steps, observe_last_action
-        self.event_discount = event_discount
+        self.event_discount, self._drone_name = event_discount, drone if isinstance(drone, (str, Path)) else "own"
         self.initial_state_source: Callable[[int], TensorDictBase] | None = None
         params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone)
         params = checks.checked_params(params.to(device=self.device, dtype=dtype), num_envs)
@@ -237,11 +236,15 @@ class QuadrotorEnv(Task, EnvBase):
         """Join what belongs together on one device: the step, what runs it, and its random numbers."""
         self.control_step = ControlStep(self, safe_state)
         self._stepper = Stepper(self.control_step, options)
-        self.randomness.noise_shapes = {
-            name: (self.num_envs, x.noise_size) for name, x in self.disturbances.items() if x.noise_size
-        }
+        sizes = {name: x.noise_size for name, x in self.disturbances.items()}
+        self.randomness.noise_shapes = {name: (self.num_envs, size) for name, size in sizes.items() if size}
         self.randomness.draw_start = functools.partial(draw_start, self)
         self.render_state: State = {}  # positions, quaternions and targets, for render()
+
+    def reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool | None = None, **options: Any) -> Any:
+        """As TorchRL's; of a mask and a state in one tensordict, ``set_state`` says which of them counts."""
+        checks.require_clear_reset(tensordict, set_state, **options)
+        return super().reset(tensordict, set_state=set_state, **options)
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = seed
@@ -250,11 +253,8 @@ class QuadrotorEnv(Task, EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if set_state:
-            source = "reset(..., set_state=True)"
-            checks.require(
-                tensordict is not None and "state" in tensordict,
-                f'{source} needs a tensordict with the state to set in "state"; got none.',
-            )
+            source, given = "reset(..., set_state=True)", tensordict is not None and "state" in tensordict
+            checks.require(given, f'{source} needs a tensordict with the state to set in "state"; got none.')
             entries = self.control_step.reset(checks.restore_state(self, tensordict.get("state"), source, mask))
         else:
             entries = self.randomness.starts(None if mask is None else mask.reshape(-1))
@@ -277,8 +277,8 @@ class QuadrotorEnv(Task, EnvBase):
         checks.require_count("max_steps", max_steps, 1, checks.MAX_STEPS)
         start, auto_reset = options.get("tensordict"), options.get("auto_reset", True)
         quick = callback is None and options.get("break_when_any_done") is False and auto_reset == (start is None)
-        own = type(self)._step, type(self)._reset  # the engine knows nothing of a step of a subclass's own
-        quick = quick and own == (QuadrotorEnv._step, QuadrotorEnv._reset)
+        # The engine knows nothing of a step of a subclass's own.
+        quick = quick and (type(self)._step, type(self)._reset) == (QuadrotorEnv._step, QuadrotorEnv._reset)
         if quick and set(options) <= {"break_when_any_done", "auto_reset", "tensordict"}:
             start = self.reset() if start is None else start
             if can_fly(self._stepper, policy, start):

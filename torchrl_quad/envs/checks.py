@@ -106,10 +106,10 @@ def full_signature(cls: type, base: type) -> inspect.Signature:
     for owner in cls.__mro__[: cls.__mro__.index(base)]:
         parameters = inspect.signature(vars(owner)["__init__"]).parameters if "__init__" in vars(owner) else {}
         for name, argument in parameters.items():
-            if name != "self" and argument.kind is not argument.VAR_KEYWORD:
+            if name != "self" and argument.kind not in (argument.VAR_KEYWORD, argument.VAR_POSITIONAL):
                 arguments.setdefault(name, argument)
     option = inspect.Parameter("compile", inspect.Parameter.KEYWORD_ONLY, default=False, annotation="bool | dict")
-    return inspect.Signature([*arguments.values(), option])
+    return inspect.Signature(sorted([*arguments.values(), option], key=lambda x: x.kind))
 
 
 def checked_weights(weights: Any, known: Mapping[str, float]) -> Mapping[str, float]:
@@ -137,6 +137,17 @@ def checked_params(params: Any, num_envs: int) -> QuadrotorParams:
         batch = value.shape[0] if value.dim() > params.dim(name) else 1
         require(batch in (1, num_envs), f"drone: field {name!r} is for {batch} environments, and num_envs={num_envs}.")
     return params
+
+
+def require_clear_reset(tensordict: Any, set_state: bool | None, select_reset_only: bool = False, **_: Any) -> None:
+    """Refuse a mask beside a state, unless it is said which counts: TorchRL 0.14 takes the state, 0.15 the mask."""
+    said = set_state is not None or select_reset_only or tensordict is None
+    unclear = not said and "_reset" in tensordict and "state" in tensordict
+    require(
+        not unclear,
+        'reset: the tensordict has a mask in "_reset" and a state. For fresh starts in the environments of the mask '
+        "write env.reset(tensordict, set_state=False); to set them to this state, set_state=True.",
+    )
 
 
 def check_source(source: Any) -> None:
@@ -320,7 +331,7 @@ def _refuse_entry(entries: Mapping[Any, Any], key: Any, safe_state: State, sourc
     require(
         not missing,
         f"{source}: the state lacks {names(missing)}. A state is restored whole: take it from a tensordict of this "
-        f"environment, which holds {names(safe_state)}.",
+        f"environment, which holds {names(safe_state)}. No transform may drop a part of it, as ExcludeTransform would.",
     )
     x, like = entries[key], safe_state[key]
     shape, expected = tuple(x.shape), tuple(like.shape)

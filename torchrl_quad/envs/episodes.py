@@ -20,6 +20,12 @@ def at_episode_end(rollout: TensorDictBase, value: Tensor) -> Tensor:
 
 def summarise_episodes(rollout: TensorDictBase) -> dict[str, Tensor]:
     """Judge the first episode of each environment; see ``QuadrotorEnv.episode_metrics``."""
+    missing = [name for name in ("crash", "success", "reward", "done") if ("next", name) not in rollout]
+    if missing:
+        raise ValueError(
+            f'episode_metrics reads ("next", {missing[0]!r}), which is not in the rollout. Judge a rollout before you '
+            "leave out entries, and evaluate without the transform that drops this one."
+        )
     ends, first = rollout["next"], first_episode(rollout)
     crash, success = (at_episode_end(rollout, ends[name]) for name in ("crash", "success"))
     dtype = ends["reward"].dtype

@@ -1,4 +1,4 @@
-"""Build the specs that TorchRL reads: shapes and types of the entries of an environment."""
+"""What an environment says of itself: the specs that TorchRL reads, and one line for people."""
 
 from __future__ import annotations
 
@@ -32,3 +32,16 @@ def set_specs(env: Any) -> None:
     env.action_spec = Bounded(-1.0, 1.0, (env.num_envs, 4), device=env.device, dtype=env.dtype)
     env.reward_spec = Unbounded((env.num_envs, 1), device=env.device, dtype=env.dtype)
     env.done_spec = spec(done)
+
+
+def describe(env: Any) -> str:
+    """The task, number of drones, which one, control period, device and so on of an environment, in one line."""
+    if not hasattr(env, "control_step"):
+        return f"{type(env).__name__}(not built)"
+    changed = "" if env.params is env.nominal else " with other parameters"
+    more = f", disturbances={'+'.join(map(str, env.disturbances))}" if env.disturbances else ""
+    return (
+        f"{type(env).__name__}(num_envs={env.num_envs}, drone={str(env._drone_name)!r}{changed}, "
+        f"control_dt={env.control_dt:g} s, max_episode_steps={env.max_episode_steps}{more}, device={env.device}, "
+        f"dtype={env.dtype}, compiled={env.is_compiled})"
+    )

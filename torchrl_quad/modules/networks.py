@@ -66,12 +66,19 @@ def make_actor(
         return_log_prob: also write the log-probability of the action, which an entropy bonus and PPO need.
 
     Raises:
-        ValueError: an entry is unknown or has more than one dimension, a width is not a whole number of at least 1, the
-            number of scales is not that of the entries, or the first action is not strictly inside the bounds.
+        ValueError: an entry is unknown or has more than one dimension, or the action has; a width is not a whole number
+            of at least 1, the number of scales is not that of the entries, or the first action is not strictly inside
+            the bounds.
     """
     spec = env.action_spec_unbatched
     if not isinstance(spec, Bounded):
         raise ValueError(f"make_actor needs an action with bounds, a Bounded spec; got {type(spec).__name__}.")
+    if len(spec.shape) != 1:
+        raise ValueError(
+            f"make_actor writes one action (k) for each environment, and here it has shape {tuple(spec.shape)}: a "
+            "transform such as MultiAction asks for several actions at once. Leave it out. To hold each action longer, "
+            "give the environment a longer control step, control_dt=0.04."
+        )
     low, high = spec.space.low, spec.space.high
     middle = 0.5 * (low + high)
     if action_init is None:

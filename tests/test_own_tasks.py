@@ -1,0 +1,151 @@
+"""Tasks and recipes of somebody's own, which are not in the repository."""
+
+import importlib
+import json
+import math
+import re
+import sys
+from importlib.metadata import EntryPoint
+
+import gymnasium
+import pytest
+from hydra.core.config_store import ConfigStore
+from own_task import CornerEnv
+from small_runs import SMALL, rows
+from test_configuration import composed
+from test_docs import ROOT, files, importable  # noqa: F401, a fixture
+from training.checkpoints import read_checkpoint
+from training.own import defaults, offer_tasks
+from training.schema import check
+
+from torchrl_quad import HoveringEnv, QuadrotorEnv, available_tasks, make_env, register_task
+from torchrl_quad.envs import TASKS, registry
+
+
+@pytest.fixture(autouse=True)
+def forget(monkeypatch):
+    """What a test registers is known to it alone."""
+    monkeypatch.setattr(registry, "TASKS", dict(TASKS))
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
+    monkeypatch.setattr(gymnasium, "registry", gymnasium.envs.registration.registry)
+    monkeypatch.setattr(ConfigStore.instance(), "repo", dict(ConfigStore.instance().repo))
+    registry._offered.cache_clear()
+    yield
+    registry._offered.cache_clear()
+
+
+def test_one_line_makes_a_task_known_to_make_env_and_to_gymnasium():
+    register_task("fly_to_corner", CornerEnv)
+    register_task("fly_to_corner", CornerEnv)  # a cell of a notebook that runs again
+    assert "fly_to_corner" in available_tasks()
+    assert type(make_env("fly_to_corner", num_envs=2, reach=0.1)) is CornerEnv
+    drones = gymnasium.make_vec("torchrl_quad/FlyToCorner-v0", num_envs=2, reach=0.1)
+    assert drones.reset(seed=0)[0].shape == (2, 13)
+    assert type(make_env("own_task.CornerEnv", num_envs=2)) is CornerEnv  # without any name
+
+
+def test_packages_offer_tasks_by_entry_points(monkeypatch):
+    offers = [("corner", "own_task:CornerEnv"), ("norm", "own_task:norm"), ("two", "a:b"), ("two", "c:d")]
+    points = [EntryPoint(name, value, "torchrl_quad.tasks") for name, value in offers]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points if group == "torchrl_quad.tasks" else [])
+    assert type(make_env("corner", num_envs=2)) is CornerEnv and "corner" in available_tasks()
+    with pytest.raises(TypeError, match="The entry point norm = 'own_task:norm': a task is a subclass of QuadrotorEnv"):
+        make_env("norm")
+    with pytest.raises(ValueError, match="Several packages offer a task 'two': a:b, c:d. Remove all but one."):
+        make_env("two")
+
+
+class UnfinishedEnv(QuadrotorEnv):
+    def observe(self, state):
+        return state["position"]
+
+
+@pytest.mark.parametrize(
+    ("name", "cls", "error", "message"),
+    [
+        ("Window", CornerEnv, ValueError, "small letters, digits and underscores, such as 'window'; got 'Window'"),
+        (
+            "hovering",
+            CornerEnv,
+            ValueError,
+            "is torchrl_quad.envs.hovering.HoveringEnv already. Choose another name for",
+        ),
+        (
+            "x",
+            CornerEnv(num_envs=1),
+            TypeError,
+            "a subclass of QuadrotorEnv, itself and not an instance; got CornerEnv",
+        ),
+        ("x", dict, TypeError, "a subclass of QuadrotorEnv, itself and not an instance; got the class dict"),
+        ("x", UnfinishedEnv, TypeError, "UnfinishedEnv lacks initial_state, is_crash, is_success, reward_terms. docs/"),
+    ],
+)
+def test_what_is_no_task_is_refused_when_it_is_registered(name, cls, error, message):
+    with pytest.raises(error, match=message):
+        register_task(name, cls)
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        ("window", "Unknown task 'window'. Choose from: .*racing.* give the path .*, or call register_task"),
+        ("no_package.WindowEnv", "Python finds no module 'no_package'. Put its folder on PYTHONPATH, or install"),
+        ("own_task.Corner", "the module 'own_task' .* has no 'Corner'"),
+        ("own_task.norm", "a task is a subclass of QuadrotorEnv"),
+    ],
+)
+def test_recipes_say_in_one_line_how_a_task_that_they_do_not_know_becomes_known(task, message, refused, tmp_path):
+    assert re.search(message, refused("bptt", f"task={task}", f"hydra.run.dir={tmp_path}/run"))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("env.reach=far", "env.reach=far: it must be a number"),
+        ("env.patience=0.5", "env.patience=0.5: it must be a whole number"),
+        ("+env.rech=1", "argument 'rech'. Did you mean 'reach'?"),
+        ("+env.seed=1", "env.seed: recipes set it for all environments. Write seed=..., without env"),
+        ("env.wind=None", "env.wind=None: it is the word 'None' to YAML. For no value write env.wind=null"),
+    ],
+)
+def test_the_settings_of_a_task_come_from_its_signature_and_are_checked_by_it(words, message):
+    assert defaults(CornerEnv) == {"reach": 0.5, "patience": None, "dt": 0.01, "max_episode_steps": 256}
+    assert defaults(HoveringEnv) == {"max_episode_steps": 256}
+    task = offer_tasks(["task._target_=own_task.CornerEnv"])
+    check(composed("bptt", *task, "env.reach=1", "env.patience=3"))
+    with pytest.raises((ValueError, TypeError), match=re.escape(message)):
+        check(composed("bptt", *task, words))
+
+
+def test_a_task_of_your_own_trains_resumes_and_is_evaluated_as_those_that_ship(train, launch, tmp_path):
+    task = "task._target_=own_task.CornerEnv"
+    train("abpt", tmp_path, task, "env.reach=0.1")
+    saved = train("abpt", tmp_path, task, "resume=auto", "total_steps=240")
+    assert saved["iteration"] == 10 and "task: own_task.CornerEnv" in saved["config"]
+    assert float(rows(tmp_path)[-1]["eval/corner_error"]) > 0
+    printed = launch("evaluate", f"checkpoint={tmp_path}/checkpoint.pt")
+    assert "abpt on own_task.CornerEnv" in printed and "distance to the corner" in printed
+    summary = json.loads((tmp_path / "evaluation.json").read_text())
+    assert summary["corner_error"] == json.loads((tmp_path / "summary.json").read_text())["corner_error"]
+
+
+@pytest.mark.usefixtures("importable", "no_pictures")
+def test_a_recipe_outside_the_repository_is_short_and_takes_any_task(tmp_path, monkeypatch, capsys):
+    """The programs of docs/writing.md, in files, as the page says."""
+    assert all(len(content.splitlines()) < 60 for content in files(ROOT / "docs/writing.md").values())
+    small = [
+        "--multirun",
+        *SMALL,
+        "hydra/launcher=basic",
+        f"hydra.sweep.dir={tmp_path}/run",
+        "hydra.sweep.subdir=${algorithm}",
+    ]
+    for name, *own in (("smooth", "task=shuttle.ShuttleEnv", "loss.smoothness=0.3"), ("train", "task=shuttle")):
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *small, *own])
+        importlib.import_module(name).main()
+    printed = capsys.readouterr().out
+    assert "smooth on shuttle.ShuttleEnv, seed 0" in printed and "abpt on shuttle, seed 0" in printed
+    saved = read_checkpoint(tmp_path / "run/smooth/checkpoint.pt")
+    assert "smoothness: 0.3" in saved["config"] and "algorithm: smooth" in saved["config"]
+    assert math.isfinite(saved["best"]["return"])

@@ -1,0 +1,134 @@
+"""The tasks by name: those that ship, those that programs register, and those of installed packages."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+import re
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from torchrl_quad.envs.base import QuadrotorEnv
+from torchrl_quad.envs.hovering import HoveringEnv
+from torchrl_quad.envs.landing import LandingEnv
+from torchrl_quad.envs.racing import RacingEnv
+from torchrl_quad.envs.tracking import TrackingEnv
+
+GROUP = "torchrl_quad.tasks"  # the group of entry points by which an installed package offers its tasks
+
+# The tasks that ship, and those that register_task has added.
+TASKS: dict[str, type[QuadrotorEnv]] = {
+    "hovering": HoveringEnv,
+    "landing": LandingEnv,
+    "racing": RacingEnv,
+    "tracking": TrackingEnv,
+}
+
+
+def register_task(name: str, cls: type[QuadrotorEnv]) -> None:
+    """Make a task of your own known by a name: to ``make_env``, to gymnasium, and to a recipe in the same program.
+
+    After ``register_task("window", WindowEnv)`` you can write ``make_env("window")``, and
+    ``gymnasium.make("torchrl_quad/Window-v0")``. An installed package offers its tasks to every program by an entry
+    point of the group "torchrl_quad.tasks": ``window = "mypackage:WindowEnv"``. A class that Python can import needs no
+    name: ``make_env("mypackage.WindowEnv")``.
+
+    Args:
+        name: in small letters, digits and underscores, such as "window" or "fly_through".
+        cls: the class, which defines all that :class:`~torchrl_quad.envs.Task` asks for.
+
+    Raises:
+        ValueError: the name is not of this form, or another class has it.
+        TypeError: this is no class of a task, or it lacks methods.
+    """
+    if not (isinstance(name, str) and re.fullmatch(r"[a-z][a-z0-9_]*", name)):
+        raise ValueError(f"A task's name is in small letters, digits and underscores, such as 'window'; got {name!r}.")
+    _require_task(cls, f"register_task({name!r}, ...)")
+    taken = TASKS.get(name)
+    if taken is not None and _path(taken) != _path(cls):  # a module that runs again, as in a notebook, may
+        raise ValueError(f"The task {name!r} is {_path(taken)} already. Choose another name for {_path(cls)}.")
+    TASKS[name] = cls
+    from torchrl_quad import register_envs  # which needs the package whole
+
+    register_envs(name)
+
+
+def available_tasks() -> list[str]:
+    """The names that :func:`make_env` knows, with those of installed packages."""
+    return sorted({*TASKS, *_offered()})
+
+
+def task_class(task: str) -> type[QuadrotorEnv]:
+    """Find the class of a task by its name, or by its path, such as "mypackage.WindowEnv", which is imported.
+
+    Raises:
+        ValueError: there is no such task.
+        TypeError: what the path or an entry point leads to is no class of a task, or lacks methods.
+    """
+    if task in list(TASKS):  # a list compares what cannot be hashed, too
+        return TASKS[task]
+    offers = _offered().get(task, []) if isinstance(task, str) else []
+    if len(offers) > 1:
+        raise ValueError(
+            f"Several packages offer a task {task!r}: {', '.join(x.value for x in offers)}. Remove all but one."
+        )
+    if offers:
+        return _require_task(offers[0].load(), f"The entry point {task} = {offers[0].value!r}")
+    if isinstance(task, str) and re.fullmatch(r"\w+(\.\w+)+", task):
+        return _require_task(_imported(task), f"task {task!r}")
+    raise ValueError(
+        f"Unknown task {task!r}. Choose from: {', '.join(available_tasks())}. For one of your own give the path of "
+        "its class, such as 'mypackage.WindowEnv', or call register_task(name, WindowEnv) before."
+    )
+
+
+def make_env(task: str, **kwargs: Any) -> QuadrotorEnv:
+    """Build a task by its name: ``make_env("hovering", num_envs=64)``; the keywords go to the environment.
+
+    :func:`register_task` says how a task of your own gets a name.
+
+    Raises:
+        ValueError: the task is unknown, or an argument is out of its range.
+        TypeError: a keyword is unknown.
+    """
+    return task_class(task)(**kwargs)
+
+
+@functools.cache
+def _offered() -> dict[str, list[EntryPoint]]:
+    """The entry points of installed packages by name; none of them is loaded."""
+    offers: dict[str, list[EntryPoint]] = {}
+    for point in entry_points(group=GROUP):
+        offers.setdefault(point.name, []).append(point)
+    return offers
+
+
+def _imported(path: str) -> Any:
+    module, _, name = path.rpartition(".")
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # the module is there, and needs one that is not
+        raise ValueError(
+            f"task {path!r}: Python finds no module {error.name!r}. Put its folder on PYTHONPATH, or install its "
+            "package."
+        ) from None
+    if not hasattr(found, name):
+        raise ValueError(f"task {path!r}: the module {module!r} ({found.__file__}) has no {name!r}.")
+    return getattr(found, name)
+
+
+def _require_task(cls: Any, source: str) -> type[QuadrotorEnv]:
+    if not (isinstance(cls, type) and issubclass(cls, QuadrotorEnv)):
+        got = f"the class {cls.__name__}" if isinstance(cls, type) else type(cls).__name__
+        raise TypeError(f"{source}: a task is a subclass of QuadrotorEnv, itself and not an instance; got {got}.")
+    if inspect.isabstract(cls):
+        missing = ", ".join(sorted(cls.__abstractmethods__))
+        raise TypeError(f"{source}: {cls.__name__} lacks {missing}. docs/writing.md says what each of them gives.")
+    return cls
+
+
+def _path(cls: type) -> str:
+    return f"{cls.__module__}.{cls.__qualname__}"

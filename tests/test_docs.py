@@ -5,7 +5,7 @@ import re
 import runpy
 import shlex
 import sys
-from importlib.metadata import metadata
+from importlib.metadata import metadata, version
 from itertools import pairwise
 from pathlib import Path
 from urllib.parse import unquote
@@ -19,7 +19,7 @@ from test_examples import BUDGET, EXAMPLES
 from test_recipes import RECIPES, ROOT, SMALL, run
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
-PAGES += sorted(ROOT.glob("docs/*.md"))
+PAGES += sorted(path for path in ROOT.glob("docs/**/*.md") if "_build" not in path.parts)
 PARTS = ("data", "dynamics", "engine", "envs", "modules", "objectives", "render")
 PUBLIC = ["torchrl_quad", *(f"torchrl_quad.{part}" for part in PARTS)]
 # Blocks that are not run: text, data, and Sphinx's directives, except those that hold code.
@@ -42,7 +42,18 @@ def public_names():
                 yield f"{module.__name__}.{name}"
 
 
-def test_the_site_builds_without_a_warning_and_describes_every_public_name(tmp_path):
+LISTINGS = "_modules", "source"  # pages that show a file of the repository
+LONG = {"docs/results_data.html"}
+SCREEN = {"width": 1280, "height": 800}
+MEASURE = """() => {
+    const {scrollWidth, scrollHeight} = document.documentElement;
+    const boxes = [...document.querySelectorAll("pre, .table-wrapper, math")];
+    const cut = boxes.filter((box) => box.scrollWidth > box.clientWidth);
+    return [scrollWidth, scrollHeight, cut.map((box) => box.textContent.trim().slice(0, 60))];
+}"""
+
+
+def test_the_site_builds_without_a_warning_describes_every_public_name_and_fits_a_browser(tmp_path, request):
     (command,) = (line for line in make("docs").splitlines() if "-m sphinx" in line)
     _, *options, folder = shlex.split(command)
     assert folder == "docs/_build/html"
@@ -52,16 +63,40 @@ def test_the_site_builds_without_a_warning_and_describes_every_public_name(tmp_p
         inventory = InventoryFile.load(file, "", lambda *parts: "".join(parts))
     described = set().union(*inventory.values())
     assert [name for name in public_names() if name not in described] == []
+    look_at(tmp_path, request.getfixturevalue("browser"))
+
+
+def look_at(site, browser):
+    """Open the pages without a network, as a reader with a small screen does. One listing stands for all of them."""
+    wrong = []
+    page = browser.new_context(offline=True, viewport=SCREEN).new_page()
+    page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("request", lambda r: None if r.url.startswith("file://") else wrong.append(r.url))
+    listings = [path for path in site.rglob("*.html") if path.relative_to(site).parts[0] in LISTINGS]
+    assert {path.relative_to(site).parts[0] for path in listings} == set(LISTINGS)
+    for path in {*site.rglob("*.html")} - {*listings[1:], site / "index.html"}:
+        name = str(path.relative_to(site))
+        page.goto(path.as_uri())
+        width, height, cut = page.evaluate(MEASURE)
+        if width > SCREEN["width"]:
+            wrong.append(f"{name}: scrolls to the side")
+        if height > 6 * SCREEN["height"] and name not in LONG and path not in listings:
+            wrong.append(f"{name}: {height} pixels long, which is more than six screens")
+        wrong += [f"{name}: wider than its column: {text}" for text in cut if path not in listings]
+    page.goto((site / "index.html").as_uri())
+    page.wait_for_url("**/docs/index.html")
+    page.context.close()
+    assert not wrong, "\n".join(sorted(wrong))
 
 
 def test_the_reference_begins_with_a_table_of_what_the_package_exports():
-    (table,) = re.findall(r"\.\. autosummary::\n\n((?:   \w+\n)+)", (ROOT / "docs/api.md").read_text())
+    (table,) = re.findall(r"\.\. autosummary::\n.*\n\n((?:   \w+\n)+)", (ROOT / "docs/api.md").read_text())
     assert sorted(table.split()) == sorted(importlib.import_module("torchrl_quad").__all__)
 
 
-@pytest.mark.parametrize("page", ["docs/examples.md", "examples/README.md"])
-def test_every_example_is_shown(page):
-    text = (ROOT / page).read_text()
+def test_every_example_is_listed():
+    text = (ROOT / "examples/README.md").read_text()
     assert {example.name for example in EXAMPLES} == set(re.findall(r"\d\d_\w+\.py", text))
 
 
@@ -189,6 +224,8 @@ def installs(words):
         word = words.pop(0)
         if word in ("--constraint", "-c"):
             assert (ROOT / words.pop(0)).is_file()
+        elif word.endswith(".whl"):
+            assert word == f"torchrl_quad-{version('torchrl_quad')}-py3-none-any.whl"
         elif word not in ("--editable", "-e"):
             wanted = Requirement(re.sub(r"^\.(?=\[|$)", "torchrl_quad", word))
             assert wanted.name in known and wanted.extras <= set(extras)

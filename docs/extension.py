@@ -72,7 +72,7 @@ def add_examples(app: Sphinx, docname: str, source: list[str]) -> None:
 def link_to_sources(app: Sphinx, doctree: nodes.document) -> None:
     """Let links to files of the repository open a page with the file, instead of a download."""
     env = app.env
-    files = app.env.__dict__.setdefault("linked_files", set())
+    files = vars(env).setdefault("linked_files", set())
     for node in [*doctree.findall(addnodes.download_reference), *doctree.findall(addnodes.pending_xref)]:
         if node.get("reftype") != "myst":
             continue
@@ -106,10 +106,10 @@ def leave_out_of_navigation(app: Sphinx, doctree: nodes.document) -> None:
 
 
 def share_navigation(app: Sphinx, name: str, template: str, context: dict[str, Any], doctree: object) -> None:
-    """Make the sidebar once for all pages of a depth that are not in it; it is most of what a page costs."""
+    """Make the sidebar once for all pages of a folder that are not in it; it is most of what a page costs."""
     if name not in {page for pages in app.env.toctree_includes.values() for page in pages}:
         make = context["toctree"]
-        tree = app.env.temp_data.setdefault("trees", {}).setdefault(name.count("/"), [])
+        tree = app.env.temp_data.setdefault("trees", {}).setdefault(name.rpartition("/")[0], [])
         context["toctree"] = lambda **options: (tree or tree.append(make(**options)) or tree)[0]
 
 

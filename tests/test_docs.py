@@ -1,6 +1,7 @@
 """The documentation: the site builds without a warning, links lead somewhere, and code blocks run."""
 
 import importlib
+import inspect
 import re
 import runpy
 import shlex
@@ -17,6 +18,8 @@ from packaging.requirements import Requirement
 from sphinx.util.inventory import InventoryFile
 from test_examples import BUDGET, EXAMPLES
 from test_recipes import RECIPES, ROOT, SMALL, run
+
+from torchrl_quad.envs import TASKS
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
 PAGES += sorted(path for path in ROOT.glob("docs/**/*.md") if "_build" not in path.parts)
@@ -63,7 +66,26 @@ def test_the_site_builds_without_a_warning_describes_every_public_name_and_fits_
         inventory = InventoryFile.load(file, "", lambda *parts: "".join(parts))
     described = set().union(*inventory.values())
     assert [name for name in public_names() if name not in described] == []
+    read(tmp_path)
     look_at(tmp_path, request.getfixturevalue("browser"))
+
+
+def read(site):
+    """Links lead to files, nothing comes from elsewhere, formulas are MathML, and classes show all their arguments."""
+    pages = {path: path.read_text() for path in site.rglob("*.html")}
+    local = re.compile(r'(?:href|src)="([^":#?]+)["#?]')
+    links = {path.parent / unquote(link) for path, text in pages.items() for link in local.findall(text)}
+    assert [link for link in links if not link.exists()] == []
+    assert not any(re.search(r'<(script|img|link)\b[^>]*(src|href)="(https?:)?//', text) for text in pages.values())
+    assert all("<math" in pages[site / f"docs/{name}.html"] for name in ("losses", "dynamics"))
+    assert not any("\\frac" in pages[path] for path in site.glob("docs/*.html"))
+    tasks = {name: task for name, task in TASKS.items() if task.__module__.startswith("torchrl_quad.")}
+    shown = {name: inspect.signature(task).parameters for name, task in tasks.items()}
+    shown["_api/torchrl_quad.objectives.ABPTLoss"] = ["zero_step_return", "clip_action_gradient"]  # the last, of a base
+    for name, arguments in shown.items():
+        text = pages[site / f"docs/{name}.html"]
+        for form in ("<strong>{}</strong>", '<span class="pre">{}</span>'):  # described, and in the signature
+            assert [argument for argument in arguments if form.format(argument) not in text] == [], name
 
 
 def look_at(site, browser):

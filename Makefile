@@ -17,6 +17,7 @@ test: $(READY)
 
 # Build the documentation site; open docs/_build/html/index.html.
 docs: $(READY)
+	rm -rf docs/_api
 	$(BIN)/python -m sphinx -W --keep-going -n -q -c docs . docs/_build/html
 
 $(READY): pyproject.toml constraints.txt
@@ -26,4 +27,4 @@ $(READY): pyproject.toml constraints.txt
 	touch $(READY)
 
 clean:
-	rm -rf $(VENV) outputs build dist docs/_build *.egg-info
+	rm -rf $(VENV) outputs build dist docs/_api docs/_build *.egg-info

@@ -1,35 +1,40 @@
 """The documentation site: ``make docs`` builds it from the Markdown files of the repository and the docstrings.
 
 The source directory is the repository, not this folder. So each page is read from its own place, and links between
-files work on GitHub and on the site.
+files work on GitHub and on the site. The site needs no network, neither to be built nor to be read.
 """
 
-import ast
-import re
+import sys
 from pathlib import Path
 
-from sphinx.application import Sphinx
-from sphinx.environment import BuildEnvironment
-from sphinx.util import inspect
+import ziamath
 
 import torchrl_quad
+
+sys.path.insert(0, str(Path(__file__).parent))  # extension.py
 
 project = "torchrl_quad"
 version = release = torchrl_quad.__version__
 root_doc = "docs/index"
-include_patterns = ["docs/*.md", "recipes/README.md", "examples/README.md", "CONTRIBUTING.md"]
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+include_patterns = ["docs/**.md", "docs/_api/*.rst", "recipes/README.md", "examples/*", "CONTRIBUTING.md"]
+exclude_patterns = ["docs/_build"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "extension",
+]
 
-myst_enable_extensions = ["dollarmath", "substitution"]
-myst_substitutions = {  # {{ fly_by_hand }} is the docstring of examples/01_fly_by_hand.py
-    path.stem[3:]: ast.get_docstring(ast.parse(path.read_text()))
-    for path in (Path(__file__).parents[1] / "examples").glob("*.py")
-}
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 4  # links to headings, by the names that GitHub gives them
 
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
+autosummary_ignore_module_all = False
+templates_path = [str(Path(__file__).parent / "templates")]  # of the pages in docs/_api
 python_maximum_signature_line_length = 90  # a longer one has each argument on a line of its own
 toc_object_entries_show_parents = "hide"
 napoleon_use_rtype = False  # "Returns:" is a sentence here; its types are in the signature
@@ -44,43 +49,12 @@ nitpick_ignore_regex = [
 ]
 
 html_theme = "furo"
-html_title = "torchrl_quad"
+pygments_dark_style = "github-dark"
+html_title = f"torchrl_quad {version}"
+html_static_path = ["site.css", str(Path(ziamath.__file__).parent / "fonts")]  # with the font of the formulas
+html_css_files = ["site.css"]
 html_extra_path = ["index.html"]  # leads from the root of the site to the pages in docs/
 html_copy_source = False
 html_show_copyright = False
-mathjax_path = "https://cdn.jsdelivr.net/npm/mathjax@3/es5/tex-mml-chtml.js"  # fetched by the reader, not by the build
-
-
-def add_short_names(app: Sphinx, env: BuildEnvironment) -> None:
-    """Let references to torchrl_quad.HoveringEnv find torchrl_quad.envs.HoveringEnv."""
-    objects = env.domains.python_domain.objects
-    for name in torchrl_quad.__all__:
-        for place in [place for place in objects if place.count(".") == 2 and place.endswith(f".{name}")]:
-            objects.setdefault(f"torchrl_quad.{name}", objects[place]._replace(aliased=True))
-
-
-def keep_shapes(app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
-    """Docstrings write shapes, (*, 3) or (3), and norms, |x|, plainly; unless escaped they would be markup."""
-    for i, line in enumerate(lines):
-        parts = line.split("``")  # every second one is a literal
-        parts[::2] = [re.sub(r"(?<=\()\*|\((?=\d+\))|\|", r"\\\g<0>", part) for part in parts[::2]]
-        lines[i] = "``".join(parts)
-
-
-def show_constructor(
-    app: Sphinx, what: str, name: str, value: type, options: object, signature: str, returned: str
-) -> tuple[str, str] | None:
-    """Show the arguments of a class, which the metaclasses of TorchRL's environments and losses hide."""
-    if what != "class" or signature != "(*args, **kwargs)":
-        return None
-    if "__init__" not in vars(value):  # the class then says where its arguments are described
-        return "(...)", returned
-    constructor = inspect.signature(value.__init__, bound_method=True)
-    return inspect.stringify_signature(constructor, show_return_annotation=False, unqualified_typehints=True), returned
-
-
-def setup(app: Sphinx) -> None:
-    """Sphinx calls this before it reads the sources."""
-    app.connect("autodoc-process-docstring", keep_shapes)
-    app.connect("autodoc-process-signature", show_constructor)
-    app.connect("env-updated", add_short_names)
+html_use_index = html_domain_indices = False  # the reference lists every name
+html_math_renderer = "mathml"

@@ -192,11 +192,12 @@ def test_other_results_leave_the_page_of_the_project_alone(monkeypatch, tmp_path
     monkeypatch.setattr(results, "draw", lambda *_: None)
     run_main(monkeypatch, results, "--data", tmp_path)
     run_main(monkeypatch, results)
-    assert filled == [tmp_path / "results.md", PROJECT / "docs/results.md"]
+    assert filled == [tmp_path / "results.md", PROJECT / "docs/results.md", PROJECT / "docs/results_data.md"]
 
 
 def test_the_page_of_the_project_shows_what_its_data_hold():
-    page, readme = ((PROJECT / name).read_text() for name in ("docs/results.md", "README.md"))
+    page = "".join((PROJECT / "docs" / name).read_text() for name in ("results.md", "results_data.md"))
+    readme = (PROJECT / "README.md").read_text()
     for name, block in results.blocks(reproduce.DATA).items():
         assert f"{results.MARKER.format(name)}\n\n{block}\n\n{results.END}" in page, f"{name}: {RENEW}"
     assert shipped.summary_table(reproduce.DATA) in readme, "run: python recipes/trial/shipped.py"

@@ -1,11 +1,12 @@
 """The documentation: the site builds without a warning, links lead somewhere, and code blocks run."""
 
 import importlib
+import inspect
 import re
 import runpy
 import shlex
 import sys
-from importlib.metadata import metadata
+from importlib.metadata import metadata, version
 from itertools import pairwise
 from pathlib import Path
 from urllib.parse import unquote
@@ -18,8 +19,10 @@ from sphinx.util.inventory import InventoryFile
 from test_examples import BUDGET, EXAMPLES
 from test_recipes import RECIPES, ROOT, SMALL, run
 
+from torchrl_quad.envs import TASKS
+
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
-PAGES += sorted(ROOT.glob("docs/*.md"))
+PAGES += sorted(path for path in ROOT.glob("docs/**/*.md") if "_build" not in path.parts)
 PARTS = ("data", "deploy", "dynamics", "engine", "envs", "modules", "objectives", "render")
 AFTER_TRAINING = ("evaluate", "export")  # recipes that read a checkpoint
 PUBLIC = ["torchrl_quad", *(f"torchrl_quad.{part}" for part in PARTS)]
@@ -43,7 +46,18 @@ def public_names():
                 yield f"{module.__name__}.{name}"
 
 
-def test_the_site_builds_without_a_warning_and_describes_every_public_name(tmp_path):
+LISTINGS = "_modules", "source"  # pages that show a file of the repository
+LONG = {"docs/results_data.html"}
+SCREEN = {"width": 1280, "height": 800}
+MEASURE = """() => {
+    const {scrollWidth, scrollHeight} = document.documentElement;
+    const boxes = [...document.querySelectorAll("pre, .table-wrapper, math")];
+    const cut = boxes.filter((box) => box.scrollWidth > box.clientWidth);
+    return [scrollWidth, scrollHeight, cut.map((box) => box.textContent.trim().slice(0, 60))];
+}"""
+
+
+def test_the_site_builds_without_a_warning_describes_every_public_name_and_fits_a_browser(tmp_path, request):
     (command,) = (line for line in make("docs").splitlines() if "-m sphinx" in line)
     _, *options, folder = shlex.split(command)
     assert folder == "docs/_build/html"
@@ -53,16 +67,59 @@ def test_the_site_builds_without_a_warning_and_describes_every_public_name(tmp_p
         inventory = InventoryFile.load(file, "", lambda *parts: "".join(parts))
     described = set().union(*inventory.values())
     assert [name for name in public_names() if name not in described] == []
+    read(tmp_path)
+    look_at(tmp_path, request.getfixturevalue("browser"))
+
+
+def read(site):
+    """Links lead to files, nothing comes from elsewhere, formulas are MathML, and classes show all their arguments."""
+    pages = {path: path.read_text() for path in site.rglob("*.html")}
+    local = re.compile(r'(?:href|src)="([^":#?]+)["#?]')
+    links = {path.parent / unquote(link) for path, text in pages.items() for link in local.findall(text)}
+    assert [link for link in links if not link.exists()] == []
+    assert not any(re.search(r'<(script|img|link)\b[^>]*(src|href)="(https?:)?//', text) for text in pages.values())
+    assert all("<math" in pages[site / f"docs/{name}.html"] for name in ("losses", "dynamics"))
+    assert not any("\\frac" in pages[path] for path in site.glob("docs/*.html"))
+    tasks = {name: task for name, task in TASKS.items() if task.__module__.startswith("torchrl_quad.")}
+    shown = {name: inspect.signature(task).parameters for name, task in tasks.items()}
+    shown["_api/torchrl_quad.objectives.ABPTLoss"] = ["zero_step_return", "clip_action_gradient"]  # the last, of a base
+    for name, arguments in shown.items():
+        text = pages[site / f"docs/{name}.html"]
+        for form in ("<strong>{}</strong>", '<span class="pre">{}</span>'):  # described, and in the signature
+            assert [argument for argument in arguments if form.format(argument) not in text] == [], name
+
+
+def look_at(site, browser):
+    """Open the pages without a network, as a reader with a small screen does. One listing stands for all of them."""
+    wrong = []
+    page = browser.new_context(offline=True, viewport=SCREEN).new_page()
+    page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("request", lambda r: None if r.url.startswith("file://") else wrong.append(r.url))
+    listings = [path for path in site.rglob("*.html") if path.relative_to(site).parts[0] in LISTINGS]
+    assert {path.relative_to(site).parts[0] for path in listings} == set(LISTINGS)
+    for path in {*site.rglob("*.html")} - {*listings[1:], site / "index.html"}:
+        name = str(path.relative_to(site))
+        page.goto(path.as_uri())
+        width, height, cut = page.evaluate(MEASURE)
+        if width > SCREEN["width"]:
+            wrong.append(f"{name}: scrolls to the side")
+        if height > 6 * SCREEN["height"] and name not in LONG and path not in listings:
+            wrong.append(f"{name}: {height} pixels long, which is more than six screens")
+        wrong += [f"{name}: wider than its column: {text}" for text in cut if path not in listings]
+    page.goto((site / "index.html").as_uri())
+    page.wait_for_url("**/docs/index.html")
+    page.context.close()
+    assert not wrong, "\n".join(sorted(wrong))
 
 
 def test_the_reference_begins_with_a_table_of_what_the_package_exports():
-    (table,) = re.findall(r"\.\. autosummary::\n\n((?:   \w+\n)+)", (ROOT / "docs/api.md").read_text())
+    (table,) = re.findall(r"\.\. autosummary::\n.*\n\n((?:   \w+\n)+)", (ROOT / "docs/api.md").read_text())
     assert sorted(table.split()) == sorted(importlib.import_module("torchrl_quad").__all__)
 
 
-@pytest.mark.parametrize("page", ["docs/examples.md", "examples/README.md"])
-def test_every_example_is_shown(page):
-    text = (ROOT / page).read_text()
+def test_every_example_is_listed():
+    text = (ROOT / "examples/README.md").read_text()
     assert {example.name for example in EXAMPLES} == set(re.findall(r"\d\d_\w+\.py", text))
 
 
@@ -119,15 +176,16 @@ def code(page, language):
     return [(line, content) for kind, line, content in blocks(page.read_text()) if kind == language]
 
 
-def files(page):
-    """The programs of a page that stand in files, by the name in their first line."""
-    return {content.split()[1]: content for _, content in code(page, "python") if re.match(r"# \w+\.py\n", content)}
+def files():
+    """The programs of the pages on writing that stand in files, by the name in their first line."""
+    programs = [content for page in ROOT.glob("docs/writing*.md") for _, content in code(page, "python")]
+    return {content.split()[1]: content for content in programs if re.match(r"# \w+\.py\n", content)}
 
 
 @pytest.fixture
 def importable(tmp_path, monkeypatch):
-    """Python finds the files of docs/writing.md, as in the folder in which they are saved."""
-    for name, content in files(ROOT / "docs/writing.md").items():
+    """Python finds the files of the pages on writing, as in the folder in which they are saved."""
+    for name, content in files().items():
         (tmp_path / name).write_text(content)
         monkeypatch.delitem(sys.modules, name.removesuffix(".py"), raising=False)
     monkeypatch.syspath_prepend(tmp_path)
@@ -146,7 +204,7 @@ def test_nothing_escapes_these_tests_behind_another_name(page):
 def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch, importable):
     lines = []  # the code, on the same lines as in the page
     for line, content in code(page, "python"):
-        if content in files(page).values():
+        if content in files().values():
             continue  # the others import it, or test_own_tasks.py does
         lines += [""] * (line - len(lines)) + content.splitlines()
     program = tmp_path / f"{page.stem}.py"
@@ -206,6 +264,8 @@ def installs(words):
         word = words.pop(0)
         if word in ("--constraint", "-c"):
             assert (ROOT / words.pop(0)).is_file()
+        elif word.endswith(".whl"):
+            assert word == f"torchrl_quad-{version('torchrl_quad')}-py3-none-any.whl"
         elif word not in ("--editable", "-e"):
             wanted = Requirement(re.sub(r"^\.(?=\[|$)", "torchrl_quad", word))
             assert wanted.name in known and wanted.extras <= set(extras)

@@ -2,8 +2,8 @@
 
 python recipes/trial/results.py
 
-Reads docs/results/data, draws into docs/results, and fills in the generated blocks of docs/results.md and README.md.
-With --data it reads another folder and makes a page there.
+Reads docs/results/data, draws into docs/results, and fills in the generated blocks of docs/results.md and
+docs/results_data.md. With --data it reads another folder and makes one page there.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ END = "<!-- end -->"
 
 
 def blocks(data: Path) -> dict[str, str]:
-    """Make the generated blocks of docs/results.md, by name."""
+    """Make the generated blocks of the pages, by name."""
     results = Results(data)
     verdicts, published = try_all(data)
     finals = results.all_finals
@@ -155,7 +155,8 @@ def main() -> None:
     results = Results(data)
     for name, figure in FIGURES.items():
         draw(results, docs / f"results/{name}.png", *figure)
-    fill(docs / "results.md", blocks(data))
+    for page in ("results.md", "results_data.md") if shipped else ("results.md",):
+        fill(docs / page, blocks(data))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The tables of docs/results.md and README.md, in Markdown, made of the results and of the recipes' configuration."""
+"""The tables of the trial's pages and of README.md, in Markdown, made of the results and the recipes' configuration."""
 
 from __future__ import annotations
 

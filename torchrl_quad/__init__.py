@@ -1,5 +1,7 @@
 """Differentiable quadrotor tasks and first-order policy losses for TorchRL."""
 
+import inspect
+
 import gymnasium
 
 from torchrl_quad.data import ObservationNormalizer, VisitedStateBuffer, differentiable_rollout, restart
@@ -50,7 +52,8 @@ def register_envs() -> None:
         name = f"torchrl_quad/{task.capitalize()}-v0"
         if name not in gymnasium.registry:
             classes = {"entry_point": "torchrl_quad.gym:GymEnv", "vector_entry_point": "torchrl_quad.gym:GymVectorEnv"}
-            gymnasium.register(name, **classes, kwargs={"task": task})
+            limit = inspect.signature(TASKS[task]).parameters["max_episode_steps"].default
+            gymnasium.register(name, **classes, max_episode_steps=limit, kwargs={"task": task})
 
 
 register_envs()

@@ -20,7 +20,7 @@ from test_recipes import RECIPES, ROOT, SMALL, run
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
 PAGES += sorted(ROOT.glob("docs/*.md"))
-PARTS = ("data", "dynamics", "engine", "envs", "modules", "objectives", "render")
+PARTS = ("adapters", "data", "dynamics", "engine", "envs", "modules", "objectives", "render")
 PUBLIC = ["torchrl_quad", *(f"torchrl_quad.{part}" for part in PARTS)]
 # Blocks that are not run: text, data, and Sphinx's directives, except those that hold code.
 NOT_RUN = re.compile(r"(|text|yaml|\{(?!code|sourcecode)[\w-]+\}.*)")

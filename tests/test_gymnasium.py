@@ -15,7 +15,7 @@ import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence, data_shares_objects
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import PassiveEnvChecker, RenderCollection, TimeLimit
+from gymnasium.wrappers import PassiveEnvChecker, RenderCollection
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 from torchrl import envs as torchrl_envs
 
@@ -95,23 +95,6 @@ def test_an_episode_under_the_passive_checker_warns_of_nothing(task):
     assert info["metrics"]
     env.close()
     env.close()
-
-
-def test_the_time_limit_is_the_task_s_own():
-    assert not any(isinstance(env, TimeLimit) for env in wrappers(gymnasium.make(HOVERING)))
-    envs = gymnasium.make_vec(HOVERING, num_envs=2, max_episode_steps=3)
-    for env, actions in ((GymEnv("hovering", max_episode_steps=3), np.zeros(4)), (envs, np.zeros((2, 4)))):
-        env.reset()
-        assert [np.all(env.step(actions)[3]) for _ in range(3)] == [False, False, True]
-    shorter = gymnasium.make(HOVERING, max_episode_steps=2)
-    shorter.reset()
-    assert [shorter.step(np.zeros(4))[3] for _ in range(2)] == [False, True]
-
-
-def wrappers(env):
-    while isinstance(env, gymnasium.Wrapper):
-        yield env
-        env = env.env
 
 
 def test_torchrl_can_wrap_the_gymnasium_environment():

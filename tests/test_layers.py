@@ -24,6 +24,7 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "files": set(),
     "diagnostics": {"data", "objectives"},
     "gym": {"envs"},
+    "adapters": set(),
 }
 # Imports within a function: of what needs an optional package, and of gymnasium's ids, which name all tasks.
 EXCEPTIONS = {("torchrl_quad.envs.base", "torchrl_quad.render.frames"), ("torchrl_quad.envs.registry", "torchrl_quad")}
@@ -41,6 +42,7 @@ LIBRARIES = {
     "files": set(),
     "diagnostics": TORCHRL,
     "gym": {"gymnasium", "numpy", "torch"},
+    "adapters": TORCHRL | {"gymnasium", "numpy", "rsl_rl", "skrl", "stable_baselines3"},
 }
 
 

@@ -67,7 +67,8 @@ __all__ = [
 
 
 _PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "diagnostics")
-_TASKS = ("hovering", "landing", "racing", "tracking")  # the names of ``envs.TASKS``, which need no torch
+# The tasks that ship, and their control steps: what gymnasium registers needs no torch.
+_TASKS = {"hovering": 256, "landing": 256, "racing": 512, "tracking": 512}
 
 
 def __getattr__(name: str) -> Any:
@@ -99,7 +100,8 @@ def register_envs(*tasks: str) -> None:
         name = f"torchrl_quad/{task.title().replace('_', '')}-v0"
         if name not in gymnasium.registry:
             classes = {"entry_point": "torchrl_quad.gym:GymEnv", "vector_entry_point": "torchrl_quad.gym:GymVectorEnv"}
-            gymnasium.register(name, **classes, kwargs={"task": task})
+            own = {} if task in _TASKS else {"max_episode_steps": None}  # a task of yours ends its episodes itself
+            gymnasium.register(name, **classes, max_episode_steps=_TASKS.get(task), kwargs={"task": task, **own})
 
 
 try:

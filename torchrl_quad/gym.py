@@ -9,6 +9,7 @@ flies all drones in one batch, and needs no processes.
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import gymnasium
@@ -21,17 +22,23 @@ from gymnasium.vector.utils import batch_space
 
 from torchrl_quad.envs import make_env
 
-# An episode ends before an entry of the state, or of the observation, exceeds this.
+# An episode ends before an entry of the state exceeds this, where a task does not know better.
 _LIMIT = 1e6
+_NO_LIMIT = 2**31  # control steps: gymnasium.make has a time limit of its own
+_MANY = 1000  # steps of one drone after which a batch would have been worth its while
 _INFO = "success", "crash", "reward_terms", "metrics"
 
 
 class GymVectorEnv(VectorEnv):
     """All drones of a task in one batched environment: ``gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=64)``.
 
-    Observations are float32 (num_envs, k), actions (num_envs, 4) in [-1, 1] as :class:`~torchrl_quad.envs.QuadrotorEnv`
-    has them, rewards float64 (num_envs). ``info`` holds ``success``, ``crash``, ``reward_terms`` and ``metrics`` by
-    name, each (num_envs), with a mask ``_name`` beside every name as in gymnasium's own vector environments.
+    Observations are float32 (num_envs, k), actions (num_envs, 4) in [-1, 1] as
+    :class:`~torchrl_quad.envs.QuadrotorEnv` has them, rewards float64 (num_envs). ``info`` holds ``success``,
+    ``crash``, ``reward_terms`` and ``metrics`` by name, each (num_envs), with a mask ``_name`` beside every name as in
+    gymnasium's own vector environments.
+
+    Observations are clipped to the bounds of their space: the box of the task, 10 for ten times the quaternion, 50 m/s
+    and 50 rad/s; 1e6 for a task without ``observation_bounds``.
 
     The time limit is the task's ``max_episode_steps``. An episode that has ended begins anew at the next step, which
     ignores the action and has no reward; or in the same step, with ``final_obs`` and ``final_info`` in ``info``; or,
@@ -72,14 +79,16 @@ class GymVectorEnv(VectorEnv):
                 f'Unknown render_mode {render_mode!r}. Choose "rgb_array", for pictures as arrays, or leave it out.'
             )
         self.render_mode = render_mode
+        if kwargs.get("max_episode_steps", 0) is None:  # as the task has it
+            del kwargs["max_episode_steps"]
         self.torchrl_env = make_env(task, num_envs=num_envs, **kwargs)
         if "seed" not in kwargs:
             self.torchrl_env.set_seed(None)
         self.num_envs, self.autoreset_mode = num_envs, AutoresetMode(autoreset_mode)
         fps = round(1 / self.torchrl_env.control_dt)
         self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
-        size = self.torchrl_env.observation_spec["observation"].shape[-1]
-        self.single_observation_space = Box(-_LIMIT, _LIMIT, (size,), np.float32)
+        self._bounds = _bounds(self.torchrl_env)
+        self.single_observation_space = Box(-self._bounds, self._bounds, dtype=np.float32)
         self.single_action_space = Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -101,7 +110,7 @@ class GymVectorEnv(VectorEnv):
         if seed is not None:
             self.torchrl_env.set_seed(seed)
         self._restart(mask)
-        return _observation(self._now), _info(self._now, mask)
+        return self._observe(self._now), _info(self._now, mask)
 
     @torch.no_grad()
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -126,7 +135,7 @@ class GymVectorEnv(VectorEnv):
             info = self._final(after)
             self._restart(self._over)
         everyone = np.ones(self.num_envs, dtype=bool)
-        return _observation(self._now), reward, terminated, truncated, {**info, **_info(self._now, everyone)}
+        return self._observe(self._now), reward, terminated, truncated, {**info, **_info(self._now, everyone)}
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture (336, 336, 3) of each drone, uint8; None without ``render_mode="rgb_array"``.
@@ -156,8 +165,13 @@ class GymVectorEnv(VectorEnv):
         self._now = self.torchrl_env.reset(start, set_state=False)
         self._over = self._over & ~mask
 
+    def _observe(self, outputs: Any) -> np.ndarray:
+        # What is handed out is copied: the next step starts from the same memory.
+        observation = outputs["observation"].numpy(force=True).astype(np.float32)
+        return observation.clip(-self._bounds, self._bounds, out=observation)
+
     def _final(self, after: Any) -> dict[str, Any]:
-        over, last = self._over, _observation(after)
+        over, last = self._over, self._observe(after)
         observations = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(over):
             observations[i] = last[i]
@@ -172,8 +186,11 @@ class GymVectorEnv(VectorEnv):
 class GymEnv(gymnasium.Env):
     """One drone of a task: ``gymnasium.make("torchrl_quad/Hovering-v0")``; see :class:`GymVectorEnv`.
 
-    ``gymnasium.make`` keeps ``max_episode_steps`` for a wrapper of its own, which can end episodes earlier than the
-    task does, and not later: for that write ``GymEnv("hovering", max_episode_steps=1000)``.
+    One drone makes some 460 steps per second; a batch of 1024, ``gymnasium.make_vec``, makes 330 000. A warning says so
+    after a thousand steps.
+
+    The time limit is gymnasium's: ``gymnasium.make`` adds that of the task, or its own ``max_episode_steps``. Built
+    without it, ``GymEnv("hovering")`` flies until ``max_episode_steps``, if given.
 
     Args:
         task: "hovering", "landing", "racing" or "tracking".
@@ -185,12 +202,15 @@ class GymEnv(gymnasium.Env):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
+    _has_warned = False  # once for all that a process builds
 
     def __init__(self, task: str, **kwargs: Any) -> None:
         for name in ("num_envs", "autoreset_mode"):
             if name in kwargs:
                 raise ValueError(f"{name} is for many drones, and GymEnv flies one. Write gymnasium.make_vec instead.")
+        kwargs.setdefault("max_episode_steps", _NO_LIMIT)
         self._drones = GymVectorEnv(task, autoreset_mode=AutoresetMode.DISABLED, **kwargs)
+        self._task, self._steps = task, 0
         self.torchrl_env, self.render_mode = self._drones.torchrl_env, self._drones.render_mode
         self.metadata = {name: self._drones.metadata[name] for name in self.metadata}
         self.observation_space = self._drones.single_observation_space
@@ -207,6 +227,14 @@ class GymEnv(gymnasium.Env):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Fly one control step with an action (4)."""
         observation, *ends, info = self._drones.step(_checked(action, self.action_space.shape)[None])
+        self._steps += 1
+        if self._steps == _MANY and not GymEnv._has_warned:
+            GymEnv._has_warned = True
+            warnings.warn(
+                f"One drone has flown {_MANY} steps, at some 460 per second. A batch flies 330 000: to train, write "
+                f'gymnasium.make_vec("torchrl_quad/{self._task.title().replace("_", "")}-v0", num_envs=1024).',
+                stacklevel=2,
+            )
         return observation[0], *(x.item() for x in ends), _first(info)
 
     def render(self) -> np.ndarray | None:
@@ -234,15 +262,18 @@ def _checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
     return action
 
 
-# What is handed out is copied: the next step starts from the same memory.
-
-
-def _observation(outputs: Any) -> np.ndarray:
-    return np.array(outputs["observation"].numpy(force=True), dtype=np.float32)
+def _bounds(env: Any) -> np.ndarray:
+    """The bounds of the observation (k): the task's, and of the commands on their way those of the action."""
+    size = env.observation_spec["observation"].shape[-1]
+    own, commands = env.observation_bounds(), env.action_delay if env.observe_last_action else 0
+    action = env.action_spec.space.high[0].repeat(commands)
+    if own is None or len(own) + len(action) != size:
+        return np.full(size, _LIMIT, dtype=np.float32)
+    return torch.cat((own, action)).numpy(force=True).astype(np.float32)
 
 
 def _array(x: torch.Tensor) -> np.ndarray:
-    """An entry (n, 1) as (n), float64 as gymnasium has it, or bool."""
+    """An entry (n, 1) as (n), a copy, float64 as gymnasium has it, or bool."""
     return np.array(x.squeeze(-1).numpy(force=True), dtype=bool if x.dtype is torch.bool else np.float64)
 
 

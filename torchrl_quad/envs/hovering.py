@@ -8,7 +8,7 @@ from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
-from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, outside, target_reward
+from torchrl_quad.envs.terms import BODY_BOUNDS, TARGET_WEIGHTS, body_observation, distance, outside, target_reward
 
 
 class HoveringEnv(QuadrotorEnv):
@@ -48,6 +48,9 @@ class HoveringEnv(QuadrotorEnv):
 
     def observe(self, state: State) -> Tensor:
         return torch.cat((state["target"] - state["position"], *body_observation(state)), -1)
+
+    def observation_bounds(self) -> Tensor:
+        return self.tensor((self.box_half_width, self.box_half_width, self.box_height, *BODY_BOUNDS))
 
     def reward_terms(self, state: State) -> State:
         return target_reward(state, self.weights)

@@ -10,7 +10,7 @@ from torchrl_quad.envs.episodes import at_episode_end
 from torchrl_quad.envs.events import Event, ball_entry, level_crossing
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
 from torchrl_quad.envs.shapes import Shape
-from torchrl_quad.envs.terms import body_observation, norm, outside
+from torchrl_quad.envs.terms import BODY_BOUNDS, body_observation, norm, outside
 
 
 class LandingEnv(QuadrotorEnv):
@@ -68,6 +68,9 @@ class LandingEnv(QuadrotorEnv):
 
     def observe(self, state: State) -> Tensor:
         return torch.cat((state["target"] - state["position"], *body_observation(state)), -1)
+
+    def observation_bounds(self) -> Tensor:
+        return self.tensor((self.box_half_width, self.box_half_width, self.box_height, *BODY_BOUNDS))
 
     def reward_terms(self, state: State) -> State:
         scale = state["position"][..., 2:].detach().clamp(0.05, 1.0)

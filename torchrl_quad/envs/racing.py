@@ -16,7 +16,15 @@ from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.envs.events import Event, ball_entry
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
-from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, norm, outside, target_reward
+from torchrl_quad.envs.terms import (
+    BODY_BOUNDS,
+    TARGET_WEIGHTS,
+    body_observation,
+    distance,
+    norm,
+    outside,
+    target_reward,
+)
 
 WEIGHTS = {  # of the reward's terms, by reward
     "position": {**TARGET_WEIGHTS, "gate": 20.0},
@@ -172,6 +180,10 @@ class RacingEnv(QuadrotorEnv):
         after = self.gates[(state["gate"][:, 0] + 1) % len(self.gates)]
         relative = [gate - state["position"] for gate in (state["target"], after)]
         return torch.cat((*relative, *body_observation(state)), -1)
+
+    def observation_bounds(self) -> Tensor:
+        width, depth = (2.0 * self.half_width).tolist()  # from one side of the box to the other
+        return self.tensor((*2 * (width, depth, self.ceiling), *BODY_BOUNDS))
 
     def reward_terms(self, state: State) -> State:
         gap = distance(state)

@@ -93,6 +93,13 @@ class Task(abc.ABC):
         """The least and the greatest value of the task's own entries; states beyond them cannot be restored."""
         return {}
 
+    def observation_bounds(self) -> Tensor | None:
+        """The greatest magnitude (k) of each entry of :meth:`observe` in a useful flight; None where nobody knows it.
+
+        gymnasium's observation spaces have these bounds, and its observations are clipped to them.
+        """
+        return None
+
     def scenery(self) -> Scenery:
         """The things that pictures show beside the drones."""
         return Scenery()

@@ -35,6 +35,10 @@ def body_observation(state: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     return 10 * state["quaternion"], state["velocity"], state["angular_velocity"]
 
 
+# Magnitudes of the above that no useful flight exceeds: the quaternion's are exact.
+BODY_BOUNDS = (*4 * (10.0,), *3 * (50.0,), *3 * (50.0,))  # velocity in m/s, angular velocity in rad/s
+
+
 def target_reward(state: dict[str, Tensor], weights: dict[str, float]) -> dict[str, Tensor]:
     """The terms of "be at the target, level and still", each (*, 1): ``survival``, and four penalties."""
     level = quaternion.identity(state["quaternion"])

@@ -12,7 +12,15 @@ from torch import Tensor
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
-from torchrl_quad.envs.terms import TARGET_WEIGHTS, body_observation, distance, norm, outside, target_reward
+from torchrl_quad.envs.terms import (
+    BODY_BOUNDS,
+    TARGET_WEIGHTS,
+    body_observation,
+    distance,
+    norm,
+    outside,
+    target_reward,
+)
 
 Curve = Callable[[Tensor], Tensor]
 
@@ -145,6 +153,10 @@ class TrackingEnv(QuadrotorEnv):
     def observe(self, state: State) -> Tensor:
         points = self.curve(state["phase"] + self.ahead) - state["position"].unsqueeze(1)
         return torch.cat((points.flatten(1), *body_observation(state)), -1)
+
+    def observation_bounds(self) -> Tensor:
+        width, depth = (2.0 * self.half_width).tolist()  # from one side of the box to the other
+        return self.tensor((*self.lookahead * (width, depth, self.ceiling), *BODY_BOUNDS))
 
     def reward_terms(self, state: State) -> State:
         return target_reward(state, self.weights)

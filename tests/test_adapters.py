@@ -1,0 +1,149 @@
+"""The tasks in other frameworks, each tried with the real package."""
+
+import importlib
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from rsl_rl.runners import OnPolicyRunner
+from skrl.agents.torch.ppo import PPO
+from skrl.memories.torch import RandomMemory
+from skrl.trainers.torch import SequentialTrainer
+from skrl.utils.model_instantiators.torch import deterministic_model, gaussian_model
+from stable_baselines3 import PPO as StablePPO
+from stable_baselines3.common.vec_env import VecMonitor
+from torchrl.envs import RewardScaling, TransformedEnv
+
+from torchrl_quad import HoveringEnv, adapters, make_env
+from torchrl_quad.adapters import DronesVecEnv, RslRlVecEnv, SkrlEnv, TorchVectorEnv
+
+NETWORK = {"class_name": "MLPModel", "hidden_dims": [8]}
+RSL_RL = {
+    "num_steps_per_env": 8,
+    "save_interval": 1,
+    "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+    "algorithm": {"class_name": "PPO"},
+    "actor": {**NETWORK, "distribution_cfg": {"class_name": "GaussianDistribution"}},
+    "critic": NETWORK,
+}
+
+
+def scattered(num_envs=8, **options):
+    """Drones that crash at different times, and a time limit."""
+    start = {"tilt": 3.0, "velocity": 20.0}
+    return make_env("racing", num_envs=num_envs, seed=3, max_episode_steps=12, random_start=start, **options)
+
+
+def test_a_torch_loop_flies_as_the_torchrl_environment_does():
+    env, reference = TorchVectorEnv(scattered()), scattered()
+    (observation, info), td, ended = env.reset(), reference.reset(), set()
+    assert info == {}
+    for action in torch.randn(40, 8, 4):  # beyond the bounds, too
+        assert torch.equal(observation, td["observation"])
+        observation, reward, terminated, truncated, info = env.step(action)
+        flown, td = reference.step_and_maybe_reset(td.set("action", action.clamp(-1, 1)))
+        end = flown["next"]
+        assert torch.equal(info["final_obs"], end["observation"])
+        for mine, its in ((reward, "reward"), (terminated, "terminated"), (truncated, "truncated")):
+            assert torch.equal(mine, end[its].squeeze(-1))
+        assert torch.equal(info["crash"], end["crash"].squeeze(-1))
+        torch.testing.assert_close(sum(info["reward_terms"].values()), reward)
+        ended.add((terminated | truncated).sum().item())
+    assert len(ended) > 3
+    assert torch.equal(env.reset(seed=5)[0], env.reset(seed=5)[0])
+
+
+def test_a_torch_loop_sees_what_transforms_make_of_a_task():
+    plain, scaled = (TorchVectorEnv(env) for env in (scattered(), TransformedEnv(scattered(), RewardScaling(0.0, 2.0))))
+    for env in (plain, scaled):
+        env.reset()
+    action = torch.zeros(8, 4)
+    torch.testing.assert_close(scaled.step(action)[1], 2 * plain.step(action)[1])
+
+
+def test_the_runner_of_rsl_rl_trains_logs_saves_and_loads(tmp_path, capsys):
+    task = HoveringEnv(num_envs=8, seed=0, max_episode_steps=10, action_delay=0)
+    env = RslRlVecEnv(task)
+    runner = OnPolicyRunner(env, RSL_RL, str(tmp_path))
+    before = [x.clone() for x in runner.alg.actor.parameters()]
+    runner.learn(3, init_at_random_ep_len=True)
+    assert any((x != y).any() for x, y in zip(before, runner.alg.actor.parameters(), strict=True))
+    assert "Episode/position_error" in capsys.readouterr().out
+    runner.load(str(tmp_path / "model_2.pt"))
+    assert runner.get_inference_policy()(env.get_observations()).shape == (8, 4)
+    # It flew in inference mode, and the same task still gives gradients.
+    action = torch.zeros(8, 4, requires_grad=True)
+    reward = task.step(env.drones.now.set("action", action))["next", "reward"]
+    assert torch.autograd.grad(reward.sum(), action)[0].abs().sum() > 0
+
+
+def test_rsl_rl_is_told_which_episodes_the_time_limit_has_ended():
+    env = RslRlVecEnv(HoveringEnv(num_envs=3, seed=0, max_episode_steps=10))
+    env.episode_length_buf = torch.tensor([0, 9, 0])
+    env.drones.now["state", "position"][2, 2] = -1.0  # underground
+    _, _, done, extras = env.step(torch.zeros(3, 4))
+    assert done.tolist() == [False, True, True]
+    assert extras["time_outs"].tolist() == [False, True, False]
+    assert extras["log"]["Episode/crash"] == 0.5
+    assert env.episode_length_buf.tolist() == [1, 0, 0]
+
+
+def test_ppo_of_skrl_trains(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    env = SkrlEnv(HoveringEnv(num_envs=8, seed=0, max_episode_steps=10))
+    spaces = {"observation_space": env.observation_space, "action_space": env.action_space, "device": env.device}
+    network = [{"name": "layer", "input": "OBSERVATIONS", "layers": [8], "activations": "tanh"}]
+    policy = gaussian_model(**spaces, network=network, output="ACTIONS")
+    value = deterministic_model(**spaces, network=network, output="ONE")
+    for model in (policy, value):
+        model.init_state_dict()
+    before = [x.clone() for x in policy.parameters()]
+    memory = RandomMemory(memory_size=8, num_envs=8, device=env.device)
+    config = {"rollouts": 8, "time_limit_bootstrap": True}
+    agent = PPO(models={"policy": policy, "value": value}, memory=memory, cfg=config, **spaces)
+    SequentialTrainer(env=env, agents=agent, cfg={"timesteps": 24, "close_environment_at_exit": False}).train()
+    assert all((x != y).any() for x, y in zip(before, policy.parameters(), strict=True))
+    observation, reward, terminated, truncated, _ = env.step(torch.zeros(8, 4))
+    assert observation.shape == (8, 13)
+    assert reward.shape == terminated.shape == truncated.shape == (8, 1)
+
+
+def test_stable_baselines3_counts_successes_and_ends():
+    options = {"num_envs": 2, "max_episode_steps": 3, "autoreset_mode": "SameStep", "render_mode": "rgb_array"}
+    drones = gymnasium.make_vec("torchrl_quad/Hovering-v0", **options)
+    state = drones.torchrl_env.reset()["state"].clone()
+    state["position"][0], state["position"][1] = state["target"][0], torch.tensor([1.0, 0.0, 0.5])
+    drones.torchrl_env.set_initial_state_source(lambda n: state.clone())
+    env = DronesVecEnv(drones)
+    env.reset()
+    hover = np.tile(drones.torchrl_env.hover_action.numpy(), (2, 1))
+    infos = [env.step(hover)[3] for _ in range(3)]
+    assert infos[0] == [{}, {}]
+    assert [info["is_success"] for info in infos[2]] == [True, False]
+    assert all(info["TimeLimit.truncated"] for info in infos[2])
+    np.testing.assert_allclose(infos[2][0]["terminal_observation"][:4], [0, 0, 0, 10], atol=0.1)
+    assert [picture.shape for picture in env.get_images()] == 2 * [(336, 336, 3)]
+    ppo = StablePPO("MlpPolicy", VecMonitor(env), n_steps=8, batch_size=16, n_epochs=1, device="cpu").learn(16)
+    assert ppo.ep_success_buffer
+    with pytest.raises(NotImplementedError, match="share 'x'"):
+        env.set_attr("x", 1)
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match=r"'NextStep', and stable-baselines3 .* autoreset_mode=\"SameStep\""):
+        DronesVecEnv(gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=2))
+    with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
+        TorchVectorEnv(scattered()).step(torch.zeros(8, 4))
+    with pytest.raises(AttributeError, match="no 'Rllib'. Choose from: DronesVecEnv, "):
+        adapters.Rllib  # noqa: B018
+
+
+@pytest.mark.parametrize("package", ["rsl_rl", "skrl", "stable_baselines3"])
+def test_a_missing_package_is_named_with_what_installs_it(package, monkeypatch):
+    monkeypatch.delitem(sys.modules, f"torchrl_quad.adapters.{package}")
+    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ImportError, match=r'needs .*: pip install "torchrl_quad\[adapters\]"'):
+        importlib.import_module(f"torchrl_quad.adapters.{package}")

@@ -1,0 +1,62 @@
+"""A task for skrl."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gymnasium import Space
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_quad.adapters.torch_vector import TorchVectorEnv
+
+try:
+    from skrl.envs.wrappers.torch import Wrapper
+except ImportError as error:
+    raise ImportError('SkrlEnv needs skrl: pip install "torchrl_quad[adapters]"') from error
+
+
+class SkrlEnv(Wrapper):
+    """An environment of skrl: ``SequentialTrainer(env=SkrlEnv(HoveringEnv(num_envs=512)), agents=agent, cfg=...)``.
+
+    It takes the place of skrl's ``wrap_env``. Rewards and ends are (num_envs, 1); ``info`` is that of
+    :class:`~torchrl_quad.adapters.TorchVectorEnv`, whose episodes begin anew in the step in which they end.
+
+    Args:
+        env: as for :class:`~torchrl_quad.adapters.TorchVectorEnv`; a task, or transforms around one.
+
+    Raises:
+        ImportError: skrl is missing.
+    """
+
+    def __init__(self, env: EnvBase) -> None:
+        super().__init__(TorchVectorEnv(env))
+
+    @property
+    def observation_space(self) -> Space:
+        """That of one drone."""
+        return self._env.single_observation_space
+
+    @property
+    def action_space(self) -> Space:
+        """That of one drone."""
+        return self._env.single_action_space
+
+    def reset(self) -> tuple[Tensor, dict[str, Any]]:
+        """Begin an episode with all drones: observations (num_envs, k), and ``info``."""
+        return self._env.reset()
+
+    def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Fly one control step with actions (num_envs, 4)."""
+        observation, *ends, info = self._env.step(actions)
+        return observation, *(x.unsqueeze(-1) for x in ends), info
+
+    def state(self) -> None:
+        """No state beside the observation."""
+
+    def render(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing: trainers call it at each step. ``env.torchrl_env.render()`` draws."""
+
+    def close(self) -> None:
+        """Close the TorchRL environment."""
+        self._env.close()

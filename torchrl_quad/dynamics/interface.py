@@ -13,7 +13,8 @@ from torchrl_quad.dynamics.parameters import QuadrotorParams
 class Dynamics(Protocol):
     """A model of a drone with its flight controller: state, limits, and one control step in two array forms.
 
-    It is built as ``Model(nominal, dt, substeps, integrator)``, and again when an environment moves to another device.
+    It is built as ``Model(nominal, dt, substeps, integrator)``, and again when an environment moves to another device. A
+    model whose actions can command different things takes ``control`` as well.
     :class:`~torchrl_quad.dynamics.Quadrotor` and :class:`~torchrl_quad.dynamics.PointMass` are the examples.
     """
 
@@ -33,6 +34,9 @@ class Dynamics(Protocol):
 
     hover_action: Tensor
     """The action (4) that holds the nominal drone where it is; (num_envs, 4) where drones differ in it."""
+
+    action_units: dict[str, str]
+    """The names of what the four entries of an action command, and the unit of each. A model may leave this out."""
 
     substeps: int
     """Physics steps in a control step."""

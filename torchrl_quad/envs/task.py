@@ -120,6 +120,11 @@ class Task(abc.ABC):
         return self.dynamics.hover_action
 
     @property
+    def action_units(self) -> dict[str, str]:
+        """The names of what the four entries of an action command, and the unit of each: ``{"thrust": "N", ...}``."""
+        return getattr(self.dynamics, "action_units", dict.fromkeys("0123", ""))
+
+    @property
     def neutral_action(self) -> Tensor:
         """The action that a new policy starts from, which hovers."""
         return self.hover_action

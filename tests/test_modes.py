@@ -7,17 +7,20 @@ import torch
 from torch import Tensor
 
 from torchrl_quad import HoveringEnv, available_drones, load_drone
-from torchrl_quad.dynamics import CONTROLS, quaternion
+from torchrl_quad.dynamics import CONTROLS, DYNAMICS, quaternion
 from torchrl_quad.gym import GymVectorEnv
 
 F64 = torch.float64
 each_mode = pytest.mark.parametrize("control", CONTROLS)
 each_drone = pytest.mark.parametrize("drone", available_drones())
+each_flight = pytest.mark.parametrize(
+    ("drone", "dynamics"), [*((name, "quadrotor") for name in available_drones()), ("visfly", "point_mass")]
+)
 
 
 def commanded(steps, *commands, control, drone="visfly", **options):
     """Fly the dynamics from rest, one drone for each command in physical units; returns the states after each step."""
-    env = HoveringEnv(num_envs=len(commands), control=control, drone=drone, dtype=F64, **options)
+    env = HoveringEnv(num_envs=len(commands), control=control, drone=drone, dt=0.01, dtype=F64, **options)
     action = env.dynamics.controller.encode(torch.tensor(commands, dtype=F64))
     state, states = env.dynamics.rest(torch.zeros(len(commands), 3, dtype=F64)), []
     for _ in range(steps):
@@ -34,8 +37,7 @@ def roll_pitch_yaw(q: Tensor) -> Tensor:
     return torch.stack((roll, torch.asin(2 * (w * y - z * x)), yaw), -1)
 
 
-@each_drone
-@pytest.mark.parametrize("dynamics", ["quadrotor", "point_mass"])
+@each_flight
 def test_roll_leans_right_pitch_leans_forward_and_yaw_turns_left(drone, dynamics):
     weight, rate = 9.81 * load_drone(drone).mass.item(), 0.3
     commands = [[weight, 0.4, 0, 0], [weight, 0, 0.4, 0], [weight, 0.3, -0.2, 0], [weight, 0, 0, rate]]
@@ -48,8 +50,7 @@ def test_roll_leans_right_pitch_leans_forward_and_yaw_turns_left(drone, dynamics
     assert angles[3, :2].abs().max() < 1e-3
 
 
-@each_drone
-@pytest.mark.parametrize("dynamics", ["quadrotor", "point_mass"])
+@each_flight
 def test_every_drone_flies_within_5_percent_of_a_commanded_velocity(drone, dynamics):
     commands = [[2.0, 0, 0, 0], [-1.0, 0, 0, 0], [0, 2.5, 0, 0.3], [0, 0, 1.0, 0], [0, 0, -1.0, 0], [1.5, -1.5, 0.5, 0]]
     states = commanded(150, *commands, control="velocity", drone=drone, dynamics=dynamics)
@@ -93,7 +94,7 @@ def test_the_hover_action_hovers_and_is_the_command_that_it_stands_for(control, 
 def test_flights_have_exact_derivatives_with_delay_and_random_drones(control):
     options = {"action_delay": 2, "randomize": {"mass": {"scale": [0.8, 1.2]}}, "wind": {"gust": 0.5}}
     start = {"tilt": 0.5, "velocity": 1.0, "angular_velocity": 1.0}
-    env = HoveringEnv(num_envs=2, control=control, dtype=F64, random_start=start, **options)
+    env = HoveringEnv(num_envs=2, control=control, dtype=F64, dt=0.01, random_start=start, **options)
     actions = (env.hover_action + 0.2 * torch.randn(2, 8, 4, dtype=F64)).requires_grad_()
     drag = env.nominal.linear_drag.clone().requires_grad_()
 
@@ -110,6 +111,20 @@ def test_flights_have_exact_derivatives_with_delay_and_random_drones(control):
     grads = torch.autograd.grad(outputs(actions, drag).sum(), actions)[0]
     assert (grads[:, :6] != 0).any(-1).all() and (grads[:, 6:] == 0).all()  # the last two are still on their way
     assert torch.autograd.gradcheck(outputs, (actions, drag), fast_mode=True, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("control", "dynamics"),
+    [*((name, "quadrotor") for name in CONTROLS), ("attitude", "point_mass"), ("velocity", "point_mass")],
+)
+def test_the_step_that_is_compiled_is_the_eager_step(control, dynamics):
+    env = HoveringEnv(num_envs=50, control=control, dynamics=dynamics, dtype=F64, dt=0.02)
+    model, action = env.dynamics, 1.2 * (2 * torch.rand(50, 4, dtype=F64) - 1)
+    state = {name: x + 0.5 * torch.randn_like(x) for name, x in model.rest(torch.zeros(50, 3, dtype=F64)).items()}
+    state["quaternion"] = quaternion.normalize(state["quaternion"])
+    after = model.control_step(state, action, env.nominal, None)
+    rows = model.rows_step()(torch.cat([x.t() for x in state.values()]), model.setpoint_rows(action), (), ())
+    torch.testing.assert_close(rows.t(), torch.cat([after[name] for name in state], 1), rtol=1e-9, atol=1e-9)
 
 
 @each_mode
@@ -133,18 +148,25 @@ def test_limits_can_be_chosen_and_gymnasium_takes_them():
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("control", "message"),
     [
-        ({"control": "thrust"}, "Unknown control 'thrust'. Choose from: rates, attitude, rotor_thrusts, velocity; or"),
-        ({"control": {"max_tilt": 0.5}}, r"control=\{'max_tilt': 0.5\} names no mode. Choose from: rates, "),
-        ({"control": None}, "control=None names no mode"),
-        ({"control": {"mode": "attitude", "max_speed": 1.0}}, "'attitude' has no limit 'max_speed'. Choose from: max_tilt"),
-        ({"control": {"mode": "rates", "max_tilt": 1.0}}, "'rates' has no limit 'max_tilt'. It has none; those of the"),
-        ({"control": {"mode": "attitude", "max_tilt": 30}}, "max_tilt must be an angle in rad between 0 and 1.571, got 30"),
-        ({"control": {"mode": "velocity", "max_speed": "5"}}, "max_speed must be a speed in m/s between 0 and 100, got '5'"),
-        ({"control": "rotor_thrusts", "dynamics": "point_mass"}, 'has no rotors, so control="rotor_thrusts" commands noth'),
+        ("thrust", "Unknown control 'thrust'. Choose from: rates, attitude, rotor_thrusts, velocity; or"),
+        ({"max_tilt": 0.5}, r"control=\{'max_tilt': 0.5\} names no mode. Choose from: rates, "),
+        (None, "control=None names no mode"),
+        ({"mode": "attitude", "max_speed": 1.0}, "'attitude' has no limit 'max_speed'. Choose from: max_tilt"),
+        ({"mode": "rates", "max_tilt": 1.0}, "'rates' has no limit 'max_tilt'. It has none; those of the drone hold"),
+        ({"mode": "attitude", "max_tilt": 30}, "max_tilt must be an angle in rad between 0 and 1.571, got 30"),
+        ({"mode": "velocity", "max_speed": "5"}, "max_speed must be a speed in m/s between 0 and 100, got '5'"),
     ],
-)  # fmt: skip
-def test_a_mode_that_makes_no_sense_is_refused(options, message):
+)
+def test_a_mode_or_a_limit_that_makes_no_sense_is_refused(control, message):
     with pytest.raises(ValueError, match=message):
-        HoveringEnv(num_envs=1, **options)
+        HoveringEnv(num_envs=1, control=control)
+
+
+def test_models_without_rotors_or_without_modes_refuse_them(monkeypatch):
+    with pytest.raises(ValueError, match='"point_mass" has no rotors, so control="rotor_thrusts" commands nothing'):
+        HoveringEnv(num_envs=1, control="rotor_thrusts", dynamics="point_mass")
+    monkeypatch.setitem(DYNAMICS, "own", lambda nominal, dt, substeps, integrator: None)
+    with pytest.raises(ValueError, match="'own' takes no control: .* Leave out control='velocity'"):
+        HoveringEnv(num_envs=1, control="velocity", dynamics="own")

@@ -53,8 +53,8 @@ class FlightController:
     setpoint_type, setpoint_sizes = Setpoint, (1, 3)
     # Of its tensors, those that each physics step reads.
     constants: tuple[str, ...] = (
-        "thrust_min", "thrust_max", "gain", "tiny", "share", "per_share", "middle", "half_span", "yaw_share", "yaw_sign",
-        "yaw_reach",
+        "thrust_min", "thrust_max", "gain", "tiny", "share", "per_share", "middle", "half_span",
+        "yaw_share", "yaw_sign", "yaw_reach",
     )  # fmt: skip
 
     def __init__(self, nominal: QuadrotorParams) -> None:

@@ -13,8 +13,8 @@ from torchrl_quad.dynamics.parameters import QuadrotorParams
 class Dynamics(Protocol):
     """A model of a drone with its flight controller: state, limits, and one control step in two array forms.
 
-    It is built as ``Model(nominal, dt, substeps, integrator)``, and again when an environment moves to another device. A
-    model whose actions can command different things takes ``control`` as well.
+    It is built as ``Model(nominal, dt, substeps, integrator)``, and again when an environment moves to another device.
+    A model with a choice of what actions command takes ``control`` as well.
     :class:`~torchrl_quad.dynamics.Quadrotor` and :class:`~torchrl_quad.dynamics.PointMass` are the examples.
     """
 

@@ -118,8 +118,7 @@ class Quadrotor:
         return after._asdict()
 
     def setpoint_rows(self, action: Tensor) -> Tensor:
-        """What an action (n, 4) asks of the controller, as rows (k, n): of ``control="rates"``, thrust [N] and body rates
-        [rad/s]."""
+        """What an action (n, 4) asks of the controller, as rows (k, n)."""
         return torch.cat([x.t() for x in self.controller.setpoint(action)])
 
     def rows_step(self) -> Callable[..., Tensor]:

@@ -45,8 +45,8 @@ class QuadrotorEnv(Task, EnvBase):
             give each of several copies its own, as in ParallelEnv.
         drone: name of a preset, path of a YAML file, mapping, or :class:`~torchrl_quad.QuadrotorParams`.
         dynamics: "quadrotor", or "point_mass", whose thrust and body rates follow the action at once.
-        control: what an action (4) in [-1, 1] commands: "rates" (thrust and body rates), "attitude" (thrust, roll, pitch
-            and yaw rate), "rotor_thrusts", "velocity" (and yaw rate), or a mapping with limits: ``docs/dynamics.md``.
+        control: what an action (4) in [-1, 1] commands: "rates" (thrust, body rates), "attitude" (thrust, roll, pitch,
+            yaw rate), "rotor_thrusts", "velocity" (and yaw rate), or a mapping with limits; see ``docs/dynamics.md``.
         dt: physics step [s].
         control_dt: control step [s], a whole multiple of dt.
         action_delay: control steps between an action and its effect.

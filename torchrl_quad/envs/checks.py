@@ -279,8 +279,8 @@ def check_action(action: Tensor | None, like: Tensor) -> None:
     if action is None or action.shape != (len(like), 4):
         got = "there is none" if action is None else f"got {tuple(action.shape)}"
         raise ValueError(
-            f"The action must have shape ({len(like)}, 4), the entries of env.action_units for each environment; {got}. "
-            'A policy writes it under "action", as make_actor(env) does.'
+            f"The action must have shape ({len(like)}, 4), named in env.action_units, for each environment; {got}. A "
+            'policy writes it under "action", as make_actor(env) does.'
         )
     if action.device != like.device:
         raise ValueError(f"The action is on {action.device}, and the environment on {like.device}.")

@@ -36,7 +36,7 @@ class Dynamics(Protocol):
     """The action (4) that holds the nominal drone where it is; (num_envs, 4) where drones differ in it."""
 
     action_units: dict[str, str]
-    """The names of what the four entries of an action command, and the unit of each. A model may leave this out."""
+    """What the four entries of an action command, by name, and the unit of each. A model may leave this out."""
 
     substeps: int
     """Physics steps in a control step."""

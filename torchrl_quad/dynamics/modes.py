@@ -1,7 +1,7 @@
 """What an action may command: body rates, an attitude, single rotors, or a velocity.
 
 The outer loops need no tuning: a loop is half as quick as what it acts through, down to the rate loop of the drone.
-Loops in such a row damp each other well, whatever their number (the damping optimum of C. Kessler and P. Naslin).
+Loops in such a row are well damped, whatever their number (the damping optimum, Naslin 1968).
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ class PointMass:
         dt: physics step [s].
         substeps: physics steps in a control step.
         integrator: must be "semi_implicit_euler".
-        control: what an action commands, as :func:`~torchrl_quad.dynamics.modes.make_controller` takes it; not rotors.
+        control: what an action commands, as :func:`~torchrl_quad.dynamics.make_controller` takes it; not rotors.
 
     Raises:
         ValueError: another integrator is asked for, or an action shall command rotors.

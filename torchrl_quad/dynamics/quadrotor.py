@@ -79,7 +79,7 @@ class Quadrotor:
         dt: physics step [s].
         substeps: physics steps in a control step.
         integrator: name of the integrator.
-        control: what an action commands, as :func:`~torchrl_quad.dynamics.modes.make_controller` takes it.
+        control: what an action commands, as :func:`~torchrl_quad.dynamics.make_controller` takes it.
     """
 
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3, "rotor_speed": 4}

@@ -121,7 +121,7 @@ class Task(abc.ABC):
 
     @property
     def action_units(self) -> dict[str, str]:
-        """The names of what the four entries of an action command, and the unit of each: ``{"thrust": "N", ...}``."""
+        """What the four entries of an action command, by name, and the unit of each, such as "N" and "rad/s"."""
         return getattr(self.dynamics, "action_units", dict.fromkeys("0123", ""))
 
     @property

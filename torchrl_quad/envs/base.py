@@ -107,7 +107,7 @@ class QuadrotorEnv(Task, EnvBase):
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.num_envs, self.dtype, self.control_dt, self.action_delay = num_envs, dtype, control_dt, action_delay
         self.max_episode_steps, self.observe_last_action = max_episode_steps, observe_last_action
-        self.event_discount = event_discount
+        self.event_discount, self.control = event_discount, control
         self.initial_state_source: Callable[[int], TensorDictBase] | None = None
         params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone)
         params = checks.checked_params(params.to(device=self.device, dtype=dtype), num_envs)

@@ -177,9 +177,8 @@ def test_what_cannot_be_exported_is_refused(tmp_path):
     with torch.no_grad():
         broken[0].module.mlp[0].bias[0] = math.nan
     refuses("the weights of the policy, or its normaliser, are not finite", broken)
-    env.control = "attitude"
-    refuses("exports thrust and body rates alone, control=\"rates\"; got 'attitude'")
-    del env.control
+    other = HoveringEnv(num_envs=2, control="attitude")
+    refuses("exports thrust and body rates alone, control=\"rates\"; got 'attitude'", env=other)
     assert not (tmp_path / "policy").exists()
     (tmp_path / "policy").mkdir()
     (tmp_path / "policy" / "thesis.txt").write_text("")

@@ -278,7 +278,7 @@ def recipe(program, words, launch, folder):
     if program == "torchrun":
         run(sys.executable, "-m", "torch.distributed.run", *words, *SMALL, f"hydra.run.dir={folder}")
     elif "--multirun" in words:  # one run of it, in this process; a test of their own has several side by side
-        arguments = [re.sub(r"^(\w+=[^,]*),.*", r"\1", word) for word in arguments]
+        arguments = [re.sub(r"^([\w.]+=[^,{]*),.*", r"\1", word) for word in arguments]
         launch(name, "--multirun", *arguments, *SMALL, f"hydra.sweep.dir={folder}", "hydra/launcher=basic")
     elif "checkpoint.pt" in " ".join(words):
         launch("abpt" if name in AFTER_TRAINING else name, *SMALL, "total_steps=48", f"hydra.run.dir={folder}")

@@ -55,7 +55,7 @@ def near(state, **other):
         (
             "tracking",
             {"curves": "circle"},
-            r"Did you mean 'curve'\? Choose from: action_delay, compile, control_dt, cur",
+            r"Did you mean 'curve'\? Choose from: action_delay, compile, control, control_dt, cur",
         ),
         (
             "hovering",
@@ -207,7 +207,7 @@ def test_parameters_that_do_not_fit_are_refused(env, params, error, message):
 
 @pytest.mark.parametrize("shape", [(4,), (4, 1), (4, 3), (4, 5), (4, 4, 1)])
 def test_an_action_of_another_shape_is_refused_and_not_broadcast(env, shape):
-    message = r"The action must have shape \(4, 4\), thrust and three body rates for each environment; got \("
+    message = r"The action must have shape \(4, 4\), named in env.action_units, for each environment; got \("
     with pytest.raises(ValueError, match=message):
         env.step(env.reset().set("action", torch.zeros(shape)))
     policy = TensorDictModule(lambda _: torch.zeros(shape), in_keys=["observation"], out_keys=["action"])

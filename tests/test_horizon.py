@@ -129,7 +129,7 @@ def break_drones(env, parameter):
 
 
 def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
-    options = {**EVERYTHING, "reward": "position"}
+    options = {**EVERYTHING, "reward": "position", "control": "velocity"}
     env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, **options)
     drag = env.nominal.linear_drag.clone().requires_grad_()
     env.params = env.nominal.replace(linear_drag=drag)

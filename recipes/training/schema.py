@@ -76,6 +76,9 @@ class Env(Section):
 
     model_config = ConfigDict(strict=True, extra="allow")
     dynamics: Literal["quadrotor", "point_mass"]
+    control: Literal["rates", "attitude", "rotor_thrusts", "velocity"] | dict[str, Any] = Field(
+        "rates", description="A mapping sets limits, too: {mode: velocity, max_speed: 5.0}."
+    )
     dt: Positive = Field(description="The physics step [s].")
     control_dt: Positive = Field(description="The control step [s], a whole multiple of env.dt.")
     action_delay: int = Field(ge=0, le=1000, description="Control steps from a command to its effect; 1 is usual.")

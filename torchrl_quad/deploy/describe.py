@@ -139,9 +139,8 @@ def describe(env: QuadrotorEnv) -> dict[str, Any]:
             f"export_policy cannot say what {type(env).__name__} observes. It knows "
             f"{', '.join(name for name, _ in _TASKS.values())}, and tasks that inherit from these."
         )
-    control = getattr(env, "control", "rates")
-    if control != "rates":
-        raise ValueError(f'export_policy exports thrust and body rates alone, control="rates"; got {control!r}.')
+    if env.control != "rates":
+        raise ValueError(f'export_policy exports thrust and body rates alone, control="rates"; got {env.control!r}.')
     name, describe_task = _TASKS[kind]
     task = describe_task(env)
     box, layout = task.pop("box"), [*task.pop("inputs"), *_BODY]

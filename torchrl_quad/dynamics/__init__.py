@@ -4,6 +4,13 @@ from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Setpoint
 from torchrl_quad.dynamics.integrators import INTEGRATORS, euler, rk4, semi_implicit_euler
 from torchrl_quad.dynamics.interface import Dynamics
+from torchrl_quad.dynamics.modes import (
+    CONTROLS,
+    AttitudeController,
+    RotorThrustController,
+    VelocityController,
+    make_controller,
+)
 from torchrl_quad.dynamics.parameters import QuadrotorParams, available_drones, load_drone
 from torchrl_quad.dynamics.point_mass import PointMass
 from torchrl_quad.dynamics.quadrotor import Quadrotor, QuadrotorState, control_step, physics_step
@@ -13,8 +20,10 @@ from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
 DYNAMICS: dict[str, type[Dynamics]] = {"quadrotor": Quadrotor, "point_mass": PointMass}
 
 __all__ = [
+    "CONTROLS",
     "DYNAMICS",
     "INTEGRATORS",
+    "AttitudeController",
     "Dynamics",
     "FlightController",
     "PointMass",
@@ -22,12 +31,15 @@ __all__ = [
     "QuadrotorParams",
     "QuadrotorState",
     "RigidBodyState",
+    "RotorThrustController",
     "Setpoint",
+    "VelocityController",
     "accelerations",
     "available_drones",
     "control_step",
     "euler",
     "load_drone",
+    "make_controller",
     "physics_step",
     "quaternion",
     "rk4",

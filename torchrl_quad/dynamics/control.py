@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,27 +29,33 @@ from torchrl_quad.dynamics.vector import (
     where_same,
 )
 
-# Of the controller's tensors, those that each physics step reads.
-_CONSTANTS = ("thrust_min", "thrust_max", "gain", "tiny", "share", "per_share", "middle", "half_span", "yaw_share")
-_CONSTANTS += ("yaw_sign", "yaw_reach")
-
 
 class Setpoint(NamedTuple):
-    """What an action asks for: collective thrust and body rates (CTBR)."""
+    """What an action of ``control="rates"`` asks for: collective thrust and body rates (CTBR)."""
 
     thrust: Vector  #: (*, 1) [N]
     body_rate: Vector  #: (*, 3) [rad/s], body frame
 
 
 class FlightController:
-    """Rate controller and mixer with the nominal parameters of the drone.
+    """Rate controller and mixer with the nominal parameters of the drone: ``control="rates"``.
 
     The plant may differ (randomised, fitted): the controller keeps a copy of what it was built with, and no gradient
-    flows into that.
+    flows into that. Those of :mod:`~torchrl_quad.dynamics.modes` give actions another meaning.
 
     Raises:
         ValueError: the rotor layout cannot make thrust and torque about each axis, or the drone cannot hover.
     """
+
+    action_units = {"thrust": "N", "roll rate": "rad/s", "pitch rate": "rad/s", "yaw rate": "rad/s"}
+    """What the four entries of an action command, and in which unit."""
+
+    setpoint_type, setpoint_sizes = Setpoint, (1, 3)
+    # Of its tensors, those that each physics step reads.
+    constants: tuple[str, ...] = (
+        "thrust_min", "thrust_max", "gain", "tiny", "share", "per_share", "middle", "half_span",
+        "yaw_share", "yaw_sign", "yaw_reach",
+    )  # fmt: skip
 
     def __init__(self, nominal: QuadrotorParams) -> None:
         nominal = nominal.detach()
@@ -69,6 +75,9 @@ class FlightController:
         self.yaw_sign, self.yaw_reach = self.yaw_share.sign(), self.yaw_share.abs().amax(-1, keepdim=True)
         self.half_range = 0.5 * nominal.max_thrust_to_weight * weight
         self.hover_speed = self.rotors.speed(matvec(self.mixer, pad(weight, (0, 3))))
+        # An action a commands (a + offset) scale.
+        self.offset = pad(weight.new_ones(1), (0, 3))
+        self.scale = join(self.half_range, nominal.max_body_rate)
         self.hover_action = pad(2.0 / nominal.max_thrust_to_weight - 1.0, (0, 3))
         _require_hover(nominal, self.hover_speed)
 
@@ -83,14 +92,30 @@ class FlightController:
             }
         )
         apart.rotors, apart.mixer = self.rotors.unbind(), unbind_rows(self.mixer)
-        for name in _CONSTANTS:
+        for name in self.constants:
             setattr(apart, name, unbind(getattr(self, name), constant=True))
         return apart
 
-    def setpoint(self, action: Tensor) -> Setpoint:
-        """Decode an action (*, 4) in [-1, 1]; values outside are clamped."""
-        action = action.clamp(-1.0, 1.0)
-        return Setpoint((action[..., :1] + 1.0) * self.half_range, action[..., 1:] * self.nominal.max_body_rate)
+    def decode(self, action: Tensor) -> Tensor:
+        """What an action (*, 4) in [-1, 1] commands, in ``action_units``; values outside are clamped."""
+        return (action.clamp(-1.0, 1.0) + self.offset) * self.scale
+
+    def encode(self, command: Tensor) -> Tensor:
+        """The action (*, 4) for a command in ``action_units``; beyond the limits it lies outside [-1, 1]."""
+        return command / self.scale - self.offset
+
+    def setpoint(self, action: Tensor) -> Any:
+        """Decode an action (*, 4), for :meth:`command`."""
+        return Setpoint(*self.decode(action).split((1, 3), -1))
+
+    def command(self, setpoint: Any, state: Any, wrench: Vector) -> Vector:
+        """Commanded rotor speed (*, 4) [rad/s] for a setpoint, the drone's state, and the present wrench (*, 4)."""
+        rates = self.rate_setpoint(setpoint, state.quaternion, state.velocity)
+        return self.rotor_speed(rates, state.angular_velocity, wrench)
+
+    def rate_setpoint(self, setpoint: Any, attitude: Vector, velocity: Vector) -> Setpoint:
+        """Thrust and body rates for a setpoint, at an attitude (*, 4) and a velocity (*, 3) [m/s], world frame."""
+        return setpoint
 
     def rotor_speed(self, setpoint: Setpoint, angular_velocity: Vector, wrench: Vector) -> Vector:
         """Commanded rotor speed (*, 4) [rad/s] for a setpoint, the body rates (*, 3), and the present wrench (*, 4).
@@ -136,6 +161,12 @@ class FlightController:
         yaw_fits = (self.half_span - used) / larger(yaw_torque.abs() * self.yaw_reach, self.tiny)
         level = level + yaw * yaw_fits.clamp_min(0.0).clamp_max(1.0)
         return where_same(limited, thrust, clamp(level * self.share, self.thrust_min, self.thrust_max))
+
+
+def join(*parts: Tensor) -> Tensor:
+    """Tensors (k) or (num_envs, k) behind each other, in the last dimension."""
+    batch = torch.broadcast_shapes(*(x.shape[:-1] for x in parts))
+    return torch.cat([x.expand(*batch, x.shape[-1]) for x in parts], -1)
 
 
 def _require_hover(nominal: QuadrotorParams, speed: Tensor) -> None:

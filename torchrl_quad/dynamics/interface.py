@@ -14,6 +14,7 @@ class Dynamics(Protocol):
     """A model of a drone with its flight controller: state, limits, and one control step in two array forms.
 
     It is built as ``Model(nominal, dt, substeps, integrator)``, and again when an environment moves to another device.
+    A model with a choice of what actions command takes ``control`` as well.
     :class:`~torchrl_quad.dynamics.Quadrotor` and :class:`~torchrl_quad.dynamics.PointMass` are the examples.
     """
 
@@ -33,6 +34,9 @@ class Dynamics(Protocol):
 
     hover_action: Tensor
     """The action (4) that holds the nominal drone where it is; (num_envs, 4) where drones differ in it."""
+
+    action_units: dict[str, str]
+    """What the four entries of an action command, by name, and the unit of each. A model may leave this out."""
 
     substeps: int
     """Physics steps in a control step."""

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.dynamics.control import FlightController
+from torchrl_quad.dynamics.modes import RotorThrustController, make_controller
 from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import drag
-from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, stack
+from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, split, stack
 
 
 class PointMass:
@@ -26,22 +27,35 @@ class PointMass:
         dt: physics step [s].
         substeps: physics steps in a control step.
         integrator: must be "semi_implicit_euler".
+        control: what an action commands, as :func:`~torchrl_quad.dynamics.make_controller` takes it; not rotors.
 
     Raises:
-        ValueError: another integrator is asked for.
+        ValueError: another integrator is asked for, or an action shall command rotors.
     """
 
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}
     plant_fields = ("mass", "linear_drag", "quadratic_drag", "gravity")
 
-    def __init__(self, nominal: QuadrotorParams, dt: float, substeps: int, integrator: str) -> None:
+    def __init__(
+        self,
+        nominal: QuadrotorParams,
+        dt: float,
+        substeps: int,
+        integrator: str,
+        control: str | Mapping[str, Any] = "rates",
+    ) -> None:
         if integrator != "semi_implicit_euler":
             raise ValueError(
                 f'dynamics="point_mass" knows the integrator "semi_implicit_euler" alone, got {integrator!r}.'
             )
-        self.controller = FlightController(nominal)
+        self.controller = make_controller(control, nominal)
+        if isinstance(self.controller, RotorThrustController):
+            raise ValueError(
+                'dynamics="point_mass" has no rotors, so control="rotor_thrusts" commands nothing. Take '
+                'dynamics="quadrotor", or another control.'
+            )
         self.nominal, self.hover_action = self.controller.nominal, self.controller.hover_action
-        self.dt, self.substeps, self.limits = dt, substeps, {}
+        self.action_units, self.dt, self.substeps, self.limits = self.controller.action_units, dt, substeps, {}
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
         """Level and still, at the positions (n, 3) [m]."""
@@ -53,27 +67,30 @@ class PointMass:
         self, state: dict[str, Tensor], action: Tensor, params: QuadrotorParams, wind: Tensor | None
     ) -> dict[str, Tensor]:
         """The entries of the drone after one control step."""
-        thrust, rates = self.controller.setpoint(action)
+        setpoint = self.controller.setpoint(action)
         position, attitude, velocity = state["position"], state["quaternion"], state["velocity"]
         for _ in range(self.substeps):
+            thrust, rates = self.controller.rate_setpoint(setpoint, attitude, velocity)
             position, attitude, velocity = _step(position, attitude, velocity, thrust, rates, params, self.dt, wind)
         return {"position": position, "quaternion": attitude, "velocity": velocity, "angular_velocity": rates}
 
     def setpoint_rows(self, action: Tensor) -> Tensor:
-        """Thrust [N] and body rates [rad/s] of an action (n, 4), as rows (4, n)."""
+        """What an action (n, 4) asks of the controller, as rows (k, n)."""
         return torch.cat([x.t() for x in self.controller.setpoint(action)])
 
     def rows_step(self) -> Callable[..., Tensor]:
         """A physics step on rows (13, n), for a compiler."""
-        nominal, dt = self.controller.unbind().nominal, self.dt
+        controller, dt = self.controller.unbind(), self.dt
 
         def step(x: Tensor, setpoint: Tensor, plant: tuple[Tensor, ...], wind: tuple[Tensor, ...]) -> Tensor:
-            rows, command = Components(x.unbind()), Components(setpoint.unbind())
-            thrust, rates, params = command[..., :1], command[..., 1:], nominal
+            rows, params = Components(x.unbind()), controller.nominal
+            position, attitude, velocity = rows[..., :3], rows[..., 3:7], rows[..., 7:10]
+            wanted = controller.setpoint_type(*split(Components(setpoint.unbind()), controller.setpoint_sizes))
+            thrust, rates = controller.rate_setpoint(wanted, attitude, velocity)
             if plant:
                 params = RawParams(**{k: Components(v.unbind()) for k, v in zip(self.plant_fields, plant, strict=True)})
             air = Components(wind[0].unbind()) if wind else None
-            after = _step(rows[..., :3], rows[..., 3:7], rows[..., 7:10], thrust, rates, params, dt, air)
+            after = _step(position, attitude, velocity, thrust, rates, params, dt, air)
             return stack(cat(*after, rates))
 
         return step

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.dynamics.control import FlightController, Setpoint
+from torchrl_quad.dynamics.control import FlightController
 from torchrl_quad.dynamics.integrators import INTEGRATORS
+from torchrl_quad.dynamics.modes import make_controller
 from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
 from torchrl_quad.dynamics.rotors import Rotors
-from torchrl_quad.dynamics.vector import Components, Vector, cat, clamp, stack
+from torchrl_quad.dynamics.vector import Components, Vector, cat, clamp, split, stack
 
 
 class QuadrotorState(NamedTuple):
@@ -29,7 +30,7 @@ class QuadrotorState(NamedTuple):
 
 def physics_step(
     state: QuadrotorState,
-    setpoint: Setpoint,
+    setpoint: Any,
     params: QuadrotorParams,
     rotors: Rotors,
     controller: FlightController,
@@ -44,7 +45,7 @@ def physics_step(
     speed = state.rotor_speed
     wrench = rotors.wrench(speed)
     believed = wrench if rotors is controller.rotors else controller.rotors.wrench(speed)
-    commanded = controller.rotor_speed(setpoint, state.angular_velocity, believed)
+    commanded = controller.command(setpoint, state, believed)
     if rotors is not controller.rotors:  # the nominal rotors can do what the controller asks of them; these may not
         commanded = clamp(commanded, params.rotor_speed_min, params.rotor_speed_max)
     body = INTEGRATORS[integrator](RigidBodyState(*state[:4]), lambda s: accelerations(s, wrench, params, wind), dt)
@@ -78,14 +79,23 @@ class Quadrotor:
         dt: physics step [s].
         substeps: physics steps in a control step.
         integrator: name of the integrator.
+        control: what an action commands, as :func:`~torchrl_quad.dynamics.make_controller` takes it.
     """
 
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3, "rotor_speed": 4}
     plant_fields = PLANT_FIELDS
 
-    def __init__(self, nominal: QuadrotorParams, dt: float, substeps: int, integrator: str) -> None:
-        self.controller = FlightController(nominal)
+    def __init__(
+        self,
+        nominal: QuadrotorParams,
+        dt: float,
+        substeps: int,
+        integrator: str,
+        control: str | Mapping[str, Any] = "rates",
+    ) -> None:
+        self.controller = make_controller(control, nominal)
         self.nominal, self.hover_action = self.controller.nominal, self.controller.hover_action
+        self.action_units = self.controller.action_units
         self.dt, self.substeps, self.integrator = dt, substeps, integrator
         self.limits = {"rotor_speed": 2.0 * self.nominal.rotor_speed_max}
 
@@ -108,7 +118,7 @@ class Quadrotor:
         return after._asdict()
 
     def setpoint_rows(self, action: Tensor) -> Tensor:
-        """Thrust [N] and body rates [rad/s] of an action (n, 4), as rows (4, n)."""
+        """What an action (n, 4) asks of the controller, as rows (k, n)."""
         return torch.cat([x.t() for x in self.controller.setpoint(action)])
 
     def rows_step(self) -> Callable[..., Tensor]:
@@ -116,24 +126,14 @@ class Quadrotor:
         controller, dt, integrator = self.controller.unbind(), self.dt, self.integrator
 
         def step(x: Tensor, setpoint: Tensor, plant: tuple[Tensor, ...], wind: tuple[Tensor, ...]) -> Tensor:
-            state = _split(Components(x.unbind()), self.sizes.values())
-            thrust, rates = _split(Components(setpoint.unbind()), (1, 3))
+            state = split(Components(x.unbind()), self.sizes.values())
+            wanted = controller.setpoint_type(*split(Components(setpoint.unbind()), controller.setpoint_sizes))
             params, rotors = controller.nominal, controller.rotors
             if plant:
                 params = RawParams(**{k: Components(v.unbind()) for k, v in zip(PLANT_FIELDS, plant, strict=True)})
                 rotors = Rotors(params)
             air = Components(wind[0].unbind()) if wind else None
-            after = physics_step(
-                QuadrotorState(*state), Setpoint(thrust, rates), params, rotors, controller, dt, integrator, air
-            )
+            after = physics_step(QuadrotorState(*state), wanted, params, rotors, controller, dt, integrator, air)
             return stack(cat(*after))
 
         return step
-
-
-def _split(x: Components, sizes) -> list[Components]:
-    parts = []
-    for size in sizes:
-        parts.append(x[..., :size])
-        x = x[..., size:]
-    return parts

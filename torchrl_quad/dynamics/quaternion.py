@@ -40,6 +40,12 @@ def rotate_inverse(q: Vector, v: Vector) -> Vector:
     return _rotate(q, v, -1.0)
 
 
+def up_in_body(q: Vector) -> Vector:
+    """The world's z axis in the body frame, (*, 3): what :func:`rotate_inverse` makes of (0, 0, 1)."""
+    w, x, y, z = q[..., :1], q[..., 1:2], q[..., 2:3], q[..., 3:]
+    return cat((x * z - w * y) * 2.0, (y * z + w * x) * 2.0, (x * x + y * y) * -2.0 + 1.0)
+
+
 def derivative(q: Vector, angular_velocity: Vector) -> Vector:
     """Time derivative (*, 4) [1/s] under the body-frame angular velocity (*, 3) [rad/s]: half of q (0, w)."""
     half = q * 0.5

@@ -7,9 +7,10 @@ no indices, so that a compiler makes one loop over drones of everything and keep
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -24,7 +25,7 @@ class Components:
     Behaves like the tensor (*, k): arithmetic goes entry by entry, and k = 1 goes with any k.
     """
 
-    def __init__(self, components: Sequence[Component]) -> None:
+    def __init__(self, components: Iterable[Component]) -> None:
         self.components = tuple(components)
 
     def __getitem__(self, index: tuple[type(Ellipsis), slice]) -> Components:
@@ -84,6 +85,12 @@ def unbind_rows(matrix: Tensor) -> list[Components]:
     return [unbind(row, constant=True) for row in matrix.unbind(-2)]
 
 
+def split(vector: Components, sizes: Iterable[int]) -> list[Components]:
+    """Its parts of these sizes, in their order."""
+    entries = iter(vector.components)
+    return [Components(itertools.islice(entries, size)) for size in sizes]
+
+
 def stack(vector: Components) -> Tensor:
     """The components, each a tensor (n), as rows (k, n)."""
     return torch.stack(vector.components)
@@ -131,6 +138,11 @@ def along_z(z: Vector) -> Vector:
 def clamp(x: Vector, low: Vector, high: Vector) -> Vector:
     """x, but not below low nor above high, entry by entry."""
     return minimum(maximum(x, low), high)
+
+
+def soft_limit(x: Vector, limit: Vector) -> Vector:
+    """x where it is small, and always less than the limit, entry by entry; its derivative is never zero."""
+    return x * ((x / limit).square() + 1.0).rsqrt()
 
 
 def maximum(a: Vector, b: Vector) -> Vector:

@@ -37,9 +37,6 @@ class QuadrotorEnv(Task, EnvBase):
     ``env.params`` is the drone that flies; ``env.params = env.params.replace(mass=0.5)`` changes it, and a parameter
     that requires grad can be fitted. ``env.nominal`` is the drone that its controller believes in.
 
-    The action is (4) in [-1, 1]: collective thrust (-1..1 maps to 0..max_thrust_to_weight times the nominal weight),
-    then roll, pitch and yaw rate in units of the drone's max_body_rate.
-
     Args:
         num_envs: number of drones that fly in parallel.
         device: device of all tensors.
@@ -48,6 +45,8 @@ class QuadrotorEnv(Task, EnvBase):
             give each of several copies its own, as in ParallelEnv.
         drone: name of a preset, path of a YAML file, mapping, or :class:`~torchrl_quad.QuadrotorParams`.
         dynamics: "quadrotor", or "point_mass", whose thrust and body rates follow the action at once.
+        control: what an action (4) in [-1, 1] commands: "rates" (thrust, body rates), "attitude" (thrust, roll, pitch,
+            yaw rate), "rotor_thrusts", "velocity" (and yaw rate), or a mapping with limits; see ``docs/dynamics.md``.
         dt: physics step [s].
         control_dt: control step [s], a whole multiple of dt.
         action_delay: control steps between an action and its effect.
@@ -83,6 +82,7 @@ class QuadrotorEnv(Task, EnvBase):
         seed: int | None = 0,
         drone: Any = "visfly",
         dynamics: str = "quadrotor",
+        control: str | Mapping[str, Any] = "rates",
         dt: float = 0.005,
         control_dt: float = 0.02,
         action_delay: int = 1,
@@ -100,18 +100,18 @@ class QuadrotorEnv(Task, EnvBase):
         **unknown: Any,
     ) -> None:
         checks.refuse_unknown(type(self), unknown)
-        substeps = checks.check_arguments(
-            num_envs, dtype, seed, dynamics, dt, control_dt, action_delay, integrator, max_episode_steps,
+        options = checks.check_arguments(
+            num_envs, dtype, seed, dynamics, control, dt, control_dt, action_delay, integrator, max_episode_steps,
             observe_last_action, event_discount,
         )  # fmt: skip
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.num_envs, self.dtype, self.control_dt, self.action_delay = num_envs, dtype, control_dt, action_delay
         self.max_episode_steps, self.observe_last_action = max_episode_steps, observe_last_action
-        self.event_discount, self._drone_name = event_discount, drone if isinstance(drone, (str, Path)) else "own"
+        self.event_discount, self.control, self._drone = event_discount, control, drone
         self.initial_state_source: Callable[[int], TensorDictBase] | None = None
         params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone)
         params = checks.checked_params(params.to(device=self.device, dtype=dtype), num_envs)
-        self._make_dynamics = functools.partial(DYNAMICS[dynamics], dt=dt, substeps=substeps, integrator=integrator)
+        self._make_dynamics = functools.partial(DYNAMICS[dynamics], **options)
         self.dynamics: Dynamics = self._make_dynamics(params)
         self._params = params if params.requires_grad else self.nominal
         self.weights = {**self.weights, **checks.checked_weights(weights or {}, self.weights)}

@@ -49,6 +49,7 @@ def check_arguments(
     dtype: Any,
     seed: Any,
     dynamics: Any,
+    control: Any,
     dt: Any,
     control_dt: Any,
     action_delay: Any,
@@ -56,14 +57,19 @@ def check_arguments(
     max_episode_steps: Any,
     observe_last_action: Any,
     event_discount: Any,
-) -> int:
-    """Refuse arguments of an environment that are out of range; return the physics steps in a control step."""
+) -> dict[str, Any]:
+    """Refuse arguments of an environment that are out of range; return those that build its dynamics model."""
     require_count("num_envs", num_envs, 1, MAX_ENVS)
     require(dtype in (torch.float32, torch.float64), f"dtype must be torch.float32 or torch.float64, got {dtype}.")
     is_whole = isinstance(seed, numbers.Integral) and not isinstance(seed, bool)
     is_seed = seed is None or (is_whole and 0 <= seed < 2**63)
     require(is_seed, f"seed must be a whole number from 0, or None for another one each time; got {seed!r}.")
     require(dynamics in list(DYNAMICS), f"Unknown dynamics {dynamics!r}. Choose from: {names(DYNAMICS)}.")
+    takes_control = "control" in inspect.signature(DYNAMICS[dynamics]).parameters
+    require(
+        takes_control or control == "rates",
+        f"dynamics={dynamics!r} takes no control: its actions have a meaning of their own. Leave out {control=}.",
+    )
     for name, value in (("dt", dt), ("control_dt", control_dt)):
         is_time = isinstance(value, numbers.Real) and 0 < value < math.inf
         require(is_time, f"{name} must be positive and finite, got {value!r}.")
@@ -86,7 +92,8 @@ def check_arguments(
         "event_discount must be above 0 and at most 1, such as the discount of the loss, 0.99, or None for events "
         f"without a gradient; got {event_discount!r}.",
     )
-    return substeps
+    options = {"dt": dt, "substeps": substeps, "integrator": integrator}
+    return {**options, "control": control} if takes_control else options
 
 
 def refuse_unknown(cls: type, unknown: Iterable[str]) -> None:
@@ -283,7 +290,7 @@ def check_action(action: Tensor | None, like: Tensor) -> None:
     if action is None or action.shape != (len(like), 4):
         got = "there is none" if action is None else f"got {tuple(action.shape)}"
         raise ValueError(
-            f"The action must have shape ({len(like)}, 4), thrust and three body rates for each environment; {got}. A "
+            f"The action must have shape ({len(like)}, 4), named in env.action_units, for each environment; {got}. A "
             'policy writes it under "action", as make_actor(env) does.'
         )
     if action.device != like.device:

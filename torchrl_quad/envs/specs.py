@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -38,10 +39,11 @@ def describe(env: Any) -> str:
     """The task, number of drones, which one, control period, device and so on of an environment, in one line."""
     if not hasattr(env, "control_step"):
         return f"{type(env).__name__}(not built)"
+    name = str(env._drone) if isinstance(env._drone, str | Path) else "own"
     changed = "" if env.params is env.nominal else " with other parameters"
     more = f", disturbances={'+'.join(map(str, env.disturbances))}" if env.disturbances else ""
     return (
-        f"{type(env).__name__}(num_envs={env.num_envs}, drone={str(env._drone_name)!r}{changed}, "
+        f"{type(env).__name__}(num_envs={env.num_envs}, drone={name!r}{changed}, "
         f"control_dt={env.control_dt:g} s, max_episode_steps={env.max_episode_steps}{more}, device={env.device}, "
         f"dtype={env.dtype}, compiled={env.is_compiled})"
     )

@@ -127,6 +127,11 @@ class Task(abc.ABC):
         return self.dynamics.hover_action
 
     @property
+    def action_units(self) -> dict[str, str]:
+        """What the four entries of an action command, by name, and the unit of each, such as "N" and "rad/s"."""
+        return getattr(self.dynamics, "action_units", dict.fromkeys("0123", ""))
+
+    @property
     def neutral_action(self) -> Tensor:
         """The action that a new policy starts from, which hovers."""
         return self.hover_action

@@ -23,7 +23,7 @@ from torchrl_quad.render.canvas import (
     set_box,
     set_scale,
 )
-from torchrl_quad.render.flights import Flight, action_names, check_rollout, state_keys
+from torchrl_quad.render.flights import Flight, check_rollout, state_keys
 
 _PAPER = {  # for figures as wide as a page of two columns
     "font.size": 8,
@@ -157,7 +157,7 @@ def plot_episode(
         set_scale(axes[0], log)
         actions = flight.rollout["action"][0].T.numpy()
         actions = np.concatenate((actions, actions[:, -1:]), 1)  # each lasts until the next instant
-        actions = dict(zip(action_names(len(actions)), actions, strict=True))
+        actions = dict(zip(flight.action_names, actions, strict=True))
         _draw_lines(axes[1], times, actions, "action", drawstyle="steps-post")
         if rotor_speed is not None:
             speeds = {f"rotor {i + 1}": x for i, x in enumerate(rotor_speed[0].T.numpy())}

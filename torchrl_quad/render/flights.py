@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.data.unwrap import base_env
+from torchrl_quad.dynamics import FlightController
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.envs.scenery import Scenery, describe_metric, visible_state
 
@@ -136,6 +137,13 @@ class Flight:
         """The distance to the target from which a state fulfils the task [m], if the task says so."""
         return self.scenery.success if self.scenery.progress is None else None
 
+    @property
+    def action_names(self) -> list[str]:
+        """The names of the entries of an action: those of the environment, else of ``control="rates"``."""
+        size = self.rollout["action"].shape[-1]
+        names = list(FlightController.action_units if self.env is None else self.env.action_units)
+        return names if size == len(names) else [str(i) for i in range(size)]
+
     def gate_index(self) -> Tensor | None:
         """The index of the gate that each drone flies to (num_envs, time + 1), if the targets are gates."""
         if self.scenery.gates is None or self.target is None:
@@ -161,11 +169,6 @@ class Flight:
         else:
             known = {"places": self.target.flatten(0, 1).mul(1e3).round().div(1e3).unique(dim=0)}
         self.scenery = dataclasses.replace(scenery, **known)
-
-
-def action_names(size: int) -> list[str]:
-    """The names of the entries of an action."""
-    return ["thrust", "roll rate", "pitch rate", "yaw rate"] if size == 4 else [str(i) for i in range(size)]
 
 
 def state_keys(*names: str) -> list[tuple[str, ...]]:

@@ -21,7 +21,7 @@ from torchrl_quad.dynamics.parameters import RawParams
 from torchrl_quad.dynamics.rotors import Rotors
 from torchrl_quad.envs.episodes import at_episode_end
 from torchrl_quad.files import replacing
-from torchrl_quad.render.flights import Flight, action_names
+from torchrl_quad.render.flights import Flight
 
 _X_FRAME = [[0.053, 0.053], [-0.053, 0.053], [-0.053, -0.053], [0.053, -0.053]]  # [m], of a drone that is not known
 
@@ -154,11 +154,10 @@ def _rewards_and_actions(flight: Flight) -> list[tuple[str, dict[str, Tensor], d
         panels.append(("reward", lines, {"peaks": True}))
     if "action" in rollout:
         action = rollout["action"].float()
-        names = action_names(action.shape[-1])
         over = torch.arange(rollout.shape[1]) >= flight.steps[:, None]
         lines = {
             name: torch.cat((x.masked_fill(over, math.nan), nothing), 1)
-            for name, x in zip(names, action.unbind(-1), strict=True)
+            for name, x in zip(flight.action_names, action.unbind(-1), strict=True)
         }
         panels.append(("action [-1, 1]", lines, {"held": True}))
     return panels

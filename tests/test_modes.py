@@ -1,0 +1,172 @@
+"""What actions may command: every mode goes where it is told, on every drone, with exact derivatives."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchrl_quad import HoveringEnv, available_drones, load_drone
+from torchrl_quad.dynamics import CONTROLS, DYNAMICS, quaternion
+from torchrl_quad.gym import GymVectorEnv
+
+F64 = torch.float64
+each_mode = pytest.mark.parametrize("control", CONTROLS)
+each_drone = pytest.mark.parametrize("drone", available_drones())
+each_flight = pytest.mark.parametrize(
+    ("drone", "dynamics"), [*((name, "quadrotor") for name in available_drones()), ("visfly", "point_mass")]
+)
+
+
+def commanded(steps, *commands, control, drone="visfly", **options):
+    """Fly the dynamics from rest, one drone for each command in physical units; returns the states after each step."""
+    env = HoveringEnv(num_envs=len(commands), control=control, drone=drone, dt=0.01, dtype=F64, **options)
+    action = env.dynamics.controller.encode(torch.tensor(commands, dtype=F64))
+    state, states = env.dynamics.rest(torch.zeros(len(commands), 3, dtype=F64)), []
+    for _ in range(steps):
+        state = env.dynamics.control_step(state, action, env.nominal, None)
+        states.append(state)
+    return states
+
+
+def roll_pitch_yaw(q: Tensor) -> Tensor:
+    """Euler angles (*, 3) in the order z, y, x, as textbooks give them."""
+    w, x, y, z = q.unbind(-1)
+    roll = torch.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    yaw = torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return torch.stack((roll, torch.asin(2 * (w * y - z * x)), yaw), -1)
+
+
+@each_flight
+def test_roll_leans_right_pitch_leans_forward_and_yaw_turns_left(drone, dynamics):
+    weight, rate = 9.81 * load_drone(drone).mass.item(), 0.3
+    commands = [[weight, 0.4, 0, 0], [weight, 0, 0.4, 0], [weight, 0.3, -0.2, 0], [weight, 0, 0, rate]]
+    states = commanded(100, *commands, control="attitude", drone=drone, dynamics=dynamics)
+    velocity, angles = states[20]["velocity"], roll_pitch_yaw(states[-1]["quaternion"])
+    assert velocity[0, 1] < -0.1 and velocity[0, 0].abs() < 1e-6  # y is to the left
+    assert velocity[1, 0] > 0.1 and velocity[1, 1].abs() < 1e-6
+    torch.testing.assert_close(angles[:3, :2], torch.tensor(commands, dtype=F64)[:3, 1:3], atol=2e-3, rtol=0)
+    assert 0.5 * 2 * rate < angles[3, 2] <= 1.05 * 2 * rate
+    assert angles[3, :2].abs().max() < 1e-3
+
+
+@each_flight
+def test_every_drone_flies_within_5_percent_of_a_commanded_velocity(drone, dynamics):
+    commands = [[2.0, 0, 0, 0], [-1.0, 0, 0, 0], [0, 2.5, 0, 0.3], [0, 0, 1.0, 0], [0, 0, -1.0, 0], [1.5, -1.5, 0.5, 0]]
+    states = commanded(150, *commands, control="velocity", drone=drone, dynamics=dynamics)
+    wanted = torch.tensor(commands, dtype=F64)
+    for state in states[-25:]:
+        error = (state["velocity"] - wanted[:, :3]).norm(dim=-1) / wanted[:, :3].norm(dim=-1)
+        assert (error < 0.05).all(), error
+    assert states[-1]["angular_velocity"][2] @ quaternion.up_in_body(states[-1]["quaternion"])[2] > 0.29
+    up = torch.stack([quaternion.up_in_body(state["quaternion"])[:, 2] for state in states])
+    assert up.min() > math.cos(math.pi / 6)
+
+
+def test_one_rotor_alone_rolls_and_pitches_away_from_itself_and_yaws_by_its_spin():
+    share = 0.25 * 9.81 * load_drone("visfly").mass.item()
+    commands = torch.full((4, 4), share).fill_diagonal_(1.1 * share).tolist()
+    state = commanded(2, *commands, control="rotor_thrusts")[-1]
+    x, y = load_drone("visfly").rotor_positions.unbind(-1)
+    signs = torch.stack((y.sign(), -x.sign(), load_drone("visfly").rotor_spin), -1).to(F64)
+    assert (state["angular_velocity"].sign() == signs).all()
+    assert (state["velocity"][:, 2] > 0).all()
+
+
+@each_mode
+@each_drone
+def test_the_hover_action_hovers_and_is_the_command_that_it_stands_for(control, drone):
+    env = HoveringEnv(num_envs=1, control=control, drone=drone, dtype=F64)
+    controller = env.dynamics.controller
+    rest, weight = env.dynamics.rest(torch.zeros(1, 3, dtype=F64)), 9.81 * env.nominal.mass.item()
+    state = rest
+    for _ in range(20):
+        state = env.dynamics.control_step(state, env.hover_action.expand(1, 4), env.nominal, None)
+    torch.testing.assert_close(state, rest, atol=1e-9, rtol=1e-9)
+    command = dict(zip(env.action_units, controller.decode(env.hover_action).tolist(), strict=True))
+    thrust = sum(x for name, x in command.items() if env.action_units[name] == "N")
+    assert thrust == pytest.approx(0 if control == "velocity" else weight)
+    torch.testing.assert_close(controller.encode(controller.decode(env.hover_action)), env.hover_action)
+    assert (env.reset()["state", "action_queue"] == env.hover_action).all()
+
+
+@each_mode
+def test_flights_have_exact_derivatives_with_delay_and_random_drones(control):
+    options = {"action_delay": 2, "randomize": {"mass": {"scale": [0.8, 1.2]}}, "wind": {"gust": 0.5}}
+    start = {"tilt": 0.5, "velocity": 1.0, "angular_velocity": 1.0}
+    env = HoveringEnv(num_envs=2, control=control, dtype=F64, dt=0.01, random_start=start, **options)
+    actions = (env.hover_action + 0.2 * torch.randn(2, 8, 4, dtype=F64)).requires_grad_()
+    drag = env.nominal.linear_drag.clone().requires_grad_()
+
+    def outputs(actions, drag):
+        env.set_seed(0)
+        env.params = env.nominal.replace(linear_drag=drag)
+        td, ends = env.reset(), []
+        for action in actions.unbind(1):
+            step = env.step(td.set("action", action))
+            ends += [step["next", "reward"].flatten(), step["next", "observation"].flatten()]
+            td = env.step_mdp(step)
+        return torch.cat(ends)
+
+    grads = torch.autograd.grad(outputs(actions, drag).sum(), actions)[0]
+    assert (grads[:, :6] != 0).any(-1).all() and (grads[:, 6:] == 0).all()  # the last two are still on their way
+    assert torch.autograd.gradcheck(outputs, (actions, drag), fast_mode=True, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("control", "dynamics"),
+    [*((name, "quadrotor") for name in CONTROLS), ("attitude", "point_mass"), ("velocity", "point_mass")],
+)
+def test_the_step_that_is_compiled_is_the_eager_step(control, dynamics):
+    env = HoveringEnv(num_envs=50, control=control, dynamics=dynamics, dtype=F64, dt=0.02)
+    model, action = env.dynamics, 1.2 * (2 * torch.rand(50, 4, dtype=F64) - 1)
+    state = {name: x + 0.5 * torch.randn_like(x) for name, x in model.rest(torch.zeros(50, 3, dtype=F64)).items()}
+    state["quaternion"] = quaternion.normalize(state["quaternion"])
+    after = model.control_step(state, action, env.nominal, None)
+    rows = model.rows_step()(torch.cat([x.t() for x in state.values()]), model.setpoint_rows(action), (), ())
+    torch.testing.assert_close(rows.t(), torch.cat([after[name] for name in state], 1), rtol=1e-9, atol=1e-9)
+
+
+@each_mode
+def test_drones_of_one_batch_each_have_their_own_controller(control):
+    command = [[0.3, 0.1, -0.1, 0.2]] * 2
+    drones = [load_drone(name, F64) for name in ("visfly", "crazyflie")]
+    both = {name: torch.stack([drone.fields()[name] for drone in drones]) for name in drones[0].fields()}
+    together = commanded(10, *command, control=control, drone=type(drones[0])(**both))[-1]
+    for i, drone in enumerate(drones):
+        alone = commanded(10, command[0], control=control, drone=drone)[-1]
+        torch.testing.assert_close({key: x[i : i + 1] for key, x in together.items()}, alone)
+
+
+def test_limits_can_be_chosen_and_gymnasium_takes_them():
+    envs = GymVectorEnv("hovering", 2, control={"mode": "velocity", "max_speed": 5.0, "max_tilt": 0.7})
+    controller = envs.torchrl_env.dynamics.controller
+    assert controller.decode(torch.ones(4)).tolist() == [5.0, 5.0, 5.0, 2.0]
+    assert list(envs.torchrl_env.action_units.values()) == ["m/s", "m/s", "m/s", "rad/s"]
+    envs.reset(seed=0)
+    assert envs.step(envs.action_space.sample())[0].shape == (2, 13)
+
+
+@pytest.mark.parametrize(
+    ("control", "message"),
+    [
+        ("thrust", "Unknown control 'thrust'. Choose from: rates, attitude, rotor_thrusts, velocity; or"),
+        ({"max_tilt": 0.5}, r"control=\{'max_tilt': 0.5\} names no mode. Choose from: rates, "),
+        (None, "control=None names no mode"),
+        ({"mode": "attitude", "max_speed": 1.0}, "'attitude' has no limit 'max_speed'. Choose from: max_tilt"),
+        ({"mode": "rates", "max_tilt": 1.0}, "'rates' has no limit 'max_tilt'. It has none; those of the drone hold"),
+        ({"mode": "attitude", "max_tilt": 30}, "max_tilt must be an angle in rad between 0 and 1.571, got 30"),
+        ({"mode": "velocity", "max_speed": "5"}, "max_speed must be a speed in m/s between 0 and 100, got '5'"),
+    ],
+)
+def test_a_mode_or_a_limit_that_makes_no_sense_is_refused(control, message):
+    with pytest.raises(ValueError, match=message):
+        HoveringEnv(num_envs=1, control=control)
+
+
+def test_models_without_rotors_or_without_modes_refuse_them(monkeypatch):
+    with pytest.raises(ValueError, match='"point_mass" has no rotors, so control="rotor_thrusts" commands nothing'):
+        HoveringEnv(num_envs=1, control="rotor_thrusts", dynamics="point_mass")
+    monkeypatch.setitem(DYNAMICS, "own", lambda nominal, dt, substeps, integrator: None)
+    with pytest.raises(ValueError, match="'own' takes no control: .* Leave out control='velocity'"):
+        HoveringEnv(num_envs=1, control="velocity", dynamics="own")

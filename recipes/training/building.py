@@ -89,7 +89,7 @@ def make_optimizer(
 class AdaptiveRate:
     """The learning rate of a policy that a horizon moves by about ``max_kl``, which falls to nothing over the run.
 
-    A horizon that moves it beyond 1.5 of the bound divides the rate by 1.2, and one that stays below 2/3 of it
+    A horizon that moves it beyond 1.5 of the bound divides the rate by 1.5, and one that stays below 2/3 of it
     multiplies it. The rate keeps between 1e-6 and 20 times the first one.
 
     Args:
@@ -113,9 +113,9 @@ class AdaptiveRate:
         low, high = self.bounds
         for group in self.optimizer.param_groups:
             if moved > self.limit:
-                group["lr"] = max(group["lr"] / 1.2, low)
+                group["lr"] = max(group["lr"] / 1.5, low)
             elif moved < self.limit / 2.25:
-                group["lr"] = min(group["lr"] * 1.2, high)
+                group["lr"] = min(group["lr"] * 1.5, high)
         self.done += 1
 
     def state_dict(self) -> dict[str, int]:

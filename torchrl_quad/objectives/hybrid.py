@@ -19,25 +19,23 @@ from torchrl_quad.objectives.pathwise import discounts, segments
 
 
 class HybridLoss(PathwiseCriticLoss):
-    r"""Hybrid of pathwise and score-function gradient, each weighted by what a rollout says of it.
+    r"""PPO with the derivative of the simulator as a control variate: each gradient where it is good.
 
     The simulator's derivative gives p_t, the gradient of an action's own lambda-return in the mean of that action.
     The flight itself gives A_t, the advantage of the same action. If p_t is right, then A_t is p_t . (u_t - loc_t) plus
     what does not depend on this action, where u_t is the action before the tanh. The loss therefore regresses A on
-    p . (u - loc). The slope is the ``pathwise_weight`` b: near 1 where the derivative tells the
-    truth, and near 0 where it does not, as before a bonus that nobody has got yet. The pathwise term is
+    p . (u - loc). The slope is the ``pathwise_weight`` b: near 1 where the derivative tells the truth, and near 0 where
+    it does not. It is a running mean over rollouts, clamped to [0, 1]. The pathwise term of the loss is
 
         - b mean_t p_t . loc(s_t)
 
-    and the score function takes the rest of the advantage, A'_t = A_t - b p_t . (u_t - loc_t), in the clipped surrogate
-    of PPO. Where b p is right, A' holds nothing but the luck of other steps. How far its gradients from two halves of
-    the environments agree, 2 g_1 . g_2 / (|g_1|^2 + |g_2|^2), is the ``score_weight`` w that multiplies it: the factor
-    of a Wiener filter. Both weights are running means over rollouts, and clamped to [0, 1]. On smooth tasks b goes to 1
-    and w towards 0, and the loss becomes first order by itself.
+    and the clipped surrogate of PPO takes the rest of the advantage, A'_t = A_t - b p_t . (u_t - loc_t). What the
+    pathwise term adds in expectation is what the surrogate loses, whatever b is, as long as p_t does not depend on the
+    noise of its own step. This is the control variate of Q-Prop (Gu et al. 2017), with the derivative of a simulated
+    flight in place of a critic's.
 
-    The pair is a control variate as that of Q-Prop (Gu et al. 2017), with the derivative of a simulated flight in
-    place of a critic's. The lambda-return of p_t bootstraps with V at every step, and each p_t is not discounted from
-    the start of the horizon. With noise that is correlated in time, an action's noise goes on in later actions, and
+    The lambda-return of p_t bootstraps with V at every step, and each p_t is not discounted from the start of the
+    horizon. With noise that is correlated in time, an action's noise goes on in later actions, and
     p_t + c p_(t+1) + c^2 p_(t+2) + ... takes the place of p_t, as it does in A_t: c = rho gamma lambda.
 
     One rollout serves several epochs of minibatches: :meth:`write_targets` reads the graph once.
@@ -57,7 +55,7 @@ class HybridLoss(PathwiseCriticLoss):
             critic's targets is ``make_value_estimator(lmbda=...)``.
         clip_epsilon: how far the ratio of probabilities may move from 1.
         clip_action_gradient: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
-        decay: of the running weights, for each rollout.
+        decay: of the running weight, for each rollout.
         average: of a scalar over the processes that train together, if there are several.
         reduction: "mean", "sum" or "none" over samples.
 
@@ -85,7 +83,7 @@ class HybridLoss(PathwiseCriticLoss):
     critic_loss_key = "loss_value"
     prediction_key = "value"
     out_keys = [
-        *("loss_actor", "loss_value", "pathwise_weight", "score_weight", "kl"),
+        *("loss_actor", "loss_value", "pathwise_weight", "kl"),
         *("pred_value", "target_value", "explained_variance"),
     ]
 
@@ -93,7 +91,6 @@ class HybridLoss(PathwiseCriticLoss):
     value_network_params: TensorDictModule
     target_value_network_params: TensorDictModule
     pathwise_weight: Tensor
-    score_weight: Tensor
 
     def __init__(
         self,
@@ -116,8 +113,8 @@ class HybridLoss(PathwiseCriticLoss):
         super().__init__(actor_network, clip_action_gradient=clip_action_gradient, reduction=reduction)
         self.gradient_lmbda, self.clip_epsilon, self.decay, self.average = gradient_lmbda, clip_epsilon, decay, average
         self.convert_to_functional(value_network, "value_network", create_target_params=False)
-        for name in ("pathwise_weight", "score_weight"):
-            self.register_buffer(name, torch.full((), math.nan, device=self._default_device, dtype=self._precision))
+        weight = torch.full((), math.nan, device=self._default_device, dtype=self._precision)
+        self.register_buffer("pathwise_weight", weight)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -132,7 +129,7 @@ class HybridLoss(PathwiseCriticLoss):
         return TensorDict({"loss_actor": loss_actor, "loss_value": loss_value, **metadata, **critic_metadata}, [])
 
     def write_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Differentiate a rollout (*, horizon), update the weights, and write what the minibatches read.
+        """Differentiate a rollout (*, horizon), update the weight, and write what the minibatches read.
 
         Returns:
             the rollout without its graph, and with ``advantage``, ``location_gradient``, ``latent`` and
@@ -152,15 +149,16 @@ class HybridLoss(PathwiseCriticLoss):
             predicted = predicted - predicted.mean()
             covariance, variance = (predicted * advantage).mean(), predicted.square().mean()
             slope = self.average(covariance) / self.average(variance).clamp_min(1e-12)
-            weight = self._update("pathwise_weight", slope)
+            running = self.pathwise_weight
+            running.copy_(torch.where(running.isnan(), slope, torch.lerp(slope, running, self.decay)))
+            weight = running.clamp(0.0, 1.0)
         data.set(keys.advantage, advantage - weight * predicted)
         data.set(keys.location_gradient, weight * grad)
         data.set(keys.latent, latent)
-        self._update("score_weight", self.average(self._agreement(data)))
         return data
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The actor's loss, and its metadata: the two weights, and KL(policy that flew || policy).
+        """The actor's loss, and its metadata: the weight, and KL(policy that flew || policy).
 
         Args:
             tensordict: as for :meth:`forward`.
@@ -172,9 +170,9 @@ class HybridLoss(PathwiseCriticLoss):
         clipped = ratio.clamp(1.0 - self.clip_epsilon, 1.0 + self.clip_epsilon)
         score = torch.minimum(ratio * advantage, clipped * advantage).squeeze(-1)
         pathwise = (tensordict.get(keys.location_gradient) * (new.loc - old.loc)).sum(-1)
-        weights = {name: getattr(self, name).clamp(0.0, 1.0) for name in ("pathwise_weight", "score_weight")}
         kl = kl_divergence(old, new).sum(-1).mean().detach()
-        return self._reduce_loss(-(weights["score_weight"] * score + pathwise)), {**weights, "kl": kl}
+        weight = self.pathwise_weight.clamp(0.0, 1.0)
+        return self._reduce_loss(-(score + pathwise)), {"pathwise_weight": weight, "kl": kl}
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The critic's loss on samples (*) of what :meth:`write_targets` returned, and its metadata."""
@@ -198,20 +196,6 @@ class HybridLoss(PathwiseCriticLoss):
         grad = action_gradient(objective, tensordict.get(keys.action)) / discount
         return grad if self.clip is None else self.clip(grad)[0]
 
-    def _agreement(self, data: TensorDictBase) -> Tensor:
-        """How far the score function's gradients from two halves of the environments agree, a scalar from -1 to 1."""
-        parameters, grads = list(self.actor_network_params.values(True, True)), []
-        for half in data.reshape(-1, data.shape[-1]).chunk(2):
-            with torch.enable_grad():
-                new, old = self._distributions(half)
-                surrogate = (self._ratio(new, old, half) * half.get(self.tensor_keys.advantage)).mean()
-            grad = torch.autograd.grad(surrogate, parameters, allow_unused=True)
-            grads.append(torch.cat([x.flatten() for x in grad if x is not None]))
-        if len(grads) < 2:  # a single flight
-            return torch.ones_like(self.score_weight)
-        product, size = grads[0] @ grads[1], grads[0].square().sum() + grads[1].square().sum()
-        return 2.0 * product / size.clamp_min(1e-30)
-
     def _distributions(self, tensordict: TensorDictBase) -> tuple[Normal, Normal]:
         """The normal distribution of the policy as it is, and as it flew."""
         new = act_again(self.actor_network, self.actor_network_params, tensordict)
@@ -221,9 +205,3 @@ class HybridLoss(PathwiseCriticLoss):
         """The ratio of the probabilities of the action that was flown: (*, 1)."""
         latent = tensordict.get(self.tensor_keys.latent)
         return (new.log_prob(latent) - old.log_prob(latent)).sum(-1, keepdim=True).exp()
-
-    def _update(self, name: str, measured: Tensor) -> Tensor:
-        """Update the running mean of a weight; it may leave [0, 1], so that noise around 0 averages to 0."""
-        running = getattr(self, name)
-        running.copy_(torch.where(running.isnan(), measured, torch.lerp(measured, running, self.decay)))
-        return running.clamp(0.0, 1.0)

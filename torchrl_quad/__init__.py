@@ -8,12 +8,13 @@ from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
 from torchrl_quad.engine import ActionSequence
 from torchrl_quad.envs import TASKS, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv, load_track, make_env
 from torchrl_quad.modules import make_actor, make_qvalue, make_value
-from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss, TrustRegion
+from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, SAPOLoss, SHACLoss, TrustRegion
 
 __version__ = "0.1.0"
 
 __all__ = [
     "ABPTLoss",
+    "AHACLoss",
     "ActionSequence",
     "BPTTLoss",
     "HoveringEnv",
@@ -22,6 +23,7 @@ __all__ = [
     "QuadrotorEnv",
     "QuadrotorParams",
     "RacingEnv",
+    "SAPOLoss",
     "SHACLoss",
     "TrackingEnv",
     "TrustRegion",

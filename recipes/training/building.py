@@ -86,6 +86,12 @@ def make_optimizer(
     return optimizer, lr_scheduler.LambdaLR(optimizer, lambda iteration: factor(min(iteration / last, 1.0)))
 
 
+def advance(schedule: lr_scheduler.LRScheduler, iteration: float) -> None:
+    """Set a schedule to an iteration, counted from 0, which may lie between two of them."""
+    schedule.last_epoch = iteration - 1
+    schedule.step()
+
+
 class TargetUpdate(SoftUpdate):
     """TorchRL's soft update of a loss's target critic, with all its parameters in one call."""
 

@@ -59,9 +59,9 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
         plain = actor.plain() if hasattr(actor, "plain") else None
         if not hasattr(plain, "drawn_again"):
             raise NotImplementedError(
-                "Gradients that are clipped in each step need a policy as make_actor builds it, whose noise follows "
-                "from its actions, and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed "
-                "parts, or leave clip_action_gradient=None."
+                "clip_action_gradient and AHACLoss need a policy as make_actor builds it, whose noise follows from its "
+                "actions, and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed parts, or "
+                "leave clip_action_gradient=None with another loss."
             )
         return act(plain, tensordict.select(*plain.in_keys).detach(), plain.drawn_again(tensordict))
 

@@ -28,11 +28,16 @@ def segments(done: Tensor) -> tuple[Tensor, Tensor]:
     return end.roll(1, -2), end
 
 
-def discounts(done: Tensor, gamma: Tensor) -> Tensor:
-    """gamma^t, where t counts the steps of each segment from 0: (*, horizon, 1), as ``done``; gamma is a scalar."""
+def step_in_segment(done: Tensor) -> Tensor:
+    """The steps of each segment, counted from 0: (*, horizon, 1), as ``done``."""
     start, _ = segments(done)
     index = torch.arange(done.shape[-2], device=done.device).unsqueeze(-1).expand(done.shape)
-    return gamma ** (index - torch.where(start, index, 0).cummax(-2).values)
+    return index - torch.where(start, index, 0).cummax(-2).values
+
+
+def discounts(done: Tensor, gamma: Tensor) -> Tensor:
+    """gamma^t, where t counts the steps of each segment from 0: (*, horizon, 1), as ``done``; gamma is a scalar."""
+    return gamma ** step_in_segment(done)
 
 
 class PathwiseLoss(LossModule):
@@ -86,6 +91,8 @@ class PathwiseLoss(LossModule):
 
     out_keys = ["loss_actor", "n_step_return"]
     value_part: str | None = None  # the part of the objective that comes from a critic
+    # What is measured of the gradients in single actions. Where anything is, the policy learns from these gradients.
+    measured_of_actions: list[str] = []
 
     actor_network: TensorDictModule
     actor_network_params: TensorDictParams
@@ -126,7 +133,8 @@ class PathwiseLoss(LossModule):
         else:
             self.register_coeff_buffer("fixed_alpha", float(alpha), **number)
         self.has_entropy_bonus = alpha == "auto" or alpha > 0
-        more_keys = [*(["clipped"] if self.clip else []), *(["entropy", "alpha"] if self.has_entropy_bonus else [])]
+        self.measured_of_actions = [*self.measured_of_actions, *(["clipped"] if self.clip else [])]
+        more_keys = [*self.measured_of_actions, *(["entropy", "alpha"] if self.has_entropy_bonus else [])]
         self.out_keys = [*self.out_keys, *more_keys, *(["loss_alpha"] if self.automatic_alpha else [])]
 
     def convert_to_functional(self, module: TensorDictModule, module_name: str, *args: Any, **kwargs: Any) -> None:
@@ -149,7 +157,7 @@ class PathwiseLoss(LossModule):
             names |= {("next", key) for key in (keys.reward, keys.done, keys.terminated)}
             if self.has_entropy_bonus:
                 names.add(keys.sample_log_prob)
-            if self.clip is not None:
+            if self.measured_of_actions:
                 names |= {"loc", "scale", *(set(self.actor_network.out_keys) & {"noise", "noise_before"})}
             self._in_keys = sorted((unravel_key(name) for name in names), key=str)
         return self._in_keys
@@ -232,18 +240,19 @@ class PathwiseLoss(LossModule):
             the loss, and its metadata by name; with an automatic alpha this includes ``loss_alpha``.
         """
         objective, metadata = self._objective(tensordict)
-        if self.clip is not None and not torch.is_grad_enabled():
-            metadata["clipped"] = torch.full_like(self.clip.median, math.nan)
-        elif self.clip is not None:
+        if self.measured_of_actions and not torch.is_grad_enabled():
+            metadata |= dict.fromkeys(self.measured_of_actions, torch.full_like(self.alpha, math.nan))
+        elif self.measured_of_actions:
             action = tensordict.get(self.tensor_keys.action)
-            grad, metadata["clipped"] = self.clip(action_gradient(objective.sum(), action))
+            grad, measured = self._measure(action_gradient(objective.sum(), action))
+            metadata |= measured
             written = act_again(self.actor_network, self.actor_network_params, tensordict)
             learned = (grad * written[self.tensor_keys.action]).sum((-2, -1)) + self._beside_actions(tensordict)
             objective = objective.detach() + learned - learned.detach()
             tensordict = tensordict.copy().update(written)
         if self.has_entropy_bonus:
             entropy = self._entropy(tensordict)
-            objective = objective + self.alpha * entropy
+            objective = objective + self._entropy_bonus(tensordict)
             metadata |= {"entropy": entropy.detach().mean(), "alpha": self.alpha.clone()}
             if self.automatic_alpha:
                 gap = entropy.detach() - self._target_entropy(tensordict)
@@ -278,16 +287,30 @@ class PathwiseLoss(LossModule):
         gamma = self.value_estimator.gamma.to(tensordict.get(("next", self.tensor_keys.reward)).dtype)
         return discounts(tensordict.get(("next", self.tensor_keys.done)), gamma)
 
+    def _measure(self, grad: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """From the gradients in the actions (*, horizon, k) those to learn from, and what is measured of them."""
+        if self.clip is None:
+            return grad, {}
+        grad, clipped = self.clip(grad)
+        return grad, {"clipped": clipped}
+
+    def _entropy_bonus(self, tensordict: TensorDictBase) -> Tensor:
+        """What is added to J for the entropy of the policy: (*)."""
+        return self.alpha * self._entropy(tensordict)
+
     def _entropy(self, tensordict: TensorDictBase) -> Tensor:
         """Minus the log-probability of the actions taken, averaged over the steps: (*)."""
+        return self._surprise(tensordict).mean((-2, -1))
+
+    def _surprise(self, tensordict: TensorDictBase) -> Tensor:
+        """Minus the log-probability of each action taken, a sample of the policy's entropy: (*, horizon, 1)."""
         log_prob = tensordict.get(self.tensor_keys.sample_log_prob, None)
         if log_prob is None:
             raise RuntimeError(
                 f"The entropy bonus of {type(self).__name__} reads {self.tensor_keys.sample_log_prob!r}, which is "
                 "not in the rollout. Build the actor with return_log_prob=True, or set the loss's alpha to 0."
             )
-        horizon = tensordict.shape[-1]
-        return -log_prob.reshape(*tensordict.shape[:-1], horizon).mean(-1)
+        return -log_prob.reshape(*tensordict.shape, 1)
 
     def _target_entropy(self, tensordict: TensorDictBase) -> float:
         if self.target_entropy == "auto":

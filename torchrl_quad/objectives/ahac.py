@@ -47,7 +47,7 @@ class AHACLoss(SHACLoss):
         **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
 
     Raises:
-        ValueError: the horizon is not between its bounds, or a number is out of its range.
+        ValueError: the horizon is not between its bounds, a number is out of its range, or the policy is another one.
     """
 
     measured_of_actions = ["stiffness"]
@@ -86,6 +86,11 @@ class AHACLoss(SHACLoss):
             delay_value=False,
             **kwargs,
         )
+        if not {"loc", "scale"} <= set(self.actor_network.out_keys):
+            raise ValueError(
+                "AHACLoss needs a policy as make_actor builds it, which writes loc and scale; this one writes "
+                f"{', '.join(map(str, self.actor_network.out_keys))}."
+            )
         self.min_horizon, self.max_horizon = low, high
         self.max_stiffness, self.horizon_lr = max_stiffness, horizon_lr
         number = {"device": self._default_device, "dtype": torch.float64}

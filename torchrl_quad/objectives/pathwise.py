@@ -98,6 +98,13 @@ class PathwiseLoss(LossModule):
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        # A class without out_keys of its own would lose those of its objects to its parent's, which tensordict turns
+        # into a property when the parent is first built.
+        super().__init_subclass__(**kwargs)
+        if "out_keys" not in vars(cls):
+            cls.out_keys = list(cls.out_keys if isinstance(cls.out_keys, list) else cls._out_keys)
+
     def __init__(
         self,
         actor_network: TensorDictModule,

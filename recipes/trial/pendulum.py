@@ -10,6 +10,7 @@ policy that swings it up about -150. All losses have the same networks, rates an
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 
 import torch
@@ -19,7 +20,6 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, PendulumEnv, RewardScaling, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import SoftUpdate
-from tqdm import tqdm
 
 from torchrl_quad import (
     ABPTLoss,
@@ -33,7 +33,8 @@ from torchrl_quad import (
     make_value,
 )
 
-ENVS, HORIZON, EPISODE, EPISODES = 256, 32, 200, 256
+ENVS, HORIZON, EPISODE, EPISODES = 256, 50, 200, 256
+LEARNING_RATE = 1e-2  # of actor and critics; it falls to a fiftieth
 REWARD = 0.1  # rewards of about one are quicker to learn than those of about ten
 LOSSES = {
     "bptt": lambda env, actor: BPTTLoss(actor),
@@ -88,17 +89,17 @@ def train(name: str, seed: int, total_steps: int) -> tuple[float, float, float]:
     loss.make_value_estimator(gamma=0.98)
     target = SoftUpdate(loss, tau=0.05) if name in ("shac", "abpt", "abpt-simulated") else None
     extra = [loss.log_alpha] if loss.automatic_alpha else []
-    actor_optimizer = torch.optim.Adam([*loss.actor_network_params.parameters(), *extra], 5e-3, betas=(0.7, 0.95))
+    actor_optimizer = torch.optim.Adam([*loss.actor_network_params.parameters(), *extra], betas=(0.7, 0.95))
     critic = [] if name == "bptt" else list(getattr(loss, f"{loss.critic_name}_params").parameters())
-    critic_optimizer = torch.optim.Adam(critic, 5e-3, betas=(0.7, 0.95)) if critic else None
+    critic_optimizer = torch.optim.Adam(critic, betas=(0.7, 0.95)) if critic else None
     learn = getattr(loss, loss.critic_loss_key) if critic else None
 
     before, start, steps = mean_return(actor), time.process_time(), 0
-    carry, age = starts(env, ENVS), 0
+    carry = starts(env, ENVS)
     while steps < total_steps:
         for optimizer in (actor_optimizer, critic_optimizer):
             if optimizer:
-                optimizer.param_groups[0]["lr"] = 5e-3 * (1.0 - 0.98 * steps / total_steps)
+                optimizer.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - 0.98 * steps / total_steps)
         rollout, carry = differentiable_rollout(env, actor, carry, getattr(loss, "horizon", HORIZON))
         loss_actor, metadata = loss.loss_actor(rollout)
         actor_optimizer.zero_grad()
@@ -107,7 +108,7 @@ def train(name: str, seed: int, total_steps: int) -> tuple[float, float, float]:
         actor_optimizer.step()
         if critic:
             data = loss.write_value_target(rollout.detach()).reshape(-1)
-            for _ in range(8):
+            for _ in range(16):
                 critic_optimizer.zero_grad()
                 learn(data[torch.randint(len(data), (512,))])[0].backward()
                 torch.nn.utils.clip_grad_norm_(critic, 1.0)
@@ -116,9 +117,10 @@ def train(name: str, seed: int, total_steps: int) -> tuple[float, float, float]:
                     target.step()
         if name == "ahac":
             loss.adapt_horizon(metadata["stiffness"])
-        steps, age = steps + rollout.numel(), age + rollout.shape[1]
-        if age >= EPISODE:  # an episode of the pendulum has no end of its own
-            carry, age = starts(env, ENVS), 0
+        steps += rollout.numel()
+        fresh = starts(env, ENVS // 2)  # an episode of the pendulum has no end of its own: half of them start afresh
+        going_on = carry.select(*fresh.keys())[torch.randperm(ENVS)[: ENVS - len(fresh)]]
+        carry = torch.cat((fresh, going_on))
     return before, mean_return(actor), time.process_time() - start
 
 
@@ -126,12 +128,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--losses", nargs="+", default=list(LOSSES), choices=list(LOSSES))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--steps", type=int, default=819_200, help="of all 256 pendulums together")
+    parser.add_argument("--steps", type=int, default=1_024_000, help="of all 256 pendulums together")
     args = parser.parse_args()
     torch.set_num_threads(1)
     lines = []
     for name in args.losses:
-        runs = [train(name, seed, args.steps) for seed in tqdm(args.seeds, desc=name, leave=False)]
+        runs = []
+        for seed in args.seeds:
+            runs.append(train(name, seed, args.steps))
+            print(f"{name}, seed {seed}: {runs[-1][1]:.0f}", file=sys.stderr)
         before, after, seconds = zip(*runs, strict=True)
         returns = ", ".join(f"{x:.0f}" for x in after)
         lines.append([name, f"{sum(before) / len(runs):.0f}", returns, f"{sum(seconds) / len(runs):.0f} s"])

@@ -54,9 +54,10 @@ def test_a_compiled_run_learns_what_an_eager_one_does(train, no_pictures, tmp_pa
 def test_every_recipe_trains_on_every_task_and_leaves_what_it_promises(launch, recipe, tmp_path, request):
     if recipe != "abpt":  # the others draw the same pictures, and do so in other tests
         request.getfixturevalue("no_pictures")
-    sweep = [f"task={','.join(TASKS)}", f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=${task}"]
+    tasks = ["landing"] if recipe in ("sapo", "ahac") else TASKS  # they differ from SHAC in their losses alone
+    sweep = [f"task={','.join(tasks)}", f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=${task}"]
     printed = launch(recipe, "--multirun", *SMALL, *sweep, "hydra/launcher=basic")
-    for task in TASKS:
+    for task in tasks:
         folder = tmp_path / task
         rows = read(folder)
         assert [int(row["iteration"]) for row in rows] == [2, 4]

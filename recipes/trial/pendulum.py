@@ -39,7 +39,7 @@ REWARD = 0.1  # rewards of about one are quicker to learn than those of about te
 LOSSES = {
     "bptt": lambda env, actor: BPTTLoss(actor),
     "shac": lambda env, actor: SHACLoss(actor, make_value(env)),
-    "sapo": lambda env, actor: SAPOLoss(actor, make_value(env), alpha_init=0.1),
+    "sapo": lambda env, actor: SAPOLoss(actor, make_value(env), alpha_init=0.01),
     "ahac": lambda env, actor: AHACLoss(actor, make_value(env), horizon=HORIZON),
     "abpt": lambda env, actor: ABPTLoss(actor, make_qvalue(env)),
     "abpt-simulated": lambda env, actor: ABPTLoss(actor, make_qvalue(env), simulated_steps=1),

@@ -99,10 +99,8 @@ class PathwiseLoss(LossModule):
     target_actor_network_params: TensorDictParams
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        # A class without out_keys of its own would lose those of its objects to its parent's, which tensordict turns
-        # into a property when the parent is first built.
         super().__init_subclass__(**kwargs)
-        if "out_keys" not in vars(cls):
+        if "out_keys" not in vars(cls):  # tensordict would take its parent's for those of its objects
             cls.out_keys = list(cls.out_keys if isinstance(cls.out_keys, list) else cls._out_keys)
 
     def __init__(
@@ -140,9 +138,9 @@ class PathwiseLoss(LossModule):
         else:
             self.register_coeff_buffer("fixed_alpha", float(alpha), **number)
         self.has_entropy_bonus = alpha == "auto" or alpha > 0
-        self.measured_of_actions = [*self.measured_of_actions, *(["clipped"] if self.clip else [])]
-        more_keys = [*self.measured_of_actions, *(["entropy", "alpha"] if self.has_entropy_bonus else [])]
-        self.out_keys = [*self.out_keys, *more_keys, *(["loss_alpha"] if self.automatic_alpha else [])]
+        self.measured_of_actions = self.measured_of_actions + ["clipped"] * (self.clip is not None)
+        of_entropy = ["entropy", "alpha"] * self.has_entropy_bonus + ["loss_alpha"] * self.automatic_alpha
+        self.out_keys = [*self.out_keys, *self.measured_of_actions, *of_entropy]
 
     def convert_to_functional(self, module: TensorDictModule, module_name: str, *args: Any, **kwargs: Any) -> None:
         """As TorchRL's, and refuse anything but a TensorDictModule."""
@@ -252,11 +250,10 @@ class PathwiseLoss(LossModule):
         elif self.measured_of_actions:
             action = tensordict.get(self.tensor_keys.action)
             grad, measured = self._measure(action_gradient(objective.sum(), action))
-            metadata |= measured
             written = act_again(self.actor_network, self.actor_network_params, tensordict)
             learned = (grad * written[self.tensor_keys.action]).sum((-2, -1)) + self._beside_actions(tensordict)
             objective = objective.detach() + learned - learned.detach()
-            tensordict = tensordict.copy().update(written)
+            tensordict, metadata = tensordict.copy().update(written), metadata | measured
         if self.has_entropy_bonus:
             entropy = self._entropy(tensordict)
             objective = objective + self._entropy_bonus(tensordict)
@@ -296,10 +293,8 @@ class PathwiseLoss(LossModule):
 
     def _measure(self, grad: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """From the gradients in the actions (*, horizon, k) those to learn from, and what is measured of them."""
-        if self.clip is None:
-            return grad, {}
-        grad, clipped = self.clip(grad)
-        return grad, {"clipped": clipped}
+        grad, clipped = (grad, None) if self.clip is None else self.clip(grad)
+        return grad, {} if clipped is None else {"clipped": clipped}
 
     def _entropy_bonus(self, tensordict: TensorDictBase) -> Tensor:
         """What is added to J for the entropy of the policy: (*)."""

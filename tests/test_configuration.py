@@ -12,7 +12,7 @@ from torchrl_quad import load_drone
 from torchrl_quad.dynamics import presets
 
 CONFIG = Path(__file__).parent.parent / "recipes/config"
-RECIPES = ["abpt", "bptt", "shac", "ppo"]
+RECIPES = ["abpt", "bptt", "shac", "ppo", "sapo", "ahac"]
 TASKS = ["hovering", "landing", "racing", "tracking"]
 
 REFUSED = [  # of ABPT, unless a recipe is named
@@ -63,6 +63,10 @@ REFUSED = [  # of ABPT, unless a recipe is named
     ("loss.alpha=-1", "loss.alpha=-1: it must be at least 0"),
     ("shac loss.target_bootstrap=1", "loss.target_bootstrap=1: it must be true or false"),
     ("shac loss.average_over_horizon=maybe", "loss.average_over_horizon=maybe: it must be true or false"),
+    ("loss.simulated_steps=-1", "loss.simulated_steps=-1: it must be at least 0"),
+    ("sapo loss.target_entropy=1", "loss.target_entropy=1: it must be less than 0. .* auto for the size of the action"),
+    ("ahac loss.max_stiffness=1", "loss.max_stiffness=1: it must be greater than 1"),
+    ("ahac loss.horizon_lr=1", "loss.horizon_lr=1: it must be less than 1"),
     ("logger.backend=csvv", "logger.backend=csvv: it must be 'wandb', 'tensorboard' or 'csv'"),
     ("logger.flight_every=-1", "logger.flight_every=-1: it must be at least 0"),
     ("resume=none.pt", "resume=none.pt: it must be the path of a checkpoint.pt that exists, or auto"),

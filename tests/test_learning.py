@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("recipe", ["abpt", "bptt", "shac"])
+@pytest.mark.parametrize("recipe", ["abpt", "bptt", "shac", "sapo", "ahac"])
 def test_every_recipe_learns_to_hover(recipe, tmp_path):
     subprocess.run([sys.executable, f"recipes/{recipe}.py", f"hydra.run.dir={tmp_path}"], cwd=ROOT, check=True)
     summary = json.loads((tmp_path / "summary.json").read_text())

@@ -10,8 +10,10 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import (
     ABPTLoss,
+    AHACLoss,
     BPTTLoss,
     HoveringEnv,
+    SAPOLoss,
     SHACLoss,
     VisitedStateBuffer,
     differentiable_rollout,
@@ -40,6 +42,8 @@ def test_in_keys_suffice_and_out_keys_come_out(entropy):
         SHACLoss(actor, make_value(env), alpha=entropy),
         ABPTLoss(actor, make_qvalue(env), alpha=entropy),
         ABPTLoss(actor, make_qvalue(env), alpha=entropy, zero_step_return=False),
+        AHACLoss(actor, make_value(env), alpha=entropy, clip_action_gradient=2.0),
+        *([SAPOLoss(actor, make_value(env), alpha=entropy)] if entropy else []),
     ):
         rollout, _ = differentiable_rollout(env, actor, None, 3)
         out = loss(rollout.select(*loss.in_keys))

@@ -27,12 +27,13 @@ if TYPE_CHECKING:
         register_task,
     )
     from torchrl_quad.modules import make_actor, make_qvalue, make_value
-    from torchrl_quad.objectives import ABPTLoss, BPTTLoss, HybridLoss, SHACLoss, TrustRegion
+    from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss, TrustRegion
 
 __version__ = "0.1.0"
 
 __all__ = [
     "ABPTLoss",
+    "AHACLoss",
     "ActionSequence",
     "BPTTLoss",
     "DifferentiableCollector",
@@ -43,6 +44,7 @@ __all__ = [
     "QuadrotorEnv",
     "QuadrotorParams",
     "RacingEnv",
+    "SAPOLoss",
     "SHACLoss",
     "TrackingEnv",
     "TrustRegion",

@@ -86,6 +86,12 @@ def make_optimizer(
     return optimizer, lr_scheduler.LambdaLR(optimizer, lambda iteration: factor(min(iteration / last, 1.0)))
 
 
+def advance(schedule: lr_scheduler.LRScheduler, iteration: float) -> None:
+    """Set a schedule to an iteration, counted from 0, which may lie between two of them."""
+    schedule.last_epoch = iteration - 1
+    schedule.step()
+
+
 class AdaptiveRate:
     """The learning rate of a policy that a horizon moves by about ``max_kl``, which falls to nothing over the run.
 

@@ -77,6 +77,9 @@ class Run:
 
     Attributes:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
+        horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
+        steps: control steps of all drones before this iteration.
+        drones: of all processes.
     """
 
     def __init__(
@@ -90,8 +93,8 @@ class Run:
     ) -> None:
         self.cfg, self.env, self.actor, self.loss, self.buffer = cfg, env, actor, loss, buffer
         self.stateful = [loss, *stateful, *([env.transform] if cfg.normalize else [])]
-        self.iterations = iterations(cfg)
-        self.steps_per_iteration = cfg.num_envs * cfg.horizon * world_size()
+        self.horizon, self.steps, self.drones = cfg.horizon, 0, cfg.num_envs * world_size()
+        self.total_steps = iterations(cfg) * cfg.horizon * self.drones
         self.recorded: dict[str, list[float]] = defaultdict(list)
         self.starts: list[Tensor] = []  # positions in which the horizons since the last row have started
         self.rows: list[dict[str, float]] = []  # of metrics.csv
@@ -107,12 +110,11 @@ class Run:
             logger_state = self._load(Path(cfg.resume))
         else:
             self.carry = env.reset()
-        self.is_over = self.done >= self.iterations and (self.folder / "summary.json").exists()
+        self.is_over = self.steps >= self.total_steps and (self.folder / "summary.json").exists()
         if rank() == 0 and not self.is_over:
             for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
                 (self.folder / name).unlink(missing_ok=True)
-            steps = self.done * self.steps_per_iteration
-            self.logs = Logs(cfg, self.folder, self.revision, self.rows, steps, logger_state)
+            self.logs = Logs(cfg, self.folder, self.revision, self.rows, self.steps, logger_state)
             with replacing(self.folder / "config.yaml") as path:
                 OmegaConf.save(cfg, path, resolve=True)
 
@@ -123,28 +125,28 @@ class Run:
             if rank() == 0:
                 print(f"Finished before: {self.folder}")
             return
-        if self.cfg.compile and self.done < self.iterations:
+        if self.cfg.compile and self.steps < self.total_steps:
             self._warm_up()
-        step = self.steps_per_iteration
         inside = self.env.flies_inside(self.actor)
         way = "policy inside the step" if inside else "policy before the step"
         with tqdm(
-            total=self.iterations * step,
-            initial=self.done * step,
+            total=self.total_steps,
+            initial=self.steps,
             unit="step",
             unit_scale=True,
             desc=f"{self.cfg.algorithm} {self.cfg.task} {self.cfg.seed}, {way}",
             disable=rank() > 0,
         ) as bar:
-            for iteration in range(self.done, self.iterations):
+            while self.steps < self.total_steps:
                 self.starts.append(self.carry["state", "position"].clone())
                 start, processor_start = time.perf_counter(), time.process_time()
-                yield iteration
+                yield self.done
                 self.seconds += time.perf_counter() - start
                 self.processor_seconds += time.process_time() - processor_start
                 self.done += 1
-                bar.update(step)
-                if self.done % self.cfg.eval.interval == 0 or self.done == self.iterations:
+                self.steps += self.horizon * self.drones
+                bar.update(self.horizon * self.drones)
+                if self.done % self.cfg.eval.interval == 0 or self.steps >= self.total_steps:
                     if rank() == 0:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
@@ -198,6 +200,7 @@ class Run:
     def _warm_up(self) -> None:
         """Compile all that the loop will call, before the clock starts; change nothing."""
         pathwise = isinstance(self.loss, PathwiseLoss)
+        before = copy.deepcopy(self.loss.state_dict())
         with (
             torch.random.fork_rng(),
             drawing_from(self.env, self.cfg.eval.seed),
@@ -205,23 +208,20 @@ class Run:
         ):
             rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, min(self.cfg.horizon, 2))
             if pathwise:
-                buffers = [(x, x.clone()) for x in self.loss.buffers()]  # such as running means
                 self.loss.loss_actor(rollout)[0].backward()
                 self.loss.zero_grad()
-                for x, before in buffers:
-                    x.copy_(before)
+        self.loss.load_state_dict(before)  # such as running means
 
     def _evaluate(self) -> dict[str, float]:
         """Fly the policy as it is, and log the result with everything recorded since the last time."""
         with drawing_from(self.env, self.cfg.eval.seed):
             metrics, flight = evaluate(self.env, self.actor)
-        steps = self.done * self.steps_per_iteration
         row = {
             "iteration": self.done,
-            "steps": steps,
+            "steps": self.steps,
             "time/seconds": self.seconds,
             "time/processor_seconds": self.processor_seconds,
-            "time/steps_per_second": steps / self.seconds,
+            "time/steps_per_second": self.steps / self.seconds,
             **{name: sum(values) / len(values) for name, values in self.recorded.items()},
             "train/start_cells": len(torch.cat(self.starts).div(CELL).floor().unique(dim=0)),
             "grad/skipped": self.skipped,
@@ -231,23 +231,23 @@ class Run:
             row |= self._diagnose()
         self.logs.add(row)
         every = self.cfg.logger.flight_every
-        if every and len(self.rows) % every == 0 and self.done < self.iterations:  # at the end the best one is drawn
+        if every and len(self.rows) % every == 0 and self.steps < self.total_steps:  # at the end the best one is drawn
             now = {**self.cfg, "episodes": len(flight), "solved": metrics["eval/solved"]}
             drawing.draw_flight(flight, self.folder / "flight", self.env, title(now))
-            self.logs.show_flight(steps)
+            self.logs.show_flight(self.steps)
         score = {name: metrics[f"eval/{name}"] for name in ("solved", "return")}
         # A checkpoint from before knows the return alone.
         record = self.best.get("solved", -math.inf), self.best["return"]
         if math.isfinite(score["return"]) and tuple(score.values()) >= record:
             policy = {"actor": self.actor, **({"normalizer": self.env.transform} if self.cfg.normalize else {})}
             weights = {name: copy.deepcopy(module.state_dict()) for name, module in policy.items()}
-            self.best = {**score, "steps": steps, **weights}
+            self.best = {**score, "steps": self.steps, **weights}
         return metrics
 
     def _diagnose(self) -> dict[str, float]:
         """Measure what reward and gradient of the next horizon are made of; change nothing."""
         with torch.random.fork_rng(), drawing_from(self.env, self.cfg.eval.seed):
-            rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, self.cfg.horizon)
+            rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, self.horizon)
             audit = audit_reward(rollout, self.actor, gamma=self.cfg.gamma)
             metrics = {f"reward/{name}": share for name, share in audit.metrics().items()}
             if isinstance(self.loss, PathwiseLoss):
@@ -259,14 +259,13 @@ class Run:
     def _finish(self) -> None:
         """Fly the best policy from fresh starts, draw it, and write the summary last: it marks the run as finished."""
         summary, flight = final_evaluation(self.cfg, *best_policy(self.cfg, self.best, self.folder))
-        steps = self.iterations * self.steps_per_iteration
-        summary |= {"steps": steps, "best_steps": self.best["steps"], "seconds": round(self.seconds, 2)}
+        summary |= {"steps": self.steps, "best_steps": self.best["steps"], "seconds": round(self.seconds, 2)}
         summary |= {"revision": self.revision}
         picture, figure, page = (self.folder / name for name in ("flight.png", "episode.pdf", "flight.html"))
         drawing.draw_flight(flight, picture, self.env, title(summary))
         drawing.publish_flight(flight, figure, page, self.env, title(summary))
         drawing.draw_learning_curve(self.folder / "metrics.csv", self.folder / "learning_curve.png", self.env)
-        self.logs.show_flight(steps)
+        self.logs.show_flight(self.steps)
         self.logs.finish(summary)
         write_summary(self.folder / "summary.json", summary)
         print_summary(summary, self.env.metric_info, self.folder)
@@ -293,6 +292,7 @@ class Run:
                 "revision": self.revision,
                 "config": OmegaConf.to_yaml(self.cfg, resolve=True),
                 "iteration": self.done,
+                "steps": self.steps,
                 "seconds": (self.seconds, self.processor_seconds),
                 "skipped": self.skipped,
                 "rows": self.rows,
@@ -329,6 +329,8 @@ class Run:
         if own["cuda"] is not None:
             torch.cuda.set_rng_state(own["cuda"], self.env.device)
         self.done, self.skipped = saved["iteration"], saved["skipped"]
+        # Before horizons could change, a checkpoint did not count them.
+        self.steps = saved.get("steps", self.done * self.cfg.horizon * self.drones)
         self.seconds, self.processor_seconds = saved["seconds"]
         self.rows, self.best, self.saved = saved["rows"], saved["best"], path
         before = saved["revision"]

@@ -152,6 +152,22 @@ class Loss(Section):
     terminal_gradient: bool | None = None
     target_bootstrap: bool | None = None
     average_over_horizon: bool | None = None
+    alpha_init: Positive | None = Field(None, description="What alpha=auto starts from.")
+    target_entropy: Annotated[Real, Field(lt=0)] | Literal["auto"] | None = Field(
+        None, description="The entropy at which alpha=auto holds the policy; auto for the size of the action."
+    )
+    simulated_steps: int | None = Field(
+        None, ge=0, le=100_000, description="Control steps that ABPT's return of the start flies before its critic."
+    )
+    min_horizon: Size | None = Field(None, description="The shortest horizon; null for a quarter of horizon.")
+    max_horizon: Size | None = Field(None, description="The longest horizon; null for twice horizon.")
+    max_stiffness: Annotated[Real, Field(gt=1)] | None = Field(
+        None, description="Where the action gradients grow beyond it along a horizon, the horizon gets shorter."
+    )
+    horizon_lr: Annotated[Real, Field(ge=0, lt=1)] | None = Field(
+        None, description="The share by which the horizon may change in an iteration."
+    )
+    num_value_nets: int | None = Field(None, ge=1, le=64, description="Critics of states.")
     num_qvalue_nets: int | None = Field(None, ge=1, le=64, description="Critics whose smallest value counts.")
     gradient_lmbda: Annotated[Real, Field(gt=0, le=1)] | None = Field(
         None, description="The lambda of the return that the pathwise gradient differentiates; 0.9 is usual."

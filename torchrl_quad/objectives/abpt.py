@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchrl_quad.objectives.calls import sample_action
 from torchrl_quad.objectives.critic import PathwiseCriticLoss
-from torchrl_quad.objectives.pathwise import segments
+from torchrl_quad.objectives.pathwise import segments, step_in_segment
 
 
 class ABPTLoss(PathwiseCriticLoss):
@@ -35,6 +35,11 @@ class ABPTLoss(PathwiseCriticLoss):
         num_qvalue_nets: number of critics made from it, each initialised anew.
         n_step_return: include J_N.
         zero_step_return: include J_0.
+        simulated_steps: let J_0 fly so many control steps through the simulator before it asks the critic: the return
+            of a segment's start is then sum_(t<k) gamma^t r_t + gamma^k V(s_k), with V(s) = Q(s, a) and a sampled anew.
+            Its gradient in a_0 is the simulator's, where that of Q(s_0, a_0) is the critic's, which may be noise. With
+            an action delay of d steps a_0 moves nothing before step d + 1: take 1 + d or more. A segment that ends
+            sooner ends J_0 there.
         delay_qvalue: keep target networks, to be updated with :class:`torchrl.objectives.SoftUpdate`.
         **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
 
@@ -68,6 +73,7 @@ class ABPTLoss(PathwiseCriticLoss):
         num_qvalue_nets: int = 2,
         n_step_return: bool = True,
         zero_step_return: bool = True,
+        simulated_steps: int = 0,
         delay_qvalue: bool = True,
         **kwargs: Any,
     ) -> None:
@@ -75,7 +81,10 @@ class ABPTLoss(PathwiseCriticLoss):
             raise ValueError("ABPTLoss needs n_step_return or zero_step_return: with both off there is no objective.")
         if not (isinstance(num_qvalue_nets, numbers.Integral) and num_qvalue_nets >= 1):
             raise ValueError(f"ABPTLoss needs at least one critic, got num_qvalue_nets={num_qvalue_nets}.")
+        if not (isinstance(simulated_steps, numbers.Integral) and simulated_steps >= 0):
+            raise ValueError(f"simulated_steps must be a number of control steps, 0 or more; got {simulated_steps}.")
         super().__init__(actor_network, **kwargs)
+        self.simulated_steps = simulated_steps
         self.n_step_return, self.zero_step_return = n_step_return, zero_step_return
         switched = {"n_step_return": n_step_return, "zero_step_return": zero_step_return}
         self.out_keys = [*self.out_keys, *(name for name, on in switched.items() if on)]
@@ -119,7 +128,13 @@ class ABPTLoss(PathwiseCriticLoss):
         return sum(parts.values()), {name: len(parts) * part.detach().mean() for name, part in parts.items()}
 
     def _zero_step_return(self, tensordict: TensorDictBase) -> Tensor:
-        """Q(s_0, a_0) of each segment, summed over the segments: (*)."""
+        """Q(s_0, a_0) of each segment, or the return of its first ``simulated_steps``, summed over segments: (*)."""
+        if self.simulated_steps:
+            reward = tensordict.get(("next", self.tensor_keys.reward))
+            self._require_graph(reward, ("next", self.tensor_keys.reward))
+            is_first, last = self._simulated(tensordict)
+            rewards = (self._discounts(tensordict) * reward * is_first).sum((-2, -1))
+            return rewards + self._discounted_value(tensordict, last)
         action = tensordict.get(self.tensor_keys.action)
         self._require_graph(action, self.tensor_keys.action)
         start, _ = segments(tensordict.get(("next", self.tensor_keys.done)))
@@ -127,10 +142,20 @@ class ABPTLoss(PathwiseCriticLoss):
         value = self._critics(first).amin(0)
         return torch.zeros_like(start, dtype=value.dtype).masked_scatter(start, value).sum((-2, -1))
 
+    def _simulated(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """The first ``simulated_steps`` of each segment, and the last of these, bool (*, horizon, 1)."""
+        done = tensordict.get(("next", self.tensor_keys.done))
+        index, (_, end) = step_in_segment(done), segments(done)
+        is_first = index < self.simulated_steps
+        return is_first, is_first & (end | (index == self.simulated_steps - 1))
+
     def _beside_actions(self, tensordict: TensorDictBase) -> Tensor | float:
-        if not self.n_step_return:
-            return 0.0
-        return self._terminal_value(tensordict.detach()) / (1 + self.zero_step_return)
+        fixed, parts = tensordict.detach(), []
+        if self.n_step_return:
+            parts.append(self._terminal_value(fixed))
+        if self.zero_step_return and self.simulated_steps:
+            parts.append(self._discounted_value(fixed, self._simulated(fixed)[1]))
+        return sum(parts) / (self.n_step_return + self.zero_step_return)
 
     def _value(self, tensordict: TensorDictBase, *, target: bool) -> Tensor:
         states = tensordict.select(*self._critic_inputs())

@@ -111,7 +111,7 @@ def _plain(actor: TensorDictModule) -> Any:
         raise NotImplementedError(
             "Gradients of single actions need a policy as make_actor builds it, whose noise follows from its actions, "
             "and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed parts, or leave "
-            "clip_action_gradient=None."
+            "clip_action_gradient=None with another loss than AHACLoss and HybridLoss."
         )
     return plain
 

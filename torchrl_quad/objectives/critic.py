@@ -111,7 +111,11 @@ class PathwiseCriticLoss(PathwiseLoss):
     def _terminal_value(self, tensordict: TensorDictBase) -> Tensor:
         """gamma^n V(s_n) of each segment that did not terminate, summed over the segments: (*)."""
         _, end = segments(tensordict.get(("next", self.tensor_keys.done)))
-        where = end & ~tensordict.get(("next", self.tensor_keys.terminated))
+        return self._discounted_value(tensordict, end)
+
+    def _discounted_value(self, tensordict: TensorDictBase, after: Tensor) -> Tensor:
+        """gamma^(t+1) V(s_(t+1)) after steps (*, horizon, 1), but for those that terminated, summed over steps: (*)."""
+        where = after & ~tensordict.get(("next", self.tensor_keys.terminated))
         next_state = tensordict.get("next").select(*self._critic_inputs(), strict=False)[where.squeeze(-1)]
         value = self._value(next_state, target=self.target_bootstrap)
         discount = self.value_estimator.gamma * self._discounts(tensordict)

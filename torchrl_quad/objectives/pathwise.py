@@ -28,11 +28,16 @@ def segments(done: Tensor) -> tuple[Tensor, Tensor]:
     return end.roll(1, -2), end
 
 
-def discounts(done: Tensor, gamma: Tensor) -> Tensor:
-    """gamma^t, where t counts the steps of each segment from 0: (*, horizon, 1), as ``done``; gamma is a scalar."""
+def step_in_segment(done: Tensor) -> Tensor:
+    """The steps of each segment, counted from 0: (*, horizon, 1), as ``done``."""
     start, _ = segments(done)
     index = torch.arange(done.shape[-2], device=done.device).unsqueeze(-1).expand(done.shape)
-    return gamma ** (index - torch.where(start, index, 0).cummax(-2).values)
+    return index - torch.where(start, index, 0).cummax(-2).values
+
+
+def discounts(done: Tensor, gamma: Tensor) -> Tensor:
+    """gamma^t, where t counts the steps of each segment from 0: (*, horizon, 1), as ``done``; gamma is a scalar."""
+    return gamma ** step_in_segment(done)
 
 
 class PathwiseLoss(LossModule):
@@ -86,10 +91,17 @@ class PathwiseLoss(LossModule):
 
     out_keys = ["loss_actor", "n_step_return"]
     value_part: str | None = None  # the part of the objective that comes from a critic
+    # What is measured of the gradients in single actions. Where anything is, the policy learns from these gradients.
+    measured_of_actions: list[str] = []
 
     actor_network: TensorDictModule
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "out_keys" not in vars(cls):  # tensordict would take its parent's for those of its objects
+            cls.out_keys = list(cls.out_keys if isinstance(cls.out_keys, list) else cls._out_keys)
 
     def __init__(
         self,
@@ -126,8 +138,9 @@ class PathwiseLoss(LossModule):
         else:
             self.register_coeff_buffer("fixed_alpha", float(alpha), **number)
         self.has_entropy_bonus = alpha == "auto" or alpha > 0
-        more_keys = [*(["clipped"] if self.clip else []), *(["entropy", "alpha"] if self.has_entropy_bonus else [])]
-        self.out_keys = [*self.out_keys, *more_keys, *(["loss_alpha"] if self.automatic_alpha else [])]
+        self.measured_of_actions = self.measured_of_actions + ["clipped"] * (self.clip is not None)
+        of_entropy = ["entropy", "alpha"] * self.has_entropy_bonus + ["loss_alpha"] * self.automatic_alpha
+        self.out_keys = [*self.out_keys, *self.measured_of_actions, *of_entropy]
 
     def convert_to_functional(self, module: TensorDictModule, module_name: str, *args: Any, **kwargs: Any) -> None:
         """As TorchRL's, and refuse anything but a TensorDictModule."""
@@ -149,7 +162,7 @@ class PathwiseLoss(LossModule):
             names |= {("next", key) for key in (keys.reward, keys.done, keys.terminated)}
             if self.has_entropy_bonus:
                 names.add(keys.sample_log_prob)
-            if self.clip is not None:
+            if self.measured_of_actions:
                 names |= {"loc", "scale", *(set(self.actor_network.out_keys) & {"noise", "noise_before"})}
             self._in_keys = sorted((unravel_key(name) for name in names), key=str)
         return self._in_keys
@@ -232,18 +245,18 @@ class PathwiseLoss(LossModule):
             the loss, and its metadata by name; with an automatic alpha this includes ``loss_alpha``.
         """
         objective, metadata = self._objective(tensordict)
-        if self.clip is not None and not torch.is_grad_enabled():
-            metadata["clipped"] = torch.full_like(self.clip.median, math.nan)
-        elif self.clip is not None:
+        if self.measured_of_actions and not torch.is_grad_enabled():
+            metadata |= dict.fromkeys(self.measured_of_actions, torch.full_like(self.alpha, math.nan))
+        elif self.measured_of_actions:
             action = tensordict.get(self.tensor_keys.action)
-            grad, metadata["clipped"] = self.clip(action_gradient(objective.sum(), action))
+            grad, measured = self._measure(action_gradient(objective.sum(), action))
             written = act_again(self.actor_network, self.actor_network_params, tensordict)
             learned = (grad * written[self.tensor_keys.action]).sum((-2, -1)) + self._beside_actions(tensordict)
             objective = objective.detach() + learned - learned.detach()
-            tensordict = tensordict.copy().update(written)
+            tensordict, metadata = tensordict.copy().update(written), metadata | measured
         if self.has_entropy_bonus:
             entropy = self._entropy(tensordict)
-            objective = objective + self.alpha * entropy
+            objective = objective + self._entropy_bonus(tensordict)
             metadata |= {"entropy": entropy.detach().mean(), "alpha": self.alpha.clone()}
             if self.automatic_alpha:
                 gap = entropy.detach() - self._target_entropy(tensordict)
@@ -278,16 +291,28 @@ class PathwiseLoss(LossModule):
         gamma = self.value_estimator.gamma.to(tensordict.get(("next", self.tensor_keys.reward)).dtype)
         return discounts(tensordict.get(("next", self.tensor_keys.done)), gamma)
 
+    def _measure(self, grad: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """From the gradients in the actions (*, horizon, k) those to learn from, and what is measured of them."""
+        grad, clipped = (grad, None) if self.clip is None else self.clip(grad)
+        return grad, {} if clipped is None else {"clipped": clipped}
+
+    def _entropy_bonus(self, tensordict: TensorDictBase) -> Tensor:
+        """What is added to J for the entropy of the policy: (*)."""
+        return self.alpha * self._entropy(tensordict)
+
     def _entropy(self, tensordict: TensorDictBase) -> Tensor:
         """Minus the log-probability of the actions taken, averaged over the steps: (*)."""
+        return self._surprise(tensordict).mean((-2, -1))
+
+    def _surprise(self, tensordict: TensorDictBase) -> Tensor:
+        """Minus the log-probability of each action taken, a sample of the policy's entropy: (*, horizon, 1)."""
         log_prob = tensordict.get(self.tensor_keys.sample_log_prob, None)
         if log_prob is None:
             raise RuntimeError(
                 f"The entropy bonus of {type(self).__name__} reads {self.tensor_keys.sample_log_prob!r}, which is "
                 "not in the rollout. Build the actor with return_log_prob=True, or set the loss's alpha to 0."
             )
-        horizon = tensordict.shape[-1]
-        return -log_prob.reshape(*tensordict.shape[:-1], horizon).mean(-1)
+        return -log_prob.reshape(*tensordict.shape, 1)
 
     def _target_entropy(self, tensordict: TensorDictBase) -> float:
         if self.target_entropy == "auto":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +33,8 @@ class SHACLoss(PathwiseCriticLoss):
             critic itself; with ``delay_value=False`` the two are one.
         average_over_horizon: divide the objective by the number of steps of the rollout, as Xu et al. do. The entropy
             bonus is a mean over steps either way.
+        num_value_nets: number of critics made from it, each initialised anew, of which the least counts; 1 takes it
+            as it is.
         delay_value: keep a target network, to be updated with :class:`torchrl.objectives.SoftUpdate`.
         **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
     """
@@ -61,13 +64,17 @@ class SHACLoss(PathwiseCriticLoss):
         terminal_gradient: bool = True,
         target_bootstrap: bool = False,
         average_over_horizon: bool = False,
+        num_value_nets: int = 1,
         delay_value: bool = True,
         **kwargs: Any,
     ) -> None:
+        if not (isinstance(num_value_nets, numbers.Integral) and num_value_nets >= 1):
+            raise ValueError(f"{type(self).__name__} needs at least one critic, got num_value_nets={num_value_nets}.")
         super().__init__(actor_network, **kwargs)
         self.terminal_gradient, self.target_bootstrap = terminal_gradient, target_bootstrap
         self.average_over_horizon = average_over_horizon
-        self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
+        copies = None if num_value_nets == 1 else num_value_nets
+        self.convert_to_functional(value_network, "value_network", expand_dim=copies, create_target_params=delay_value)
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The critic's loss (paper, equation 16).

@@ -1,0 +1,125 @@
+"""Adaptive-horizon actor-critic."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+
+from torchrl_quad.objectives.shac import SHACLoss
+
+SMOOTHING = 0.2  # how much of the multiplier is new in each iteration
+
+
+class AHACLoss(SHACLoss):
+    """Adaptive-horizon actor-critic (Georgiev et al. 2024, arXiv:2405.17784): SHAC whose horizon follows the stiffness.
+
+    Where the dynamics are stiff the adjoint, the gradient of the objective in each action, grows backwards through the
+    horizon. Its ``stiffness`` is the root mean square of the lengths of these gradients over all environments and
+    steps, in units of their median: 1 to 2 where all are alike, and large where a few explode. :meth:`adapt_horizon`
+    holds it at a bound by a Lagrange multiplier phi on a horizon of N steps:
+
+        phi <- phi + 0.2 (clip(stiffness / max_stiffness - 1, -1, 1) - phi),    N <- N exp(-horizon_lr phi)
+
+    The least of two critics without target networks is the value at the end of the horizon, and that of their targets.
+
+    .. code-block:: python
+
+        rollout, carry = differentiable_rollout(env, actor, carry, loss.horizon)
+        loss_actor, metadata = loss.loss_actor(rollout)
+        ...
+        loss.adapt_horizon(metadata["stiffness"])
+
+    Args:
+        actor_network: the policy that flew the rollout, as :func:`~torchrl_quad.make_actor` builds it.
+        value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
+        horizon: control steps of the first rollout.
+        min_horizon: the shortest horizon; None means a quarter of the first.
+        max_horizon: the longest horizon; None means twice the first.
+        max_stiffness: the bound.
+        horizon_lr: the horizon changes by at most this share in an iteration.
+        num_value_nets: number of critics made from ``value_network``, each initialised anew.
+        terminal_gradient: as for :class:`SHACLoss`.
+        average_over_horizon: divide the objective by the number of steps of the rollout, as Georgiev et al. do.
+        **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
+
+    Raises:
+        ValueError: the horizon is not between its bounds, a number is out of its range, or the policy is another one.
+    """
+
+    measured_of_actions = ["stiffness"]
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        value_network: TensorDictModule,
+        *,
+        horizon: int = 32,
+        min_horizon: int | None = None,
+        max_horizon: int | None = None,
+        max_stiffness: float = 2.0,
+        horizon_lr: float = 0.1,
+        num_value_nets: int = 2,
+        terminal_gradient: bool = True,
+        average_over_horizon: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        low = max(horizon // 4, 1) if min_horizon is None else min_horizon
+        high = 2 * horizon if max_horizon is None else max_horizon
+        if not 1 <= low <= horizon <= high:
+            raise ValueError(
+                f"horizon={horizon} must lie between min_horizon={low} and max_horizon={high}, and be at least 1."
+            )
+        if not 1 < max_stiffness < math.inf:
+            raise ValueError(f"max_stiffness must be finite and above 1, got {max_stiffness}; 1.5 to 3 are usual.")
+        if not 0 <= horizon_lr < 1:
+            raise ValueError(f"horizon_lr must lie from 0 to below 1, got {horizon_lr}.")
+        super().__init__(
+            actor_network,
+            value_network,
+            num_value_nets=num_value_nets,
+            terminal_gradient=terminal_gradient,
+            average_over_horizon=average_over_horizon,
+            delay_value=False,
+            **kwargs,
+        )
+        if not {"loc", "scale"} <= set(self.actor_network.out_keys):
+            raise ValueError(
+                "AHACLoss needs a policy as make_actor builds it, which writes loc and scale; this one writes "
+                f"{', '.join(map(str, self.actor_network.out_keys))}."
+            )
+        self.min_horizon, self.max_horizon = low, high
+        self.max_stiffness, self.horizon_lr = max_stiffness, horizon_lr
+        number = {"device": self._default_device, "dtype": torch.float64}
+        self.register_buffer("length", torch.tensor(horizon, **number))
+        self.register_buffer("multiplier", torch.zeros((), **number))
+
+    @property
+    def horizon(self) -> int:
+        """Control steps of the next rollout; a checkpoint of the loss holds it."""
+        return round(self.length.item())
+
+    @torch.no_grad()
+    def adapt_horizon(self, stiffness: Tensor) -> None:
+        """Shorten the horizon where the stiffness is above its bound, and make it longer where it is below.
+
+        Args:
+            stiffness: as ``loss_actor`` measured it, a scalar. The mean of several processes keeps their horizons
+                alike. NaN, where no action had a gradient, changes nothing.
+        """
+        if stiffness.isnan():
+            return
+        excess = (stiffness.to(self.length) / self.max_stiffness - 1.0).clamp(-1.0, 1.0)
+        self.multiplier.lerp_(excess, SMOOTHING)
+        self.length.mul_((-self.horizon_lr * self.multiplier).exp()).clamp_(self.min_horizon, self.max_horizon)
+
+    def _measure(self, grad: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        length = grad.norm(dim=-1)
+        counts = length > 0  # the last actions move nothing within the horizon
+        median = torch.where(counts, length, torch.nan).nanmedian()
+        stiffness = (length.square().sum() / counts.sum()).sqrt() / median
+        grad, measured = super()._measure(grad)
+        return grad, {"stiffness": stiffness, **measured}

@@ -1,0 +1,99 @@
+"""Soft analytic policy optimization."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+
+from torchrl_quad.objectives.shac import SHACLoss
+
+
+class SAPOLoss(SHACLoss):
+    """Soft analytic policy optimization (Xing et al. 2025, arXiv:2412.12089): short-horizon actor-critic with entropy.
+
+    The objective of a segment is sum_t gamma^t (r_t + alpha H_t) + gamma^n V(s_n). The critics learn the same soft
+    return, so that the entropy counts beyond the horizon, too. H_t = (h_t + |h*|) / (2 |h*|) measures the entropy
+    h_t = -log pi(a_t|s_t) against its target h* < 0: it is 0 at h*, and 1 at -h*, whatever the size of the action.
+
+    The critics have no target networks. Their targets take the least of them, and the actor climbs their mean.
+
+    Args:
+        actor_network: the policy that flew the rollout, with log-probabilities (``return_log_prob=True``).
+        value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
+        num_value_nets: number of critics made from it, each initialised anew.
+        alpha: coefficient of the entropy: a positive number, or "auto" to hold the entropy at its target.
+        alpha_init: with ``alpha="auto"``, the coefficient to start from.
+        target_entropy: a negative number; "auto" means minus half the number of action entries.
+        terminal_gradient: as for :class:`SHACLoss`.
+        average_over_horizon: divide the objective by the number of steps of the rollout, as Xing et al. do.
+        **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
+
+    Raises:
+        ValueError: alpha is 0, or the target entropy is not negative.
+    """
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        value_network: TensorDictModule,
+        *,
+        num_value_nets: int = 2,
+        alpha: float | str = "auto",
+        alpha_init: float = 1.0,
+        target_entropy: float | str = "auto",
+        terminal_gradient: bool = True,
+        average_over_horizon: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        if alpha == 0:
+            raise ValueError("SAPOLoss needs an alpha above 0, or 'auto': without entropy take SHACLoss.")
+        if target_entropy != "auto" and not target_entropy < 0:
+            raise ValueError(
+                f"target_entropy must be 'auto' or a negative number, in whose size SAPOLoss measures the entropy; got "
+                f"{target_entropy}."
+            )
+        super().__init__(
+            actor_network,
+            value_network,
+            num_value_nets=num_value_nets,
+            alpha=alpha,
+            alpha_init=alpha_init,
+            target_entropy=target_entropy,
+            terminal_gradient=terminal_gradient,
+            average_over_horizon=average_over_horizon,
+            delay_value=False,
+            **kwargs,
+        )
+
+    def write_value_target(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the TD(lambda) target of each step's soft return into a rollout, and return it.
+
+        As :meth:`PathwiseCriticLoss.write_value_target`, with the reward r_t + alpha H_t.
+        """
+        self._require_rollout(tensordict)
+        soft, key = tensordict.detach(), ("next", self.tensor_keys.reward)
+        soft.set(key, soft.get(key) + self.alpha * self._normalized_entropy(soft))
+        target = super().write_value_target(soft).get(self.tensor_keys.value_target)
+        return tensordict.set(self.tensor_keys.value_target, target)
+
+    def _entropy_bonus(self, tensordict: TensorDictBase) -> Tensor:
+        """Alpha times the normalised entropy of each step, discounted as its reward is: (*)."""
+        steps = tensordict.shape[-1] if self.average_over_horizon else 1
+        entropy = self._discounts(tensordict) * self._normalized_entropy(tensordict)
+        return self.alpha * entropy.sum((-2, -1)) / steps
+
+    def _normalized_entropy(self, tensordict: TensorDictBase) -> Tensor:
+        """(h + |h*|) / (2 |h*|) of each step: (*, horizon, 1)."""
+        size = abs(self._target_entropy(tensordict))
+        return (self._surprise(tensordict) + size) / (2.0 * size)
+
+    def _target_entropy(self, tensordict: TensorDictBase) -> float:
+        target = super()._target_entropy(tensordict)
+        return 0.5 * target if self.target_entropy == "auto" else target
+
+    def _value(self, tensordict: TensorDictBase, *, target: bool) -> Tensor:
+        values = self._critics(tensordict, target=target)
+        return values.amin(0) if target else values.mean(0)

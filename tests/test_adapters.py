@@ -136,6 +136,10 @@ def test_what_does_not_fit_is_refused():
         DronesVecEnv(gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=2))
     with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
         TorchVectorEnv(scattered()).step(torch.zeros(8, 4))
+    env = TorchVectorEnv(scattered())
+    env.reset()
+    with pytest.raises(ValueError, match=r"shape \(4,\), expected \(8, 4\)"):
+        env.step(torch.zeros(4))
     with pytest.raises(AttributeError, match="no 'Rllib'. Choose from: DronesVecEnv, "):
         adapters.Rllib  # noqa: B018
 

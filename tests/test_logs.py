@@ -15,8 +15,8 @@ from training.checkpoints import read_checkpoint, revision
 
 def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(launch, tmp_path):
     small = [*SMALL, f"hydra.run.dir={tmp_path}"]
-    (tmp_path / "bundle").mkdir()  # what has been exported lies beside the checkpoint
-    (tmp_path / "bundle/policy.txt").write_text("exported")
+    (tmp_path / "policy").mkdir()  # what has been exported lies beside the checkpoint
+    (tmp_path / "policy/policy.txt").write_text("exported")
     launch("bptt", *small, "seed=3", "actor.lr=0.01", "logger.backend=wandb", "logger.flight_every=3")
     launch("bptt", *small, "seed=3", "actor.lr=0.01", "resume=auto", "total_steps=240")
     resumed = read_checkpoint(tmp_path / "checkpoint.pt")
@@ -65,7 +65,7 @@ def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(lau
     artifact = first["artifact"][0].artifact
     assert artifact.type == "model" and list(artifact.aliases) == ["best", "latest"]
     contents = {entry.path for entry in artifact.manifest.contents}
-    assert contents == {"checkpoint.pt", "config.yaml", "summary.json", "bundle/policy.txt"}
+    assert contents == {"checkpoint.pt", "config.yaml", "summary.json", "policy/policy.txt"}
     assert json.loads(second["artifact"][0].artifact.metadata)["return"] == final["return"]
     assert [logged(r)["steps"] for r in second["history"] if "eval/return" in logged(r)] == [240]
 

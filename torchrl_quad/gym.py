@@ -251,7 +251,7 @@ def _checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
     action = np.asarray(action, dtype=np.float64)
     if action.shape != shape:
         raise ValueError(
-            f"The action has shape {action.shape}, expected {shape}: thrust, roll, pitch and yaw rate, each in [-1, 1]"
+            f"The action has shape {action.shape}, expected {shape}, each entry in [-1, 1]"
             + (", a row for each drone." if len(shape) > 1 else ".")
         )
     if not np.isfinite(action).all():

@@ -17,7 +17,7 @@ from torchrl_quad.files import replacing
 from training.drawing import film_of
 from training.evaluation import as_json
 
-ARTIFACT = ("checkpoint.pt", "config.yaml", "bundle")  # of a run's folder, where they are there; and summary.json
+ARTIFACT = ("checkpoint.pt", "config.yaml", "policy")  # of a run's folder, where they are there; and summary.json
 NOT_IN_A_NAME = ("task=", "seed=", "resume=", "device=", "threads=", "logger.")
 
 

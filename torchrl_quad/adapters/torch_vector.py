@@ -74,9 +74,14 @@ class TorchVectorEnv:
 
         Raises:
             RuntimeError: before the first reset.
+            ValueError: the actions have another shape.
         """
         if self.now is None:
             raise RuntimeError("A step needs an episode: call reset() first.")
+        if action.shape != self._low.shape:
+            raise ValueError(
+                f"The actions have shape {tuple(action.shape)}, expected {tuple(self._low.shape)}: a row for each drone."
+            )
         # Frameworks act in inference mode, whose tensors could not be differentiated later.
         with torch.inference_mode(False), torch.no_grad():
             action = action.to(self._low).clamp(self._low, self._high)

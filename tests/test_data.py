@@ -318,5 +318,7 @@ def test_a_restart_begins_a_fraction_of_the_flights_afresh_and_lets_the_others_g
         assert fresh.float().mean().item() == pytest.approx(fraction, abs=0.06)
         assert (after["state"][~fresh] == carry["state"][~fresh]).all()
         torch.testing.assert_close(after["observation"][~fresh], carry["observation"][~fresh])
-    with pytest.raises(ValueError, match="restart needs the whole state, .'state',., and the carry lacks 'state'"):
+    with pytest.raises(
+        ValueError, match="restart needs the whole state, .'state',., and the carry lacks .'state', 'action_queue'."
+    ):
         restart(env, carry.exclude("state"), 0.5)

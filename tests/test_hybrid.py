@@ -77,6 +77,7 @@ def test_the_loss_is_the_surrogate_of_the_rest_and_the_pathwise_term(env):
     pathwise = loss.pathwise_weight.clamp(0, 1)
     assert not data["advantage"].requires_grad
     losses = loss(data)
+    assert set(losses.keys()) == set(loss.out_keys)
     # At the policy that flew, the gradient of the ratio is that of the log-probability.
     actor = loss.actor_network
     with loss.actor_network_params.to_module(actor):
@@ -92,7 +93,8 @@ def test_the_loss_is_the_surrogate_of_the_rest_and_the_pathwise_term(env):
     whole = data["advantage"] + predicted - predicted.mean()
     advantage = data["value_target"] - value_of(loss, data)
     torch.testing.assert_close(whole, (advantage - advantage.mean()) / advantage.std())
-    slope = (predicted / pathwise * whole).mean() / (predicted / pathwise).var(correction=0)
+    x, y = (z - z.mean(0) for z in (predicted / pathwise, whole))  # in each step of the horizon
+    slope = (x * y).mean() / x.square().mean()
     torch.testing.assert_close(slope, loss.pathwise_weight)
     loss(data.flatten()[:5])["loss_value"].backward()
 
@@ -133,5 +135,16 @@ def test_errors(env):
         with pytest.raises(ValueError, match=named):
             make_loss(env, **options)
     loss = make_loss(env)
+    rollout = flight(env, loss)
     with pytest.raises(RuntimeError, match="carries no gradient"):
-        loss.write_targets(flight(env, loss).detach())
+        loss.write_targets(rollout.detach())
+    with torch.no_grad(), pytest.raises(RuntimeError, match="with gradients enabled"):
+        loss.write_targets(rollout)
+    # A crash that leaves numbers that are not finite has no value, and no gradient.
+    broken = rollout.clone(recurse=True)
+    broken["next", "terminated"][2, 4] = broken["next", "done"][2, 4] = True
+    broken["next", "observation"] = torch.where(broken["next", "terminated"], torch.nan, broken["next", "observation"])
+    data = loss.write_targets(rollout.copy().update({"next": broken["next"]}))
+    assert data["location_gradient"].isfinite().all() and loss.pathwise_weight.isfinite()
+    read = loss.write_targets(rollout.select(*loss.in_keys))
+    assert loss(read)["loss_actor"].isfinite()

@@ -49,7 +49,8 @@ def build_env(cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = Fals
 def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModuleBase:
     """Build the policy of a configuration; it writes log-probabilities if the loss needs them."""
     log_prob = "entropy_bonus" in cfg.loss or cfg.loss.get("alpha", 0) != 0  # of PPO, or of an entropy bonus
-    noise = {name: cfg.actor[name] for name in ("scale_init", "learn_scale", "noise_correlation")}
+    noise = {name: cfg.actor[name] for name in ("scale_init", "noise_correlation")}
+    noise["learn_scale"] = cfg.actor.get("learn_scale", True)  # checkpoints from before do not say
     return make_actor(env, **network(cfg, "actor"), **noise, return_log_prob=log_prob)
 
 
@@ -93,7 +94,7 @@ def advance(schedule: lr_scheduler.LRScheduler, iteration: float) -> None:
 
 
 class AdaptiveRate:
-    """The learning rate of a policy that a horizon moves by about ``max_kl``, which falls to nothing over the run.
+    """The learning rate of a policy that a horizon moves by about ``max_kl``, which falls to 2 % over the run.
 
     A horizon that moves it beyond 1.5 of the bound divides the rate by 1.5, and one that stays below 2/3 of it
     multiplies it. The rate keeps between 1e-6 and 20 times the first one.
@@ -105,6 +106,8 @@ class AdaptiveRate:
     """
 
     def __init__(self, optimizer: torch.optim.Optimizer, max_kl: float, iterations: int) -> None:
+        if max_kl is None:
+            raise ValueError("actor.max_kl=null: this recipe sets its rate by it. Write a number; 0.25 is usual.")
         self.optimizer, self.max_kl, self.iterations = optimizer, max_kl, iterations
         self.bounds = (1e-6, 20.0 * optimizer.param_groups[0]["lr"])
         self.done = 0

@@ -46,7 +46,7 @@ class TiltController(FlightController):
 
     Args:
         nominal: the drone it believes to fly.
-        max_tilt: greatest angle that an action can ask for [rad].
+        max_tilt: greatest roll and greatest pitch that an action can ask for, each [rad].
     """
 
     constants = (*FlightController.constants, "tilt_gain", "tilt_rate")
@@ -60,16 +60,13 @@ class TiltController(FlightController):
         lag = (1.0 + nominal.rate_damping / nominal.inertia) / nominal.rate_gain
         self.tilt_gain, self.tilt_rate = 0.5 / lag[..., :2], nominal.max_body_rate[..., :2]
 
-    def tilting_rates(self, error: Vector, up: Vector, yaw_rate: Vector) -> Vector:
-        """Body rates (*, 3) [rad/s] that reduce a tilt error and turn about the world's up.
+    def tilting_rates(self, error: Vector) -> Vector:
+        """Roll and pitch rate (*, 2) [rad/s] that reduce a tilt error.
 
         Args:
             error: sine of the angle left to turn about body x and y, (*, 2).
-            up: the world's up in the body frame, (*, 3).
-            yaw_rate: about it, (*, 1) [rad/s].
         """
-        tilting = soft_limit(self.tilt_gain * error, self.tilt_rate)
-        return cat(tilting + yaw_rate * up[..., :2], yaw_rate * up[..., 2:])
+        return soft_limit(self.tilt_gain * error, self.tilt_rate)
 
 
 class AttitudeController(TiltController):
@@ -98,7 +95,9 @@ class AttitudeController(TiltController):
         up = quaternion.up_in_body(attitude)
         (x, y, z), (wanted_x, wanted_y, wanted_z) = _entries(up), _entries(setpoint.up)
         error = cat(wanted_y * z - wanted_z * y, wanted_z * x - wanted_x * z)  # wanted up x present up
-        return Setpoint(setpoint.thrust, self.tilting_rates(error, up, setpoint.yaw_rate))
+        yaw = setpoint.yaw_rate  # about the world's up: roll and pitch turn with the heading
+        rates = cat(self.tilting_rates(error) + yaw * up[..., :2], yaw * up[..., 2:])
+        return Setpoint(setpoint.thrust, rates)
 
 
 class RotorThrustController(FlightController):
@@ -168,7 +167,9 @@ class VelocityController(TiltController):
         thrust = minimum((seen[..., 2:] * self.nominal.mass).clamp_min(0.0), self.full_thrust)
         x, y, _ = _entries(seen * dot(wanted, wanted).rsqrt())
         error = cat(-y, x)  # body z x wanted direction of thrust
-        return Setpoint(thrust, self.tilting_rates(error, quaternion.up_in_body(attitude), setpoint.yaw_rate))
+        # The thrust keeps its direction in the world while the drone turns under it.
+        rates = cat(self.tilting_rates(error), setpoint.yaw_rate * quaternion.up_in_body(attitude)[..., 2:])
+        return Setpoint(thrust, rates)
 
 
 #: The flight controllers by the name of what their actions command.

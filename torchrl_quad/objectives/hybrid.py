@@ -24,8 +24,8 @@ class HybridLoss(PathwiseCriticLoss):
     The simulator's derivative gives p_t, the gradient of an action's own lambda-return in the mean of that action.
     The flight itself gives A_t, the advantage of the same action. If p_t is right, then A_t is p_t . (u_t - loc_t) plus
     what does not depend on this action, where u_t is the action before the tanh. The loss therefore regresses A on
-    p . (u - loc). The slope is the ``pathwise_weight`` b: near 1 where the derivative tells the truth, and near 0 where
-    it does not. It is a running mean over rollouts, clamped to [0, 1]. The pathwise term of the loss is
+    p . (u - loc). The slope is the ``pathwise_weight`` b: near 1 where the derivative tells the truth, and far from it
+    where it does not. It is a running mean over rollouts, clamped to [0, 1]. The pathwise term of the loss is
 
         - b mean_t p_t . loc(s_t)
 
@@ -36,7 +36,8 @@ class HybridLoss(PathwiseCriticLoss):
 
     The lambda-return of p_t bootstraps with V at every step, and each p_t is not discounted from the start of the
     horizon. With noise that is correlated in time, an action's noise goes on in later actions, and
-    p_t + c p_(t+1) + c^2 p_(t+2) + ... takes the place of p_t, as it does in A_t: c = rho gamma lambda.
+    p_t + c p_(t+1) + c^2 p_(t+2) + ... takes the place of p_t, as it does in A_t: c = rho gamma lambda,
+    with the lambda of the advantage.
 
     One rollout serves several epochs of minibatches: :meth:`write_targets` reads the graph once.
 
@@ -104,7 +105,7 @@ class HybridLoss(PathwiseCriticLoss):
         average: Callable[[Tensor], Tensor] = lambda x: x,
         reduction: str = "mean",
     ) -> None:
-        if not 0 < gradient_lmbda <= 1:
+        if not (isinstance(gradient_lmbda, int | float) and 0 < gradient_lmbda <= 1):
             raise ValueError(f"gradient_lmbda must lie in (0, 1], got {gradient_lmbda}; 0.9 is usual.")
         if not 0 < clip_epsilon < 1:
             raise ValueError(f"clip_epsilon must lie between 0 and 1, got {clip_epsilon}; 0.2 is usual.")
@@ -112,9 +113,14 @@ class HybridLoss(PathwiseCriticLoss):
             raise ValueError(f"decay must lie in [0, 1), got {decay}.")
         super().__init__(actor_network, clip_action_gradient=clip_action_gradient, reduction=reduction)
         self.gradient_lmbda, self.clip_epsilon, self.decay, self.average = gradient_lmbda, clip_epsilon, decay, average
+        self.out_keys = [name for name in self.out_keys if name != "clipped"]  # minibatches clip no gradient
         self.convert_to_functional(value_network, "value_network", create_target_params=False)
         weight = torch.full((), math.nan, device=self._default_device, dtype=self._precision)
         self.register_buffer("pathwise_weight", weight)
+
+    def _network_in_keys(self) -> set[NestedKey]:
+        noise = set(self.actor_network.out_keys) & {"noise", "noise_before"}
+        return {*super()._network_in_keys(), "loc", "scale", *noise}
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -136,6 +142,8 @@ class HybridLoss(PathwiseCriticLoss):
             ``value_target``, each under its tensor key.
         """
         self._require_rollout(tensordict)
+        if not torch.is_grad_enabled():
+            raise RuntimeError("write_targets differentiates the rollout: call it with gradients enabled.")
         keys = self.tensor_keys
         grad = self._own_gradient(tensordict)
         data = self.write_value_target(tensordict.detach())
@@ -146,13 +154,8 @@ class HybridLoss(PathwiseCriticLoss):
             deviation = advantage.std().clamp_min(1e-12)
             advantage, grad = (advantage - advantage.mean()) / deviation, grad / deviation
             predicted = (grad * (latent - data.get("loc"))).sum(-1, keepdim=True)
-            predicted = predicted - predicted.mean()
-            covariance, variance = (predicted * advantage).mean(), predicted.square().mean()
-            slope = self.average(covariance) / self.average(variance).clamp_min(1e-12)
-            running = self.pathwise_weight
-            running.copy_(torch.where(running.isnan(), slope, torch.lerp(slope, running, self.decay)))
-            weight = running.clamp(0.0, 1.0)
-        data.set(keys.advantage, advantage - weight * predicted)
+            weight = self._regress(advantage, predicted)
+        data.set(keys.advantage, advantage - weight * (predicted - predicted.mean()))
         data.set(keys.location_gradient, weight * grad)
         data.set(keys.latent, latent)
         return data
@@ -188,13 +191,30 @@ class HybridLoss(PathwiseCriticLoss):
         reward = tensordict.get(("next", keys.reward))
         self._require_graph(reward, ("next", keys.reward))
         gamma = estimator.gamma.to(reward.dtype)
-        value = self._value(tensordict.get("next").select(*self._critic_inputs()), target=False)
+        goes_on = tensordict.get("next").select(*self._critic_inputs())[~terminated.squeeze(-1)]
+        value = self._value(goes_on, target=False).to(reward.dtype)
         _, end = segments(done)
-        bootstrap = torch.where(terminated, 0.0, torch.where(end, 1.0, 1.0 - self.gradient_lmbda) * value)
+        bootstrap = torch.where(end, 1.0, 1.0 - self.gradient_lmbda).to(reward.dtype)
+        bootstrap = bootstrap * torch.zeros_like(reward).masked_scatter(~terminated, value)
         discount = discounts(done, gamma * self.gradient_lmbda)
         objective = (discount * (reward + gamma * bootstrap)).sum()
         grad = action_gradient(objective, tensordict.get(keys.action)) / discount
         return grad if self.clip is None else self.clip(grad)[0]
+
+    def _regress(self, advantage: Tensor, predicted: Tensor) -> Tensor:
+        """Update the weight with the slope of the advantages over what was predicted, each (*, horizon, 1).
+
+        Both are centred in each step of the horizon: before the critic knows anything, an advantage says first of all
+        how many steps are left.
+        """
+        batch = tuple(range(advantage.ndim - 2))
+        advantage, predicted = (x - x.mean(batch, keepdim=True) for x in (advantage, predicted))
+        covariance, variance = (predicted * advantage).mean(), predicted.square().mean()
+        slope = (self.average(covariance) / self.average(variance).clamp_min(1e-12)).clamp(-1.0, 2.0)
+        running = self.pathwise_weight
+        slope = torch.where(slope.isfinite(), slope, running)
+        running.copy_(torch.where(running.isnan(), slope, torch.lerp(slope, running, self.decay)))
+        return running.nan_to_num(0.0).clamp(0.0, 1.0)
 
     def _distributions(self, tensordict: TensorDictBase) -> tuple[Normal, Normal]:
         """The normal distribution of the policy as it is, and as it flew."""

@@ -80,7 +80,7 @@ class TorchVectorEnv:
             raise RuntimeError("A step needs an episode: call reset() first.")
         if action.shape != self._low.shape:
             raise ValueError(
-                f"The actions have shape {tuple(action.shape)}, expected {tuple(self._low.shape)}: a row for each drone."
+                f"The actions have shape {tuple(action.shape)}, expected {tuple(self._low.shape)}: a row a drone."
             )
         # Frameworks act in inference mode, whose tensors could not be differentiated later.
         with torch.inference_mode(False), torch.no_grad():

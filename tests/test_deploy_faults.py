@@ -223,10 +223,7 @@ try:
 except ImportError as error:
     print(error)
 """
-    assert (
-        python(BLOCKED + missing.format(str(folder)))
-        == "A bundle flies with onnxruntime: pip install 'torchrl_quad[deploy]'\n"
-    )
+    assert python(BLOCKED + missing.format(str(folder))) == "A bundle flies with onnxruntime: pip install onnxruntime\n"
 
 
 def test_the_package_imports_its_parts_when_they_are_asked_for():

@@ -59,7 +59,7 @@ class Bundle:
         try:
             import onnxruntime
         except ImportError as error:
-            raise ImportError("A bundle flies with onnxruntime: pip install 'torchrl_quad[deploy]'") from error
+            raise ImportError("A bundle flies with onnxruntime: pip install onnxruntime") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3

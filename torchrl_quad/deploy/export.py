@@ -80,7 +80,7 @@ def export_policy(
         import onnx  # noqa: F401, asked for before anything flies
         import onnxruntime  # noqa: F401
     except ImportError as error:
-        raise ImportError("export_policy needs onnx and onnxruntime: pip install 'torchrl_quad[deploy]'") from error
+        raise ImportError("export_policy needs onnx and onnxruntime: pip install onnx onnxruntime") from error
     folder, (env, normalizer) = Path(folder), _unwrapped(env, normalizer)
     _require_replaceable(folder)
     contract = {"version": contracts.VERSION, **describe(env)}

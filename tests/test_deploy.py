@@ -21,7 +21,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_quad import HoveringEnv
 from torchrl_quad.deploy import TamperedBundle as Tampered
 from torchrl_quad.deploy import UnknownContract, WrongActions, contract, export_policy, load_bundle
-from torchrl_quad.deploy.network import ACTIVATIONS, Layer, write_onnx
+from torchrl_quad.deploy.network import ACTIVATIONS, Layer, write_c, write_onnx
 
 GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
 
@@ -108,6 +108,16 @@ def test_a_bundle_flies_the_environment_as_the_actor_does(exported):
     assert (torch.stack(actions).std(0) > 1e-3).any()
 
 
+def test_a_gate_that_is_passed_during_a_fault_counts_afterwards(export_once):
+    bundle = load_bundle(export_once("racing")[2], on_fault="hover")
+    gate = np.array(bundle.contract["task"]["gates"][0])
+    bundle(resting(position=gate - (1, 0, 0)))
+    bundle(resting(position=[np.nan] * 3))
+    assert bundle.rule.passed == 0
+    bundle(resting(position=gate + (1, 0, 0)))
+    assert (bundle.rule.gate, bundle.rule.passed) == (1, 1)
+
+
 def test_a_drone_that_turns_round_keeps_the_sign_of_its_quaternion(hovering):
     bundle = load_bundle(hovering)
     for angle in np.linspace(0.0, 4 * np.pi, 200):
@@ -137,11 +147,18 @@ def test_every_activation_is_written_alike_as_onnx_and_c(tmp_path):
         np.testing.assert_allclose([function(v) for v in x], expected, rtol=2e-6, atol=1e-6, err_msg=name)
 
 
-def test_c_answers_nan_with_the_hover_action_and_decodes_commands(hovering, tmp_path):
-    library = compiled(hovering, tmp_path / "policy.so")
-    observation, action = (ctypes.c_float * 13)(*[float("nan")] * 13), (ctypes.c_float * 4)()
-    assert library.policy_action(observation, action) == 1
-    assert list(action) == pytest.approx([-1 / 3, 0, 0, 0])
+def test_c_answers_what_is_not_finite_with_the_hover_action_and_decodes_commands(hovering, tmp_path):
+    one, four = np.ones((8, 13), np.float32), np.ones((4, 8), np.float32)
+    layers = [Layer(one, one[:, 0], "ReLU"), Layer(four, four[:, 0], "Tanh")]  # both hide NaN or infinity
+    about = json.loads((hovering / "contract.json").read_text())
+    for name, content in write_c(layers, about, one[:1], four[:1, :4]).items():
+        (tmp_path / name).write_bytes(content)
+    library = compiled(tmp_path, tmp_path / "policy.so")
+    action = (ctypes.c_float * 4)()
+    for value in ("nan", "inf", "-inf"):
+        assert library.policy_action((ctypes.c_float * 13)(0.0, 0.0, float(value)), action) == 1
+        assert list(action) == pytest.approx([-1 / 3, 0, 0, 0])
+    assert library.policy_action((ctypes.c_float * 13)(), action) == 0
     thrust, rates = ctypes.c_float(), (ctypes.c_float * 3)()
     library.policy_command((ctypes.c_float * 4)(-1 / 3, 0.5, -1.0, 0.25), ctypes.byref(thrust), rates)
     assert [thrust.value, *rates] == pytest.approx([0.46 * 9.81, 1.0, -2.0, 0.5])

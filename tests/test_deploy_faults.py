@@ -54,16 +54,22 @@ FAULTS = [
         {"position": [0, 0, 1e9], "velocity": [0, math.nan, 0]},
     ),
     (NotFinite, "age", {"age": math.inf}),
+    (NotFinite, "beyond 1e.06: position", {"position": [10**400, 0, 0]}),
+    (NotFinite, "beyond 1e.06: age", {"age": 10**400}),
     (NotUnitQuaternion, "The quaternion has norm 1.01; it must be 1 to 0.001", {"quaternion": [1.01, 0, 0, 0]}),
     (NotUnitQuaternion, "norm 0;", {"quaternion": [0, 0, 0, 0]}),
     (StaleState, "The state is 0.03 s old; the contract allows 0 to 0.02 s", {"age": 0.03}),
     (StaleState, "-1 s old", {"age": -1}),
+    (MissingQuantity, "The state must be a mapping of position, quaternion, .* and age, got None", None),
+    (MissingQuantity, r"and age, got \[\]", []),
 ]
 
 
 @pytest.mark.parametrize(("kind", "message", "changes"), FAULTS)
 def test_each_fault_has_a_name_and_changes_nothing_or_hovers_and_is_counted(folder, kind, message, changes):
-    state = {key: x for key, x in resting(**changes).items() if x is not None}
+    state = changes
+    if isinstance(changes, dict):
+        state = {key: x for key, x in resting(**changes).items() if x is not None}
     raising, hovering, untouched = load_bundle(folder), load_bundle(folder, on_fault="hover"), load_bundle(folder)
     for bundle in (raising, hovering, untouched):
         bundle(resting())

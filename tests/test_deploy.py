@@ -4,6 +4,7 @@ import ctypes
 import functools
 import io
 import json
+import os
 import shutil
 import subprocess
 
@@ -272,11 +273,33 @@ def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_pa
     old = (folder / "contract.json").read_bytes()
     with torch.no_grad():
         actor[0].module.mlp[-1].bias.add_(0.1)
-    with monkeypatch.context() as patch:
-        patch.setattr("torchrl_quad.deploy.export._require_the_same_flight", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
+    aside = tmp_path / ".policy.old"
+    for stopped_by_a_kill in (False, True):  # between the two renames
+        if stopped_by_a_kill:
+            folder.rename(aside)
+            (tmp_path / f".policy.{2**22 + 1}.new").mkdir()  # of a process that cannot be
+        with monkeypatch.context() as patch:
+            patch.setattr("torchrl_quad.deploy.export._require_the_same_flight", lambda *_: 1 / 0)
+            with pytest.raises(ZeroDivisionError):
+                export_policy(actor, env, folder)
+        assert (folder / "contract.json").read_bytes() == old
+        assert [path.name for path in tmp_path.iterdir()] == ["policy"]
+    with monkeypatch.context() as patch:  # neither the new bundle nor the old one can take the place
+
+        def replace(source, target, rename=os.replace):
+            if target == folder:
+                raise OSError("no")
+            rename(source, target)
+
+        patch.setattr("os.replace", replace)
+        with pytest.raises(OSError, match="no"):
             export_policy(actor, env, folder)
-    assert (folder / "contract.json").read_bytes() == old
-    export_policy(actor, env, folder)
+    assert (aside / "contract.json").read_bytes() == old
+    (tmp_path / "link").symlink_to(folder)
+    export_policy(actor, env, tmp_path / "link")
     assert (folder / "contract.json").read_bytes() != old
-    assert [path.name for path in tmp_path.iterdir()] == ["policy"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "policy"] and (tmp_path / "link").is_symlink()
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"policy also holds notes.txt: .* Move it away, or choose another"):
+        export_policy(actor, env, folder)
+    assert (folder / "notes.txt").read_text() == "mine"

@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from importlib import metadata, resources
@@ -28,6 +29,7 @@ from torchrl_quad.deploy.bundle import load_bundle
 from torchrl_quad.deploy.describe import describe, envelope, results, seen_ranges
 from torchrl_quad.deploy.network import ACTIVATIONS, Layer, write_c, write_onnx
 from torchrl_quad.envs import QuadrotorEnv
+from torchrl_quad.files import is_running
 
 VECTORS, SELF_TEST_VECTORS = 1024, 16
 STARTS = 2_000_000  # seed of the starts, that of recipes/evaluate.py
@@ -73,7 +75,7 @@ def export_policy(
 
     Raises:
         ValueError: the policy or the task cannot be exported, or the bundle does not fly as they do.
-        FileExistsError: the folder exists and holds something else than a bundle.
+        FileExistsError: the folder exists and holds something else than a bundle, or files beside it.
         ImportError: onnx or onnxruntime is missing.
     """
     try:
@@ -81,8 +83,10 @@ def export_policy(
         import onnxruntime  # noqa: F401
     except ImportError as error:
         raise ImportError("export_policy needs onnx and onnxruntime: pip install onnx onnxruntime") from error
-    folder, (env, normalizer) = Path(folder), _unwrapped(env, normalizer)
-    _require_replaceable(folder)
+    env, normalizer = _unwrapped(env, normalizer)
+    place = Path(folder).resolve()  # a link stays, what it points to is replaced
+    _restore(place)
+    _require_replaceable(place)
     contract = {"version": contracts.VERSION, **describe(env)}
     layers = fold(actor, normalizer)
     width, size = layers[0].weight.shape[1], contract["inputs"][-1]["stop"]
@@ -108,13 +112,13 @@ def export_policy(
     contract["sha256"] = {name: contracts.sha256(files[name]) for name in contracts.FILES}
     contract["digest"] = contracts.digest(contract)
     files["contract.json"] = (json.dumps(contract, indent=2, allow_nan=False) + "\n").encode()
-    with _replacing_folder(folder) as temporary:
+    with _replacing_folder(place) as temporary:
         for name, content in files.items():
             with open(temporary / name, "wb") as file:
                 file.write(content)
                 os.fsync(file.fileno())
         _require_the_same_flight(temporary, env, flight)
-    return folder
+    return Path(folder)
 
 
 def fold(actor: TensorDictModuleBase, normalizer: ObservationNormalizer | None = None) -> list[Layer]:
@@ -286,22 +290,44 @@ def _readme(contract: Mapping[str, Any]) -> bytes:
 # -- the folder --------------------------------------------------------------------------------------------------------
 
 
+def _old(folder: Path) -> Path:
+    """Where a bundle waits for its successor to take its place."""
+    return folder.with_name(f".{folder.name}.old")
+
+
+def _restore(folder: Path) -> None:
+    """Bring back a bundle that a killed export had set aside, and delete what else it left behind."""
+    if not folder.exists() and _old(folder).exists():
+        os.replace(_old(folder), folder)
+    shutil.rmtree(_old(folder), ignore_errors=True)
+    temporary = re.compile(rf"\.{re.escape(folder.name)}\.(\d+)\.new")
+    for other in folder.parent.glob(".*.new"):
+        match = temporary.fullmatch(other.name)
+        if match and not is_running(int(match[1])):
+            shutil.rmtree(other, ignore_errors=True)
+
+
 def _require_replaceable(folder: Path) -> None:
-    if folder.exists() and not (folder / "contract.json").is_file() and (folder.is_file() or any(folder.iterdir())):
+    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    if folder.is_file() or (names and not (folder / "contract.json").is_file()):
         raise FileExistsError(f"{folder} exists and is no bundle. Choose another folder, or empty this one.")
+    if others := sorted(names - {*contracts.FILES, "contract.json"}):
+        raise FileExistsError(
+            f"{folder} also holds {', '.join(others)}: an export replaces the folder, and would delete that. Move it "
+            "away, or choose another folder."
+        )
 
 
 @contextlib.contextmanager
 def _replacing_folder(folder: Path) -> Iterator[Path]:
     """A temporary folder that takes the place of ``folder`` when the block ends, and disappears when it raises."""
-    folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary, old = (folder.with_name(f".{folder.name}.{os.getpid()}.{end}") for end in ("new", "old"))
-    for leftover in (temporary, old):
-        shutil.rmtree(leftover, ignore_errors=True)
+    temporary, old = folder.with_name(f".{folder.name}.{os.getpid()}.new"), _old(folder)
+    shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
     try:
         yield temporary
+        _require_replaceable(folder)  # again: flying took its time
         if folder.exists():
             os.replace(folder, old)
         os.replace(temporary, folder)
@@ -310,5 +336,6 @@ def _replacing_folder(folder: Path) -> Iterator[Path]:
             os.replace(old, folder)
         raise
     finally:
-        for leftover in (temporary, old):
-            shutil.rmtree(leftover, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
+        if folder.exists():
+            shutil.rmtree(old, ignore_errors=True)

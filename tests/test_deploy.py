@@ -277,6 +277,7 @@ def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_pa
     for stopped_by_a_kill in (False, True):  # between the two renames
         if stopped_by_a_kill:
             folder.rename(aside)
+            folder.mkdir()  # by somebody who missed it
             (tmp_path / f".policy.{2**22 + 1}.new").mkdir()  # of a process that cannot be
         with monkeypatch.context() as patch:
             patch.setattr("torchrl_quad.deploy.export._require_the_same_flight", lambda *_: 1 / 0)

@@ -17,7 +17,7 @@ from torch import nn
 from torchrl.envs import RewardSum, TransformedEnv
 
 import torchrl_quad
-from torchrl_quad import HoveringEnv, TrackingEnv, make_actor, make_env
+from torchrl_quad import HoveringEnv, RacingEnv, TrackingEnv, make_actor, make_env
 from torchrl_quad.deploy import (
     MissingQuantity,
     NotFinite,
@@ -135,6 +135,15 @@ def test_gates_are_passed_in_their_order_on_the_line_between_two_positions():
             gates.reset(gate)
 
 
+def test_a_race_with_noise_and_delay_is_exported_though_gates_are_counted_from_true_positions(tmp_path):
+    gates = [[0, 0, 2], [1, 0, 2]]
+    sensors = {"observation_noise": {"position": 0.3}, "observation_delay": 2}
+    env = RacingEnv(num_envs=16, max_episode_steps=16, track={"gates": gates, "starts": gates}, **sensors)
+    assert (
+        load_bundle(export_policy(make_actor(env, (8,)), env, tmp_path / "policy")).contract["observation_delay"] == 2
+    )
+
+
 @pytest.mark.parametrize("curve", ["slow_circle", "fast_circle", "lemniscate"])
 def test_a_curve_is_a_few_harmonics(curve):
     env = TrackingEnv(num_envs=1, curve=curve, dtype=torch.float64)
@@ -233,7 +242,7 @@ except ImportError as error:
 
 
 def test_the_package_imports_its_parts_when_they_are_asked_for():
-    assert tuple(sorted(TASKS)) == torchrl_quad._TASKS
+    assert sorted(TASKS) == list(torchrl_quad._TASKS)
     assert {*torchrl_quad.__all__, *torchrl_quad._PARTS} <= set(dir(torchrl_quad))
     for name in torchrl_quad.__all__:
         assert getattr(torchrl_quad, name).__module__.startswith("torchrl_quad"), name

@@ -4,6 +4,7 @@ The source directory is the repository, not this folder. So each page is read fr
 files work on GitHub and on the site. The site needs no network, neither to be built nor to be read.
 """
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -12,6 +13,8 @@ import ziamath
 import torchrl_quad
 
 sys.path.insert(0, str(Path(__file__).parent))  # extension.py
+
+shutil.rmtree(Path(__file__).parent / "_api", ignore_errors=True)  # pages of classes, which may be there no more
 
 project = "torchrl_quad"
 version = release = torchrl_quad.__version__

@@ -4,6 +4,7 @@ import ctypes
 import functools
 import io
 import json
+import os
 import shutil
 import subprocess
 
@@ -21,7 +22,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_quad import HoveringEnv
 from torchrl_quad.deploy import TamperedBundle as Tampered
 from torchrl_quad.deploy import UnknownContract, WrongActions, contract, export_policy, load_bundle
-from torchrl_quad.deploy.network import ACTIVATIONS, Layer, write_onnx
+from torchrl_quad.deploy.network import ACTIVATIONS, Layer, write_c, write_onnx
 
 GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
 
@@ -108,6 +109,16 @@ def test_a_bundle_flies_the_environment_as_the_actor_does(exported):
     assert (torch.stack(actions).std(0) > 1e-3).any()
 
 
+def test_a_gate_that_is_passed_during_a_fault_counts_afterwards(export_once):
+    bundle = load_bundle(export_once("racing")[2], on_fault="hover")
+    gate = np.array(bundle.contract["task"]["gates"][0])
+    bundle(resting(position=gate - (1, 0, 0)))
+    bundle(resting(position=[np.nan] * 3))
+    assert bundle.rule.passed == 0
+    bundle(resting(position=gate + (1, 0, 0)))
+    assert (bundle.rule.gate, bundle.rule.passed) == (1, 1)
+
+
 def test_a_drone_that_turns_round_keeps_the_sign_of_its_quaternion(hovering):
     bundle = load_bundle(hovering)
     for angle in np.linspace(0.0, 4 * np.pi, 200):
@@ -137,11 +148,18 @@ def test_every_activation_is_written_alike_as_onnx_and_c(tmp_path):
         np.testing.assert_allclose([function(v) for v in x], expected, rtol=2e-6, atol=1e-6, err_msg=name)
 
 
-def test_c_answers_nan_with_the_hover_action_and_decodes_commands(hovering, tmp_path):
-    library = compiled(hovering, tmp_path / "policy.so")
-    observation, action = (ctypes.c_float * 13)(*[float("nan")] * 13), (ctypes.c_float * 4)()
-    assert library.policy_action(observation, action) == 1
-    assert list(action) == pytest.approx([-1 / 3, 0, 0, 0])
+def test_c_answers_what_is_not_finite_with_the_hover_action_and_decodes_commands(hovering, tmp_path):
+    one, four = np.ones((8, 13), np.float32), np.ones((4, 8), np.float32)
+    layers = [Layer(one, one[:, 0], "ReLU"), Layer(four, four[:, 0], "Tanh")]  # both hide NaN or infinity
+    about = json.loads((hovering / "contract.json").read_text())
+    for name, content in write_c(layers, about, one[:1], four[:1, :4]).items():
+        (tmp_path / name).write_bytes(content)
+    library = compiled(tmp_path, tmp_path / "policy.so")
+    action = (ctypes.c_float * 4)()
+    for value in ("nan", "inf", "-inf"):
+        assert library.policy_action((ctypes.c_float * 13)(0.0, 0.0, float(value)), action) == 1
+        assert list(action) == pytest.approx([-1 / 3, 0, 0, 0])
+    assert library.policy_action((ctypes.c_float * 13)(), action) == 0
     thrust, rates = ctypes.c_float(), (ctypes.c_float * 3)()
     library.policy_command((ctypes.c_float * 4)(-1 / 3, 0.5, -1.0, 0.25), ctypes.byref(thrust), rates)
     assert [thrust.value, *rates] == pytest.approx([0.46 * 9.81, 1.0, -2.0, 0.5])
@@ -255,11 +273,34 @@ def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_pa
     old = (folder / "contract.json").read_bytes()
     with torch.no_grad():
         actor[0].module.mlp[-1].bias.add_(0.1)
-    with monkeypatch.context() as patch:
-        patch.setattr("torchrl_quad.deploy.export._require_the_same_flight", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
+    aside = tmp_path / ".policy.old"
+    for stopped_by_a_kill in (False, True):  # between the two renames
+        if stopped_by_a_kill:
+            folder.rename(aside)
+            folder.mkdir()  # by somebody who missed it
+            (tmp_path / f".policy.{2**22 + 1}.new").mkdir()  # of a process that cannot be
+        with monkeypatch.context() as patch:
+            patch.setattr("torchrl_quad.deploy.export._require_the_same_flight", lambda *_: 1 / 0)
+            with pytest.raises(ZeroDivisionError):
+                export_policy(actor, env, folder)
+        assert (folder / "contract.json").read_bytes() == old
+        assert [path.name for path in tmp_path.iterdir()] == ["policy"]
+    with monkeypatch.context() as patch:  # neither the new bundle nor the old one can take the place
+
+        def replace(source, target, rename=os.replace):
+            if target == folder:
+                raise OSError("no")
+            rename(source, target)
+
+        patch.setattr("os.replace", replace)
+        with pytest.raises(OSError, match="no"):
             export_policy(actor, env, folder)
-    assert (folder / "contract.json").read_bytes() == old
-    export_policy(actor, env, folder)
+    assert (aside / "contract.json").read_bytes() == old
+    (tmp_path / "link").symlink_to(folder)
+    export_policy(actor, env, tmp_path / "link")
     assert (folder / "contract.json").read_bytes() != old
-    assert [path.name for path in tmp_path.iterdir()] == ["policy"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "policy"] and (tmp_path / "link").is_symlink()
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"policy also holds notes.txt: .* Move it away, or choose another"):
+        export_policy(actor, env, folder)
+    assert (folder / "notes.txt").read_text() == "mine"

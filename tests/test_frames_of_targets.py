@@ -1,5 +1,7 @@
 """Conventions of autopilots and simulators: round trips, and cases worked by hand that a wrong sign fails."""
 
+import struct
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,7 @@ TARGETS = [
     frames.crazyflie(),
     frames.crazyflie(manual=True),
     frames.mavros(),
-    frames.mavros("nwu"),
+    frames.mavros("nwu", thrust_scaling=0.05),
     frames.mujoco(),
     frames.rotorpy(),
     frames.crazyflow(),
@@ -41,7 +43,8 @@ def test_there_and_back_gives_the_same(target):
     newtons = np.linspace(0.0, 8.0, 7)
     for factor in (0.0, 0.4, 1.0):
         command = target.thrust(newtons, 10.0, factor)
-        np.testing.assert_allclose(target.newtons(command, 10.0, factor), newtons, rtol=0, atol=1e-12)
+        tolerance = 10.0 / 65535 if target.whole_thrust else 1e-12  # half a step, on a slope of at most 2
+        np.testing.assert_allclose(target.newtons(command, 10.0, factor), newtons, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda x: getattr(x, "name", ""))
@@ -147,11 +150,18 @@ def test_thrust_by_hand():
     assert frames.px4().thrust(weight, full_thrust=weight / 0.4) == pytest.approx(-0.4)  # hovers at MPC_THR_HOVER
     assert frames.px4().thrust(100.0, 10.0) == -1.0
     assert frames.ardupilot().thrust(2 * weight, full_thrust=weight / 0.4) == pytest.approx(0.8)
-    assert frames.mavros().thrust(weight, full_thrust=1 / 0.05) == pytest.approx(0.2)
+    # mavros sends clip(thrust_scaling x what it gets, 0, 1) to the autopilot, which hovers at 0.4 here.
+    for scaling in (1.0, 0.05, 0.4 / weight):
+        for newtons, share in ((weight, 0.4), (2 * weight, 0.8), (10 * weight, 1.0)):
+            command = frames.mavros(thrust_scaling=scaling).thrust(newtons, full_thrust=weight / 0.4)
+            assert np.clip(scaling * command, 0.0, 1.0) == pytest.approx(share)
+    newtons = frames.mavros(thrust_scaling=0.4 / weight).thrust(weight, full_thrust=weight / 0.4)
+    assert newtons == pytest.approx(weight)
     assert frames.betaflight().thrust(2.5, 10.0) == pytest.approx(1250.0)
     assert frames.betaflight().thrust(2.5, 10.0, model_factor=1.0) == pytest.approx(1500.0)  # thrust = signal squared
-    assert frames.crazyflie().thrust(0.3, 4 * 0.15) == pytest.approx(32767.5)
-    assert frames.crazyflie().thrust(0.6, 4 * 0.15) == pytest.approx(60000)
+    command = frames.crazyflie().thrust(0.2, 4 * 0.15)
+    assert struct.unpack("<H", struct.pack("<H", command)) == (65535 // 3,)  # as cflib sends it
+    assert frames.crazyflie().thrust([0.2, 0.6], 4 * 0.15).tolist() == [65535 // 3, 60000]
     assert frames.crazyflie_percentage([10001, 60000]).tolist() == [0.0, 100.0]
     assert frames.mujoco().thrust(1.25) == 1.25
     assert frames.motor_thrust(0.5, 0.4) == pytest.approx(0.4 * 0.25 + 0.6 * 0.5)
@@ -166,3 +176,17 @@ def test_what_has_no_meaning_is_refused():
         frames.px4().back({"quaternion": [1, 0, 0]})
     with pytest.raises(ValueError, match="MuJoCo has no order of motors"):
         frames.mujoco().to({"motors": [1, 2, 3, 4]})
+    with pytest.raises(ValueError, match=r"thrust_scaling must be above 0, got 0.0: .* Write its parameter"):
+        frames.mavros(thrust_scaling=0.0)
+    px4 = frames.px4()
+    for full_thrust in (None, 0.0, -1.0, np.nan, np.inf):
+        for translate in (px4.thrust, px4.newtons):
+            with pytest.raises(ValueError, match=r"full_thrust must be the thrust \[N\] of the full command of PX4"):
+                translate(0.5, full_thrust)
+    for factor in (-0.1, 1.1, np.nan):
+        for translate in (px4.thrust, px4.newtons):
+            with pytest.raises(ValueError, match="model_factor must lie from 0 to 1"):
+                translate(0.5, 10.0, factor)
+    for target in (px4, frames.mujoco()):
+        with pytest.raises(ValueError, match="newtons must be finite: there is no command for"):
+            target.thrust([1.0, np.nan], 10.0)

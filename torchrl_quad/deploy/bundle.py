@@ -59,7 +59,7 @@ class Bundle:
         try:
             import onnxruntime
         except ImportError as error:
-            raise ImportError("A bundle flies with onnxruntime: pip install 'torchrl_quad[deploy]'") from error
+            raise ImportError("A bundle flies with onnxruntime: pip install onnxruntime") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
@@ -119,7 +119,8 @@ class Bundle:
 
         Raises:
             Fault: the policy cannot fly from this state; the bundle is as before the call. With ``on_fault="hover"``
-                the command is to hover instead, the time goes on, and :attr:`faults` counts it.
+                the command is to hover instead, the time goes on, and :attr:`faults` counts it. A gate that is passed
+                meanwhile counts with the next good state.
         """
         try:
             position = self._read(state)
@@ -131,11 +132,9 @@ class Bundle:
             action = self._hover
             if self._begun:
                 self.rule.advance(None, None)
-            position = None
         else:
-            action = self._action
+            action, self._position = self._action, position
         self.action, self._begun = action, True
-        self._position = position
         if len(self.queue):
             self.queue = np.concatenate((self.queue[1:], action[None]))
         return self._half_thrust * (float(action[0]) + 1.0), self._max_rates * action[1:]
@@ -162,6 +161,8 @@ class Bundle:
 
     def _read(self, state: Mapping[str, Any]) -> NDArray[np.float64]:
         """Compute the action from a state; the position in it. Nothing of the bundle changes before a fault."""
+        if not isinstance(state, Mapping):
+            raise MissingQuantity(f"The state must be a mapping of {', '.join(QUANTITIES)} and age, got {state!r}.")
         parts = []
         for name, size in QUANTITIES.items():
             try:
@@ -170,6 +171,8 @@ class Bundle:
                 raise MissingQuantity(f"The state lacks {name!r}: give {', '.join(QUANTITIES)} and age.") from None
             except (TypeError, ValueError):
                 raise MissingQuantity(f"{name} must be {size} numbers, got {state[name]!r}.") from None
+            except OverflowError:
+                raise NotFinite(f"Not finite, or beyond {self._max_value:g}: {name}.") from None
             if part.shape != (size,):
                 raise MissingQuantity(f"{name} must have shape ({size},), got {part.shape}.")
             parts.append(part)
@@ -179,6 +182,8 @@ class Bundle:
             raise MissingQuantity("The state lacks 'age', the time since it was measured [s].") from None
         except (TypeError, ValueError):
             raise MissingQuantity(f"age must be a number [s], got {state['age']!r}.") from None
+        except OverflowError:
+            raise NotFinite(f"Not finite, or beyond {self._max_value:g}: age.") from None
         if not (math.isfinite(age) and np.abs(np.concatenate(parts)).max() <= self._max_value):
             names = [name for name, part in zip(QUANTITIES, parts, strict=True) if not self._is_sane(part)]
             raise NotFinite(f"Not finite, or beyond {self._max_value:g}: {', '.join(names) or 'age'}.")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from importlib import metadata, resources
@@ -27,7 +29,9 @@ from torchrl_quad.deploy import contract as contracts
 from torchrl_quad.deploy.bundle import load_bundle
 from torchrl_quad.deploy.describe import describe, envelope, results, seen_ranges
 from torchrl_quad.deploy.network import ACTIVATIONS, Layer, write_c, write_onnx
+from torchrl_quad.deploy.tasks import Rule
 from torchrl_quad.envs import QuadrotorEnv
+from torchrl_quad.files import is_running
 
 VECTORS, SELF_TEST_VECTORS = 1024, 16
 STARTS = 2_000_000  # seed of the starts, that of recipes/evaluate.py
@@ -73,16 +77,18 @@ def export_policy(
 
     Raises:
         ValueError: the policy or the task cannot be exported, or the bundle does not fly as they do.
-        FileExistsError: the folder exists and holds something else than a bundle.
+        FileExistsError: the folder exists and holds something else than a bundle, or files beside it.
         ImportError: onnx or onnxruntime is missing.
     """
     try:
         import onnx  # noqa: F401, asked for before anything flies
         import onnxruntime  # noqa: F401
     except ImportError as error:
-        raise ImportError("export_policy needs onnx and onnxruntime: pip install 'torchrl_quad[deploy]'") from error
-    folder, (env, normalizer) = Path(folder), _unwrapped(env, normalizer)
-    _require_replaceable(folder)
+        raise ImportError("export_policy needs onnx and onnxruntime: pip install onnx onnxruntime") from error
+    env, normalizer = _unwrapped(env, normalizer)
+    place = Path(folder).resolve()  # a link stays, what it points to is replaced
+    _require_replaceable(place)
+    _restore(place)
     contract = {"version": contracts.VERSION, **describe(env)}
     layers = fold(actor, normalizer)
     width, size = layers[0].weight.shape[1], contract["inputs"][-1]["stop"]
@@ -108,13 +114,13 @@ def export_policy(
     contract["sha256"] = {name: contracts.sha256(files[name]) for name in contracts.FILES}
     contract["digest"] = contracts.digest(contract)
     files["contract.json"] = (json.dumps(contract, indent=2, allow_nan=False) + "\n").encode()
-    with _replacing_folder(folder) as temporary:
+    with _replacing_folder(place) as temporary:
         for name, content in files.items():
             with open(temporary / name, "wb") as file:
                 file.write(content)
                 os.fsync(file.fileno())
         _require_the_same_flight(temporary, env, flight)
-    return folder
+    return Path(folder)
 
 
 def fold(actor: TensorDictModuleBase, normalizer: ObservationNormalizer | None = None) -> list[Layer]:
@@ -215,6 +221,9 @@ def _require_the_same_flight(folder: Path, env: QuadrotorEnv, flight: TensorDict
         start = seen[entry][0].cpu().numpy()
         bundle.reset(**{entry: start if start.size > 1 else start.item()})
         states = {k: seen[k].cpu().numpy() for k in ("position", "quaternion", "velocity", "angular_velocity")}
+        true = episode["state", "position"].cpu().numpy()
+        if not np.array_equal(true, states["position"]):
+            _go_by(bundle.rule, true)  # the environment counts gates from there, a bundle from what it measures
         for t in range(length):
             bundle({name: x[t] for name, x in states.items()} | {"age": 0.0})
             gap = np.abs(bundle.observation - episode["observation"][t].float().cpu().numpy()).max()
@@ -224,6 +233,12 @@ def _require_the_same_flight(folder: Path, env: QuadrotorEnv, flight: TensorDict
                     f"in step {t}. A contract describes the package's own observations and rules; this environment has "
                     "others."
                 )
+
+
+def _go_by(rule: Rule, positions: np.ndarray) -> None:
+    """Let a rule advance along positions (t, 3), whatever the bundle tells it."""
+    advance, steps = type(rule).advance, itertools.pairwise(positions)
+    vars(rule)["advance"] = lambda before, position: advance(rule, *next(steps))
 
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -251,9 +266,9 @@ def _readme(contract: Mapping[str, Any]) -> bytes:
         "curve": "The point moves along the curve of `task`: offset + sum over k = 1, 2, ... of cosine[k-1] "
         "cos(k phase) + sine[k-1] sin(k phase). The phase starts anywhere, and grows by 2 pi control_dt / period in "
         "each control step after the first. Point i = 1, 2, ... has the phase + 2 pi i lookahead_interval / period.",
-        "gates": "A gate is passed when the straight line between the positions of two control steps comes nearer to "
-        "its centre than `task.gate_radius`. The observation of that step is already about the gate after it. After "
-        "the last gate comes the first.",
+        "gates": "A gate is passed when the straight line between the measured positions of two control steps comes "
+        "nearer to its centre than `task.gate_radius`; training counted with true positions. The observation of that "
+        "step is already about the gate after it. After the last gate comes the first.",
     }
     queue = contract["action_queue"]
     values = {
@@ -286,22 +301,40 @@ def _readme(contract: Mapping[str, Any]) -> bytes:
 # -- the folder --------------------------------------------------------------------------------------------------------
 
 
+def _restore(folder: Path) -> None:
+    """Bring back a bundle that a killed export had set aside, and delete what else it left behind."""
+    old = folder.with_name(f".{folder.name}.old")
+    if old.exists() and not any(folder.glob("*")):
+        os.replace(old, folder)
+    shutil.rmtree(old, ignore_errors=True)
+    temporary = re.compile(rf"\.{re.escape(folder.name)}\.(\d+)\.new")
+    for other in folder.parent.glob(".*.new"):
+        match = temporary.fullmatch(other.name)
+        if match and not is_running(int(match[1])):
+            shutil.rmtree(other, ignore_errors=True)
+
+
 def _require_replaceable(folder: Path) -> None:
-    if folder.exists() and not (folder / "contract.json").is_file() and (folder.is_file() or any(folder.iterdir())):
+    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    if folder.is_file() or (names and not (folder / "contract.json").is_file()):
         raise FileExistsError(f"{folder} exists and is no bundle. Choose another folder, or empty this one.")
+    if others := sorted(names - {*contracts.FILES, "contract.json"}):
+        raise FileExistsError(
+            f"{folder} also holds {', '.join(others)}: an export replaces the folder, and would delete that. Move it "
+            "away, or choose another folder."
+        )
 
 
 @contextlib.contextmanager
 def _replacing_folder(folder: Path) -> Iterator[Path]:
     """A temporary folder that takes the place of ``folder`` when the block ends, and disappears when it raises."""
-    folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary, old = (folder.with_name(f".{folder.name}.{os.getpid()}.{end}") for end in ("new", "old"))
-    for leftover in (temporary, old):
-        shutil.rmtree(leftover, ignore_errors=True)
+    temporary, old = (folder.with_name(f".{folder.name}.{end}") for end in (f"{os.getpid()}.new", "old"))
+    shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
     try:
         yield temporary
+        _require_replaceable(folder)  # again: flying took its time
         if folder.exists():
             os.replace(folder, old)
         os.replace(temporary, folder)
@@ -310,5 +343,6 @@ def _replacing_folder(folder: Path) -> Iterator[Path]:
             os.replace(old, folder)
         raise
     finally:
-        for leftover in (temporary, old):
-            shutil.rmtree(leftover, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
+        if folder.exists():
+            shutil.rmtree(old, ignore_errors=True)

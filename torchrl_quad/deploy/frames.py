@@ -12,8 +12,8 @@ Ours: a world with z up, in which x and y may point anywhere; body x forward, y 
 (w, x, y, z) from body to world; rotors front left, back left, back right, front right. Where a target knows north, say
 where our x and y point: ``world="enu"``, x east and y north, or ``world="nwu"``, x north and y west.
 
-Everything broadcasts over leading dimensions. The facts come from the sources of the targets as of 2025; check them
-against the version that you fly.
+Everything broadcasts over leading dimensions. ``docs/deploy.md`` says which facts were read in the source of a target,
+and which in its documentation. Check them against the version that you fly.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ class Convention:
         None  #: their commands for no and for full thrust; newtons where there are none
     )
     thrust_limit: float = 1.0  #: the share of this range that may be commanded
+    whole_thrust: bool = False  #: whether their command is a whole number
 
     def to(self, quantities: Mapping[str, ArrayLike]) -> dict[str, Array]:
         """Our quantities as theirs.
@@ -76,30 +77,46 @@ class Convention:
         """Their quantities as ours; see :meth:`to`."""
         return {name: self._translate(name, self._checked(name, x), True) for name, x in quantities.items()}
 
-    def thrust(self, newtons: ArrayLike, full_thrust: float = 1.0, model_factor: float = 0.0) -> Array:
+    def thrust(self, newtons: ArrayLike, full_thrust: float | None = None, model_factor: float = 0.0) -> Array:
         """Their command for a collective thrust [N].
 
         A command beyond their range is moved to its end. Where they take newtons, that is what they get.
 
         Args:
             newtons: our collective thrust.
-            full_thrust: the thrust [N] of their full command. From the command that hovers: weight / hover command. For
-                mavros 1 / thrust_scaling, for a Crazyflie 4 THRUST_MAX.
+            full_thrust: the thrust [N] of their full command; every target needs it that does not take newtons. From
+                the command that hovers: weight / hover command. For a Crazyflie 4 THRUST_MAX.
             model_factor: f of the thrust curve f s^2 + (1 - f) s of the signal s, where the target does not undo it
                 itself. PX4 does, by THR_MDL_FAC, and ArduPilot, by MOT_THST_EXPO: leave it 0 there.
-        """
-        if self.thrust_range is None:
-            return np.asarray(newtons, float)
-        low, high = self.thrust_range
-        share = motor_signal(np.asarray(newtons, float) / full_thrust, model_factor)
-        return low + (high - low) * np.clip(share, 0.0, self.thrust_limit)
 
-    def newtons(self, command: ArrayLike, full_thrust: float = 1.0, model_factor: float = 0.0) -> Array:
+        Raises:
+            ValueError: a thrust is not finite, full_thrust is missing or not above 0, or model_factor is not in 0 to 1.
+        """
+        x = np.asarray(newtons, float)
+        if not np.isfinite(x).all():
+            raise ValueError(f"newtons must be finite: there is no command for {newtons!r}. Give the thrust [N].")
+        if self.thrust_range is None:
+            return x
+        low, high = self.thrust_range
+        share = motor_signal(x / self._full_thrust(full_thrust), model_factor)
+        command = low + (high - low) * np.clip(share, 0.0, self.thrust_limit)
+        return np.rint(command).astype(int) if self.whole_thrust else command
+
+    def newtons(self, command: ArrayLike, full_thrust: float | None = None, model_factor: float = 0.0) -> Array:
         """The collective thrust [N] of their command; see :meth:`thrust`."""
         if self.thrust_range is None:
             return np.asarray(command, float)
         low, high = self.thrust_range
-        return full_thrust * motor_thrust((np.asarray(command, float) - low) / (high - low), model_factor)
+        share = motor_thrust((np.asarray(command, float) - low) / (high - low), model_factor)
+        return self._full_thrust(full_thrust) * share
+
+    def _full_thrust(self, value: float | None) -> float:
+        if value is None or not 0.0 < value < np.inf:
+            raise ValueError(
+                f"full_thrust must be the thrust [N] of the full command of {self.name}, above 0, got {value!r}: it "
+                "turns newtons into a share. Write weight / hover command."
+            )
+        return value
 
     def _checked(self, name: str, value: ArrayLike) -> Array:
         if name not in _SIZES:
@@ -152,7 +169,10 @@ def betaflight(sitl: bool = False) -> Convention:
 def crazyflie(manual: bool = False) -> Convention:
     """Crazyflie through cflib: z up and FLU, x y z w. Rates [deg/s] and thrust (0 to 65535, at most 60000) of
     ``send_setpoint``, in rate mode; or, with ``manual``, of ``send_setpoint_manual(rate=True)``, whose yaw has the
-    other sign and whose thrust :func:`crazyflie_percentage` converts."""
+    other sign and whose thrust :func:`crazyflie_percentage` converts. Thrust is a whole number, as cflib packs it.
+
+    Send one ``send_setpoint`` of zero thrust first: until then the firmware holds the motors. Measured body rates are
+    ``stateEstimateZ.rateRoll``, ``ratePitch`` and ``rateYaw`` in mrad/s; ratePitch has the other sign than ours."""
     rates = (DEGREES, DEGREES, DEGREES if manual else -DEGREES)
     return Convention(
         "Crazyflie",
@@ -161,13 +181,21 @@ def crazyflie(manual: bool = False) -> Convention:
         rates=rates,
         thrust_range=(0.0, 65535.0),
         thrust_limit=60000 / 65535,
+        whole_thrust=True,
     )
 
 
-def mavros(world: str = "enu") -> Convention:
-    """mavros (ROS): ENU and FLU, x y z w; it translates to the autopilot's frames itself. Thrust from 0 to 1."""
+def mavros(world: str = "enu", thrust_scaling: float = 1.0) -> Convention:
+    """mavros (ROS): ENU and FLU, x y z w; it translates to the autopilot's frames itself. The thrust of
+    ``setpoint_raw/attitude``: mavros multiplies it by its parameter ``setpoint_raw/thrust_scaling``, and clips the
+    product to 0 to 1. Give that parameter here; with 1 / full_thrust the command is in newtons."""
+    if not 0.0 < thrust_scaling < np.inf:
+        raise ValueError(
+            f"thrust_scaling must be above 0, got {thrust_scaling!r}: mavros multiplies the thrust by it. Write its "
+            "parameter setpoint_raw/thrust_scaling."
+        )
     turn = {"enu": SAME, "nwu": NWU_TO_ENU}
-    return Convention("mavros", _choose(turn, world), xyzw=True, thrust_range=(0.0, 1.0))
+    return Convention("mavros", _choose(turn, world), xyzw=True, thrust_range=(0.0, 1.0 / thrust_scaling))
 
 
 def mujoco() -> Convention:
@@ -188,20 +216,29 @@ def crazyflow() -> Convention:
 
 def motor_signal(thrust: ArrayLike, model_factor: float) -> Array:
     """The signal s, from 0 to 1, whose thrust f s^2 + (1 - f) s, a share of all thrust, is the one given."""
-    u, f = np.asarray(thrust, float), model_factor
+    u, f = np.asarray(thrust, float), _model_factor(model_factor)
     root = np.sqrt((1.0 - f) ** 2 + 4.0 * f * np.maximum(u, 0.0))
     return 2.0 * u / (1.0 - f + root) if f < 1.0 else np.sqrt(np.maximum(u, 0.0))
 
 
 def motor_thrust(signal: ArrayLike, model_factor: float) -> Array:
     """The share of all thrust, f s^2 + (1 - f) s, of a signal s; PX4 calls f THR_MDL_FAC."""
-    s = np.asarray(signal, float)
-    return model_factor * s * s + (1.0 - model_factor) * s
+    s, f = np.asarray(signal, float), _model_factor(model_factor)
+    return f * s * s + (1.0 - f) * s
 
 
 def crazyflie_percentage(command: ArrayLike) -> Array:
     """The ``thrust_percentage`` of ``send_setpoint_manual`` that sends this thrust command; from 10001 to 60000."""
     return np.clip((np.asarray(command, float) - 10001.0) / (60000.0 - 10001.0), 0.0, 1.0) * 100.0
+
+
+def _model_factor(value: float) -> float:
+    if not 0.0 <= value <= 1.0:
+        raise ValueError(
+            f"model_factor must lie from 0 to 1, got {value!r}: it is f of the thrust curve f s^2 + (1 - f) s. Write 0 "
+            "where the target undoes the curve itself."
+        )
+    return value
 
 
 def _to_ned(world: str) -> Quaternion:

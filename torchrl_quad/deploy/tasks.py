@@ -87,7 +87,7 @@ class Gates:
     """Gates that are passed in their order, round after round: racing.
 
     A gate is passed when the straight line between the positions of two control steps comes nearer to its centre than
-    its radius.
+    its radius. In flight these are the measured positions; an environment counts from the true ones.
     """
 
     def __init__(self, task: Mapping[str, Any]) -> None:

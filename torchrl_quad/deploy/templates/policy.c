@@ -31,6 +31,9 @@ int policy_action(const float observation[POLICY_OBSERVATION], float action[POLI
 
     (void)one;
     (void)two;
+    /* A layer may turn NaN into a number, and saturate infinity. */
+    for (int i = 0; i < POLICY_OBSERVATION; ++i)
+        if (!isfinite(observation[i])) broken = 1;
 $layers
     for (int i = 0; i < POLICY_ACTION; ++i) {
         if (!isfinite(action[i])) broken = 1;

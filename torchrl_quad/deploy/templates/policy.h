@@ -17,7 +17,8 @@ extern "C" {
 
 extern const float policy_hover_action[POLICY_ACTION];
 
-/* The action for an observation. Returns 0; or 1, and writes the action that hovers, where the result is not finite. */
+/* The action for an observation. Returns 0; or 1, and writes the action that hovers, where an entry of the observation
+ * or the result is not finite. Do not compile with -ffast-math: it removes this check. */
 int policy_action(const float observation[POLICY_OBSERVATION], float action[POLICY_ACTION]);
 
 /* What an action commands: collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up. */

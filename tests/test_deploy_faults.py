@@ -266,4 +266,4 @@ def test_the_recipe_exports_the_best_policy_of_a_run_with_its_results(train, lau
 
 
 def test_the_page_shows_every_field_of_the_contract():
-    assert contract.schema_table() in (ROOT / "docs/deploy.md").read_text(), "put this table into docs/deploy.md"
+    assert contract.schema_table() in (ROOT / "docs/deploy_contract.md").read_text(), "put it into this page"

@@ -76,7 +76,8 @@ def first_metric(task: str) -> tuple[str, float, int, str]:
 def summary_table(data: Path) -> str:
     """Show what the recipes reach as they ship."""
     runs, lines = read(data / "shipped.csv"), []
-    for task in dict.fromkeys([*TASKS, *(x["task"] for x in runs)]):
+    flown = dict.fromkeys(x["task"] for x in runs)
+    for task in sorted(flown, key=[*TASKS, *flown].index):
         shown = TASKS.get(task) or first_metric(task)
         groups = ([x for x in runs if (x["task"], x["algorithm"]) == (task, method)] for method in METHODS)
         lines.append([task, *(cell(group, *shown) for group in groups)])

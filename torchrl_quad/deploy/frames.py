@@ -12,8 +12,8 @@ Ours: a world with z up, in which x and y may point anywhere; body x forward, y 
 (w, x, y, z) from body to world; rotors front left, back left, back right, front right. Where a target knows north, say
 where our x and y point: ``world="enu"``, x east and y north, or ``world="nwu"``, x north and y west.
 
-Everything broadcasts over leading dimensions. ``docs/deploy_autopilots.md`` says which facts were read in the source of a target,
-and which in its documentation. Check them against the version that you fly.
+Everything broadcasts over leading dimensions. ``docs/deploy_autopilots.md`` says which facts were read in the source of
+a target, and which in its documentation. Check them against the version that you fly.
 """
 
 from __future__ import annotations

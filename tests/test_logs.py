@@ -110,7 +110,7 @@ def test_tensorboard_gets_the_names_of_the_csv_and_forgets_what_is_flown_again(t
         assert [scalar.value for scalar in scalars] == pytest.approx([float(row[name]) for row in table]), name
 
 
-@pytest.mark.parametrize("recipe", ["abpt", "bptt", "shac", "ppo"])
+@pytest.mark.parametrize("recipe", ["abpt", "bptt", "ppo"])
 def test_a_run_with_diagnostics_learns_the_same_bit_for_bit_and_logs_them(recipe, train, tmp_path):
     options = [*EVERYTHING, "task=landing", "env.event_discount=null"]
     options += ["buffer.capacity=24"] if recipe == "abpt" else []

@@ -16,9 +16,12 @@ from training.checkpoints import read_checkpoint
 ROOT = Path(__file__).parent.parent
 
 
-@pytest.mark.parametrize("recipe", ["abpt", "bptt", "shac", "ppo", "ahac"])
+@pytest.mark.parametrize("recipe", ["abpt", "bptt", "hybrid", "ppo", "ahac"])
 def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(recipe, train, refused, tmp_path, monkeypatch):
-    options = [*EVERYTHING, *([] if recipe == "ppo" else ["loss.alpha=auto", "loss.clip_action_gradient=3"])]
+    options = [
+        *EVERYTHING,
+        *([] if recipe in ("ppo", "hybrid") else ["loss.alpha=auto", "loss.clip_action_gradient=3"]),
+    ]
     options += ["buffer.capacity=24"] if recipe == "abpt" else []  # full from the start: what is unused is arbitrary
     straight = train(recipe, tmp_path / "straight", *options)
     folder = tmp_path / "stopped"

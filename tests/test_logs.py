@@ -63,7 +63,7 @@ def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(lau
     for name, path in media:
         assert (logs[0].parent / "files" / path).read_bytes().startswith(kinds[name][1]), name
     artifact = first["artifact"][0].artifact
-    assert artifact.type == "model" and list(artifact.aliases) == ["best", "latest"]
+    assert artifact.type == "model" and set(artifact.aliases) == {"best", "latest"}
     contents = {entry.path for entry in artifact.manifest.contents}
     assert contents == {"checkpoint.pt", "config.yaml", "summary.json", "policy/policy.txt"}
     assert json.loads(second["artifact"][0].artifact.metadata)["return"] == final["return"]

@@ -22,8 +22,8 @@ def main(cfg: DictConfig) -> None:
     critic_parameters = loss.value_network_params.parameters()
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
 
-    run = Run(cfg, env, actor, loss, [actor_optimizer, rate, critic_optimizer, critic_schedule])
-    for _ in run:
+    run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer, critic_schedule])
+    for iteration in run:
         # Both gradients of one horizon, and what they are worth.
         rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         data = loss.write_targets(rollout)
@@ -32,14 +32,14 @@ def main(cfg: DictConfig) -> None:
         moved = 0.0
         for batch in shuffled(data, cfg.batch_size, cfg.epochs):
             losses = loss(batch)
-            if moved < rate.limit:
+            if moved < rate.limit(iteration):
                 moved = max(moved, mean_of_all(losses["kl"]).item())
                 run.optimise("actor", actor_optimizer, losses["loss_actor"], cfg.actor.max_grad_norm)
             run.optimise("critic", critic_optimizer, losses["loss_value"], cfg.critic.max_grad_norm)
 
         update_normalizer(env, data)
         run.carry = restart(env, end, cfg.restart_fraction)
-        rate.step(moved)
+        rate.step(iteration, moved)
         critic_schedule.step()
         run.record(**losses)
 

@@ -110,30 +110,19 @@ class AdaptiveRate:
             raise ValueError("actor.max_kl=null: this recipe sets its rate by it. Write a number; 0.25 is usual.")
         self.optimizer, self.max_kl, self.iterations = optimizer, max_kl, iterations
         self.bounds = (1e-6, 20.0 * optimizer.param_groups[0]["lr"])
-        self.done = 0
 
-    @property
-    def limit(self) -> float:
-        """How far this horizon may move the policy."""
-        return 1.5 * self.max_kl * max(1.0 - self.done / self.iterations, 0.02)
+    def limit(self, iteration: int) -> float:
+        """How far the horizon of an iteration, counted from 0, may move the policy."""
+        return 1.5 * self.max_kl * max(1.0 - iteration / self.iterations, 0.02)
 
-    def step(self, moved: float) -> None:
-        """Adapt the rate to how far the horizon has moved the policy."""
+    def step(self, iteration: int, moved: float) -> None:
+        """Adapt the rate, which the optimizer keeps, to how far the horizon has moved the policy."""
         low, high = self.bounds
         for group in self.optimizer.param_groups:
-            if moved > self.limit:
+            if moved > self.limit(iteration):
                 group["lr"] = max(group["lr"] / 1.5, low)
-            elif moved < self.limit / 2.25:
+            elif moved < self.limit(iteration) / 2.25:
                 group["lr"] = min(group["lr"] * 1.5, high)
-        self.done += 1
-
-    def state_dict(self) -> dict[str, int]:
-        """What a checkpoint keeps; the rate itself is in the optimiser's."""
-        return {"done": self.done}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on from a checkpoint."""
-        self.done = state["done"]
 
 
 class TargetUpdate(SoftUpdate):

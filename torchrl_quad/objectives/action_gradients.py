@@ -116,6 +116,11 @@ def _plain(actor: TensorDictModule) -> Any:
     return plain
 
 
+def median_length(length: Tensor) -> Tensor:
+    """The median of lengths, of those that are not zero: a scalar, NaN where all are."""
+    return torch.where(length > 0, length, torch.nan).nanmedian()
+
+
 class MedianClip(nn.Module):
     """Shortens gradients (*, k) that are longer than ``factor`` times the running median of their lengths.
 
@@ -137,7 +142,7 @@ class MedianClip(nn.Module):
         """The gradients, and the fraction that was shortened of those that are not zero; infinite ones become zero."""
         length = grad.norm(dim=-1, keepdim=True)
         counts = length > 0
-        median = torch.where(counts, length, torch.nan).nanmedian()  # NaN where nothing counts
+        median = median_length(length)
         running = torch.where(self.median > 0, torch.lerp(median, self.median.to(median), self.decay), median)
         self.median = torch.where(median.isnan(), self.median.to(median), running)
         factor = (self.factor * self.median / length.clamp_min(1e-30)).clamp_max(1.0)

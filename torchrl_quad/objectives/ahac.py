@@ -9,6 +9,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
+from torchrl_quad.objectives.action_gradients import median_length
 from torchrl_quad.objectives.shac import SHACLoss
 
 SMOOTHING = 0.2  # how much of the multiplier is new in each iteration
@@ -119,7 +120,6 @@ class AHACLoss(SHACLoss):
     def _measure(self, grad: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         length = grad.norm(dim=-1)
         counts = length > 0  # the last actions move nothing within the horizon
-        median = torch.where(counts, length, torch.nan).nanmedian()
-        stiffness = (length.square().sum() / counts.sum()).sqrt() / median
+        stiffness = (length.square().sum() / counts.sum()).sqrt() / median_length(length)
         grad, measured = super()._measure(grad)
         return grad, {"stiffness": stiffness, **measured}

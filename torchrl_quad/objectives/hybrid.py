@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 
 from torchrl_quad.objectives.action_gradients import act_again, action_gradient, location_gradient
-from torchrl_quad.objectives.critic import PathwiseCriticLoss
 from torchrl_quad.objectives.pathwise import discounts, segments
+from torchrl_quad.objectives.shac import SHACLoss
 
 
-class HybridLoss(PathwiseCriticLoss):
+class HybridLoss(SHACLoss):
     r"""PPO with the derivative of the simulator as a control variate: each gradient where it is good.
 
     The simulator's derivative gives p_t, the gradient of an action's own lambda-return in the mean of that action.
@@ -66,31 +66,24 @@ class HybridLoss(PathwiseCriticLoss):
     """
 
     @dataclass
-    class _AcceptedKeys(PathwiseCriticLoss._AcceptedKeys):
-        """As for every pathwise loss with a critic, and the keys under which :meth:`HybridLoss.write_targets` writes.
+    class _AcceptedKeys(SHACLoss._AcceptedKeys):
+        """As for SHAC, and the keys under which :meth:`HybridLoss.write_targets` writes.
 
         ``advantage`` is A' and ``location_gradient`` b p, both divided by the standard deviation of A; ``latent`` is
         the action before the tanh.
         """
 
-        value: NestedKey = "state_value"
         advantage: NestedKey = "advantage"
         location_gradient: NestedKey = "location_gradient"
         latent: NestedKey = "latent"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    critic_name = "value_network"
-    critic_loss_key = "loss_value"
-    prediction_key = "value"
     out_keys = [
         *("loss_actor", "loss_value", "pathwise_weight", "kl"),
         *("pred_value", "target_value", "explained_variance"),
     ]
 
-    value_network: TensorDictModule
-    value_network_params: TensorDictModule
-    target_value_network_params: TensorDictModule
     pathwise_weight: Tensor
 
     def __init__(
@@ -111,10 +104,10 @@ class HybridLoss(PathwiseCriticLoss):
             raise ValueError(f"clip_epsilon must lie between 0 and 1, got {clip_epsilon}; 0.2 is usual.")
         if not 0 <= decay < 1:
             raise ValueError(f"decay must lie in [0, 1), got {decay}.")
-        super().__init__(actor_network, clip_action_gradient=clip_action_gradient, reduction=reduction)
+        options = {"clip_action_gradient": clip_action_gradient, "reduction": reduction}
+        super().__init__(actor_network, value_network, delay_value=False, **options)
         self.gradient_lmbda, self.clip_epsilon, self.decay, self.average = gradient_lmbda, clip_epsilon, decay, average
         self.out_keys = [name for name in self.out_keys if name != "clipped"]  # minibatches clip no gradient
-        self.convert_to_functional(value_network, "value_network", create_target_params=False)
         weight = torch.full((), math.nan, device=self._default_device, dtype=self._precision)
         self.register_buffer("pathwise_weight", weight)
 
@@ -129,10 +122,7 @@ class HybridLoss(PathwiseCriticLoss):
         Args:
             tensordict: samples (*) of what :meth:`write_targets` returned, or a rollout (*, horizon) with its graph.
         """
-        tensordict = self._with_targets(tensordict)
-        loss_actor, metadata = self.loss_actor(tensordict)
-        loss_value, critic_metadata = self.loss_value(tensordict)
-        return TensorDict({"loss_actor": loss_actor, "loss_value": loss_value, **metadata, **critic_metadata}, [])
+        return super().forward(self._with_targets(tensordict))
 
     def write_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Differentiate a rollout (*, horizon), update the weight, and write what the minibatches read.
@@ -176,10 +166,6 @@ class HybridLoss(PathwiseCriticLoss):
         kl = kl_divergence(old, new).sum(-1).mean().detach()
         weight = self.pathwise_weight.clamp(0.0, 1.0)
         return self._reduce_loss(-(score + pathwise)), {"pathwise_weight": weight, "kl": kl}
-
-    def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The critic's loss on samples (*) of what :meth:`write_targets` returned, and its metadata."""
-        return self._critic_loss(tensordict)
 
     def _with_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict if self.tensor_keys.advantage in tensordict else self.write_targets(tensordict)

@@ -15,7 +15,7 @@ from torchrl_quad.identification.streams import Array, Signal
 Mask = NDArray[np.bool_]
 MAX_LAG = 0.3  # [s] between streams
 CALM = 0.1  # [rad/s]: slower rotations are lost in the noise of motion capture
-SURE = 0.1  # how much better a hypothesis must correlate than the log as it is given
+SURE = 0.05  # how much better a hypothesis must correlate than the log as it is given
 FRD = np.array([1.0, -1.0, -1.0])
 _NAME = "Name its columns in the order w x y z"
 _TURN = "conjugate it: Columns(names, scale=(1, -1, -1, -1)), whose second to fourth are x y z"
@@ -208,7 +208,7 @@ def _check_by_thrust(
     fits = {name: float(np.mean((u * pull)[moving].sum(-1))) for name, u in up.items()}
     lean = {name: _compare(u[:, :2], pull[:, :2], dt, moving)[0] for name, u in up.items()}
     best = max(lean, key=lambda name: lean[name] + fits[name])
-    if lean[best] + fits[best] > lean["as given"] + fits["as given"] + 3.0 * SURE and lean[best] > 0.5:
+    if lean[best] + fits[best] > lean["as given"] + fits["as given"] + 6.0 * SURE and lean[best] > 0.5:
         raise WrongQuaternion(
             f"{given} leans where the drone accelerates if it is {best} (correlation {lean[best]:.2f}), and not as "
             f"given ({lean['as given']:.2f}). We need w x y z, from body to world. {_FIXES[best]}"

@@ -44,30 +44,23 @@ def find_pieces(
     """Pieces (start, stop) in flight without gaps, and notes.
 
     The drone stands where its motors idle and it does not move. It flies where its motors run and it is more than
-    ``clearance`` above the place where it stood before or will stand next, whichever is nearer in time.
+    ``clearance`` above the place where it stood, or will stand next.
 
     Raises:
         NoFlight: it never does.
-        WrongFrame: it goes down from where it stood.
+        WrongFrame: it takes off downwards.
         GapsTooLarge: it does, but never for ``min_duration`` without a gap.
     """
     carried, idle = motors_on(at["motor_command"], dt, name)
     z = at["position"][:, 2]
     resting = _long(idle & (np.linalg.norm(at["velocity"], axis=-1) < REST), REST, dt)
-    flying = carried
-    if resting.any():
-        floor = _floor(z, resting)
-        if np.median((z - floor)[carried]) < -0.2:
-            raise WrongFrame(
-                f"{name}: z falls from {np.median(floor):.2f} to {z[carried].min():.2f} m when the motors run, so z "
-                "points down. If the log is in NED and FRD, write convention=frames.px4()."
-            )
-        flying = carried & (z > floor + clearance)
-        if not flying.any():
-            raise NoFlight(
-                f"{name} is no flight: it rises {(z - floor).max():.3f} m at most above where it stood, and never "
-                f"{clearance:g} m. Give the log of a flight, or a smaller clearance."
-            )
+    flying = carried & ~_near_ground(z, resting, clearance, name)
+    if not flying.any():
+        rise = (z - np.median(z[resting])).max()
+        raise NoFlight(
+            f"{name} is no flight: it rises {rise:.3f} m at most above where it stood, and never {clearance:g} m. Give "
+            "the log of a flight, or a smaller clearance."
+        )
     notes: list[str] = []
     airborne = flying & ~_impacts(at.get("acceleration"), flying, dt, notes)
     pieces = _runs(airborne & valid, min_duration, dt)
@@ -99,13 +92,38 @@ def find_pieces(
     return pieces, notes
 
 
-def _floor(z: Array, resting: Mask) -> Array:
-    """The height where the drone stands at the nearest rest in time."""
-    runs = _runs(resting, 0.0, 1.0)
-    heights = np.array([np.median(z[start:stop]) for start, stop in runs])
-    # Between two rests the nearer one counts: half of the way each.
-    borders = [(runs[k][1] + runs[k + 1][0]) // 2 for k in range(len(runs) - 1)]
-    return heights[np.searchsorted(np.array(borders, int), np.arange(len(z)), side="right")]
+def _near_ground(z: Array, resting: Mask, clearance: float, name: str) -> Mask:
+    """From each stand until the drone has risen by ``clearance``, back from the next one likewise, and in between
+    whenever it is that near to the lower of the two.
+
+    Raises:
+        WrongFrame: it leaves every stand downwards.
+    """
+    low = resting.copy()
+    stands = _runs(resting, 0.0, 1.0)
+    heights = [float(np.median(z[start:stop])) for start, stop in stands]
+    begins, ends = [0, *(stop for _, stop in stands)], [*(start for start, _ in stands), len(z)]
+    away = []
+    for k, (begin, end) in enumerate(zip(begins, ends, strict=True)):
+        beside = heights[max(k - 1, 0) : k + 1]
+        part = z[begin:end]
+        if not beside or not len(part):
+            continue
+        low[begin:end] = part < min(beside) + clearance
+        stood = [(heights[k - 1], 1)] if k else []
+        stood += [(heights[k], -1)] if k < len(stands) else []
+        for height, order in stood:
+            rise = part[::order] - height
+            left = np.flatnonzero(np.abs(rise) > clearance)
+            away += [rise[left[0]] > 0.0] if len(left) else []
+            up = np.flatnonzero(rise > clearance)
+            low[begin:end][::order][: up[0] if len(up) else len(part)] = True
+    if away and not any(away):
+        raise WrongFrame(
+            f"{name}: z falls when the drone takes off, from {heights[0]:.2f} to {z.min():.2f} m, so z points down. If "
+            "the log is in NED and FRD, write convention=frames.px4()."
+        )
+    return low
 
 
 def _impacts(force: Array | None, flying: Mask, dt: float, notes: list[str]) -> Mask:

@@ -111,7 +111,7 @@ def read_log(
             'write columns={"time": Columns(("t",), scale=1e-3), ...}.'
         )
     start, stop = max(s.time[0] for s in main), min(s.time[-1] for s in main)
-    if stop - start < max(min_duration, 5.0 * step):
+    if stop - start < 20.0 * step:
         raise NoFlight(
             f"{path.name} is no flight: its streams share {max(stop - start, 0.0):.2f} s. Give a longer log, or name "
             "columns that were recorded at the same time."

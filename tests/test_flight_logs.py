@@ -131,6 +131,17 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
 }
 
 
+def test_a_tracker_that_jumps_is_cut_out(table, read):
+    t = table["t"]
+    swapped = (t > 5.0) & (t < 5.04)  # its markers are taken for one another
+    reset = t > 7.0  # its origin moves
+    log = read({"qx": np.where(swapped, 0.7, table["qx"]), "qw": np.where(swapped, 0.714, table["qw"]),
+                "py": table["py"] + 0.5 * reset})  # fmt: skip
+    assert "a jump of the quaternion, of" in str(log) and "a jump of the position, of" in str(log)
+    edges = [round(k * log.dt, 1) for piece in log.segments for k in piece]
+    assert edges[1:-1] == pytest.approx([4.9, 5.1, 6.9, 7.1], abs=0.11)
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_each_fault_has_its_name_and_its_remedy(fault, table, read):
     change, error, message = FAULTS[fault]
@@ -184,7 +195,7 @@ def test_repeated_times_a_missing_battery_and_an_impact_are_told(table, read):
     assert "repeat the time" in str(log)
     hit = table["t"][600] - table["t"][0]
     (_, b), (c, _) = log.segments
-    assert "impact of" in str(log)
+    assert "an impact, of 78 m/s^2, at" in str(log)
     assert b * log.dt == pytest.approx(hit - 0.1, abs=0.03) and c * log.dt == pytest.approx(hit + 0.3, abs=0.05)
 
 

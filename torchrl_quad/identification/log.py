@@ -19,7 +19,7 @@ from torchrl_quad.identification.checks import (
 )
 from torchrl_quad.identification.errors import NoFlight, WrongUnit
 from torchrl_quad.identification.layouts import Columns, Layout, gather
-from torchrl_quad.identification.pieces import find_pieces, motors_on
+from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
 from torchrl_quad.identification.sources import read_streams
 from torchrl_quad.identification.streams import Array, Signal, clean, covered, frozen, resample
 
@@ -120,7 +120,8 @@ def read_log(
     valid = _cover(main, grid, step, max_gap, notes)
     at = _at(signals, grid, step)
     on, _ = motors_on(at["motor_command"], step, path.name)
-    moving = on & valid if (on & valid).sum() > 10 else on
+    sound = on & valid & ~broken(at, on, step)[0]
+    moving = sound if sound.sum() > 10 else on
     check_velocity(at, signals, step, moving)
     check_specific_force(at, signals, moving)
     note, _ = check_rates(at, signals, step, moving)

@@ -61,8 +61,8 @@ def find_pieces(
             f"{name} is no flight: it rises {rise:.3f} m at most above where it stood, and never {clearance:g} m. Give "
             "the log of a flight, or a smaller clearance."
         )
-    notes: list[str] = []
-    airborne = flying & ~_impacts(at.get("acceleration"), flying, dt, notes)
+    cut, notes = broken(at, flying, dt)
+    airborne = flying & ~cut
     pieces = _runs(airborne & valid, min_duration, dt)
     if not pieces:
         if _runs(airborne, min_duration, dt):
@@ -126,21 +126,33 @@ def _near_ground(z: Array, resting: Mask, clearance: float, name: str) -> Mask:
     return low
 
 
-def _impacts(force: Array | None, flying: Mask, dt: float, notes: list[str]) -> Mask:
-    """A tenth of a second before to three after each spike of the specific force, which no rotor makes."""
-    hit = np.zeros(len(flying), bool)
-    if force is None or not flying.any():
-        return hit
+def broken(at: Mapping[str, Array], flying: Mask, dt: float) -> tuple[Mask, list[str]]:
+    """Around spikes of the specific force, which no rotor makes, and where the tracker or the estimator jumps; and
+    what was found."""
+    cut = np.zeros(len(flying), bool)
+    notes: list[str] = []
+    if not flying.any():
+        return cut, notes
     half = max(1, round(0.05 / dt))
-    windows = sliding_window_view(np.pad(force, ((half, half), (0, 0)), mode="edge"), 2 * half + 1, 0)
-    spike = np.linalg.norm(force - np.median(windows, -1), axis=-1)
-    limit = max(15.0, 10.0 * 1.4826 * float(np.median(spike[flying])))
-    for start, stop in _runs(flying & (spike > limit), 0.0, dt):
-        low, high = max(0, start - round(0.1 / dt)), stop + round(0.3 / dt)
-        if not hit[low:high].any():
-            notes.append(f"impact of {spike[start:stop].max():.0f} m/s^2 at {start * dt:.2f} s: cut out")
-        hit[low:high] = True
-    return hit
+    for name, least, unit, what, after in (
+        ("acceleration", 15.0, " m/s^2", "an impact", 0.3),
+        # From sample to sample, beyond what a drone that accelerates by 50 m/s^2 or 200 rad/s^2 adds.
+        ("position", 0.05 + 50.0 * dt**2, " m", "a jump of the position", 0.1),
+        ("quaternion", 0.1 + 100.0 * dt**2, "", "a jump of the quaternion", 0.1),
+    ):
+        if name not in at:
+            continue
+        x = at[name] if name == "acceleration" else np.diff(at[name], axis=0, prepend=at[name][:1])
+        windows = sliding_window_view(np.pad(x, ((half, half), (0, 0)), mode="edge"), 2 * half + 1, 0)
+        spike = np.linalg.norm(x - np.median(windows, -1), axis=-1)
+        limit = max(least, 10.0 * 1.4826 * float(np.median(spike[flying])))
+        end = 0
+        for start, stop in _runs(flying & (spike > limit), 0.0, dt):
+            if start >= end:
+                notes.append(f"{what}, of {spike[start:stop].max():.2g}{unit}, at {start * dt:.2f} s: cut out")
+            end = stop + round(after / dt)
+            cut[max(0, start - round(0.1 / dt)) : end] = True
+    return cut, notes
 
 
 def _runs(mask: Mask, shortest: float, dt: float) -> tuple[tuple[int, int], ...]:

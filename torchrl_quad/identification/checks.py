@@ -156,14 +156,17 @@ def check_rates(
         _check_by_thrust(at, given, hypotheses, dt, moving)
         return "no gyro: angular_velocity was derived from the attitude", None
     signal, gyro = signals["angular_velocity"], at["angular_velocity"]
+    right = smooth(body_rates(q, dt), dt)
+    turning = float(np.sqrt((right[moving] ** 2).mean()))
+    calm = f"{signal} was not checked: the flight turns too slowly ({turning:.2f} rad/s)"
+    if turning < CALM / 5.0:
+        return calm, None
     trials = {name: (smooth(body_rates(h, dt), dt), smooth(gyro, dt)) for name, h in hypotheses.items()}
-    right = trials["as given"][0]
     trials["body y right, z down"] = (right, smooth(gyro * FRD, dt))
     trials["in the world frame"] = (right, smooth(rotate(q * FLIP, gyro), dt))
     fits = {name: _compare(b, a, dt, moving) for name, (a, b) in trials.items()}
     fit, factor, lag = fits["as given"]
     best = max(fits, key=lambda name: fits[name][0])
-    turning = float(np.sqrt((right[moving] ** 2).mean()))
     if fits[best][0] > max(0.5, fit + SURE):
         told = f"{signal} correlates with the derivative of {given} by {fit:.2f} as given, and by {fits[best][0]:.2f}"
         if best in hypotheses:
@@ -185,7 +188,7 @@ def check_rates(
                 f'columns={{"angular_velocity": Columns({signal.columns!r}, scale={scale})}}.'
             )
     if turning < CALM:
-        return f"{signal} was not checked: the flight turns too slowly ({turning:.2f} rad/s)", None
+        return calm, None
     if fit < 0.5:
         raise InconsistentRates(
             f"{signal} does not follow {given}: their correlation is {fit:.2f} at best, also if the quaternion is "

@@ -38,12 +38,12 @@ class FlightLog:
     quaternion: Array  #: (T, 4), unit norm, without jumps of sign
     velocity: Array  #: (T, 3) [m/s], world frame
     angular_velocity: Array  #: (T, 3) [rad/s], body frame
-    acceleration: Array | None  #: (T, 3) [m/s^2], specific force in the body frame: what an accelerometer measures
+    acceleration: Array | None  #: (T, 3) [m/s^2], what an accelerometer measures, body frame
     motor_command: Array  #: (T, 4), 0 to 1 of the full command; front left, back left, back right, front right
     battery_voltage: Array | None  #: (T,) [V]
     setpoint: Mapping[str, Array] | None  #: what the controller was asked for, by name, held between samples
-    segments: tuple[tuple[int, int], ...]  #: (start, stop) of pieces in flight without gaps: ``position[start:stop]``
-    onboard: tuple[str, ...]  #: fields by another clock than the position: late by an unknown, constant delay
+    segments: tuple[tuple[int, int], ...]  #: pieces in flight without gaps, for ``position[start:stop]``
+    onboard: tuple[str, ...]  #: fields by another clock than the position's, late by an unknown, constant delay
     notes: tuple[str, ...]  #: what was found and done, a sentence each
 
     @property

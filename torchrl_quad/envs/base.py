@@ -16,7 +16,8 @@ from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams, load_dron
 from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compiler, nested
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import checks
-from torchrl_quad.envs.disturbances import Disturbance, choose_disturbances
+from torchrl_quad.envs.disturbances import Disturbance
+from torchrl_quad.envs.options import choose_disturbances
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenery import merge_reset, visible_state
 from torchrl_quad.envs.specs import describe, set_specs
@@ -63,6 +64,9 @@ class QuadrotorEnv(Task, EnvBase):
         wind: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.Wind`, or one of these.
         random_start: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.RandomStart`, or one of these.
         disturbances: disturbances of your own; see :class:`~torchrl_quad.envs.disturbances.Disturbance`.
+        scene: obstacles, which end an episode by a crash: a mapping or a YAML file; see :class:`~torchrl_quad.Scene`.
+        camera: adds ``"depth"`` (num_envs, 1, height, width) [m] to what a policy sees: a
+            :class:`~torchrl_quad.DepthCamera`, or a mapping of its fields. Without a scene it sees the ground z = 0.
         compile: compile the step and its first derivative: half a minute the first time; see ``docs/performance.md``.
 
     Raises:
@@ -97,6 +101,8 @@ class QuadrotorEnv(Task, EnvBase):
         wind: Mapping[str, Any] | Disturbance | None = None,
         random_start: Mapping[str, float] | Disturbance | None = None,
         disturbances: Sequence[Disturbance] = (),
+        scene: Any = None,
+        camera: Any = None,
         **unknown: Any,
     ) -> None:
         checks.refuse_unknown(type(self), unknown)
@@ -118,6 +124,7 @@ class QuadrotorEnv(Task, EnvBase):
         self._make_disturbances = functools.partial(
             choose_disturbances, random_start=random_start, randomize=randomize, wind=wind,
             observation_noise=observation_noise, observation_delay=observation_delay, more=disturbances,
+            scene=scene, camera=camera,
         )  # fmt: skip
         self.disturbances = self._make_disturbances(self.nominal, self.dynamics.plant_fields)
         self.randomness = Randomness(self.device, dtype)
@@ -211,9 +218,7 @@ class QuadrotorEnv(Task, EnvBase):
         return self
 
     def render(self, drones: Sequence[int] | None = None, *, size: int = 336) -> Any:
-        """Draw the drones as the last reset, step or rollout left them, with their targets, into one picture.
-
-        TorchRL's ``PixelRenderTransform(drones=[0, 1], size=480)`` calls it, and ``VideoRecorder`` films it.
+        """Draw the drones as the last reset, step or rollout left them; TorchRL's ``PixelRenderTransform`` calls it.
 
         Args:
             drones: indices of those to draw; by default the first six.
@@ -224,7 +229,6 @@ class QuadrotorEnv(Task, EnvBase):
 
         Raises:
             ValueError: there is no state yet, as before the first reset; or an argument is out of its range.
-            ImportError: matplotlib is missing.
         """
         from torchrl_quad.render.frames import draw_frame  # matplotlib is needed only here
 

@@ -188,7 +188,7 @@ class QuadrotorEnv(Task, EnvBase):
         """Compile the control step and its derivative; the keywords go to torch.compile. Under transforms, compile the
         environment inside, ``TransformedEnv(HoveringEnv(compile=True), ...)``: TransformedEnv's own takes minutes."""
         kwargs.pop("warmup", None)  # TorchRL's option for steps whose input changes its layout: ours never does
-        self._stepper = Stepper(self.control_step, kwargs if has_compiler() else None)
+        self._run(kwargs if has_compiler() else None)
         return self
 
     def flies_inside(self, policy: Any) -> bool:
@@ -198,7 +198,7 @@ class QuadrotorEnv(Task, EnvBase):
 
     def eager(self) -> QuadrotorEnv:
         """Undo :meth:`compile`."""
-        self._stepper = Stepper(self.control_step)
+        self._run(None)
         return self
 
     def to(self, device: torch.device | str) -> QuadrotorEnv:
@@ -239,11 +239,17 @@ class QuadrotorEnv(Task, EnvBase):
     def _connect(self, safe_state: State, options: dict[str, Any] | None = None) -> None:
         """Join what belongs together on one device: the step, what runs it, and its random numbers."""
         self.control_step = ControlStep(self, safe_state)
-        self._stepper = Stepper(self.control_step, options)
+        self._run(options)
         sizes = {name: x.noise_size for name, x in self.disturbances.items()}
         self.randomness.noise_shapes = {name: (self.num_envs, size) for name, size in sizes.items() if size}
         self.randomness.draw_start = functools.partial(draw_start, self)
         self.render_state: State = {}  # positions, quaternions and targets, for render()
+
+    def _run(self, options: dict[str, Any] | None) -> None:
+        """Run steps compiled with these options, eager for None; and the camera, which starts use, too, likewise."""
+        self._stepper = Stepper(self.control_step, options)
+        if "camera" in self.disturbances:
+            self.disturbances["camera"].is_compiled = self.is_compiled
 
     def reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool | None = None, **options: Any) -> Any:
         """As TorchRL's; of a mask and a state in one tensordict, ``set_state`` says which of them counts."""

@@ -7,7 +7,8 @@ from typing import Any
 
 from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.envs.disturbances import Disturbance, DroneRandomization, RandomStart, Sensors, Wind, build
-from torchrl_quad.envs.scenes import Eye, Scene
+from torchrl_quad.envs.eyes import Eye
+from torchrl_quad.envs.scenes import Scene
 from torchrl_quad.vision import DepthCamera
 
 

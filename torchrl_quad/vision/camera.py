@@ -144,20 +144,21 @@ class DepthCamera:
         eye = position + quaternion.rotate(attitude, offset.expand_as(position))
         return eye, quaternion.multiply(attitude, self.mount(attitude).expand_as(attitude))
 
-    def depth(self, solids: Primitives, position: Tensor, attitude: Tensor) -> Tensor:
+    def depth(self, solids: Primitives, position: Tensor, attitude: Tensor, *, fused: bool = False) -> Tensor:
         """What the camera sees without noise, rate and delay.
 
         Args:
             solids: of n scenes.
             position: of the drones (n, 3) [m], world frame.
             attitude: of the drones (n, 4), unit quaternions, body to world.
+            fused: compile the rays, 30 times as fast; as a compiled step does in any case.
 
         Returns:
             images (n, 1, height, width) [m].
         """
         plane = self.plane(position)
         pose = self.pose(position, attitude)
-        depth = cast_rays(solids, *pose, plane, self.range, self.differentiable)
+        depth = cast_rays(solids, *pose, plane, self.range, self.differentiable, fused=fused)
         if self.along_ray:
             depth = (depth * (1.0 + plane.square().sum(0)).sqrt()).clamp_max(self.range)
         return depth.unflatten(1, (1, self.height, self.width))

@@ -23,7 +23,14 @@ GRAZING = 0.05  # the least cosine between a ray and a normal that derivatives k
 
 
 def cast_rays(
-    solids: Primitives, position: Tensor, attitude: Tensor, plane: Tensor, far: float, differentiable: bool = False
+    solids: Primitives,
+    position: Tensor,
+    attitude: Tensor,
+    plane: Tensor,
+    far: float,
+    differentiable: bool = False,
+    *,
+    fused: bool = False,
 ) -> Tensor:
     """How far rays fly until they meet a solid, as a multiple of their direction, (n, p), at most ``far``.
 
@@ -36,15 +43,16 @@ def cast_rays(
         attitude: of the eye (n, 4), a unit quaternion, to the world.
         plane: where the rays pass the plane x = 1 in the frame of the eye (2, p): y to the left, z upwards.
         far: what is further away is not seen [m].
+        fused: compile the rays into one loop, as a compiled step does in any case; it takes seconds the first time.
         differentiable: with the derivative in position and attitude. It is that of the surface that is seen; what
             jumps, as an edge does that comes before another surface, has none. At a grazing ray it is limited.
     """
     solids = Primitives(*(x.detach() for x in solids))
     inputs = position.detach(), attitude.detach(), plane, *solids._replace(boxes=_with_axes(solids.boxes))
-    inputs = [x.contiguous() for x in inputs]
+    inputs, fused = [x.contiguous() for x in inputs], fused or is_traced()
     if not differentiable:
-        return _cast(*inputs, far=far) if is_traced() else _chunks(False, inputs, far)[0]
-    depth, index = _cast_which(*inputs, far=far) if is_traced() else _chunks(True, inputs, far)
+        return _cast(*inputs, far=far) if fused else _chunks(False, inputs, far)[0]
+    depth, index = _cast_which(*inputs, far=far) if fused else _chunks(True, inputs, far)
     return _attached(solids, position, attitude, plane, depth, index, far)
 
 

@@ -140,7 +140,9 @@ class ForestEnv(QuadrotorEnv):
         start = self.tensor([-self.run_up[0], 0.0, self.cruise_height])
         goal = self.tensor([self.length, 0.0, self.cruise_height])
         low = self.tensor([-self.before, -self.half_width, self.scene.radius])
-        if not has_way(fixed, start, goal, low, self.tensor([self.length + 1.0, self.half_width, top]), self.scene.radius):
+        if not has_way(
+            fixed, start, goal, low, self.tensor([self.length + 1.0, self.half_width, top]), self.scene.radius
+        ):
             raise ValueError(
                 f"{self.scene.source}: the obstacles leave no way from (x, y, z) = (-1, 0, 1.5) to (30, 0, 1.5) m, within "
                 f"{self.half_width:g} m to both sides and below {top:g} m, for a drone of radius "

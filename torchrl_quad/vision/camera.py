@@ -106,7 +106,9 @@ class DepthCamera:
             return spec
         allowed = [field.name for field in dataclasses.fields(cls)]
         if not isinstance(spec, Mapping):
-            raise ValueError(f"camera must be a DepthCamera, or a mapping with any of {', '.join(allowed)}; got {spec!r}.")
+            raise ValueError(
+                f"camera must be a DepthCamera, or a mapping with any of {', '.join(allowed)}; got {spec!r}."
+            )
         unknown = sorted(str(key) for key in spec if key not in allowed)
         _require(not unknown, f"unknown key {unknown[0] if unknown else ''!r}. Allowed: {', '.join(allowed)}.")
         return cls(**spec)

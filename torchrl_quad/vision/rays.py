@@ -272,4 +272,3 @@ def _cast_which(
 def _(position, attitude, plane, spheres, cylinders, boxes, planes, far):
     shape = len(position), plane.shape[1]
     return position.new_empty(shape), position.new_empty(shape, dtype=torch.int64)
-

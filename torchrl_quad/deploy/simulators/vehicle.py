@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
@@ -93,7 +93,8 @@ class ContractLoop:
         self.drone, self.dt = drone, dt
         self.gain = drone.inertia * drone.rate_gain
         self.share, self.per_share = drone.mixer[:, 0], 1.0 / drone.mixer[:, 0]
-        lowest, highest = (drone.thrust_limits[0] * self.per_share).max(), (drone.thrust_limits[1] * self.per_share).min()
+        least, greatest = drone.thrust_limits
+        lowest, highest = (least * self.per_share).max(), (greatest * self.per_share).min()
         self.middle, self.half_span = 0.5 * (highest + lowest), 0.5 * (highest - lowest)
         self.yaw_share, self.tiny = drone.mixer[:, 3] * self.per_share, 1e-6 * drone.weight
 
@@ -178,17 +179,16 @@ class PIDLoop(ContractLoop):
             self.before = self.before[chosen]
 
 
+def damping_ratio(drone: Drone) -> Array:
+    """Of the contract's rate loop, a second-order system about each axis (3); see its ``rate_loop``."""
+    return (1.0 + drone.rate_damping / drone.inertia) / (2.0 * np.sqrt(drone.rate_gain * drone.motor_time_constant))
+
+
 def bandwidth(drone: Drone) -> Array:
-    """At which the answer of the contract's rate loop to a sine has fallen by 3 dB (3) [rad/s]; see the contract."""
-    gain, tau = drone.rate_gain, drone.motor_time_constant
-    ratio = (1.0 + drone.rate_damping / drone.inertia) / (2.0 * np.sqrt(gain * tau))
-    part = 1.0 - 2.0 * ratio**2
-    return np.sqrt(gain / tau) * np.sqrt(part + np.sqrt(part**2 + 1.0))
+    """At which the answer of the contract's rate loop to a sine has fallen by 3 dB (3) [rad/s]."""
+    part = 1.0 - 2.0 * damping_ratio(drone) ** 2
+    return np.sqrt(drone.rate_gain / drone.motor_time_constant) * np.sqrt(part + np.sqrt(part**2 + 1.0))
 
 
 LOOPS: dict[str, type[ContractLoop]] = {"contract": ContractLoop, "pid": PIDLoop}
 
-
-def as_rows(value: ArrayLike, n: int) -> Array:
-    """A value for each of n drones."""
-    return np.tile(np.asarray(value, float), (n, 1))

@@ -1,7 +1,7 @@
 """Judge flights as the package's own evaluation does, from the contract and the trajectory, in numpy.
 
-A flight is a mapping of arrays: ``position`` and ``velocity`` (n, time + 1, 3), of which the first is the start, and the
-``target`` (n, 3), ``phase`` (n, 1) or ``gate`` (n, 1) that it starts with, by the rule of the contract's task.
+A flight is a mapping of arrays: ``position`` and ``velocity`` (n, time + 1, 3), of which the first is the start, and
+the ``target`` (n, 3), ``phase`` (n, 1) or ``gate`` (n, 1) that it starts with, by the rule of the contract's task.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ PRECISION = {
 }
 
 
-def endings(contract: Mapping[str, Any], position: Array, velocity: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def endings(
+    contract: Mapping[str, Any], position: Array, velocity: Array
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which states (..., 3) are crashes, and which end the episode because the task is done; each (...)."""
     box, task = contract["safety"]["position"], contract["task"]
     (x0, y0, z0), (x1, y1, z1) = box["low"], box["high"]

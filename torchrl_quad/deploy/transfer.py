@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,12 @@ from torchrl_quad.deploy.simulators import make_simulator
 from torchrl_quad.deploy.tasks import PROGRESS
 
 Array = NDArray[np.float64]
+OF_THE_LOOP = (
+    "rate_gain",
+    "rate_damping",
+    "max_body_rate",
+    "max_thrust_to_weight",
+)  # which does not know the true drone
 
 
 @dataclass(frozen=True)
@@ -30,7 +37,12 @@ class Mutant:
     """A mistake in a port, made on purpose: flown, it must fail."""
 
     about: str
-    quaternion: tuple[int, ...] = (0, 1, 2, 3)  #: the entries of the quaternion, in the order in which the bundle gets them
+    quaternion: tuple[int, ...] = (
+        0,
+        1,
+        2,
+        3,
+    )  #: the entries of the quaternion, in the order in which the bundle gets them
     attitude: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)  #: times the quaternion that the bundle gets
     measured: tuple[float, ...] = (1.0, 1.0, 1.0)  #: times the body rates that the bundle gets
     commanded: tuple[float, ...] = (1.0, 1.0, 1.0)  #: times the body rates that it commands
@@ -56,6 +68,9 @@ def fly(
     simulator: str,
     loop: str = "contract",
     mutant: Mutant | None = None,
+    *,
+    scale: Mapping[str, float] | None = None,
+    late: int = 0,
     episodes: int | None = None,
 ) -> dict[str, Any]:
     """Fly a bundle from its fresh starts, one episode each, in a simulator.
@@ -68,6 +83,8 @@ def fly(
         simulator: one of :data:`~torchrl_quad.deploy.simulators.SIMULATORS`.
         loop: the rate loop: "contract", "pid", or "own", that of the simulator.
         mutant: a mistake to make.
+        scale: fields of the drone that flies, times a factor: ``{"mass": 1.2}``. The rate loop does not know of it.
+        late: control steps by which commands take effect later than the contract says.
         episodes: of the starts, how many; by default all.
 
     Returns:
@@ -75,14 +92,14 @@ def fly(
         an episode; ``action`` (n, time, 4); what :func:`~torchrl_quad.deploy.judging.judge` finds (n); ``simulator``,
         name and version; ``faults``, the bundle's refusals by name.
     """
-    bundle = load_bundle(folder, on_fault="hover") if not isinstance(folder, Bundle) else folder
-    contract, mutant = bundle.contract, mutant or Mutant("none")
+    bundle = folder if isinstance(folder, Bundle) else load_bundle(folder, on_fault="hover")
+    contract, mutant = other_drone(bundle.contract, scale or {}), mutant or Mutant("none")
     starts = {name: x[:episodes] for name, x in bundle.starts().items()}
     n, steps = len(starts["position"]), contract["task"]["max_episode_steps"]
     world = make_simulator(simulator, contract, loop, mutant.motors)
     world.reset({name: starts[name] for name in QUANTITIES})
     pilots = [_pilot(bundle, {k: x[i] for k, x in starts.items()}) for i in range(n)]
-    delay = contract["action_delay"] if mutant.delay is None else mutant.delay
+    delay = late + (contract["action_delay"] if mutant.delay is None else mutant.delay)
     queue = deque([np.tile(_hover(contract), (n, 1))] * delay)
     state = world.state()
     seen = deque([state] * (contract["observation_delay"] + 1), contract["observation_delay"] + 1)
@@ -113,6 +130,21 @@ def fly(
     flight[progress] = starts[progress]
     faults = sum((pilot.faults for pilot in pilots), Counter())
     return {**flight, **judge(contract, flight), "simulator": world.version, "faults": dict(faults)}
+
+
+def other_drone(contract: Mapping[str, Any], scale: Mapping[str, float]) -> dict[str, Any]:
+    """The contract with another drone in its ``plant``: fields times a factor.
+
+    Raises:
+        ValueError: a field is unknown, or belongs to the rate loop.
+    """
+    drone, plant = contract["drone"] | contract["plant"], dict(contract["plant"])
+    fields = [name for name in drone if name not in OF_THE_LOOP]
+    for name, factor in scale.items():
+        if name not in fields:
+            raise ValueError(f"scale: the drone has no {name!r} to scale. Choose from: {', '.join(fields)}.")
+        plant[name] = (factor * np.array(drone[name], float)).tolist()
+    return {**contract, "plant": plant}
 
 
 def _hover(contract: dict[str, Any]) -> Array:

@@ -43,6 +43,22 @@ class Simulator(Protocol):
         """Go on with these drones alone (n)."""
 
 
+def simulator_class(name: str) -> type[Simulator]:
+    """The class of a simulator by its name.
+
+    Raises:
+        ValueError: it is unknown.
+        ImportError: it is not installed.
+    """
+    if name not in SIMULATORS:
+        raise ValueError(f"Unknown simulator {name!r}. Choose from: {', '.join(SIMULATORS)}.")
+    module, cls, package = SIMULATORS[name]
+    try:
+        return getattr(importlib.import_module(f"{__name__}.{module}"), cls)
+    except ImportError as error:
+        raise ImportError(f"Flying in {name} needs {package}: pip install {package} ({error})") from error
+
+
 def make_simulator(
     name: str, contract: Mapping[str, Any], loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
 ) -> Simulator:
@@ -52,13 +68,7 @@ def make_simulator(
         ValueError: it is unknown, or has no such rate loop.
         ImportError: it is not installed.
     """
-    if name not in SIMULATORS:
-        raise ValueError(f"Unknown simulator {name!r}. Choose from: {', '.join(SIMULATORS)}.")
-    module, cls, package = SIMULATORS[name]
-    try:
-        kind = getattr(importlib.import_module(f"{__name__}.{module}"), cls)
-    except ImportError as error:
-        raise ImportError(f"Flying in {name} failed to start: {error}. Write: pip install {package}") from error
+    kind = simulator_class(name)
     if loop not in kind.loops:
         raise ValueError(f"{name} has no rate loop {loop!r}. Choose from: {', '.join(kind.loops)}.")
     return kind(contract, loop, motors)

@@ -66,7 +66,9 @@ class Crazyflow:
         theirs["rotor_vel"] = np.tile(self.frame.to({"motors": drone.hover_speed})["motors"] * RPM, (n, 1))
         data = self.sim.data
         states = data.states.replace(**{name: jnp.asarray(x, jnp.float32)[:, None] for name, x in theirs.items()})
-        params = data.params.replace(**{k: jnp.asarray(x, jnp.float32) for k, x in _parameters(drone, self.frame).items()})
+        params = data.params.replace(
+            **{k: jnp.asarray(x, jnp.float32) for k, x in _parameters(drone, self.frame).items()}
+        )
         self.sim.data = data.replace(states=states, params=params)
         self.flying = np.arange(n)  # the others go on, too, but nobody looks at them
 

@@ -29,7 +29,9 @@ def model(drone: Drone, timestep: float) -> str:
     into them, and turn by its drag torque.
     """
     places, spins = drone.rotor_positions.tolist(), drone.rotor_spin.tolist()
-    sites = "".join(f'<site name="{name}" pos="{x!r} {y!r} 0"/>' for name, (x, y) in zip(FRONT_TO_BACK, places, strict=True))
+    sites = "".join(
+        f'<site name="{name}" pos="{x!r} {y!r} 0"/>' for name, (x, y) in zip(FRONT_TO_BACK, places, strict=True)
+    )
     lag = f'dyntype="filterexact" dynprm="{drone.motor_time_constant!r}" gaintype="fixed" gainprm="0" biastype="none"'
     lags = "".join(f'<general site="{name}" {lag} gear="0 0 1 0 0 0" ctrllimited="false"/>' for name in FRONT_TO_BACK)
     thrusts = "".join(
@@ -105,9 +107,7 @@ class MuJoCo:
             np.clip(asked[:, self.motors], *limits, out=command)
             lift[:] = drone.thrust(speed)
             force[:] = drone.drag(x[:, STATE["quaternion"]], x[:, STATE["velocity"]])
-            self.rollout.rollout(
-                self.model, [self.data], x, self.control, control_spec=self.inputs, state=self.after
-            )
+            self.rollout.rollout(self.model, [self.data], x, self.control, control_spec=self.inputs, state=self.after)
             self.x, self.after = self.after[:, 0], x[:, None]
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:

@@ -31,7 +31,9 @@ class Ours:
         about = contract["simulator"]
         self.version = contract["origin"]["package"]
         nominal, substeps = load_drone(contract["drone"]), round(contract["control_dt"] / about["dt"])
-        self.params: QuadrotorParams = load_drone(contract["drone"] | contract["plant"]) if contract["plant"] else nominal
+        self.params: QuadrotorParams = (
+            load_drone(contract["drone"] | contract["plant"]) if contract["plant"] else nominal
+        )
         kind = DYNAMICS[about["dynamics"]]
         self.dynamics = kind(nominal, about["dt"], substeps, about["integrator"], "rates")
         if not contract["plant"]:

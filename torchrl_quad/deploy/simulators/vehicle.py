@@ -191,4 +191,3 @@ def bandwidth(drone: Drone) -> Array:
 
 
 LOOPS: dict[str, type[ContractLoop]] = {"contract": ContractLoop, "pid": PIDLoop}
-

@@ -31,7 +31,7 @@ class Simulator(Protocol):
     loops: tuple[str, ...]  #: the rate loops that it can fly with
 
     def reset(self, starts: Mapping[str, Array]) -> None:
-        """Begin in these states (n, ...), with the rotors at hover speed."""
+        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
 
     def state(self) -> dict[str, Array]:
         """``position``, ``quaternion``, ``velocity``, ``angular_velocity`` and ``rotor_speed``, each (n, ...)."""

@@ -45,11 +45,12 @@ class Crazyflow:
         self.substeps = max(round(contract["control_dt"] * RATE), 1)
         self.rate = round(self.substeps / contract["control_dt"])
         self.drone = Drone(contract["drone"] | contract["plant"])
-        self.loop = LOOPS[loop](Drone(contract["drone"]), 1.0 / self.rate)
+        nominal = Drone(contract["drone"])
+        self.loop, self.hover_speed = LOOPS[loop](nominal, 1.0 / self.rate), nominal.hover_speed
         self.frame, self.order = frames.crazyflow(), list(motors)
 
     def reset(self, starts: Mapping[str, Array]) -> None:
-        """Begin in these states (n, ...), with the rotors at hover speed."""
+        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
         n, drone = len(starts["position"]), self.drone
         self.sim = Sim(
             n_worlds=n,
@@ -63,7 +64,7 @@ class Crazyflow:
         self.sim.step_pipeline["clip_rotor_vel_cmd"] = clip
         self.sim.build_step_fn()
         theirs = {NAMES[name]: x for name, x in self.frame.to(starts).items()}
-        theirs["rotor_vel"] = np.tile(self.frame.to({"motors": drone.hover_speed})["motors"] * RPM, (n, 1))
+        theirs["rotor_vel"] = np.tile(self.frame.to({"motors": self.hover_speed})["motors"] * RPM, (n, 1))
         data = self.sim.data
         states = data.states.replace(**{name: jnp.asarray(x, jnp.float32)[:, None] for name, x in theirs.items()})
         params = data.params.replace(

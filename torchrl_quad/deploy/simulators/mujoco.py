@@ -77,7 +77,7 @@ class MuJoCo:
         self.substeps = max(round(contract["control_dt"] * RATE), 1)
         timestep = contract["control_dt"] / self.substeps
         nominal = Drone(contract["drone"])
-        self.drone = Drone(contract["drone"] | contract["plant"])
+        self.drone, self.hover_speed = Drone(contract["drone"] | contract["plant"]), nominal.hover_speed
         self.loop, self.motors = LOOPS[loop](nominal, timestep), list(motors)
         self.model = mujoco.MjModel.from_xml_string(model(self.drone, timestep))
         self.data = mujoco.MjData(self.model)
@@ -85,11 +85,11 @@ class MuJoCo:
         self.inputs = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED)
 
     def reset(self, starts: Mapping[str, Array]) -> None:
-        """Begin in these states (n, ...), with the rotors at hover speed."""
+        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
         n = len(starts["position"])
         self.x = np.zeros((n, mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
         for name, at in STATE.items():
-            self.x[:, at] = starts.get(name, self.drone.hover_speed)
+            self.x[:, at] = starts.get(name, self.hover_speed)
         self._allocate()
 
     def state(self) -> dict[str, Array]:

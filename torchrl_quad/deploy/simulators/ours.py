@@ -40,7 +40,7 @@ class Ours:
             self.params = self.dynamics.nominal
 
     def reset(self, starts: Mapping[str, Array]) -> None:
-        """Begin in these states (n, ...), with the rotors at hover speed."""
+        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
         given = {name: torch.from_numpy(x).float() for name, x in starts.items()}
         self.now = {**self.dynamics.rest(given["position"]), **given}
 

@@ -42,8 +42,9 @@ class RotorPy:
         self.version = f"RotorPy {version('rotorpy')}"
         self.dt = contract["simulator"]["dt"]
         self.substeps = round(contract["control_dt"] / self.dt)
-        nominal, drone = _squared(contract["drone"]), _squared(contract["drone"] | contract["plant"])
-        self.frame, self.drone, self.order = frames.rotorpy(), drone, list(motors)
+        speed = Drone(contract["drone"]).hover_speed
+        nominal, drone = (_squared(x, speed) for x in (contract["drone"], contract["drone"] | contract["plant"]))
+        self.frame, self.hover_speed, self.order = frames.rotorpy(), nominal.hover_speed, list(motors)
         self.loop = None if loop == "own" else LOOPS[loop](nominal, self.dt)
         ratio, tau = damping_ratio(nominal), nominal.motor_time_constant
         gain = float((1.0 / (4.0 * ratio**2 * tau))[:2].mean())
@@ -53,9 +54,10 @@ class RotorPy:
         self.vehicle = Multirotor(parameters, control_abstraction=kind, integrator_kwargs=solver)
 
     def reset(self, starts: Mapping[str, Array]) -> None:
-        """Begin in these states (n, ...), with the rotors at hover speed."""
+        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
         theirs = self.frame.to(starts)
-        still = {"wind": np.zeros(3), "rotor_speeds": np.full(4, self.drone.hover_speed)}
+        speeds = self.frame.to({"motors": self.hover_speed})["motors"]
+        still = {"wind": np.zeros(3), "rotor_speeds": speeds}
         n = len(starts["position"])
         self.now = [{**{NAMES[k]: x[i] for k, x in theirs.items()}, **still} for i in range(n)]
 
@@ -84,10 +86,10 @@ class RotorPy:
             self.loop.keep(chosen)
 
 
-def _squared(fields: Mapping[str, Any]) -> Drone:
-    """The drone with thrust k w^2 that is the contract's in hover, and has its limits of thrust."""
+def _squared(fields: Mapping[str, Any], speed: Array) -> Drone:
+    """The drone with thrust k w^2 that is its own at a speed (4) [rad/s] of the rotors, and with its limits."""
     drone = Drone(fields)
-    k = float((drone.mixer[:, 0] * drone.weight / drone.hover_speed**2).mean())
+    k = float((drone.thrust(speed) / speed**2).mean())
     least, greatest = (float(np.sqrt(x / k)) for x in drone.thrust_limits)
     return Drone({**fields, "thrust_map": [k, 0.0, 0.0], "rotor_speed_min": least, "rotor_speed_max": greatest})
 

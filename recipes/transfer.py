@@ -47,6 +47,9 @@ SHOWN = ("task", *KEY[1:], "solved", "crash", "precision", "seconds")
 
 
 def main() -> None:
+    if {"-h", "--help"} & set(sys.argv):
+        print(__doc__)
+        raise SystemExit(0)
     cfg = settings(sys.argv[1:])
     bundle = load_bundle(cfg["bundle"], on_fault="hover")
     bundle.check()

@@ -86,6 +86,7 @@ def wobble(simulator, contract, steps=400, **options):
     attitude = np.array([1.0, 0, 0, 0]) + 0.4 * draw.standard_normal((n, 4))
     starts = dict(zip(NAMES, (draw.standard_normal((n, k)) for k in (3, 4, 3, 3)), strict=True))
     starts["velocity"] *= 3.0
+    starts["position"][:, 2] += 5.0  # Crazyflow has a floor
     starts["quaternion"] = attitude / np.linalg.norm(attitude, axis=1, keepdims=True)
     world.reset(starts)
     for t in range(steps):
@@ -107,6 +108,26 @@ def test_mujoco_moves_a_drone_as_our_simulator_does(hovering):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-5, atol=1e-4, err_msg=name)
     shifted = wobble("mujoco", {**contract, "plant": {**contract["plant"], "mass": 0.46}})  # the tolerance is not wide
     assert np.abs(shifted["position"] - expected["position"]).max() > 1e-3
+
+
+@pytest.mark.slow  # both are optional, and slow to start
+@pytest.mark.filterwarnings("ignore:Attaching a spec with an empty prefix:UserWarning")  # of Crazyflow's own model
+@pytest.mark.parametrize(
+    ("simulator", "changes"),
+    [
+        ("crazyflow", {"quadratic_drag": [0.0, 0.0, 0.0]}),
+        ("rotorpy", {"quadratic_drag": [0.0] * 3, "linear_drag": [0.0] * 3, "thrust_map": [4.1e-7, 0.0, 0.0]}),
+    ],
+)
+def test_other_simulators_move_a_drone_as_ours_does_where_their_models_agree(hovering, simulator, changes):
+    pytest.importorskip(simulator)
+    contract = load_bundle(hovering).contract
+    contract = {**contract, "control_dt": 0.001, "simulator": {**contract["simulator"], "dt": 0.001}}
+    contract |= {"drone": {**contract["drone"], **changes}, "plant": {"mass": 0.47, "motor_time_constant": 0.03}}
+    expected, found = wobble("torchrl_quad", contract), wobble(simulator, contract)
+    for name, tolerance in {"position": 5e-3, "quaternion": 1e-3, "velocity": 5e-3, "angular_velocity": 1e-2}.items():
+        np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=tolerance, err_msg=name)
+    np.testing.assert_allclose(found["rotor_speed"], expected["rotor_speed"], rtol=3e-3)  # of another order in time
 
 
 def test_the_pid_loop_follows_body_rates_without_reading_rotor_speeds(hovering):

@@ -7,7 +7,7 @@ package's own evaluation does, adds a row to ``transfer.csv`` beside the bundle,
 flown again. Settings:
 
     simulator=mujoco     or rotorpy, crazyflow, torchrl_quad (our own, which needs torch)
-    loop=pid             one rate loop alone: contract, pid, or own, RotorPy's
+    loop=pid             one rate loop alone: contract, pid, pd, or own, RotorPy's
     mutants=true         fly mistakes of a port too, each of which must fail
     scale={mass: 1.2}    fly another drone than the policy was told of
     late=1               control steps by which commands are later than the contract says

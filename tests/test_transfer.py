@@ -266,7 +266,7 @@ def test_the_recipe_says_what_is_wrong(hovering, refused, monkeypatch):
     assert "Unknown simulator 'gazebo'. Choose from: torchrl_quad, mujoco" in refused(
         "transfer", bundle, "simulator=gazebo"
     )
-    assert "mujoco has no rate loop 'own'. Choose from: contract, pid." in refused("transfer", bundle, "loop=own")
+    assert "mujoco has no rate loop 'own'. Choose from: contract, pid, pd." in refused("transfer", bundle, "loop=own")
     assert "unknown setting 'bundel=x'. Choose from: bundle=..." in refused("transfer", "bundel=x")
     assert "episodes=all: episodes must be a int" in refused("transfer", bundle, "episodes=all")
     assert "late must be at least 0" in refused("transfer", bundle, "late=-1")

@@ -32,7 +32,7 @@ class Crazyflow:
 
     Args:
         contract: of a bundle. Its ``plant`` flies, its ``drone`` is what the rate loop believes in.
-        loop: "contract" or "pid".
+        loop: "contract", "pid" or "pd".
         motors: for each rotor the index of the motor whose command it gets.
     """
 

@@ -64,7 +64,7 @@ class MuJoCo:
 
     Args:
         contract: of a bundle. Its ``plant`` flies, its ``drone`` is what the rate loop believes in.
-        loop: "contract" or "pid".
+        loop: "contract", "pid" or "pd".
         motors: for each rotor the index of the motor whose command it gets.
     """
 

@@ -29,7 +29,7 @@ class RotorPy:
 
     Args:
         contract: of a bundle. Its ``plant`` flies.
-        loop: "contract", "pid", or "own": RotorPy's ``cmd_ctbr``, proportional, with the gain that gives the damping of
+        loop: "contract", "pid", "pd", or "own": RotorPy's ``cmd_ctbr``, proportional, with the gain that gives the damping of
             the contract's loop.
         motors: for each rotor the index of the motor whose command it gets.
     """

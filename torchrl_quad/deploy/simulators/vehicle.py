@@ -179,6 +179,12 @@ class PIDLoop(ContractLoop):
             self.before = self.before[chosen]
 
 
+class PDLoop(PIDLoop):
+    """The same without the integral, which firmware holds back while the setpoint moves fast."""
+
+    integral_share = 0.0
+
+
 def damping_ratio(drone: Drone) -> Array:
     """Of the contract's rate loop, a second-order system about each axis (3); see its ``rate_loop``."""
     return (1.0 + drone.rate_damping / drone.inertia) / (2.0 * np.sqrt(drone.rate_gain * drone.motor_time_constant))
@@ -190,4 +196,4 @@ def bandwidth(drone: Drone) -> Array:
     return np.sqrt(drone.rate_gain / drone.motor_time_constant) * np.sqrt(part + np.sqrt(part**2 + 1.0))
 
 
-LOOPS: dict[str, type[ContractLoop]] = {"contract": ContractLoop, "pid": PIDLoop}
+LOOPS: dict[str, type[ContractLoop]] = {"contract": ContractLoop, "pid": PIDLoop, "pd": PDLoop}

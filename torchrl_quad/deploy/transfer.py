@@ -24,12 +24,8 @@ from torchrl_quad.deploy.simulators import make_simulator
 from torchrl_quad.deploy.tasks import PROGRESS
 
 Array = NDArray[np.float64]
-OF_THE_LOOP = (
-    "rate_gain",
-    "rate_damping",
-    "max_body_rate",
-    "max_thrust_to_weight",
-)  # which does not know the true drone
+# Fields of the rate loop, which does not know the true drone.
+OF_THE_LOOP = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
 
 
 @dataclass(frozen=True)
@@ -37,12 +33,7 @@ class Mutant:
     """A mistake in a port, made on purpose: flown, it must fail."""
 
     about: str
-    quaternion: tuple[int, ...] = (
-        0,
-        1,
-        2,
-        3,
-    )  #: the entries of the quaternion, in the order in which the bundle gets them
+    quaternion: tuple[int, ...] = (0, 1, 2, 3)  #: the order in which the bundle gets the entries of the quaternion
     attitude: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)  #: times the quaternion that the bundle gets
     measured: tuple[float, ...] = (1.0, 1.0, 1.0)  #: times the body rates that the bundle gets
     commanded: tuple[float, ...] = (1.0, 1.0, 1.0)  #: times the body rates that it commands

@@ -29,8 +29,8 @@ class RotorPy:
 
     Args:
         contract: of a bundle. Its ``plant`` flies.
-        loop: "contract", "pid", "pd", or "own": RotorPy's ``cmd_ctbr``, proportional, with the gain that gives the damping of
-            the contract's loop.
+        loop: "contract", "pid", "pd", or "own": RotorPy's ``cmd_ctbr``, proportional, with the gain that gives the
+            damping of the contract's loop.
         motors: for each rotor the index of the motor whose command it gets.
     """
 

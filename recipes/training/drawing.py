@@ -44,7 +44,7 @@ def draw_transfer(bundle: Bundle, simulator: str, loop: str, path: Path, drones:
         fly(bundle, name, how, episodes=drones) for name, how in (("torchrl_quad", "contract"), (simulator, loop))
     ]
     ours, theirs = (as_rollout(bundle.contract, flight) for flight in flights)
-    env, labels = environment(bundle.contract), [flight["simulator"] for flight in flights]
+    env, labels = environment(bundle.contract), tuple(flight["simulator"] for flight in flights)
     film = film_of(path)
     with replacing(film) as temporary:
         animate_flight(ours, temporary, env=env, beside=theirs, labels=labels)

@@ -97,7 +97,7 @@ def animate_flight(
     max_seconds: float = 12.0,
     size: int = 336,
     beside: TensorDictBase | None = None,
-    labels: Sequence[str] = ("", ""),
+    labels: tuple[str, str] = ("", ""),
 ) -> None:
     """Film the first episodes of a flight in real time: drones with trails, their targets, and the task's scenery.
 
@@ -131,20 +131,25 @@ def animate_flight(
     flights = [Flight("animate_flight", x, env, control_dt, needed, num_envs) for x in both]
     control_dt = flights[0].control_dt
     last = min(max(round(max_seconds / control_dt), 1), *(x.shape[1] for x in both))  # step
-    view = torch.cat([flight.state("position")[:, : last + 1].flatten(0, 1) for flight in flights])
+    paths = [flight.state("position")[:, : last + 1] for flight in flights]
+    view = torch.cat([path.flatten(0, 1) for path in paths])
     scenes = [Scene(view, len(flight), size + size % 2, flight.scenery) for flight in flights]
+    attitudes = [flight.state("quaternion") for flight in flights]
     trail = max(round(1.0 / control_dt), 1)
     stride = max(int(1.0 / (min(fps, 50) * control_dt) + 1e-6), 1)
     instants = np.append(np.arange(0, last, stride), last)
 
-    def draw(scene: Scene, flight: Flight, label: str, t: int) -> np.ndarray:
-        position, attitude, target = flight.state("position"), flight.state("quaternion"), flight.target
-        text = f"{control_dt * t:.1f} s  {label}".rstrip()
-        trails = position[:, max(t - trail, 0) : t + 1]
-        return scene.draw(position[:, t], attitude[:, t], None if target is None else target[:, t], trails, text)
+    def frame(i: int, t: int) -> np.ndarray:
+        target = flights[i].target
+        return scenes[i].draw(
+            paths[i][:, t],
+            attitudes[i][:, t],
+            None if target is None else target[:, t],
+            trails=paths[i][:, max(t - trail, 0) : t + 1],
+            text=f"{control_dt * t:.1f} s  {labels[i]}".rstrip(),
+        )
 
-    views = list(zip(scenes, flights, labels, strict=False))
-    frames = (np.concatenate([draw(*view, t) for view in views], 1) for t in instants)
+    frames = (np.concatenate([frame(i, t) for i in range(len(flights))], 1) for t in instants)
     write(Path(path), frames, control_dt * np.append(instants, instants[-1] + stride))
 
 

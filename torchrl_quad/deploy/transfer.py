@@ -71,7 +71,7 @@ def fly(
 
     Args:
         folder: a bundle.
-        simulator: one of :data:`~torchrl_quad.deploy.simulators.SIMULATORS`.
+        simulator: one of ``torchrl_quad.deploy.simulators.SIMULATORS``.
         loop: the rate loop: "contract", "pid", "pd", or "own", that of the simulator.
         mutant: a mistake to make.
         scale: fields of the drone that flies, times a factor: ``{"mass": 1.2}``. The rate loop does not know of it.

@@ -21,11 +21,12 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
-from torchrl_quad.deploy import load_bundle
+from torchrl_quad.deploy import Bundle, load_bundle
 from torchrl_quad.deploy.judging import PRECISION
 from torchrl_quad.deploy.simulators import make_simulator, simulator_class
 from torchrl_quad.deploy.transfer import MUTANTS, fly
@@ -67,7 +68,7 @@ def main() -> None:
         draw_transfer(bundle, cfg["simulator"], loops[0], folder / f"transfer_{cfg['simulator']}")
 
 
-def measure(bundle, cfg, loop, mutant, path) -> None:
+def measure(bundle: Bundle, cfg: dict, loop: str, mutant: str | None, path: Path) -> None:
     """Fly once, and add the result to the table, unless it is there."""
     contract, about = bundle.contract, {**cfg["scale"], **({"late": cfg["late"]} if cfg["late"] else {})}
     task = contract["task"]["name"]
@@ -106,15 +107,15 @@ def measure(bundle, cfg, loop, mutant, path) -> None:
         writer.writerows(rows)
 
 
-def read(path) -> list:
-    """The rows that are there."""
+def read(path: Path) -> list[dict[str, str]]:
+    """The flights that are there."""
     if not path.exists():
         return []
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
 
 
-def show(path, bundle) -> None:
+def show(path: Path, bundle: str) -> None:
     """Print the flights of a bundle as a table."""
     rows = [dict(zip(SHOWN, SHOWN, strict=True)), *(row for row in read(path) if row["bundle"] == bundle)]
     widths = [max(len(row[name]) for row in rows) for name in SHOWN]
@@ -123,7 +124,7 @@ def show(path, bundle) -> None:
     print(f"\n{path}")
 
 
-def settings(arguments: list) -> dict:
+def settings(arguments: list[str]) -> dict[str, Any]:
     """The settings of a command line, ``name=value`` with values in YAML.
 
     Raises:

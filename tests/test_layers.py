@@ -39,7 +39,7 @@ LIBRARIES = {
     "modules": TORCHRL,
     "objectives": TORCHRL,
     "data": TORCHRL,
-    "deploy": TORCHRL | {"numpy", "onnx", "onnxruntime"},
+    "deploy": TORCHRL | {"numpy", "onnx", "onnxruntime", "mujoco", "rotorpy", "crazyflow", "jax"},
     "files": set(),
     "diagnostics": TORCHRL,
     "gym": {"gymnasium", "numpy", "torch"},

@@ -5,6 +5,7 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from torchrl_quad.controllers import MPC, GeometricController
     from torchrl_quad.data import (
         DifferentiableCollector,
         ObservationNormalizer,
@@ -32,11 +33,13 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "MPC",
     "ABPTLoss",
     "AHACLoss",
     "ActionSequence",
     "BPTTLoss",
     "DifferentiableCollector",
+    "GeometricController",
     "HoveringEnv",
     "HybridLoss",
     "LandingEnv",
@@ -68,7 +71,7 @@ __all__ = [
 ]
 
 
-_PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "diagnostics")
+_PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "controllers", "diagnostics")
 # The tasks that ship, and their control steps: what gymnasium registers needs no torch.
 _TASKS = {"hovering": 256, "landing": 256, "racing": 512, "tracking": 512}
 

@@ -4,7 +4,7 @@ python benchmarks/controllers.py --checkpoints outputs/.../checkpoint.pt ...
 
 All fly the same fresh starts with the same delay and limits, as the recipes configure each task. "Other drones" are the
 same starts with mass and motors drawn at random in each episode, which neither the controllers nor the policies know. A
-time is the median over single calls with one drone on one core. Writes ``benchmarks/results/controllers.csv`` row by
+time is the median processor time of single calls with one drone. Writes ``benchmarks/results/controllers.csv`` row by
 row, leaves out what is there already, and fills in the table of docs/controllers.md.
 """
 
@@ -53,13 +53,13 @@ def configuration(task: str, steps: int | None, **changes: Any) -> Any:
 
 
 def milliseconds(env: EnvBase, policy: TensorDictModuleBase, calls: int) -> float:
-    """The median duration of a call for one drone [ms]; the environment's step is not in it."""
+    """The median processor time of a call for one drone [ms]; the environment's step is not in it."""
     carry, durations = env.reset(), []
     with torch.no_grad():
         for _ in range(calls + 1):
-            begin = time.perf_counter()
+            begin = time.process_time()
             carry = policy(carry)
-            durations.append(time.perf_counter() - begin)
+            durations.append(time.process_time() - begin)
             _, carry = env.step_and_maybe_reset(carry)
     return 1e3 * float(np.median(durations[1:]))
 
@@ -91,7 +91,16 @@ def measure(task: str, name: str, checkpoint: str | None, args: argparse.Namespa
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The results in Markdown."""
-    head = ["task", "policy", "starts", "solved", "error or gates", "ms per step", "other drones: solved", "error or gates"]
+    head = [
+        "task",
+        "policy",
+        "starts",
+        "solved",
+        "error or gates",
+        "ms per step",
+        "other drones: solved",
+        "error or gates",
+    ]
     lines = [head, ["---"] * len(head)]
     for row in rows:
         reached = []

@@ -7,7 +7,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad import MPC, BPTTLoss, GeometricController, HoveringEnv, differentiable_rollout, make_actor
 
-ITERATIONS = 60
+ITERATIONS = 80
 STEPS = 256
 
 torch.set_num_threads(1)
@@ -19,13 +19,15 @@ def train(env):
     actor = make_actor(env)
     loss = BPTTLoss(actor)
     optimizer = torch.optim.Adam(actor.parameters(), 1e-2)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.01, ITERATIONS)
     carry = env.reset()
     for _ in range(ITERATIONS):
-        rollout, carry = differentiable_rollout(env, actor, carry, 64)
+        rollout, carry = differentiable_rollout(env, actor, carry, 96)
         optimizer.zero_grad()
         loss(rollout)["loss_actor"].backward()
         torch.nn.utils.clip_grad_norm_(actor.parameters(), 0.5)
         optimizer.step()
+        schedule.step()
     return actor
 
 
@@ -42,9 +44,8 @@ def fly(name, policy, env):
 
 
 learned = train(HoveringEnv(num_envs=64))
-for title, options in (("the drone they know", {}), ("drones 20 % lighter to 20 % heavier", {"mass": {"scale": [0.8, 1.2]}})):
-    env = HoveringEnv(num_envs=4, randomize=options or None)
-    print(f"\n{title}\n{'':14s}{'solved':>12s}{'error':>15s}{'a step':>15s}")
-    fly("BPTT", learned, env)
-    fly("geometric", GeometricController(env), env)
-    fly("MPC", MPC(env), env)
+env = HoveringEnv(num_envs=4)
+print(f"{'':14s}{'solved':>12s}{'error':>15s}{'a step':>15s}")
+fly("BPTT", learned, env)
+fly("geometric", GeometricController(env), env)
+fly("MPC", MPC(env), env)

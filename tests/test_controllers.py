@@ -122,7 +122,9 @@ def test_what_the_planner_predicts_is_what_the_environment_flies(delay):
     td, mpc = env.reset(), MPC(env, horizon=6)
     plan = mpc(td.copy())["plan"].transpose(0, 1)
     now = ActionSequence(torch.cat((plan, plan[-1:].expand(delay, -1, -1)))) if delay else ActionSequence(plan)
-    flown = env.rollout(6 + delay, now, tensordict=td.copy(), auto_reset=False, break_when_any_done=False)["next", "state"]
+    flown = env.rollout(6 + delay, now, tensordict=td.copy(), auto_reset=False, break_when_any_done=False)[
+        "next", "state"
+    ]
     start = td["state"] if delay == 0 else flown[:, delay - 1]
     predicted = mpc.predict(mpc.pack(dict(start.items())), plan)
     for t in range(1, 7):
@@ -153,7 +155,7 @@ def test_a_step_of_gauss_newton_never_raises_the_cost_and_its_derivatives_are_fi
 
 
 def test_the_backward_pass_solves_the_linear_quadratic_problem():
-    """Without bounds: the gain of scipy's algebraic Riccati equation, far from the end. Within bounds: by brute force."""
+    """Without bounds: the gain of scipy's algebraic Riccati equation, far from the end. Within: by brute force."""
     torch.manual_seed(0)
     a, b = torch.eye(3).double() + 0.1 * torch.randn(3, 3).double(), torch.randn(3, 2).double()
     q, r = torch.tensor([1.0, 2.0, 0.5]).double(), torch.tensor([0.3, 0.7]).double()

@@ -115,7 +115,8 @@ class MPC(Controller):
         wanted = quaternion.multiply(quaternion.normalize(turn), attitude.expand(*up.shape[:-1], 4))
         still = torch.zeros_like(up)
         goal = torch.cat(
-            (motion.position.transpose(0, 1), wanted, motion.velocity.transpose(0, 1), still, torch.ones_like(wanted)), -1
+            (motion.position.transpose(0, 1), wanted, motion.velocity.transpose(0, 1), still, torch.ones_like(wanted)),
+            -1,
         )
         thrust = self.nominal.mass * torch.linalg.vector_norm(force, dim=-1, keepdim=True)
         neutral = self.dynamics.controller.encode(pad(thrust, (0, 3))).clamp(-1.0, 1.0)

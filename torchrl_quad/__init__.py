@@ -17,10 +17,13 @@ if TYPE_CHECKING:
     from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
     from torchrl_quad.engine import ActionSequence
     from torchrl_quad.envs import (
+        Forest,
+        ForestEnv,
         HoveringEnv,
         LandingEnv,
         QuadrotorEnv,
         RacingEnv,
+        Scene,
         TrackingEnv,
         available_tasks,
         load_track,
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
     )
     from torchrl_quad.modules import make_actor, make_qvalue, make_value
     from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss, TrustRegion
+    from torchrl_quad.vision import DepthCamera
 
 __version__ = "0.1.0"
 
@@ -38,7 +42,10 @@ __all__ = [
     "AHACLoss",
     "ActionSequence",
     "BPTTLoss",
+    "DepthCamera",
     "DifferentiableCollector",
+    "Forest",
+    "ForestEnv",
     "GeometricController",
     "HoveringEnv",
     "HybridLoss",
@@ -49,6 +56,7 @@ __all__ = [
     "RacingEnv",
     "SAPOLoss",
     "SHACLoss",
+    "Scene",
     "TrackingEnv",
     "TrustRegion",
     "VisitedStateBuffer",
@@ -71,9 +79,9 @@ __all__ = [
 ]
 
 
-_PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "controllers", "diagnostics")
+_PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "vision", "controllers", "diagnostics")
 # The tasks that ship, and their control steps: what gymnasium registers needs no torch.
-_TASKS = {"hovering": 256, "landing": 256, "racing": 512, "tracking": 512}
+_TASKS = {"forest": 900, "hovering": 256, "landing": 256, "racing": 512, "tracking": 512}
 
 
 def __getattr__(name: str) -> Any:

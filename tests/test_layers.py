@@ -15,7 +15,8 @@ UNWRAP = "data.unwrap"  # the one helper that networks and pictures share with d
 ALLOWED = {  # what each part of the package may import of the others: parts, or single modules
     "dynamics": set(),
     "engine": set(),
-    "envs": {"dynamics", "engine"},
+    "vision": {"dynamics", "engine"},
+    "envs": {"dynamics", "engine", "vision"},
     "render": {"dynamics", "envs", "files", UNWRAP},
     "modules": {UNWRAP},
     "objectives": {UNWRAP},
@@ -33,6 +34,7 @@ TORCHRL = {"torch", "torchrl", "tensordict"}
 LIBRARIES = {
     "dynamics": {"torch", "numpy", "yaml"},
     "engine": {"torch", "tensordict"},
+    "vision": {"torch"},
     "envs": TORCHRL | {"numpy"},
     "render": TORCHRL | {"matplotlib", "mpl_toolkits", "plotly", "PIL", "imageio_ffmpeg", "numpy"},
     "modules": TORCHRL,

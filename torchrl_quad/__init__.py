@@ -30,8 +30,8 @@ if TYPE_CHECKING:
         register_task,
     )
     from torchrl_quad.modules import make_actor, make_qvalue, make_value
-    from torchrl_quad.vision import DepthCamera
     from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss, TrustRegion
+    from torchrl_quad.vision import DepthCamera
 
 __version__ = "0.1.0"
 

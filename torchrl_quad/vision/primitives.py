@@ -97,7 +97,7 @@ def closest_approach(solids: Primitives, start: Tensor, end: Tensor) -> Tensor:
         return torch.stack(parts, 1).amin(1, keepdim=True)
 
 
-# -- each kind: its distance (*), and the gradient of it, three components (*), from solids (*, k) and points (*, 3) -----
+# -- each kind: its distance (*), and the gradient of that, three components (*), from solids (*, k) and points (*, 3) -
 
 
 def _sphere(x: Tensor, point: Tensor) -> Tensor:

@@ -2,13 +2,17 @@
 
 import math
 
+import gymnasium
 import pytest
 import torch
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3 import PPO
 from tensordict.nn import TensorDictModule
 from torchrl.envs import DoubleToFloat, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_quad import ActionSequence, DepthCamera, ForestEnv, HoveringEnv, LandingEnv, differentiable_rollout
+from torchrl_quad.adapters import DronesVecEnv
 from torchrl_quad.vision import Primitives, nearest
 
 PILLARS = {
@@ -218,3 +222,17 @@ def test_a_state_within_an_obstacle_is_not_restored():
     with pytest.raises(ValueError, match=r"environments 1: an obstacle stands within 0.128 m of 'position'"):
         env.reset(td, set_state=True)
     assert math.isclose(env.scene.radius, 0.128, abs_tol=1e-3)
+
+
+def test_stable_baselines3_learns_from_images_and_vectors_of_a_gymnasium_environment():
+    drones = gymnasium.make_vec(
+        "torchrl_quad/Forest-v0", num_envs=4, autoreset_mode="SameStep", max_episode_steps=3, camera={"rate": 2}
+    )
+    observation, _ = drones.reset(seed=0)
+    assert drones.observation_space.contains(observation)
+    assert {name: x.shape for name, x in observation.items()} == {"observation": (4, 9), "depth": (4, 1, 12, 16)}
+    ppo = PPO("MultiInputPolicy", DronesVecEnv(drones), n_steps=4, batch_size=8, n_epochs=1, device="cpu", seed=0)
+    before = [x.clone() for x in ppo.policy.parameters()]
+    ppo.learn(32)
+    assert any((x != y).any() for x, y in zip(ppo.policy.parameters(), before, strict=True))
+    check_env(gymnasium.make("torchrl_quad/Forest-v0").unwrapped, skip_render_check=True)

@@ -17,7 +17,7 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "engine": set(),
     "vision": {"dynamics", "engine"},
     "envs": {"dynamics", "engine", "vision"},
-    "render": {"dynamics", "envs", "files", UNWRAP},
+    "render": {"dynamics", "envs", "files", "vision", UNWRAP},
     "modules": {UNWRAP},
     "objectives": {UNWRAP},
     "data": set(),

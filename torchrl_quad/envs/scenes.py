@@ -115,6 +115,11 @@ class Scene(Disturbance):
             raise ValueError(f"{source}: unknown key {unknown[0]!r}. Allowed: {', '.join(allowed)}.")
         return cls(**values, source=source)
 
+    @property
+    def is_random(self) -> bool:
+        """Whether each episode has obstacles of its own."""
+        return self.is_drawn_elsewhere or any(self.random.values())
+
     def bound(self, nominal: QuadrotorParams) -> Scene:
         """A copy for a drone, with its tensors in the drone's precision and on its device."""
         own, like = copy.copy(self), nominal.mass

@@ -23,7 +23,7 @@ from torchrl_quad.envs import TASKS
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
 PAGES += sorted(path for path in ROOT.glob("docs/**/*.md") if "_build" not in path.parts)
-PARTS = ("adapters", "data", "deploy", "dynamics", "engine", "envs", "modules", "objectives", "render")
+PARTS = ("adapters", "data", "deploy", "dynamics", "engine", "envs", "modules", "objectives", "render", "vision")
 AFTER_TRAINING = ("evaluate", "export")  # recipes that read a checkpoint
 PUBLIC = ["torchrl_quad", *(f"torchrl_quad.{part}" for part in PARTS)]
 # Blocks that are not run: text, data, and Sphinx's directives, except those that hold code.

@@ -148,7 +148,7 @@ def animate_flight(
     position, attitude = flight.state("position"), flight.state("quaternion")
     scenery, seen = with_obstacles(flight.scenery, flight.solids(0)), flight.depth
     image = None if seen is None else seen.shape[-2:]
-    scene = Scene(position[:, : last + 1], len(flight), size + size % 2, scenery, image)
+    scene = Scene(position[:, : last + 1], len(flight), size + size % 2, scenery, image=image)
     far = 10.0 if flight.env is None or flight.env.camera is None else flight.env.camera.range
     trail = max(round(1.0 / control_dt), 1)
     stride = max(int(1.0 / (min(fps, 50) * control_dt) + 1e-6), 1)
@@ -241,7 +241,7 @@ def draw_frame(env: EnvBase, drones: Sequence[int] | None, size: int) -> np.ndar
         scenery, pixels = with_obstacles(env.scenery(), solids), None if image is None else image.shape
         if drawn:
             scenes.clear()  # of episodes that are over
-        scenes[len(chosen), size, known] = scene = Scene(corners, len(chosen), size, scenery, pixels)
+        scenes[len(chosen), size, known] = scene = Scene(corners, len(chosen), size, scenery, image=pixels)
     return scene.draw(*shown.values(), image=image)
 
 

@@ -93,7 +93,8 @@ def plot_from_above(
     low, high = (f(position.nan_to_num().flatten(0, 1)) for f in (lambda x: x.amin(0), lambda x: x.amax(0)))
     sides = (high - low)[:2].clamp_min(2.0) + 4.0
     width = 10.0
-    figure = make_figure(figsize=(width, min(0.6 + len(groups) * (width * (sides[1] / sides[0]).item() + 0.3), 14.0)))
+    height = min(0.6 + len(groups) * (0.88 * width * (sides[1] / sides[0]).item() + 0.2), 14.0)
+    figure = make_figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
     fastest, crash = speed.nan_to_num().amax().item(), flight.rollout.get(("next", "crash"), None)
     for axis, group in zip(axes, groups, strict=True):
@@ -114,8 +115,7 @@ def plot_from_above(
         axis.set_ylabel("y [m]")
     axes[-1].set_xlabel("x [m]")
     figure.suptitle(flight.title if title is None else title, x=0.02, ha="left", fontsize=12)
-    figure.tight_layout()
-    figure.colorbar(line, ax=list(axes), label="speed [m/s]", shrink=0.8, pad=0.02)
+    figure.colorbar(line, ax=list(axes), label="speed [m/s]", shrink=0.6, pad=0.01, aspect=30)
     figure.savefig(path, dpi=130)
 
 

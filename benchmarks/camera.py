@@ -3,9 +3,9 @@
 python benchmarks/camera.py
 
 Trees are upright cylinders; the mixed scenes have a third each of balls, cylinders and boxes turned at random. Every
-camera has a scene of its own. All look at it from the same places with the same rays. MuJoCo casts the rays of one camera
-in one call of ``mj_multiRay``, without normals. Time is that of the processor, so that other programs on the machine
-disturb little; the best of all rounds counts. Writes ``benchmarks/results/camera.csv``.
+camera has a scene of its own. MuJoCo casts the same rays, those of one camera in one call of ``mj_multiRay``, without
+normals. Time is that of the processor, so that other programs on the machine disturb little; the best of all rounds
+counts. Writes ``benchmarks/results/camera.csv``.
 """
 
 import argparse

@@ -1,11 +1,16 @@
 """Scenes and cameras in tasks, and the forest: steps, gradients, restored states, refusals."""
 
+import base64
+import json
 import math
+import re
 
 import gymnasium
+import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from PIL import Image
 from stable_baselines3 import PPO
 from tensordict.nn import TensorDictModule
 from torchrl.envs import DoubleToFloat, TransformedEnv
@@ -13,6 +18,8 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_quad import ActionSequence, DepthCamera, ForestEnv, HoveringEnv, LandingEnv, differentiable_rollout
 from torchrl_quad.adapters import DronesVecEnv
+from torchrl_quad.render import animate_flight, obstacles, plot_from_above, write_replay
+from torchrl_quad.render.canvas import make_figure
 from torchrl_quad.vision import Primitives, nearest
 
 PILLARS = {
@@ -236,3 +243,34 @@ def test_stable_baselines3_learns_from_images_and_vectors_of_a_gymnasium_environ
     ppo.learn(32)
     assert any((x != y).any() for x, y in zip(ppo.policy.parameters(), before, strict=True))
     check_env(gymnasium.make("torchrl_quad/Forest-v0").unwrapped, skip_render_check=True)
+
+
+def test_pictures_show_the_obstacles_and_beside_the_flight_what_the_camera_saw(tmp_path, monkeypatch):
+    env = ForestEnv(num_envs=2, density=0.02, camera={"rate": 2})
+    rollout = env.rollout(4, break_when_any_done=False)
+    write_replay(rollout, tmp_path / "replay.html", env=env)
+    page = re.search(r'id="flight">(.*?)</script>', (tmp_path / "replay.html").read_text(), re.DOTALL)[1]
+    page = json.loads(page)
+    seen = np.frombuffer(base64.b64decode(page["images"]["data"]), np.uint8).reshape(2, 5, 12, 16)
+    depth = torch.cat((rollout["depth"][:, :1], rollout["next", "depth"]), 1).squeeze(2).numpy()
+    order = np.argsort(depth.flatten(), kind="stable")
+    assert (np.diff(seen.flatten()[order].astype(int)) <= 0).all(), "the nearer the brighter"
+    assert np.unique(seen).size > 10
+    trees = [(x[:, 2] == 0.0).sum().item() for x in rollout["state", "scene", "cylinders"][:, 0]]
+    meshes = [np.frombuffer(base64.b64decode(x["points"]), "<f4").reshape(-1, 3) for x in page["obstacles"]]
+    assert [len(mesh) for mesh in meshes] == [96 * count for count in trees]
+    drawn = []
+    monkeypatch.setattr(obstacles, "make_figure", lambda **o: drawn.append(make_figure(**o)) or drawn[-1])
+    plot_from_above(rollout, tmp_path / "above.png", env=env)
+    panels = drawn[0].axes[:2]
+    assert [len(panel.patches) for panel in panels] == trees
+    assert panels[0].patches[0].get_radius() == rollout["state", "scene", "cylinders"][0, 0, 0, 3].item()
+    animate_flight(rollout, tmp_path / "film.gif", env=env, size=200)
+    with Image.open(tmp_path / "film.gif") as film:
+        corner = np.asarray(film.convert("RGB"))[:50, 132:].astype(int)
+    assert (corner.max(-1) - corner.min(-1) > 30).mean() > 0.2, "an image in the corner, in its colours"
+    before = env.render(size=150)
+    env.reset()
+    assert (env.render(size=150) != before).mean() > 0.01, "another episode, another forest"
+    with pytest.raises(ValueError, match="this HoveringEnv has none: build it with a scene"):
+        plot_from_above(rollout, tmp_path / "above.png", env=HoveringEnv(num_envs=2))

@@ -114,8 +114,8 @@ def animate_flight(
 ) -> None:
     """Film the first episodes of a flight in real time: drones with trails, their targets, and the task's scenery.
 
-    A task with a camera shows what the first drone saw, the nearer the brighter. Where each episode has obstacles of its
-    own, the film shows the first environment alone.
+    A task with a camera shows what the first drone saw, the nearer the brighter. Where each episode has obstacles of
+    its own, the film shows the first environment alone.
 
     Args:
         rollout: (num_envs, time), of any task.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -83,8 +84,8 @@ def plot_from_above(
     flight = Flight("plot_from_above", rollout, env, 0.02, state_keys("position", "velocity"), num_envs)
     if flight.env.scene is None:
         raise ValueError(
-            f"plot_from_above draws obstacles, and this {type(flight.env).__name__} has none: build it with a scene, or "
-            "draw it with plot_flight."
+            f"plot_from_above draws obstacles, and this {type(flight.env).__name__} has none: build it with a scene, "
+            "or draw its flights with plot_flight."
         )
     from matplotlib.collections import LineCollection
 
@@ -92,7 +93,8 @@ def plot_from_above(
     groups = [[i] for i in range(len(flight))] if flight.env.scene.is_random else [list(range(len(flight)))]
     low, high = (f(position.nan_to_num().flatten(0, 1)) for f in (lambda x: x.amin(0), lambda x: x.amax(0)))
     sides = (high - low)[:2].clamp_min(2.0) + 4.0
-    width = 10.0
+    middle, width = 0.5 * (low + high)[:2], 10.0
+    left, bottom, right, top = torch.cat((middle - 0.5 * sides, middle + 0.5 * sides)).tolist()
     height = min(0.6 + len(groups) * (0.88 * width * (sides[1] / sides[0]).item() + 0.2), 14.0)
     figure = make_figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
@@ -101,18 +103,14 @@ def plot_from_above(
         _draw_sections(axis, flight.solids(group[0]), low[2].item(), high[2].item())
         for i in group:
             flown = position[i, : int(flight.steps[i]) + 1, :2].numpy()
-            line = LineCollection(list(zip(flown[:-1], flown[1:], strict=True)), cmap="viridis", linewidth=1.8)
+            line = LineCollection(list(itertools.pairwise(flown)), cmap="viridis", linewidth=1.8)
             line.set_array(speed[i, : len(flown) - 1].numpy())
             line.set_clim(0.0, fastest)
             axis.add_collection(line)
             axis.plot(*flown[0], marker="o", color=INK, markersize=5, fillstyle="none")
             if crash is not None and crash[i, : int(flight.steps[i])].any():
                 axis.plot(*flown[-1], marker="x", color=RED, markersize=9, markeredgewidth=2)
-        middle, half = 0.5 * (low + high), 0.5 * sides
-        axis.set(
-            xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]), aspect="equal"
-        )
-        axis.set_ylabel("y [m]")
+        axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", ylabel="y [m]")
     axes[-1].set_xlabel("x [m]")
     figure.suptitle(flight.title if title is None else title, x=0.02, ha="left", fontsize=12)
     figure.colorbar(line, ax=list(axes), label="speed [m/s]", shrink=0.6, pad=0.01, aspect=30)

@@ -17,6 +17,7 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "engine": set(),
     "vision": {"dynamics", "engine"},
     "envs": {"dynamics", "engine", "vision"},
+    "controllers": {"dynamics", "envs", UNWRAP},
     "render": {"dynamics", "envs", "files", "vision", UNWRAP},
     "modules": {UNWRAP},
     "objectives": {UNWRAP},
@@ -26,6 +27,7 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "diagnostics": {"data", "objectives"},
     "gym": {"envs"},
     "adapters": set(),
+    "identification": {"deploy.frames", "dynamics", "files"},
 }
 # Imports within a function: of what needs an optional package, and of gymnasium's ids, which name all tasks.
 EXCEPTIONS = {("torchrl_quad.envs.base", "torchrl_quad.render.frames"), ("torchrl_quad.envs.registry", "torchrl_quad")}
@@ -36,15 +38,17 @@ LIBRARIES = {
     "engine": {"torch", "tensordict"},
     "vision": {"torch"},
     "envs": TORCHRL | {"numpy"},
+    "controllers": TORCHRL,
     "render": TORCHRL | {"matplotlib", "mpl_toolkits", "plotly", "PIL", "imageio_ffmpeg", "numpy"},
     "modules": TORCHRL,
     "objectives": TORCHRL,
     "data": TORCHRL,
-    "deploy": TORCHRL | {"numpy", "onnx", "onnxruntime"},
+    "deploy": TORCHRL | {"numpy", "onnx", "onnxruntime", "mujoco", "rotorpy", "crazyflow", "jax"},
     "files": set(),
     "diagnostics": TORCHRL,
     "gym": {"gymnasium", "numpy", "torch"},
     "adapters": TORCHRL | {"gymnasium", "numpy", "rsl_rl", "skrl", "stable_baselines3"},
+    "identification": {"torch", "numpy", "yaml", "pyulog", "rosbags"},
 }
 
 

@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs.scenery import Scenery
 from torchrl_quad.render.canvas import INK, RED, bounds, box, draw_scenery, drone_colors, make_figure, set_box
@@ -111,6 +112,8 @@ def animate_flight(
     fps: int = 15,
     max_seconds: float = 12.0,
     size: int = 336,
+    beside: TensorDictBase | None = None,
+    labels: tuple[str, str] = ("", ""),
 ) -> None:
     """Film the first episodes of a flight in real time: drones with trails, their targets, and the task's scenery.
 
@@ -127,6 +130,8 @@ def animate_flight(
         fps: frames per second, at least; up to 50, and rounded up so that a frame lasts whole control steps.
         max_seconds: the length of the film, at most.
         size: width and height [pixels], rounded up to an even number.
+        beside: another flight of the same task, (num_envs, time), to film to the right of the first, in the same view.
+        labels: a word for each of the two, in their corners.
 
     Raises:
         ImportError: ``path`` is an MP4, and ``imageio-ffmpeg`` is not installed.
@@ -140,30 +145,44 @@ def animate_flight(
     for name, value in (("control_dt", control_dt), ("fps", fps), ("max_seconds", max_seconds), ("size", size)):
         if not value > 0:
             raise ValueError(f"animate_flight: {name} must be positive, got {value!r}.")
-    own = getattr(None if env is None else getattr(env, "base_env", env), "scene", None)
-    num_envs = min(num_envs, 1) if own is not None and own.is_random else num_envs
-    flight = Flight("animate_flight", rollout, env, control_dt, state_keys("position", "quaternion"), num_envs)
-    control_dt, target = flight.control_dt, flight.target
-    last = min(max(round(max_seconds / control_dt), 1), rollout.shape[1])  # step
-    position, attitude = flight.state("position"), flight.state("quaternion")
-    scenery, seen = with_obstacles(flight.scenery, flight.solids(0)), flight.depth
-    image = None if seen is None else seen.shape[-2:]
-    scene = Scene(position[:, : last + 1], len(flight), size + size % 2, scenery, image=image)
-    far = 10.0 if flight.env is None or flight.env.camera is None else flight.env.camera.range
+    scene = getattr(None if env is None else base_env(env), "scene", None)
+    num_envs = 1 if scene is not None and scene.is_random else num_envs
+    needed = state_keys("position", "quaternion")
+    both = [rollout] if beside is None else [rollout, beside]
+    flights = [Flight("animate_flight", x, env, control_dt, needed, num_envs) for x in both]
+    control_dt = flights[0].control_dt
+    last = min(max(round(max_seconds / control_dt), 1), *(x.shape[1] for x in both))  # step
+    paths = [flight.state("position")[:, : last + 1] for flight in flights]
+    view = torch.cat([path.flatten(0, 1) for path in paths])
+    seen = [flight.depth for flight in flights]
+    far = getattr(getattr(flights[0].env, "camera", None), "range", 10.0)
+    scenes = [
+        Scene(
+            view,
+            len(flight),
+            size + size % 2,
+            with_obstacles(flight.scenery, flight.solids(0)),
+            image=None if depth is None else depth.shape[-2:],
+        )
+        for flight, depth in zip(flights, seen, strict=True)
+    ]
+    attitudes = [flight.state("quaternion") for flight in flights]
     trail = max(round(1.0 / control_dt), 1)
     stride = max(int(1.0 / (min(fps, 50) * control_dt) + 1e-6), 1)
     instants = np.append(np.arange(0, last, stride), last)
-    frames = (
-        scene.draw(
-            position[:, t],
-            attitude[:, t],
+
+    def frame(i: int, t: int) -> np.ndarray:
+        target = flights[i].target
+        return scenes[i].draw(
+            paths[i][:, t],
+            attitudes[i][:, t],
             None if target is None else target[:, t],
-            trails=position[:, max(t - trail, 0) : t + 1],
-            text=f"{control_dt * t:.1f} s",
-            image=None if seen is None else depth_image(seen[0, t], far),
+            trails=paths[i][:, max(t - trail, 0) : t + 1],
+            text=f"{control_dt * t:.1f} s  {labels[i]}".rstrip(),
+            image=None if seen[i] is None else depth_image(seen[i][0, t], far),
         )
-        for t in instants
-    )
+
+    frames = (np.concatenate([frame(i, t) for i in range(len(flights))], 1) for t in instants)
     write(Path(path), frames, control_dt * np.append(instants, instants[-1] + stride))
 
 

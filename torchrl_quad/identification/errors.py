@@ -1,0 +1,45 @@
+"""What a log may be refused for, by name."""
+
+
+class LogError(ValueError):
+    """A log cannot be used. Each of its classes names one reason, and each message what to do."""
+
+
+class UnreadableLog(LogError):
+    """The file is empty, cut off, of no known kind, or needs a package that is missing."""
+
+
+class MissingColumns(LogError):
+    """The file lacks a column that was asked for, or no layout is known for its columns."""
+
+
+class NotFiniteLog(LogError):
+    """Fewer than two samples of a quantity are finite."""
+
+
+class ClockJumpsBack(LogError):
+    """Time runs backwards in a stream."""
+
+
+class GapsTooLarge(LogError):
+    """Gaps leave no piece of the flight that is long enough."""
+
+
+class WrongUnit(LogError):
+    """A column is not in the unit that it should have: degrees, millimetres, g, milliseconds, or counts of a motor."""
+
+
+class WrongQuaternion(LogError):
+    """Quaternions are in another order, turn the world to the body, or are not of unit length."""
+
+
+class WrongFrame(LogError):
+    """A quantity is in another frame: z down, body y right, a velocity of the body, or rates of the world."""
+
+
+class InconsistentRates(LogError):
+    """The gyro and the derivative of the attitude fit under no convention."""
+
+
+class NoFlight(LogError):
+    """Nothing in the file flies: the motors stand, or the drone stays on the ground."""

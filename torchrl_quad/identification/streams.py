@@ -1,0 +1,121 @@
+"""What a file holds before it is a flight: streams of columns, each with its own clock."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_quad.identification.errors import ClockJumpsBack, NotFiniteLog
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Columns of one rate: a table of a CSV file, a message of an autopilot, a topic of a bag."""
+
+    name: str
+    time: Array  # (N,) [s], from any start
+    columns: Mapping[str, Array]  # each (N,), by the name that a layout uses
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A quantity at its own rate."""
+
+    field: str
+    columns: tuple[str, ...]  # what the file calls it, for messages
+    time: Array  # (N,) [s]
+    values: Array  # (N, size)
+
+    @property
+    def step(self) -> float:
+        """The usual time between samples [s]."""
+        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else np.inf
+
+    def __str__(self) -> str:
+        return f"{self.field} ({', '.join(self.columns)})"
+
+
+def clean(signal: Signal) -> tuple[Signal, str | None]:
+    """Without samples that are not finite or repeat a time, and what was dropped.
+
+    Raises:
+        ClockJumpsBack: the clock runs backwards.
+        NotFiniteLog: fewer than two samples are finite.
+    """
+    time, values = signal.time, signal.values
+    finite = np.isfinite(values).all(-1) & np.isfinite(time)
+    if finite.sum() < 2:  # of tables that join several rates, most rows of the slower ones are empty
+        raise NotFiniteLog(
+            f"{finite.sum()} of {len(finite)} samples of {signal} are finite: nothing was recorded there. Name other "
+            "columns, or leave this quantity out if it is optional."
+        )
+    time, values = time[finite], values[finite]
+    back = np.flatnonzero(np.diff(time) < 0.0)
+    if len(back):
+        k = back[0]
+        raise ClockJumpsBack(
+            f"The clock of {signal} jumps back from {time[k]:.6g} to {time[k + 1]:.6g} s at sample {k + 1}, and "
+            f"{len(back)} time(s) in all: samples have no order in time. Cut the file there and read the parts, or "
+            "name the right time column."
+        )
+    new = np.concatenate(([True], np.diff(time) > 0.0))
+    lost, repeated = int((~finite).sum()), int((~new).sum())
+    note = []
+    if lost:
+        note.append(f"{lost} samples of {signal} are not finite; they count as missing")
+    if repeated:
+        note.append(f"{repeated} samples of {signal} repeat the time of the sample before, and were dropped")
+    return Signal(signal.field, signal.columns, time[new], values[new]), "; ".join(note) or None
+
+
+def resample(signal: Signal, grid: Array, dt: float, hold: bool = False) -> Array:
+    """The signal at the times of a uniform grid (T, size).
+
+    Slower signals are interpolated linearly, or held. Faster ones are averaged over a step that is centred at each
+    time, which lets nothing alias and delays nothing.
+    """
+    t, x = signal.time, signal.values
+    if hold:
+        return x[np.clip(np.searchsorted(t, grid + 1e-9, side="right") - 1, 0, None)]
+    if signal.step > 0.67 * dt:
+        return np.stack([np.interp(grid, t, column) for column in x.T], -1)
+    area = np.concatenate((np.zeros_like(x[:1]), np.cumsum((x[1:] + x[:-1]) * np.diff(t)[:, None] / 2.0, 0)))
+    low, high = np.clip(grid - dt / 2.0, t[0], t[-1]), np.clip(grid + dt / 2.0, t[0], t[-1])
+    return (_integral(high, t, x, area) - _integral(low, t, x, area)) / (high - low)[:, None]
+
+
+def _integral(at: Array, t: Array, x: Array, area: Array) -> Array:
+    """The integral of the linear interpolation from t[0] to each time."""
+    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    share = (at - t[k])[:, None]
+    slope = (x[k + 1] - x[k]) / (t[k + 1] - t[k])[:, None]
+    return area[k] + share * (x[k] + slope * share / 2.0)
+
+
+def covered(signal: Signal, grid: Array, max_gap: float) -> tuple[NDArray[np.bool_], Array]:
+    """Which times of the grid lie in no gap of the signal, and the lengths of its gaps [s]."""
+    spacing = np.diff(signal.time)
+    gap = spacing > max(max_gap, 3.0 * signal.step)
+    k = np.searchsorted(signal.time, grid, side="right") - 1
+    inside = (k >= 0) & (k < len(spacing)) & gap[np.clip(k, 0, len(gap) - 1)]
+    inside &= grid > signal.time[np.clip(k, 0, None)] + 1e-9
+    return ~inside, spacing[gap]
+
+
+def frozen(signal: Signal, grid: Array, max_gap: float) -> tuple[NDArray[np.bool_], Array]:
+    """Which times of the grid lie where the signal repeats itself digit by digit for longer than ``max_gap``, and for
+    how long [s]: a tracker that lost the drone. A signal that is held between slower samples is not frozen."""
+    same = (np.diff(signal.values, axis=0) == 0.0).all(-1)
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], same.astype(np.int8), [0])))).reshape(-1, 2)
+    lengths = signal.time[edges[:, 1]] - signal.time[edges[:, 0]]
+    usual = float(np.median(lengths)) if len(lengths) > 0.05 * len(signal.time) else 0.0
+    long = lengths > max(max_gap, 3.0 * usual)
+    inside = np.zeros(len(grid), bool)
+    for first, last in signal.time[edges[long]]:
+        inside |= (grid > first + 1e-9) & (grid < last - 1e-9)
+    return inside, lengths[long]

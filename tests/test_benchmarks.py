@@ -16,6 +16,7 @@ SMALL = "num_envs=4 horizon=4 env.max_episode_steps=20 compile=false"
     [
         ("throughput", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 7),
         ("memory", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 1),
+        ("camera", "--primitives 2 --scenes trees --images 2x4x3 --rounds 1", 1),
         ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),
         ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
     ],
@@ -62,6 +63,7 @@ def test_the_benchmark_of_controllers_writes_a_table(tmp_path, monkeypatch):
 def test_the_results_that_are_published_name_their_machine():
     published = list((BENCHMARKS / "results").glob("*.csv"))
     assert {path.stem for path in published} >= {
+        "camera",
         "throughput",
         "memory",
         "time_to_solve",

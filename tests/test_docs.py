@@ -35,6 +35,7 @@ PARTS = (
     "modules",
     "objectives",
     "render",
+    "vision",
 )
 AFTER_TRAINING = ("evaluate", "export")  # recipes that read a checkpoint
 PUBLIC = ["torchrl_quad", *(f"torchrl_quad.{part}" for part in PARTS)]

@@ -15,9 +15,10 @@ UNWRAP = "data.unwrap"  # the one helper that networks and pictures share with d
 ALLOWED = {  # what each part of the package may import of the others: parts, or single modules
     "dynamics": set(),
     "engine": set(),
-    "envs": {"dynamics", "engine"},
+    "vision": {"dynamics", "engine"},
+    "envs": {"dynamics", "engine", "vision"},
     "controllers": {"dynamics", "envs", UNWRAP},
-    "render": {"dynamics", "envs", "files", UNWRAP},
+    "render": {"dynamics", "envs", "files", "vision", UNWRAP},
     "modules": {UNWRAP},
     "objectives": {UNWRAP},
     "data": set(),
@@ -35,6 +36,7 @@ TORCHRL = {"torch", "torchrl", "tensordict"}
 LIBRARIES = {
     "dynamics": {"torch", "numpy", "yaml"},
     "engine": {"torch", "tensordict"},
+    "vision": {"torch"},
     "envs": TORCHRL | {"numpy"},
     "controllers": TORCHRL,
     "render": TORCHRL | {"matplotlib", "mpl_toolkits", "plotly", "PIL", "imageio_ffmpeg", "numpy"},

@@ -80,7 +80,7 @@ def saved(monkeypatch):
 def scenes(monkeypatch):
     """The scenery of each film."""
     scenes = []
-    monkeypatch.setattr(frames, "Scene", lambda *args: scenes.append(args[-1]) or Scene(*args))
+    monkeypatch.setattr(frames, "Scene", lambda *args, **more: scenes.append(args[-1]) or Scene(*args, **more))
     return scenes
 
 

@@ -16,10 +16,13 @@ if TYPE_CHECKING:
     from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
     from torchrl_quad.engine import ActionSequence
     from torchrl_quad.envs import (
+        Forest,
+        ForestEnv,
         HoveringEnv,
         LandingEnv,
         QuadrotorEnv,
         RacingEnv,
+        Scene,
         TrackingEnv,
         available_tasks,
         load_track,
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
         register_task,
     )
     from torchrl_quad.modules import make_actor, make_qvalue, make_value
+    from torchrl_quad.vision import DepthCamera
     from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss, TrustRegion
 
 __version__ = "0.1.0"
@@ -36,7 +40,10 @@ __all__ = [
     "AHACLoss",
     "ActionSequence",
     "BPTTLoss",
+    "DepthCamera",
     "DifferentiableCollector",
+    "Forest",
+    "ForestEnv",
     "HoveringEnv",
     "HybridLoss",
     "LandingEnv",
@@ -46,6 +53,7 @@ __all__ = [
     "RacingEnv",
     "SAPOLoss",
     "SHACLoss",
+    "Scene",
     "TrackingEnv",
     "TrustRegion",
     "VisitedStateBuffer",
@@ -68,9 +76,9 @@ __all__ = [
 ]
 
 
-_PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "diagnostics")
+_PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "vision", "diagnostics")
 # The tasks that ship, and their control steps: what gymnasium registers needs no torch.
-_TASKS = {"hovering": 256, "landing": 256, "racing": 512, "tracking": 512}
+_TASKS = {"forest": 900, "hovering": 256, "landing": 256, "racing": 512, "tracking": 512}
 
 
 def __getattr__(name: str) -> Any:

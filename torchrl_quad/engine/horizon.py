@@ -29,7 +29,8 @@ class Source(Protocol):
 def can_fly(stepper: Stepper, policy: Any, tensordict: TensorDictBase) -> bool:
     """Whether :func:`fly` gives what TorchRL's own loop does.
 
-    So it is if the policy reads nothing but observation, state, and what it has written itself in the step before.
+    So it is if the policy reads nothing but state, observation and the other outputs of a step, and what it has written
+    itself in the step before.
     """
     if not isinstance(policy, TensorDictModuleBase) or "_" in policy.out_keys:
         return False
@@ -37,7 +38,7 @@ def can_fly(stepper: Stepper, policy: Any, tensordict: TensorDictBase) -> bool:
     needed = {"observation", *stepper.output_layout.place} - {"reward"}
     writes, reads = ({flat_key(*_path(key)) for key in keys} for keys in (policy.out_keys, policy.in_keys))
     given = set(tensordict.keys(True, True))
-    knows = reads <= state | {"observation"} | writes and "action" in writes
+    knows = reads <= state | needed | writes and "action" in writes
     return knows and needed <= given <= state | needed | writes
 
 
@@ -135,9 +136,11 @@ def _call(
     ends: list[Record] = []
     written = []
     kind, done_row, _ = stepper.output_layout.place["done"]
+    reads = any(flat_key(*_path(key)) in stepper.output_layout.place for key in policy.in_keys)
     for t in range(steps):
         root = roots[-1]
-        action, before = _act(stepper, policy, root.observation, stepper.layout.unpack(root.state), before)
+        outputs = {"observation": root.observation, **(stepper.output_layout.unpack(root.outputs) if reads else {})}
+        action, before = _act(stepper, policy, outputs, stepper.layout.unpack(root.state), before)
         written.append(before)
         end = stepper.step_rows(root.state, valid, action, source.noise())
         ends.append(end)
@@ -163,7 +166,7 @@ def _fly_eager(
     outputs = {key: tensordict.get(key) for key in ("observation", *stepper.output_layout.place) if key != "reward"}
     roots, ends, written = [_of_state(state) | outputs], [], []
     for t in range(steps):
-        action, before = _act(stepper, policy, roots[-1]["observation"], state, before)
+        action, before = _act(stepper, policy, roots[-1], state, before)
         written.append(before)
         state, outputs = stepper.step(state, valid, action, source.noise())
         ends.append(_of_state(state) | flat(outputs))
@@ -185,12 +188,14 @@ def _fly_eager(
 
 
 def _act(
-    stepper: Stepper, policy: TensorDictModuleBase, observation: Tensor, state: State, before: dict[Any, Tensor]
+    stepper: Stepper, policy: TensorDictModuleBase, outputs: dict[Key, Tensor], state: State, before: dict[Any, Tensor]
 ) -> tuple[Tensor, dict[Any, Tensor]]:
     """The action of a policy that is called, and all that it writes; it sees what it wrote in the step before."""
     handed_on = {key: x for key, x in before.items() if key != "action"}
-    td = TensorDict({**handed_on, "observation": observation}, [len(observation)], observation.device)
-    if any(flat_key(*_path(key)) != "observation" for key in policy.in_keys):
+    reads, observation = {flat_key(*_path(key)) for key in policy.in_keys}, outputs["observation"]
+    read = {key: x for key, x in outputs.items() if key in reads or key == "observation"}
+    td = TensorDict({**handed_on, **nested(read)}, [len(observation)], observation.device)
+    if reads - {"observation"}:
         td["state"] = nested(state)
     td = policy(td)
     action = td.get("action")

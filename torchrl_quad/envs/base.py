@@ -16,7 +16,8 @@ from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams, load_dron
 from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compiler, nested
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import checks
-from torchrl_quad.envs.disturbances import Disturbance, choose_disturbances
+from torchrl_quad.envs.disturbances import Disturbance
+from torchrl_quad.envs.options import choose_disturbances
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenery import merge_reset, visible_state
 from torchrl_quad.envs.specs import describe, set_specs
@@ -63,6 +64,9 @@ class QuadrotorEnv(Task, EnvBase):
         wind: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.Wind`, or one of these.
         random_start: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.RandomStart`, or one of these.
         disturbances: disturbances of your own; see :class:`~torchrl_quad.envs.disturbances.Disturbance`.
+        scene: obstacles, which end an episode by a crash: a mapping or a YAML file; see :class:`~torchrl_quad.Scene`.
+        camera: adds ``"depth"`` (num_envs, 1, height, width) [m] to what a policy sees: a
+            :class:`~torchrl_quad.DepthCamera`, or a mapping of its fields. Without a scene it sees the ground z = 0.
         compile: compile the step and its first derivative: half a minute the first time; see ``docs/performance.md``.
 
     Raises:
@@ -97,6 +101,8 @@ class QuadrotorEnv(Task, EnvBase):
         wind: Mapping[str, Any] | Disturbance | None = None,
         random_start: Mapping[str, float] | Disturbance | None = None,
         disturbances: Sequence[Disturbance] = (),
+        scene: Any = None,
+        camera: Any = None,
         **unknown: Any,
     ) -> None:
         checks.refuse_unknown(type(self), unknown)
@@ -118,6 +124,7 @@ class QuadrotorEnv(Task, EnvBase):
         self._make_disturbances = functools.partial(
             choose_disturbances, random_start=random_start, randomize=randomize, wind=wind,
             observation_noise=observation_noise, observation_delay=observation_delay, more=disturbances,
+            scene=scene, camera=camera,
         )  # fmt: skip
         self.disturbances = self._make_disturbances(self.nominal, self.dynamics.plant_fields)
         self.randomness = Randomness(self.device, dtype)
@@ -181,7 +188,7 @@ class QuadrotorEnv(Task, EnvBase):
         """Compile the control step and its derivative; the keywords go to torch.compile. Under transforms, compile the
         environment inside, ``TransformedEnv(HoveringEnv(compile=True), ...)``: TransformedEnv's own takes minutes."""
         kwargs.pop("warmup", None)  # TorchRL's option for steps whose input changes its layout: ours never does
-        self._stepper = Stepper(self.control_step, kwargs if has_compiler() else None)
+        self._run(kwargs if has_compiler() else None)
         return self
 
     def flies_inside(self, policy: Any) -> bool:
@@ -191,7 +198,7 @@ class QuadrotorEnv(Task, EnvBase):
 
     def eager(self) -> QuadrotorEnv:
         """Undo :meth:`compile`."""
-        self._stepper = Stepper(self.control_step)
+        self._run(None)
         return self
 
     def to(self, device: torch.device | str) -> QuadrotorEnv:
@@ -211,9 +218,7 @@ class QuadrotorEnv(Task, EnvBase):
         return self
 
     def render(self, drones: Sequence[int] | None = None, *, size: int = 336) -> Any:
-        """Draw the drones as the last reset, step or rollout left them, with their targets, into one picture.
-
-        TorchRL's ``PixelRenderTransform(drones=[0, 1], size=480)`` calls it, and ``VideoRecorder`` films it.
+        """Draw the drones as the last reset, step or rollout left them; TorchRL's ``PixelRenderTransform`` calls it.
 
         Args:
             drones: indices of those to draw; by default the first six.
@@ -224,7 +229,6 @@ class QuadrotorEnv(Task, EnvBase):
 
         Raises:
             ValueError: there is no state yet, as before the first reset; or an argument is out of its range.
-            ImportError: matplotlib is missing.
         """
         from torchrl_quad.render.frames import draw_frame  # matplotlib is needed only here
 
@@ -235,11 +239,17 @@ class QuadrotorEnv(Task, EnvBase):
     def _connect(self, safe_state: State, options: dict[str, Any] | None = None) -> None:
         """Join what belongs together on one device: the step, what runs it, and its random numbers."""
         self.control_step = ControlStep(self, safe_state)
-        self._stepper = Stepper(self.control_step, options)
+        self._run(options)
         sizes = {name: x.noise_size for name, x in self.disturbances.items()}
         self.randomness.noise_shapes = {name: (self.num_envs, size) for name, size in sizes.items() if size}
         self.randomness.draw_start = functools.partial(draw_start, self)
         self.render_state: State = {}  # positions, quaternions and targets, for render()
+
+    def _run(self, options: dict[str, Any] | None) -> None:
+        """Run steps compiled with these options, eager for None; and the camera, which starts use, too, likewise."""
+        self._stepper = Stepper(self.control_step, options)
+        if "camera" in self.disturbances:
+            self.disturbances["camera"].is_compiled = self.is_compiled
 
     def reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool | None = None, **options: Any) -> Any:
         """As TorchRL's; of a mask and a state in one tensordict, ``set_state`` says which of them counts."""

@@ -64,7 +64,7 @@ def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModuleBase:
 
 def sees(cfg: DictConfig, env: EnvBase) -> bool:
     """Whether the policy of a configuration reads the images of a camera; checkpoints from before do not say."""
-    return bool(cfg.actor.get("vision", False)) and "depth" in env.observation_spec.keys()
+    return bool(cfg.actor.get("vision", False)) and "depth" in env.observation_spec
 
 
 def network(cfg: DictConfig, name: str) -> dict[str, Any]:
@@ -168,7 +168,9 @@ def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDict
 
 
 def shuffled(rollout: TensorDictBase, batch_size: int, epochs: int) -> Iterator[TensorDictBase]:
-    """All steps of a rollout ``epochs`` times, in random batches."""
-    steps = rollout.reshape(-1)
+    """All steps of a rollout ``epochs`` times, in random batches; of a policy that remembers, whole horizons."""
+    remembers, horizon = "is_init" in rollout, rollout.shape[-1]
+    steps = rollout if remembers else rollout.reshape(-1)
+    size = max(batch_size // horizon, 1) if remembers else batch_size
     for _ in range(epochs):
-        yield from steps[torch.randperm(len(steps), device=steps.device)].split(batch_size)
+        yield from steps[torch.randperm(len(steps), device=steps.device)].split(size)

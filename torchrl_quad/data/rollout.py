@@ -27,8 +27,8 @@ def differentiable_rollout(
 
     Environments that finish are reset on the way. The gradient is cut exactly there, and ``"next"`` keeps the true last
     state. The rollout is the environment's own ``rollout``, so this works for any differentiable TorchRL environment
-    and any stack of transforms. The gradient also goes through the memory of a recurrent actor, which is cleared where an
-    episode begins, and cut there.
+    and any stack of transforms. The gradient also goes through the memory of a recurrent actor, which is cleared where
+    an episode begins, and cut there.
 
     Args:
         env: the environment.

@@ -213,7 +213,7 @@ def _act(
     stepper.simulation.check_action(action)
     written = {key: td.get(key) for key in policy.out_keys}
     for key in memory:
-        after = written["next", *_path(key)]
+        after = written[("next", *_path(key))]
         written[key] = torch.zeros_like(after) if before.get(key) is None else before[key]
     if memory:
         written |= {"is_init": td["is_init"], ("next", "is_init"): torch.zeros_like(td["is_init"])}
@@ -236,7 +236,7 @@ def _handed_on(policy: TensorDictModuleBase, written: dict[Any, Tensor], done: T
         return written
     before = {key: x for key, x in written.items() if _path(key)[0] != "next"}
     for key in memory:
-        x = written["next", *_path(key)]
+        x = written[("next", *_path(key))]
         before[key] = torch.where(like(done, x), 0.0, x) if _may_restart(done) else x
     return before | {"is_init": done}
 

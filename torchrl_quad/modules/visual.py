@@ -12,10 +12,10 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase, TensorDictPrimer
-from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor
+from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, set_recurrent_mode
 
 from torchrl_quad.modules.networks import OBSERVATION, first_action, network_of, sampling, start_near
-from torchrl_quad.modules.plain import GaussianHead, Network
+from torchrl_quad.modules.plain import GaussianHead, Network, PlainTanhGaussian, bounds_of, samples
 
 MEMORY = "recurrent_state"
 NEAREST = 0.3  # [m], of what a policy tells apart
@@ -161,6 +161,10 @@ class VisualActor(ProbabilisticActor):
             )
         return super().forward(tensordict, **kwargs)
 
+    def replayed(self) -> Replay | None:
+        """The policy as losses let it act again in a whole rollout, or None where it explores in another way."""
+        return None if samples(self) is None else Replay(self)
+
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """TorchRL's transform that gives an environment the memory of this policy, in its precision.
 
@@ -173,3 +177,24 @@ class VisualActor(ProbabilisticActor):
                 spec = Unbounded((1, weight.shape[-1]), dtype=weight.dtype, device=weight.device)
                 return TensorDictPrimer({MEMORY: spec}, expand_specs=True)
         raise ValueError("This policy has no memory: it was built with recurrent=False, and needs no primer.")
+
+
+class Replay(PlainTanhGaussian):
+    """A policy that sees, in the states of a rollout that it has flown. Its memory comes about anew in them."""
+
+    def __init__(self, actor: VisualActor) -> None:
+        head, sample = actor[0][-1].module.head, actor[1]
+        self.actor, self.head, self.size, self.rho = actor, head, head.size, None
+        self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
+        self.low, self.high = (x if x is None else x.tolist() for x in bounds_of(actor))
+
+    def replay(self, tensordict: TensorDictBase) -> dict[Any, Tensor]:
+        """What it writes in the states of a rollout (*, horizon), with the noise of the rollout.
+
+        Single steps (n) that are no rollout are each remembered as they were flown.
+        """
+        has_time = tensordict.ndim > 1 or tensordict.names[-1] == "time"
+        with set_recurrent_mode(has_time):
+            read = self.actor.get_dist_params(tensordict.select(*self.actor.in_keys).detach())
+        noise = self.drawn_again(tensordict).view_as(tensordict["action"])
+        return self._squash(read["loc"], read["scale"], noise, self.log_prob_key)

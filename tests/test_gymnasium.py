@@ -23,7 +23,7 @@ import torchrl_quad
 from torchrl_quad import load_drone, make_env
 from torchrl_quad.gym import GymEnv, GymVectorEnv
 
-TASKS = ["hovering", "landing", "racing", "tracking"]
+TASKS = ["forest", "hovering", "landing", "racing", "tracking"]
 MODES = list(AutoresetMode)
 HOVERING = "torchrl_quad/Hovering-v0"
 

@@ -5,6 +5,7 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from torchrl_quad.controllers import MPC, GeometricController
     from torchrl_quad.data import (
         DifferentiableCollector,
         ObservationNormalizer,
@@ -30,12 +31,13 @@ if TYPE_CHECKING:
         register_task,
     )
     from torchrl_quad.modules import make_actor, make_qvalue, make_value, make_visual_actor
-    from torchrl_quad.vision import DepthCamera
     from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss, TrustRegion
+    from torchrl_quad.vision import DepthCamera
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "MPC",
     "ABPTLoss",
     "AHACLoss",
     "ActionSequence",
@@ -44,6 +46,7 @@ __all__ = [
     "DifferentiableCollector",
     "Forest",
     "ForestEnv",
+    "GeometricController",
     "HoveringEnv",
     "HybridLoss",
     "LandingEnv",
@@ -77,7 +80,7 @@ __all__ = [
 ]
 
 
-_PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "vision", "diagnostics")
+_PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "vision", "controllers", "diagnostics")
 # The tasks that ship, and their control steps: what gymnasium registers needs no torch.
 _TASKS = {"forest": 900, "hovering": 256, "landing": 256, "racing": 512, "tracking": 512}
 

@@ -31,8 +31,8 @@ class Eye(Disturbance):
         if reach > scene.radius:
             raise ValueError(
                 f"camera: its position is {reach:.3g} m from the drone's centre, outside of the sphere of "
-                f"{scene.radius:.3g} m that must not touch anything, so the camera could be inside an obstacle. Move the "
-                f"camera, or give the scene a drone_radius of {math.ceil(100 * reach) / 100:g} m."
+                f"{scene.radius:.3g} m that must not touch anything, so the camera could be inside an obstacle. Move "
+                f"it, or give the scene a drone_radius of {math.ceil(100 * reach) / 100:g} m."
             )
 
     @property

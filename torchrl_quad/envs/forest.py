@@ -57,8 +57,8 @@ class ForestEnv(QuadrotorEnv):
     the middle, 4 m before the forest, or 4 m high; truncated after ``max_episode_steps``, 900. Success of an episode:
     that it ended in success.
 
-    Metrics: ``distance``, how far the drone has come in the forest [m]; ``flown_speed``, towards the target [m/s], of an
-    episode its mean; ``clearance``, d of the trees and the ground [m], of an episode the least.
+    Metrics: ``distance``, how far the drone has come in the forest [m]; ``flown_speed``, towards the target [m/s], its
+    mean over an episode; ``clearance``, d of the trees and the ground [m], the least of an episode.
 
     Args:
         num_envs: number of drones that fly in parallel.
@@ -140,13 +140,12 @@ class ForestEnv(QuadrotorEnv):
         start = self.tensor([-self.run_up[0], 0.0, self.cruise_height])
         goal = self.tensor([self.length, 0.0, self.cruise_height])
         low = self.tensor([-self.before, -self.half_width, self.scene.radius])
-        if not has_way(
-            fixed, start, goal, low, self.tensor([self.length + 1.0, self.half_width, top]), self.scene.radius
-        ):
+        high, radius = self.tensor([self.length + 1.0, self.half_width, top]), self.scene.radius
+        if not has_way(fixed, start, goal, low, high, radius):
             raise ValueError(
-                f"{self.scene.source}: the obstacles leave no way from (x, y, z) = (-1, 0, 1.5) to (30, 0, 1.5) m, within "
-                f"{self.half_width:g} m to both sides and below {top:g} m, for a drone of radius "
-                f"{self.scene.radius:.3g} m. Take some away, or open a gap."
+                f"{self.scene.source}: the obstacles leave no way from (x, y, z) = (-1, 0, 1.5) to (30, 0, 1.5) m, "
+                f"within {self.half_width:g} m to both sides and below {top:g} m, for a drone of radius {radius:.3g} m."
+                " Take some away, or open a gap."
             )
 
     def initial_state(self, n: int) -> State:
@@ -229,9 +228,9 @@ class ForestEnv(QuadrotorEnv):
 class Forest(Scene):
     """A random forest on flat ground: another one in each episode, whose trees keep a gap between each other.
 
-    Trees are drawn evenly over the ground; one that finds no place among 12 that is far enough from the trees before it is left
-    out. Since the gaps are wider than the drone, the trees made thicker by its radius do not touch each other. What
-    does not touch encloses nothing: there is a way through.
+    Trees are drawn evenly over the ground. One that finds no place among 12 that is far enough from the trees before it
+    is left out. Since the gaps are wider than the drone, the trees made thicker by its radius do not touch each other.
+    What does not touch encloses nothing: there is a way through.
 
     Args:
         density: trees per square metre.
@@ -276,8 +275,8 @@ class Forest(Scene):
         own = super().bound(nominal)
         if self.gap <= 2.0 * own.radius:
             raise ValueError(
-                f"forest: a drone of radius {own.radius:.3g} m does not fit through gaps of {self.gap:g} m, so the trees "
-                f"could leave no way through. Give a gap of more than {2.0 * own.radius:.3g} m."
+                f"forest: a drone of radius {own.radius:.3g} m does not fit through gaps of {self.gap:g} m, so the "
+                f"trees could leave no way through. Give a gap of more than {2.0 * own.radius:.3g} m."
             )
         return own
 

@@ -47,8 +47,8 @@ class Scene(Disturbance):
           - {count: 20, low: [-5, -5, 0], high: [5, 5, 0], radius: [0.1, 0.3], height: 4}
         boxes: [{centre: [0, 2, 0.5], size: [1, 1, 1], yaw: 0.5}]      # or quaternion: [w, x, y, z], to world
 
-    An entry with a ``count`` stands for so many obstacles, which each episode draws anew: the position (centre, or base)
-    evenly from ``low`` to ``high``, and a field with two values evenly between them. They keep clear of where the drone
+    An entry with a ``count`` stands for so many obstacles, which each episode draws anew: the centre, or base, evenly
+    from ``low`` to ``high``, and a field with two values evenly between them. They keep clear of where the drone
     starts, and of its ``target`` if the state has one. One that finds no place in 20 tries is left out.
 
     State added: ``("scene", kind)`` for kinds with random obstacles, as :class:`~torchrl_quad.vision.Primitives` has
@@ -115,6 +115,11 @@ class Scene(Disturbance):
             raise ValueError(f"{source}: unknown key {unknown[0]!r}. Allowed: {', '.join(allowed)}.")
         return cls(**values, source=source)
 
+    @property
+    def is_random(self) -> bool:
+        """Whether each episode has obstacles of its own."""
+        return self.is_drawn_elsewhere or any(self.random.values())
+
     def bound(self, nominal: QuadrotorParams) -> Scene:
         """A copy for a drone, with its tensors in the drone's precision and on its device."""
         own, like = copy.copy(self), nominal.mass
@@ -150,7 +155,7 @@ class Scene(Disturbance):
                 if where.any():
                     raise ValueError(
                         f"{self.source}: {complaint}, and drones would start there, such as at "
-                        f"{[round(x, 2) for x in state['position'][where][0].tolist()]} m. Move the obstacle or the start."
+                        f"{[round(x, 2) for x in state['position'][where][0].tolist()]} m. Move one of them."
                     )
         return {**drawn, "collided": torch.zeros_like(state["position"][:, :1], dtype=torch.bool)}
 
@@ -259,10 +264,10 @@ class Scene(Disturbance):
 
     def _draw_clear(self, random: Randomness, kind: str, group: dict[str, Any], points: Tensor) -> Tensor:
         """The obstacles (n, count, ...) of a group; none stands at the points (n, k, 3)."""
-        drawn = None
+        drawn = _draw(random, kind, group, len(points))
+        blocked = torch.ones_like(drawn[..., 0], dtype=torch.bool)
         for _ in range(TRIES):
-            new = _draw(random, kind, group, len(points))
-            drawn = new if drawn is None else torch.where(blocked.unsqueeze(-1), new, drawn)
+            drawn = torch.where(blocked.unsqueeze(-1), _draw(random, kind, group, len(points)), drawn)
             alone = Primitives(*(drawn if name == kind else x[:, :0] for name, x in _none(points).items()))
             blocked = (distances(alone, points) < self.radius + self.clearance).any(1)
             if looks_are_free(points.device) and not blocked.any():

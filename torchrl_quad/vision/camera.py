@@ -72,8 +72,8 @@ class DepthCamera:
         tall = math.atan(self.height / self.width * math.tan(0.5 * angle)) * 2
         _require(
             tall < MAX_FIELD_OF_VIEW,
-            f"{self.height} rows of {self.width} square pixels see {math.degrees(tall):.0f} degrees from top to bottom; "
-            "170 are too many. Give fewer rows, or a smaller field_of_view.",
+            f"{self.height} rows of {self.width} square pixels see {math.degrees(tall):.0f} degrees from top to "
+            "bottom; 170 are too many. Give fewer rows, or a smaller field_of_view.",
         )
         _require(_is_numbers(self.position, 3), f"position must be three numbers [m], got {self.position!r}.")
         _require(

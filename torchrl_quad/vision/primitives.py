@@ -20,10 +20,10 @@ SAMPLES = 8  # intervals into which the way of a step is divided, and once more 
 class Primitives(NamedTuple):
     """The solids of n scenes; [m], world frame. Each scene has as many of a kind as the others, or all share one."""
 
-    spheres: Tensor  #: (n or 1, m, 4): centre (3), radius
-    cylinders: Tensor  #: upright, (n or 1, m, 5): centre of the base (3), radius, height
-    boxes: Tensor  #: (n or 1, m, 10): centre (3), half of the edges (3), attitude as a unit quaternion (4), to world
-    planes: Tensor  #: (n or 1, m, 4): unit normal (3) into free space, and its product with a point of the plane
+    spheres: Tensor  #: centre (3) and radius, (n or 1, m, 4)
+    cylinders: Tensor  #: upright; centre of the base (3), radius and height, (n or 1, m, 5)
+    boxes: Tensor  #: centre (3), half of the edges (3), attitude as a unit quaternion (4) to world, (n or 1, m, 10)
+    planes: Tensor  #: unit normal (3) into free space, and its product with a point of the plane, (n or 1, m, 4)
 
     @property
     def count(self) -> int:
@@ -97,7 +97,7 @@ def closest_approach(solids: Primitives, start: Tensor, end: Tensor) -> Tensor:
         return torch.stack(parts, 1).amin(1, keepdim=True)
 
 
-# -- each kind: its distance (*), and the gradient of it, three components (*), from solids (*, k) and points (*, 3) -----
+# -- each kind: its distance (*), and the gradient of that, three components (*), from solids (*, k) and points (*, 3) -
 
 
 def _sphere(x: Tensor, point: Tensor) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool3d
 
 from torchrl_quad.vision.primitives import Primitives, distances
 
@@ -27,19 +26,20 @@ def has_way(
     first = Primitives(*(x[:1] for x in solids))
     step = max(1, CHUNK // max(first.count, 1))
     free = torch.cat([(distances(first, x.unsqueeze(0))[0] > radius).all(-1) for x in centres.split(step)])
-    free = free.reshape(1, 1, *counts.tolist()).float()
+    free = free.reshape(counts.tolist())
 
-    def where(point: Tensor) -> tuple[int, ...]:
+    def cell_of(point: Tensor) -> tuple[int, ...]:
         index = ((point - low) / (high - low) * counts).long()
-        return (0, 0, *torch.minimum(index.clamp_min(0), counts - 1).tolist())
+        return tuple(torch.minimum(index.clamp_min(0), counts - 1).tolist())
 
-    reached = torch.zeros_like(free)
-    reached[where(start)] = 1.0
-    reached = reached * free
-    goal_cell, count = where(goal), -1.0
-    while count != reached.sum().item() and not reached[goal_cell]:
-        count = reached.sum().item()
+    reached, goal_cell, count = torch.zeros_like(free), cell_of(goal), 0
+    reached[cell_of(start)] = True
+    reached &= free
+    while count != (count := reached.sum().item()) and not reached[goal_cell]:
         for _ in range(8):  # to neighbours by a face
-            grown = [max_pool3d(reached, k, 1, [x // 2 for x in k]) for k in ([3, 1, 1], [1, 3, 1], [1, 1, 3])]
-            reached = torch.stack(grown).amax(0) * free
+            for axis, size in enumerate(free.shape):
+                lower, upper = reached.narrow(axis, 0, size - 1), reached.narrow(axis, 1, size - 1)
+                upper |= lower.clone()
+                lower |= upper.clone()
+                reached &= free
     return bool(reached[goal_cell])

@@ -118,6 +118,18 @@ class Windows:
         spun = seen.angular_velocity.diff(dim=1) / self.dt - angular
         return Push(quaternion.rotate_inverse(middle.quaternion, sped).mean(1), spun.mean(1))
 
+    def turning(self, stream_delay: Tensor, span: int) -> Tensor:
+        """How much further the attitude turned in pieces of ``span`` samples than the gyro says, (W, pieces, 3) [rad].
+
+        Only the delay between them matters to it, not the drone.
+        """
+        count = self.future // span
+        seen = self.measured(stream_delay, torch.arange(0, count * span + 1))
+        attitude = seen.quaternion[:, ::span]
+        rate = 0.5 * (seen.angular_velocity[:, 1:] + seen.angular_velocity[:, :-1])
+        gyro = rate.unflatten(1, (count, span)).sum(2) * self.dt
+        return rotation_vector(attitude[:, 1:], attitude[:, :-1]) - gyro
+
     def fly(self, plant: Plant, start: Trajectory, speed: Tensor, push: Push) -> Trajectory:
         """Open-loop predictions, from states at the starts, at every step of the body: (W, future / stride + 1, k)."""
         rotors, steps = Rotors(plant.params), self.future // self.stride

@@ -6,15 +6,15 @@ class LogError(ValueError):
 
 
 class UnreadableLog(LogError):
-    """The file is empty, cut off, or of no known kind."""
+    """The file is empty, cut off, of no known kind, or needs a package that is missing."""
 
 
 class MissingColumns(LogError):
-    """The file lacks a column that the layout names, or no layout is known for its columns."""
+    """The file lacks a column that was asked for, or no layout is known for its columns."""
 
 
 class NotFiniteLog(LogError):
-    """Most values of a column are NaN or infinite."""
+    """Fewer than two samples of a quantity are finite."""
 
 
 class ClockJumpsBack(LogError):
@@ -26,11 +26,11 @@ class GapsTooLarge(LogError):
 
 
 class WrongUnit(LogError):
-    """A column is not in the unit that it should have: degrees, millimetres, g, or counts of a motor."""
+    """A column is not in the unit that it should have: degrees, millimetres, g, milliseconds, or counts of a motor."""
 
 
 class WrongQuaternion(LogError):
-    """Quaternions are scalar-last, turn the world to the body, or are not of unit length."""
+    """Quaternions are in another order, turn the world to the body, or are not of unit length."""
 
 
 class WrongFrame(LogError):
@@ -43,3 +43,15 @@ class InconsistentRates(LogError):
 
 class NoFlight(LogError):
     """Nothing in the file flies: the motors stand, or the drone stays on the ground."""
+
+
+class TooShort(LogError):
+    """No piece of the flight is long enough to predict anything."""
+
+
+class TooLittleFlight(LogError):
+    """The flights have fewer windows than a fit has unknowns."""
+
+
+class UnknownField(LogError):
+    """A field cannot be identified, or is not known."""

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from torchrl_quad.deploy import frames
-from torchrl_quad.identification.errors import MissingColumns
-from torchrl_quad.identification.streams import Signal, Stream
+from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
+from torchrl_quad.identification.streams import Array, Signal, Stream
 
-SIZES = {
+SIZES = {  # how many columns a quantity has; setpoints may have any number
     "position": 3,
     "quaternion": 4,
     "euler": 3,
@@ -23,108 +23,221 @@ SIZES = {
     "motor_command": 4,
     "battery_voltage": 1,
 }
+NEEDED = (("position",), ("quaternion", "euler"), ("motor_command",))
 DEGREE = np.pi / 180.0
 G = 9.80665
-OURS = frames.Convention("our frames")
+OURS = frames.Convention("torchrl_quad", motors=(0, 1, 2, 3))
+ROS = frames.Convention("ROS", xyzw=True, motors=(0, 1, 2, 3))
+BY_IMU = ("angular_velocity", "acceleration", "motor_command", "battery_voltage", "setpoint")
 
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of one quantity, in the order of the layout's convention, and what to multiply them by."""
+    """The columns of one quantity: value = scale * (what the file says - offset), in SI units.
+
+    ``Columns(("m1", "m2", "m3", "m4"), scale=1e-3, offset=1000)`` reads pulses from 1000 to 2000 us as 0 to 1.
+    """
 
     names: tuple[str, ...]
     scale: ArrayLike = 1.0
+    offset: ArrayLike = 0.0
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a kind of file keeps each quantity.
+    """Where one kind of file keeps each quantity."""
 
-    ``columns`` maps a quantity, or ``"setpoint.NAME"``, to its :class:`Columns`, best first; the first whose columns
-    are all there is read. The convention says the frames, and the order of quaternions and motors.
-    """
-
-    about: str
-    columns: Mapping[str, tuple[Columns, ...]]
-    convention: frames.Convention = OURS
-    onboard: tuple[str, ...] = ()
-    time: Columns = field(default_factory=lambda: Columns(("time",)))  # of CSV files; others have clocks
+    columns: Mapping[str, tuple[Columns, ...]]  #: choices for each quantity; the first that the file has is read
+    convention: frames.Convention = OURS  #: the frames, and the order in which quaternions and motors are named
+    onboard: tuple[str, ...] = ()  #: fields by a clock of their own
+    time: Columns = Columns(("time",))  #: of CSV files; others have clocks
 
 
-def _c(names: str, scale: ArrayLike = 1.0) -> tuple[Columns]:
-    return (Columns(tuple(names.split()), scale),)
+def _c(names: str, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> Columns:
+    return Columns(tuple(names.split()), scale, offset)
+
+
+def _three(stem: str) -> str:
+    return " ".join(f"{stem}[{k}]" for k in range(3))
 
 
 LAYOUTS = {
-    "nanobench": Layout(
-        "CSV files of NanoBench: Crazyflie 2.1 in Vicon, with its on-board log",
+    "nanobench": Layout(  # arXiv:2603.09908: Vicon, and the on-board log of a Crazyflie 2.1
         {
-            "position": _c("px py pz"),
-            "quaternion": _c("qx qy qz qw"),
-            "velocity": _c("vx vy vz"),
-            "angular_velocity": _c("imu_gyro_x imu_gyro_y imu_gyro_z"),
-            "acceleration": _c("imu_acc_x imu_acc_y imu_acc_z", G),
-            "motor_command": _c("motor_motor_m1 motor_motor_m2 motor_motor_m3 motor_motor_m4", 1 / 65535),
-            "battery_voltage": _c("pwr_pm_vbat"),
-            "setpoint.position": _c("sp_ctrltarget_x sp_ctrltarget_y sp_ctrltarget_z"),
-            "setpoint.yaw": _c("sp_ctrltarget_yaw", DEGREE),
+            "position": (_c("px py pz"),),
+            "quaternion": (_c("qx qy qz qw"),),
+            "velocity": (_c("vx vy vz"),),
+            "angular_velocity": (_c("imu_gyro_x imu_gyro_y imu_gyro_z"),),
+            "acceleration": (_c("imu_acc_x imu_acc_y imu_acc_z", G),),
+            "motor_command": (_c("motor_motor_m1 motor_motor_m2 motor_motor_m3 motor_motor_m4", 1 / 65535),),
+            "battery_voltage": (_c("pwr_pm_vbat"),),
+            "setpoint.position": (_c("sp_ctrltarget_x sp_ctrltarget_y sp_ctrltarget_z"),),
+            "setpoint.yaw": (_c("sp_ctrltarget_yaw", DEGREE),),
         },
         frames.crazyflie(),
-        ("angular_velocity", "acceleration", "motor_command", "battery_voltage", "setpoint"),
+        BY_IMU,
         Columns(("t",)),
     ),
+    "px4": Layout(  # msg/*.msg of PX4 1.14; older firmware has no actuator_motors
+        {
+            "position": (_c("vehicle_local_position.x vehicle_local_position.y vehicle_local_position.z"),),
+            "quaternion": (_c(f"vehicle_attitude.q[0] {' '.join(f'vehicle_attitude.q[{k}]' for k in (1, 2, 3))}"),),
+            "velocity": (_c("vehicle_local_position.vx vehicle_local_position.vy vehicle_local_position.vz"),),
+            "angular_velocity": (_c(_three("vehicle_angular_velocity.xyz")), _c(_three("sensor_combined.gyro_rad"))),
+            "acceleration": (
+                _c(_three("vehicle_acceleration.xyz")),
+                _c(_three("sensor_combined.accelerometer_m_s2")),
+            ),
+            "motor_command": (
+                _c(" ".join(f"actuator_motors.signal[{k}]" for k in range(4))),
+                _c(" ".join(f"actuator_outputs.output[{k}]" for k in range(4)), 1e-3, 1000.0),
+            ),
+            "battery_voltage": (_c("battery_status.voltage_v"),),
+            "setpoint.position": (
+                _c(_three("trajectory_setpoint.position")),
+                _c(" ".join(f"vehicle_local_position_setpoint.{axis}" for axis in "xyz")),
+            ),
+        },
+        frames.px4(),
+    ),
+    "crazyflie": Layout(  # the log variables of the firmware, as the uSD deck writes them
+        {
+            "position": (
+                _c("stateEstimate.x stateEstimate.y stateEstimate.z"),
+                _c("stateEstimateZ.x stateEstimateZ.y stateEstimateZ.z", 1e-3),
+            ),
+            "quaternion": (
+                _c("stateEstimate.qx stateEstimate.qy stateEstimate.qz stateEstimate.qw"),
+                _c("stateEstimateZ.qx stateEstimateZ.qy stateEstimateZ.qz stateEstimateZ.qw"),
+            ),
+            "euler": tuple(  # the firmware counts pitch the other way round
+                _c(f"{group}.roll {group}.pitch {group}.yaw", (DEGREE, -DEGREE, DEGREE))
+                for group in ("stateEstimate", "stabilizer")
+            ),
+            "velocity": (
+                _c("stateEstimate.vx stateEstimate.vy stateEstimate.vz"),
+                _c("stateEstimateZ.vx stateEstimateZ.vy stateEstimateZ.vz", 1e-3),
+            ),
+            "angular_velocity": (
+                _c("gyro.x gyro.y gyro.z", DEGREE),
+                _c("stateEstimateZ.rateRoll stateEstimateZ.ratePitch stateEstimateZ.rateYaw", (1e-3, -1e-3, 1e-3)),
+            ),
+            "acceleration": (_c("acc.x acc.y acc.z", G),),
+            "motor_command": (_c("motor.m1 motor.m2 motor.m3 motor.m4", 1 / 65535),),
+            "battery_voltage": (_c("pm.vbat"),),
+            "setpoint.position": (_c("ctrltarget.x ctrltarget.y ctrltarget.z"),),
+            "setpoint.yaw": (_c("ctrltarget.yaw", DEGREE),),
+        },
+        frames.crazyflie(),
+    ),
 }
+
+
+def choose(columns: str | Layout | Mapping[str, object], default: Layout | None) -> Layout:
+    """The layout for what a caller names: a preset, a layout, or a mapping, which goes over the default if there is
+    one."""
+    if isinstance(columns, Layout):
+        return columns
+    if isinstance(columns, str):
+        if columns not in LAYOUTS:
+            raise MissingColumns(f"Unknown layout {columns!r}. Choose from: {', '.join(LAYOUTS)}.")
+        return LAYOUTS[columns]
+    chosen = {quantity: (_as_columns(quantity, names),) for quantity, names in columns.items()}
+    time = chosen.pop("time", (Columns(("time",)),))[0]
+    if default is None:
+        return Layout(chosen, onboard=BY_IMU, time=time)
+    if "quaternion" in chosen or "euler" in chosen:
+        default_columns = {q: c for q, c in default.columns.items() if q not in ("quaternion", "euler")}
+    else:
+        default_columns = dict(default.columns)
+    return Layout(default_columns | chosen, default.convention, default.onboard, time)
+
+
+def _as_columns(quantity: str, names: object) -> Columns:
+    known = [*SIZES, "time", "setpoint.NAME"]
+    if quantity not in SIZES and quantity != "time" and not quantity.startswith("setpoint."):
+        raise MissingColumns(f"Unknown quantity {quantity!r} in columns. Choose from: {', '.join(known)}.")
+    if not isinstance(names, Columns):
+        names = Columns((names,) if isinstance(names, str) else tuple(names))  # type: ignore[arg-type]
+    size = 1 if quantity == "time" else SIZES.get(quantity, len(names.names))
+    if len(names.names) != size:
+        raise MissingColumns(
+            f"{quantity} takes {size} column(s), got {len(names.names)}: {', '.join(names.names)}. Name each."
+        )
+    return names
 
 
 def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Signal]:
     """Each quantity of the layout that the streams have, in our units, frames and orders.
 
     Raises:
-        MissingColumns: the streams lack a quantity that every log needs.
+        MissingColumns: the streams lack a quantity that every log needs, or a column of a mapping.
+        UnreadableLog: the columns of a quantity stand in streams of different clocks.
     """
-    found: dict[str, Signal] = {}
-    by_column = {column: stream for stream in reversed(streams) for column in stream.columns}
+    owner = {column: stream for stream in reversed(streams) for column in stream.columns}
+    found = {}
     for quantity, choices in layout.columns.items():
-        for choice in choices:
-            owners = {id(by_column[c]): by_column[c] for c in choice.names if c in by_column}
-            if len(owners) == 1 and all(c in by_column for c in choice.names):
-                stream = next(iter(owners.values()))
-                values = np.stack([np.asarray(stream.columns[c], float) for c in choice.names], -1)
-                values = _convert(quantity, values * choice.scale, layout.convention)
-                found[quantity] = Signal(quantity, choice.names, stream.time, values)
-                break
-    for needed in (("position",), ("quaternion", "euler"), ("motor_command",)):
-        if not any(quantity in found for quantity in needed):
-            asked = [c for q in needed for choice in layout.columns.get(q, ()) for c in choice.names]
-            there = sorted(by_column)
+        choice = next((c for c in choices if all(column in owner for column in c.names)), None)
+        if choice is None:
+            continue
+        stream = owner[choice.names[0]]
+        if any(owner[column] is not stream for column in choice.names):
+            raise UnreadableLog(
+                f"{name}: the columns of {quantity}, {', '.join(choice.names)}, stand in different streams, whose "
+                "samples have different times. Name columns of one."
+            )
+        values = np.stack([np.asarray(stream.columns[column], float) for column in choice.names], -1)
+        values = _translate(quantity, (values - choice.offset) * choice.scale, layout.convention)
+        found[quantity] = Signal(quantity, choice.names, stream.time, values)
+    if "quaternion" in found:
+        found.pop("euler", None)
+    if "velocity" in found:
+        found.pop("velocity_body", None)
+    for quantities in NEEDED:
+        if not found.keys() & set(quantities):
+            asked = [column for q in quantities for choice in layout.columns.get(q, ()) for column in choice.names]
             raise MissingColumns(
-                f"{name} has no {' or '.join(needed)}: looked for {', '.join(asked) or 'nothing'}. Every log needs "
-                "position, attitude and motor commands. Name the columns with columns={...}; there are: "
-                f"{', '.join(there[:60])}{' ...' if len(there) > 60 else ''}."
+                f"{name} has no {' or '.join(quantities)}: looked for {', '.join(asked) or 'nothing'}. Every log needs "
+                f"position, attitude and motor commands. {_columns_there(owner)}"
             )
     return found
 
 
-def _convert(quantity: str, values: np.ndarray, convention: frames.Convention) -> np.ndarray:
-    kind = {"acceleration": "angular_velocity", "velocity_body": "angular_velocity", "motor_command": "motors"}
-    kind |= {"setpoint.position": "position", "setpoint.velocity": "velocity", "setpoint.quaternion": "quaternion"}
-    name = kind.get(quantity, quantity)
+def match(header: Sequence[str], name: str) -> Layout:
+    """The preset for the columns of a CSV file.
+
+    Raises:
+        MissingColumns: none knows them.
+    """
+    for layout in LAYOUTS.values():
+        if {*layout.time.names, *layout.columns["position"][0].names} <= set(header):
+            return layout
+    raise MissingColumns(f"No preset knows the columns of {name}. {_columns_there(header)}")
+
+
+def _columns_there(names: Sequence[str] | Mapping[str, Stream]) -> str:
+    there = sorted(names)
+    more = f" and {len(there) - 40} more" if len(there) > 40 else ""
+    return (
+        'Name them: columns={"time": "t", "position": ["x", "y", "z"], ...}. '
+        f"There are: {', '.join(there[:40]) or 'none'}{more}."
+    )
+
+
+def _translate(quantity: str, values: Array, convention: frames.Convention) -> Array:
+    """From the frames and orders of a convention into ours."""
+    alike = {
+        "acceleration": "angular_velocity",  # a vector of the body
+        "velocity_body": "angular_velocity",
+        "motor_command": "motors",
+        "setpoint.position": "position",
+        "setpoint.velocity": "velocity",
+        "setpoint.quaternion": "quaternion",
+        "setpoint.angular_velocity": "angular_velocity",
+    }
+    name = alike.get(quantity, quantity)
+    if name not in ("position", "velocity", "quaternion", "angular_velocity", "motors"):
+        return values
     if name == "motors" and convention.motors is None:
         return values
-    if name in ("position", "velocity", "quaternion", "angular_velocity", "motors"):
-        return convention.back({name: values})[name]
-    return values
-
-
-def own_layout(columns: Mapping[str, Sequence[str] | str], scale: Mapping[str, ArrayLike] | None) -> Layout:
-    """The layout that a user's mapping describes."""
-    scale = scale or {}
-    chosen = {
-        quantity: (Columns((names,) if isinstance(names, str) else tuple(names), scale.get(quantity, 1.0)),)
-        for quantity, names in columns.items()
-    }
-    time = chosen.pop("time", (Columns(("time",)),))[0]
-    return Layout("a mapping of columns", chosen, time=time)
-
-
-__all__ = ["LAYOUTS", "SIZES", "Columns", "Layout", "gather", "own_layout", "replace"]
+    return convention.back({name: values})[name]

@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
-import gzip
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from torchrl_quad.deploy.frames import Convention
-from torchrl_quad.identification.errors import MissingColumns, NoFlight, UnreadableLog
-from torchrl_quad.identification.layouts import LAYOUTS, Layout, gather, own_layout
-from torchrl_quad.identification.streams import Array, Stream, clean, covered, resample
+from torchrl_quad.identification.attitude import body_rates, continuous, from_euler, rotate, slope
+from torchrl_quad.identification.checks import (
+    check_motors,
+    check_quaternion,
+    check_rates,
+    check_specific_force,
+    check_velocity,
+)
+from torchrl_quad.identification.errors import NoFlight, WrongUnit
+from torchrl_quad.identification.layouts import Columns, Layout, gather
+from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
+from torchrl_quad.identification.sources import read_streams
+from torchrl_quad.identification.streams import Array, Signal, clean, covered, frozen, resample
 
 
 @dataclass(frozen=True)
 class FlightLog:
-    """A flight as :func:`read_log` gives it: world z up, body FLU, quaternions (w, x, y, z) from body to world."""
+    """A flight as :func:`read_log` gives it: world z up, body FLU, quaternions (w, x, y, z) from body to world.
+
+    All fields are of float64 and share ``time``. Streams of other clocks were put there as if they had the same clock:
+    the fields that ``onboard`` names may be late by a constant delay, which the fit estimates.
+    """
 
     name: str
     time: Array  #: (T,) [s], in uniform steps from 0
@@ -29,22 +41,26 @@ class FlightLog:
     acceleration: Array | None  #: (T, 3) [m/s^2], specific force in the body frame: what an accelerometer measures
     motor_command: Array  #: (T, 4), 0 to 1 of the full command; front left, back left, back right, front right
     battery_voltage: Array | None  #: (T,) [V]
-    setpoint: Mapping[str, Array] | None  #: what the controller was asked for, by name
+    setpoint: Mapping[str, Array] | None  #: what the controller was asked for, by name, held between samples
     segments: tuple[tuple[int, int], ...]  #: (start, stop) of pieces in flight without gaps: ``position[start:stop]``
-    onboard: tuple[str, ...]  #: fields by the on-board clock: late against the others by an unknown, constant delay
-    notes: tuple[str, ...]  #: what was found and done
+    onboard: tuple[str, ...]  #: fields by another clock than the position: late by an unknown, constant delay
+    notes: tuple[str, ...]  #: what was found and done, a sentence each
 
     @property
     def dt(self) -> float:
         """The step [s]."""
         return float(self.time[1] - self.time[0])
 
+    def __str__(self) -> str:
+        pieces = ", ".join(f"{a * self.dt:.2f} to {b * self.dt:.2f}" for a, b in self.segments)
+        lines = [f"{self.name}: {len(self.time)} samples in steps of {1000.0 * self.dt:g} ms; in flight {pieces} s"]
+        return "\n".join(lines + [f"- {note}" for note in self.notes])
+
 
 def read_log(
     path: str | Path,
-    columns: str | Mapping[str, Sequence[str] | str] | None = None,
+    columns: str | Layout | Mapping[str, str | Sequence[str] | Columns] | None = None,
     *,
-    scale: Mapping[str, ArrayLike] | None = None,
     convention: Convention | None = None,
     onboard: Sequence[str] | None = None,
     dt: float | None = None,
@@ -52,73 +68,141 @@ def read_log(
     max_gap: float = 0.05,
     min_duration: float = 0.5,
 ) -> FlightLog:
-    """Read the log of a flight."""
+    """Read the log of a flight: CSV (also gz), PX4 ULog, ROS bag, or the uSD log of a Crazyflie.
+
+    .. code-block:: python
+
+        log = read_log("flight.csv", columns={"time": "t", "position": ["x", "y", "z"],
+                       "quaternion": ["qw", "qx", "qy", "qz"], "motor_command": ["m4", "m3", "m2", "m1"],
+                       "acceleration": Columns(("ax", "ay", "az"), scale=9.80665)})
+        print(log)
+
+    ULog needs pyulog and bags need rosbags: ``pip install 'torchrl_quad[logs]'``.
+
+    Args:
+        path: a file, or the folder of a ROS 2 bag. Its first bytes say of what kind it is.
+        columns: which columns are which quantity: a preset's name ("nanobench", "px4", "crazyflie"), a
+            :class:`Layout`, or a mapping from quantities to names or :class:`Columns`, in the order of the convention.
+            By default the kind of file and the header decide. For a CSV file a mapping stands alone; for other kinds
+            it replaces entries of their preset.
+        convention: the frames and orders of the file, of :mod:`torchrl_quad.deploy.frames`; by default the preset's,
+            and for a mapping of a CSV file ours. Its ``xyzw`` and ``motors`` say how quaternions and motors are named.
+        onboard: fields that another clock than the position's has stamped; "setpoint" is one.
+        dt: step of the result [s]; by default that of the attitude.
+        clearance: height above where the drone stood [m] up to which it counts as on the ground.
+        max_gap: the longest time without samples [s] that is bridged; at least three usual steps always are. Longer
+            gaps separate pieces.
+        min_duration: the shortest piece in flight that is kept [s].
+
+    Raises:
+        LogError: the log cannot be used. Its subclasses name the reason; ``docs/flight_logs.md`` lists them.
+    """
     path = Path(path)
-    streams, layout = _read_csv(path, columns, scale)
-    if convention is not None:
-        layout = replace(layout, convention=convention)
-    if onboard is not None:
-        layout = replace(layout, onboard=tuple(onboard))
-    notes = []
-    signals = {}
-    for quantity, signal in gather(layout, streams, path.name).items():
-        signals[quantity], note = clean(signal)
-        notes += [note] if note else []
+    streams, layout, notes = read_streams(path, columns)
+    layout = layout if convention is None else replace(layout, convention=convention)
+    fields = layout.onboard if onboard is None else tuple(onboard)
+    signals = _signals(layout, streams, path.name, notes)
     main = [s for q, s in signals.items() if q != "battery_voltage" and not q.startswith("setpoint.")]
-    step = dt or round(signals["quaternion"].step, 5)
+    attitude = signals.get("quaternion") or signals["euler"]
+    step = dt or round(attitude.step, 5)
+    if not 0.0 < step < 0.5:
+        raise WrongUnit(
+            f"{path.name}: the clock steps by {attitude.step:.4g} s, which is no flight. Is it in milliseconds? Then "
+            'write columns={"time": Columns(("t",), scale=1e-3), ...}.'
+        )
     start, stop = max(s.time[0] for s in main), min(s.time[-1] for s in main)
+    if stop - start < 20.0 * step:
+        raise NoFlight(
+            f"{path.name} is no flight: its streams share {max(stop - start, 0.0):.2f} s. Give a longer log, or name "
+            "columns that were recorded at the same time."
+        )
     grid = start + step * np.arange(int((stop - start) / step + 1e-6) + 1)
-    valid = np.ones(len(grid), bool)
-    for signal in main:
-        inside, gaps = covered(signal, grid, max_gap)
-        valid &= inside
-        if len(gaps):
-            notes.append(f"{len(gaps)} gaps of up to {gaps.max():.3g} s in {signal}: cut out")
-    at = {q: resample(s, grid, step, hold=q.startswith("setpoint.")) for q, s in signals.items()}
-    q = at["quaternion"] / np.linalg.norm(at["quaternion"], axis=-1, keepdims=True)
-    motors = at["motor_command"]
-    z = at["position"][:, 2]
-    still = motors.mean(-1) < 0.02
-    flying = valid & ~still & (z > np.median(z[still]) + clearance if still.any() else True)
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], flying.astype(int), [0]))))
-    segments = tuple((int(a), int(b)) for a, b in edges.reshape(-1, 2) if (b - a) * step >= min_duration)
-    if not segments:
-        raise NoFlight(f"{path.name}: nothing in it flies.")
+    valid = _cover(main, grid, step, max_gap, notes)
+    at = _at(signals, grid, step)
+    on, _ = motors_on(at["motor_command"], step, path.name)
+    sound = on & valid & ~broken(at, on, step)[0]
+    moving = sound if sound.sum() > 10 else on
+    check_velocity(at, signals, step, moving)
+    check_specific_force(at, signals, moving)
+    note, _ = check_rates(at, signals, step, moving)
+    segments, found = find_pieces(at, valid, step, path.name, clearance, min_duration)
     setpoint = {q.removeprefix("setpoint."): x for q, x in at.items() if q.startswith("setpoint.")}
+    present = {q.partition(".")[0] for q in at}
+    if "battery_voltage" not in at:
+        notes.append("no battery voltage: the thrust of a command cannot be told from the charge of the battery")
     return FlightLog(
-        path.name.removesuffix(".gz").removesuffix(".csv"),
-        grid - start,
-        at["position"],
-        q,
-        at["velocity"],
-        at["angular_velocity"],
-        at.get("acceleration"),
-        np.clip(motors, 0.0, 1.0),
-        at["battery_voltage"][:, 0] if "battery_voltage" in at else None,
-        {name: x[:, 0] if x.shape[-1] == 1 else x for name, x in setpoint.items()} or None,
-        segments,
-        layout.onboard,
-        tuple(notes),
+        name=path.name.removesuffix(".gz").rsplit(".", 1)[0] if path.is_file() else path.name,
+        time=step * np.arange(len(grid)),
+        position=at["position"],
+        quaternion=at["quaternion"],
+        velocity=at["velocity"],
+        angular_velocity=at["angular_velocity"],
+        acceleration=at.get("acceleration"),
+        motor_command=np.clip(at["motor_command"], 0.0, 1.0),
+        battery_voltage=at["battery_voltage"][:, 0] if "battery_voltage" in at else None,
+        setpoint={name: x[:, 0] if x.shape[-1] == 1 else x for name, x in setpoint.items()} or None,
+        segments=segments,
+        onboard=tuple(f for f in fields if f in present and (f != "angular_velocity" or f in signals)),
+        notes=tuple(notes + [note] + found),
     )
 
 
-def _read_csv(
-    path: Path, columns: str | Mapping[str, Sequence[str] | str] | None, scale: Mapping[str, ArrayLike] | None
-) -> tuple[list[Stream], Layout]:
-    with gzip.open(path, "rt") if path.suffix == ".gz" else open(path) as file:
-        header = [name.strip() for name in file.readline().split(",")]
-        table = np.genfromtxt(file, delimiter=",", ndmin=2)
-    if table.size == 0:
-        raise UnreadableLog(f"{path.name} has no rows.")
-    if isinstance(columns, Mapping):
-        layout = own_layout(columns, scale)
-    elif columns is not None:
-        layout = LAYOUTS[columns]
-    else:
-        known = (x for x in LAYOUTS.values() if {*x.time.names, *x.columns["position"][0].names} <= set(header))
-        layout = next(known, None)
-        if layout is None:
-            raise MissingColumns(f"No preset knows the columns of {path.name}.")
-    data = dict(zip(header, table.T, strict=True))
-    time = data[layout.time.names[0]] * np.asarray(layout.time.scale)
-    return [Stream("csv", time, data)], layout
+def _signals(layout: Layout, streams: Sequence, name: str, notes: list[str]) -> dict[str, Signal]:
+    """Each quantity at its own rate, finite, in order of time, and in range."""
+    signals = {}
+    for quantity, signal in gather(layout, streams, name).items():
+        if quantity == "battery_voltage" and not (signal.values > 0.0).any():
+            continue  # autopilots say 0 where no battery is measured
+        if quantity == "quaternion":
+            lost = check_quaternion(clean(signal)[0])
+            notes += [lost] if lost else []
+            norm = np.linalg.norm(signal.values, axis=-1, keepdims=True)
+            unit = np.where(np.abs(norm - 1.0) < 0.05, signal.values / np.where(norm > 0.0, norm, 1.0), np.nan)
+            signal = replace(signal, values=unit)
+        optional = quantity == "battery_voltage" or quantity.startswith("setpoint.")
+        if optional and np.isfinite(signal.values).all(-1).sum() < 2:
+            notes.append(f"{signal} holds no finite samples: left out")
+            continue
+        signals[quantity], note = clean(signal)
+        notes += [note] if note else []
+    note = check_motors(signals["motor_command"])
+    notes += [note] if note else []
+    return signals
+
+
+def _cover(main: Sequence[Signal], grid: Array, step: float, max_gap: float, notes: list[str]) -> np.ndarray:
+    """Which times lie in no gap of any stream; gaps, and streams that are slower than the log, are noted."""
+    valid = np.ones(len(grid), bool)
+    told: dict[tuple[int, float], list[str]] = {}
+    for signal in main:
+        free, gaps = covered(signal, grid, max_gap)
+        if signal.field in ("position", "quaternion"):
+            held, stuck = frozen(signal, grid, max_gap)
+            free, gaps = free & ~held, np.concatenate((gaps, stuck))
+        valid &= free
+        if len(gaps):
+            told.setdefault((len(gaps), round(float(gaps.max()), 3)), []).append(signal.field)
+        if signal.step > 1.5 * step:
+            notes.append(f"{signal.field} comes at {1.0 / signal.step:.0f} Hz only: interpolated")
+    for (count, longest), fields in told.items():
+        notes.append(f"{count} gap(s) of up to {longest:g} s in {', '.join(fields)}: cut out")
+    return valid
+
+
+def _at(signals: Mapping[str, Signal], grid: Array, step: float) -> dict[str, Array]:
+    """Every quantity of the schema at the times of the grid, derived from others where the file lacks it."""
+    signals = dict(signals)
+    if "quaternion" not in signals:
+        euler = signals.pop("euler")
+        signals["quaternion"] = replace(euler, values=from_euler(euler.values))
+    q = signals["quaternion"]
+    signals["quaternion"] = replace(q, values=continuous(q.values))
+    at = {name: resample(s, grid, step, hold=name.startswith("setpoint.")) for name, s in signals.items()}
+    at["quaternion"] /= np.linalg.norm(at["quaternion"], axis=-1, keepdims=True)
+    if "velocity_body" in at:
+        at["velocity"] = rotate(at["quaternion"], at.pop("velocity_body"))
+    if "velocity" not in at:
+        at["velocity"] = slope(at["position"], step)
+    if "angular_velocity" not in at:
+        at["angular_velocity"] = body_rates(at["quaternion"], step)
+    return at

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
 from torchrl_quad.dynamics.parameters import RawParams
-from torchrl_quad.identification.errors import LogError
+from torchrl_quad.identification.errors import UnknownField
 from torchrl_quad.identification.windows import MAX_DELAY, Plant
 
 #: What ``fields`` of :func:`~torchrl_quad.identification.identify` may name, and the unknowns that each stands for.
@@ -26,10 +26,6 @@ FIELDS: dict[str, tuple[str, ...]] = {
     "command_delay": ("delay",),
     "stream_delay": ("stream",),
 }
-
-
-class UnknownField(LogError):
-    """A field cannot be identified, or is not known."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -136,6 +136,3 @@ def _coast(start: Trajectory, windows: Windows) -> Trajectory:
     turn = quaternion.from_axis_angle(rate * time)
     attitude = quaternion.multiply(start.quaternion[:, None].expand(-1, windows.future + 1, -1), turn)
     return Trajectory(start.position[:, None] + velocity * time, velocity, attitude, rate)
-
-
-

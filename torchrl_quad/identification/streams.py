@@ -45,15 +45,14 @@ def clean(signal: Signal) -> tuple[Signal, str | None]:
 
     Raises:
         ClockJumpsBack: the clock runs backwards.
-        NotFiniteLog: fewer than half of the samples, or fewer than two, are finite.
+        NotFiniteLog: fewer than two samples are finite.
     """
     time, values = signal.time, signal.values
     finite = np.isfinite(values).all(-1) & np.isfinite(time)
-    share = 1.0 - finite.mean() if len(finite) else 1.0
-    if share > 0.5 or finite.sum() < 2:
+    if finite.sum() < 2:  # of tables that join several rates, most rows of the slower ones are empty
         raise NotFiniteLog(
-            f"{share:.0%} of {signal} are NaN or infinite: too little is left to fit. Name columns that were recorded, "
-            "or leave this quantity out if it is optional."
+            f"{finite.sum()} of {len(finite)} samples of {signal} are finite: nothing was recorded there. Name other "
+            "columns, or leave this quantity out if it is optional."
         )
     time, values = time[finite], values[finite]
     back = np.flatnonzero(np.diff(time) < 0.0)
@@ -106,3 +105,17 @@ def covered(signal: Signal, grid: Array, max_gap: float) -> tuple[NDArray[np.boo
     inside = (k >= 0) & (k < len(spacing)) & gap[np.clip(k, 0, len(gap) - 1)]
     inside &= grid > signal.time[np.clip(k, 0, None)] + 1e-9
     return ~inside, spacing[gap]
+
+
+def frozen(signal: Signal, grid: Array, max_gap: float) -> tuple[NDArray[np.bool_], Array]:
+    """Which times of the grid lie where the signal repeats itself digit by digit for longer than ``max_gap``, and for
+    how long [s]: a tracker that lost the drone. A signal that is held between slower samples is not frozen."""
+    same = (np.diff(signal.values, axis=0) == 0.0).all(-1)
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], same.astype(np.int8), [0])))).reshape(-1, 2)
+    lengths = signal.time[edges[:, 1]] - signal.time[edges[:, 0]]
+    usual = float(np.median(lengths)) if len(lengths) > 0.05 * len(signal.time) else 0.0
+    long = lengths > max(max_gap, 3.0 * usual)
+    inside = np.zeros(len(grid), bool)
+    for first, last in signal.time[edges[long]]:
+        inside |= (grid > first + 1e-9) & (grid < last - 1e-9)
+    return inside, lengths[long]

@@ -15,16 +15,12 @@ from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.integrators import rk4
 from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
 from torchrl_quad.dynamics.rotors import Rotors
-from torchrl_quad.identification.errors import LogError
+from torchrl_quad.identification.errors import TooShort
 from torchrl_quad.identification.log import FlightLog
 
 SAMPLE = 0.01  # [s], aimed at: logs that are quicker are read with a whole number of their samples to one of ours
 WARM_UP = 0.5  # [s] of commands, from which the rotors' speeds follow
 MAX_DELAY = 0.2  # [s], of the on-board clock and of commands, each way
-
-
-class TooShort(LogError):
-    """No piece of the flight is long enough to predict anything."""
 
 
 class Plant(NamedTuple):

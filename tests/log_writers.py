@@ -1,0 +1,142 @@
+"""A flight whose every quantity is known at every time, and writers of logs that share no code with the readers."""
+
+import struct
+import zlib
+
+import numpy as np
+
+END = 10.0  # [s]
+G = 9.80665
+STEP = {"<u4": "I", "<u8": "Q"}
+
+
+def product(p, q):
+    w = p[:, 0] * q[:, 0] - (p[:, 1:] * q[:, 1:]).sum(-1)
+    v = p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])
+    return np.concatenate((w[:, None], v), -1)
+
+
+def matrix(q):
+    """Rotation matrices (T, 3, 3) of quaternions w x y z."""
+    w, x, y, z = q.T
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    ).transpose(2, 0, 1)
+
+
+def _position(t):
+    rise = np.clip((t - 1.0) / 2.0, 0.0, 1.0) * np.clip((9.0 - t) / 2.0, 0.0, 1.0)
+    s = rise**4 * (35.0 - 84.0 * rise + 70.0 * rise**2 - 20.0 * rise**3)  # three derivatives begin and end at 0
+    return np.stack((s * np.sin(1.7 * t), 0.8 * s * np.sin(2.3 * t + 0.4), 0.05 + 1.2 * s), -1)
+
+
+def _attitude(t):
+    """Leaning where it accelerates, as a quadrotor must, and turning about its thrust."""
+    h = 1e-3
+    pull = (_position(t + h) - 2.0 * _position(t) + _position(t - h)) / h**2 + (0.0, 0.0, G)
+    size = np.linalg.norm(pull, axis=-1)
+    x, y, z = (pull / size[:, None]).T
+    lean = np.stack((1.0 + z, -y, x, np.zeros_like(x)), -1)
+    yaw = 1.2 * np.sin(0.8 * t) * (t > 0.0)
+    turn = np.stack((np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)), -1)
+    return product(lean / np.linalg.norm(lean, axis=-1, keepdims=True), turn), size
+
+
+def flight(t):
+    """What is true at times t [s]: it stands for a second, flies for eight, lands and stands again."""
+    h = 1e-4
+    q, size = _attitude(t)
+    rate = (_attitude(t + h)[0] - _attitude(t - h)[0]) / (2.0 * h)
+    on = ((t > 0.7) & (t < 9.3))[:, None]
+    k = np.arange(4)
+    return {
+        "position": _position(t),
+        "quaternion": q,
+        "velocity": (_position(t + h) - _position(t - h)) / (2.0 * h),
+        "angular_velocity": 2.0 * product(q * (1, -1, -1, -1), rate)[:, 1:],
+        "acceleration": size[:, None] * (0.0, 0.0, 1.0),
+        "motor_command": on * (0.5 + 0.05 * k + 0.03 * np.sin(t[:, None] * (k + 1))),
+        "battery_voltage": 4.1 - 0.04 * t,
+    }
+
+
+def write_csv(path, columns):
+    table = np.stack(list(columns.values()), -1)
+    np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
+    return path
+
+
+def quaternion_of(r):
+    """Quaternions of rotation matrices, by the eigenvector that all of them share with Davenport's matrix."""
+    k = np.zeros((len(r), 4, 4))
+    k[:, 0, 0] = np.trace(r, axis1=1, axis2=2)
+    off = np.stack((r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]), -1)
+    k[:, 0, 1:] = k[:, 1:, 0] = off
+    k[:, 1:, 1:] = r + r.transpose(0, 2, 1) - np.trace(r, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    return np.linalg.eigh(k)[1][:, :, -1]
+
+
+def ned(true):
+    """What PX4 logs of a flight in our frames: x east becomes y east; body y left becomes y right."""
+    world = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    body = np.diag([1.0, -1.0, -1.0])
+    rotation = np.einsum("ij,njk,kl->nil", world, matrix(true["quaternion"]), body)
+    return {
+        "position": true["position"] @ world.T,
+        "velocity": true["velocity"] @ world.T,
+        "quaternion": quaternion_of(rotation),
+        "angular_velocity": true["angular_velocity"] @ body,
+        "acceleration": true["acceleration"] @ body,
+    }
+
+
+def write_ulog(path, messages, parameters):
+    """A ULog, by its published format: header, formats, parameters, subscriptions, data.
+
+    ``messages`` maps a name to (times [s], {field: (type, array)}); arrays of shape (T, n) are fields of n.
+    """
+
+    def message(kind, body):
+        return struct.pack("<HB", len(body), ord(kind)) + body
+
+    out = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), message("B", bytes(40))]
+    letters = {"float": "f4", "uint64_t": "u8"}
+    for name, (_, fields) in messages.items():
+        parts = ["uint64_t timestamp"]
+        for field, (kind, values) in fields.items():
+            parts.append(f"{kind}[{values.shape[1]}] {field}" if values.ndim == 2 else f"{kind} {field}")
+        out.append(message("F", f"{name}:{';'.join(parts)};".encode()))
+    for name, value in parameters.items():
+        key = f"float {name}".encode()
+        out.append(message("P", bytes([len(key)]) + key + struct.pack("<f", value)))
+    for k, name in enumerate(messages):
+        out.append(message("A", bytes([0]) + struct.pack("<H", k) + name.encode()))
+    rows = []
+    for k, (times, fields) in enumerate(messages.values()):
+        stamps = np.round(times * 1e6).astype("<u8")
+        parts = [v.astype("<" + letters[kind]).reshape(len(times), -1) for kind, v in fields.values()]
+        for i, stamp in enumerate(stamps):
+            rows.append((stamp, struct.pack("<H", k) + stamp.tobytes() + b"".join(p[i].tobytes() for p in parts)))
+    out += [message("D", body) for _, body in sorted(rows, key=lambda row: row[0])]
+    path.write_bytes(b"".join(out))
+    return path
+
+
+def write_usd(path, events, version):
+    """A uSD log: ``events`` maps a name to (times [s], {variable: (letter, array)})."""
+    out = [b"\xbc", struct.pack("<HH", version, len(events))]
+    rows = []
+    for k, (name, (times, variables)) in enumerate(events.items()):
+        out.append(struct.pack("<H", 7 + k) + name.encode() + b"\0" + struct.pack("<H", len(variables)))
+        out += [f"{variable}({letter})".encode() + b"\0" for variable, (letter, _) in variables.items()]
+        layout = "<H" + {1: "I", 2: "Q"}[version] + "".join(letter for letter, _ in variables.values())
+        ticks = np.round(times * {1: 1e3, 2: 1e6}[version]).astype(int)
+        columns = [v.tolist() for _, v in variables.values()]
+        rows += [(t, struct.pack(layout, 7 + k, t, *x)) for t, *x in zip(ticks.tolist(), *columns, strict=True)]
+    data = b"".join(out + [row for _, row in sorted(rows, key=lambda row: row[0])])
+    path.write_bytes(data + struct.pack("<I", zlib.crc32(data)))
+    return path

@@ -1,0 +1,140 @@
+"""Tables of a flight whose every quantity is known, with columns, rates, units and frames of all kinds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from log_writers import END, G, flight, matrix, ned, write_csv
+
+from torchrl_quad.deploy import frames
+from torchrl_quad.identification import (
+    LAYOUTS,
+    Columns,
+    MissingColumns,
+    WrongFrame,
+    WrongQuaternion,
+    WrongUnit,
+    read_log,
+)
+
+OURS = {
+    "position": ("x", "y", "z"),
+    "quaternion": ("qw", "qx", "qy", "qz"),
+    "velocity": ("vx", "vy", "vz"),
+    "angular_velocity": ("wx", "wy", "wz"),
+    "acceleration": ("fx", "fy", "fz"),
+    "motor_command": ("u0", "u1", "u2", "u3"),
+}
+
+
+def own_table(t, **changes):
+    true = flight(t) | changes
+    columns = {"t": t}
+    for quantity, names in OURS.items():
+        columns |= dict(zip(names, true[quantity].T, strict=True))
+    return columns | {"v": true["battery_voltage"]}
+
+
+def test_a_mapping_reads_any_table_and_rates_are_matched(tmp_path):
+    t = np.arange(0.0, END, 0.004)  # 250 Hz, with a battery that is measured each 0.2 s
+    columns = own_table(t, battery_voltage=np.where(np.arange(len(t)) % 50, np.nan, flight(t)["battery_voltage"]))
+    mapping = {"time": "t", "battery_voltage": "v", **OURS}
+    path = write_csv(tmp_path / "own.csv", columns)
+    log = read_log(path, mapping, dt=0.01)
+    start, stop = log.segments[0]
+    inside = np.arange(start, stop)
+    # Where the climb ends and the descent begins, the angular acceleration jumps: a mean over a step differs there.
+    inside = inside[(np.abs(log.time[inside] - 3.0) > 0.015) & (np.abs(log.time[inside] - 7.0) > 0.015)]
+    true = flight(log.time)
+    for name, tolerance in {"position": 1e-4, "velocity": 1e-3, "angular_velocity": 2e-3, "acceleration": 2e-3}.items():
+        np.testing.assert_allclose(getattr(log, name)[inside], true[name][inside], atol=tolerance)
+    np.testing.assert_allclose(log.motor_command[inside], true["motor_command"][inside], atol=1e-3)
+    np.testing.assert_allclose(np.abs((log.quaternion * true["quaternion"]).sum(-1)), 1.0, atol=1e-6)
+    np.testing.assert_allclose(log.battery_voltage[inside], true["battery_voltage"][inside], atol=1e-3)
+    assert log.onboard == ("angular_velocity", "acceleration", "motor_command", "battery_voltage")
+
+    with pytest.raises(WrongQuaternion, match="scalar last"):
+        read_log(path, {**mapping, "quaternion": ("qx", "qy", "qz", "qw")})
+    xyzw = replace(LAYOUTS["nanobench"].convention, motors=(0, 1, 2, 3))
+    listed = {**mapping, "quaternion": ("qx", "qy", "qz", "qw")}
+    np.testing.assert_allclose(read_log(path, listed, convention=xyzw, dt=0.01).quaternion, log.quaternion)
+    for wrong, message in (
+        ({"motor_command": ("u0", "u1", "u2")}, "takes 4 column"),
+        ({"speed": ("vx", "vy", "vz")}, "Unknown quantity 'speed'"),
+        ({"velocity": ("vx", "vy", "nowhere")}, "no column nowhere. There are: t, x, y"),
+    ):
+        with pytest.raises(MissingColumns, match=message):
+            read_log(path, {**mapping, **wrong})
+    with pytest.raises(MissingColumns, match="has no motor_command"):
+        read_log(path, {k: v for k, v in mapping.items() if k != "motor_command"})
+    with pytest.raises(MissingColumns, match="No preset knows.*columns="):
+        read_log(path)
+
+
+def test_what_is_faster_than_the_log_does_not_alias(tmp_path):
+    t = np.arange(0.0, END, 0.002)
+    buzz = 2.0 * (-1.0) ** np.arange(len(t))[:, None]  # each fifth sample alone would see it as a bias
+    path = write_csv(tmp_path / "fast.csv", own_table(t, angular_velocity=flight(t)["angular_velocity"] + buzz))
+    log = read_log(path, {"time": "t", **OURS}, dt=0.01)
+    assert np.abs((log.angular_velocity - flight(log.time)["angular_velocity"])[1:-1].mean(0)).max() < 0.01
+
+
+def test_touching_down_and_landing_on_a_table_are_cut_out(tmp_path):
+    t = np.arange(0.0, 12.0, 0.01)
+    knots = {0: 0, 1: 0, 2: 1, 4: 1, 5: 0.03, 5.5: 0.03, 6.5: 1, 8: 1, 9: 0.6, 12: 0.6}  # it lands 0.6 m higher
+    true = flight(0.0 * t + 0.01)
+    true["position"][:, 2] = 0.05 + np.interp(t, list(knots), list(knots.values()))
+    noise = np.random.default_rng(0).normal(scale=1e-4, size=(2, len(t)))  # a tracker that says the same is frozen
+    true["position"][:, 0], true["quaternion"][:, 1] = noise
+    true["velocity"][:, 2] = np.gradient(true["position"][:, 2], t)
+    true["motor_command"] = np.full((len(t), 4), 0.5) * ((t > 0.8) & (t < 10.0))[:, None]
+    log = read_log(write_csv(tmp_path / "touch.csv", own_table(t, **true)), {"time": "t", **OURS})
+    expected = (
+        (1.1, 4 + 0.9 / 0.97),
+        (5.5 + 0.07 / 0.97, 8.75),
+    )  # from 0.1 m above the ground to 0.1 m above the table
+    np.testing.assert_allclose(np.array(log.segments) * log.dt, expected, atol=0.02)
+    assert "between take-off and landing are within 0.1 m of the ground" in str(log)
+
+
+def test_euler_angles_and_velocities_of_the_body_become_ours(tmp_path):
+    t = np.arange(0.0, END, 0.01)
+    true = flight(t)
+    r = matrix(true["quaternion"])
+    columns = own_table(t, velocity=np.einsum("nji,nj->ni", r, true["velocity"]))
+    columns["roll"], columns["pitch"] = np.arctan2(r[:, 2, 1], r[:, 2, 2]), -np.arcsin(r[:, 2, 0])
+    columns["yaw"] = np.degrees(np.arctan2(r[:, 1, 0], r[:, 0, 0]))
+    path = write_csv(tmp_path / "own.csv", columns)
+    mapping = {"time": "t", **OURS}
+    euler = Columns(("roll", "pitch", "yaw"), scale=(1.0, 1.0, np.pi / 180))
+    turned = {k: v for k, v in mapping.items() if k not in ("velocity", "quaternion")}
+    log = read_log(path, {**turned, "velocity_body": OURS["velocity"], "euler": euler})
+    np.testing.assert_allclose(log.velocity, true["velocity"], atol=1e-6)
+    np.testing.assert_allclose(np.abs((log.quaternion * true["quaternion"]).sum(-1)), 1.0, atol=1e-7)
+    with pytest.raises(WrongFrame, match='"velocity_body"'):
+        read_log(path, mapping)
+    world = np.einsum("nij,nj->ni", r, true["angular_velocity"])
+    with pytest.raises(WrongFrame, match="in the world frame"):
+        read_log(write_csv(path, own_table(t, angular_velocity=world)), mapping)
+    for scale, message in ((1 / G, "in g.*scale=9.80665"), (1e3 / G, "scale=9.80665e-3")):
+        with pytest.raises(WrongUnit, match=message):
+            read_log(write_csv(path, own_table(t, acceleration=true["acceleration"] * scale)), mapping)
+    for motors, message in ((65535.0, "scale=1 / 65535"), (100.0, "scale=1 / 100"), (2000.0, "offset=1000")):
+        with pytest.raises(WrongUnit, match=message):
+            read_log(write_csv(path, own_table(t, motor_command=true["motor_command"] * motors)), mapping)
+    log = read_log(path, {k: v for k, v in mapping.items() if k in ("time", "position", "quaternion")} | {
+        "motor_command": Columns(OURS["motor_command"], scale=1 / 2000)}, convention=None)  # fmt: skip
+    inside = slice(*log.segments[0])
+    np.testing.assert_allclose(log.velocity[inside], true["velocity"][inside], atol=0.02)
+    assert log.acceleration is None and log.setpoint is None
+
+
+def test_a_log_in_ned_is_read_by_its_convention(tmp_path):
+    t = np.arange(0.0, END, 0.01)
+    path = write_csv(tmp_path / "ned.csv", own_table(t, **ned(flight(t))))
+    mapping = {"time": "t", **OURS}
+    with pytest.raises(WrongFrame, match=r"frames.px4\(\)"):
+        read_log(path, mapping)
+    log = read_log(path, mapping, convention=replace(frames.px4(), motors=(0, 1, 2, 3)))
+    np.testing.assert_allclose(log.position, flight(t)["position"], atol=1e-6)
+    np.testing.assert_allclose(log.angular_velocity, flight(t)["angular_velocity"], atol=1e-6)

@@ -1,0 +1,236 @@
+"""Does a log mean what its columns claim? Each quantity is held against what follows from another one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_quad.identification.attitude import FLIP, body_rates, rotate, slope, smooth
+from torchrl_quad.identification.errors import InconsistentRates, WrongFrame, WrongQuaternion, WrongUnit
+from torchrl_quad.identification.layouts import G
+from torchrl_quad.identification.streams import Array, Signal
+
+Mask = NDArray[np.bool_]
+MAX_LAG = 0.3  # [s] between streams
+CALM = 0.1  # [rad/s]: slower rotations are lost in the noise of motion capture
+SURE = 0.05  # how much better a hypothesis must correlate than the log as it is given
+FRD = np.array([1.0, -1.0, -1.0])
+_NAME = "Name its columns in the order w x y z"
+_TURN = "conjugate it: Columns(names, scale=(1, -1, -1, -1)), whose second to fourth are x y z"
+_FIRST = (
+    "The convention in use expects x y z w, and the file has w x y z: say another convention, or name the columns so"
+)
+_FIXES = {
+    "from world to body": f"To {_TURN}.",
+    "scalar last": f"{_NAME}.",
+    "scalar last, from world to body": f"{_NAME}, and {_TURN}.",
+    "scalar first": f"{_FIRST}.",
+    "scalar first, from world to body": f"{_FIRST}, and {_TURN}.",
+}
+
+
+def check_motors(signal: Signal) -> str | None:
+    """Refuse commands outside of 0 to 1.
+
+    Raises:
+        WrongUnit: they are counts, pulses or percents.
+    """
+    low, high = signal.values.min(), signal.values.max()
+    if low >= -0.01 and high <= 1.01:
+        outside = (signal.values < 0.0).any() or (signal.values > 1.0).any()
+        return f"{signal} reaches {low:.3f} to {high:.3f}: clipped to 0 to 1" if outside else None
+    names = f"Columns({signal.columns!r}, "
+    guess = "scale=1 / FULL)"
+    for full, text in ((101.0, "scale=1 / 100)"), (2600.0, "scale=1e-3, offset=1000)"), (65535.5, "scale=1 / 65535)")):
+        if high <= full:
+            guess = text
+            break
+    raise WrongUnit(
+        f"{signal} runs from {low:.4g} to {high:.4g}, and must run from 0 to 1, the full command. "
+        f'Write columns={{"motor_command": {names}{guess}}}.'
+    )
+
+
+def check_quaternion(signal: Signal) -> str | None:
+    """Refuse quaternions that are not of unit length; those of a tracker that lost the drone are all zero."""
+    norm = np.linalg.norm(signal.values, axis=-1)
+    off = np.abs(norm - 1.0) > 0.05
+    if off.mean() > 0.01:
+        raise WrongQuaternion(
+            f"{off.mean():.0%} of {signal} are not of length 1; the median is {np.median(norm):.3g}. Name the four "
+            "columns of one quaternion, scalar first, or scale them."
+        )
+    return f"{off.sum()} samples of {signal} are not of length 1; they count as missing" if off.any() else None
+
+
+def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> None:
+    """Hold the velocity against the derivative of the position, and both against the specific force.
+
+    Raises:
+        WrongUnit: they, or the clock, are in other units.
+        WrongFrame: the velocity is in the body frame.
+    """
+    position, q = at["position"], at["quaternion"]
+    derived = smooth(slope(position, dt), dt)
+    speed = np.linalg.norm(derived[moving], axis=-1)
+    place = signals["position"]
+    if np.percentile(speed, 99) > 100.0:
+        raise WrongUnit(
+            f"By {place} the drone flies at {np.percentile(speed, 99):.3g} m/s. Is it in millimetres? Then write "
+            f'columns={{"position": Columns({place.columns!r}, scale=1e-3)}}, and the same for the velocity.'
+        )
+    signal = signals.get("velocity")
+    if signal is None or speed.std() + speed.mean() < 0.05:
+        return
+    given = smooth(at["velocity"], dt)
+    fit, factor, _ = _compare(given, derived, dt, moving)
+    if not 0.5 < factor < 2.0:
+        what = "millimetres" if factor < 0.01 else "other units"
+        raise WrongUnit(
+            f"{signal} is {factor:.3g} times the derivative of {place}: one of them, or the clock, is in {what}. Write "
+            f'columns={{"position": Columns({place.columns!r}, scale=1e-3)}} for millimetres.'
+        )
+    body, _, _ = _compare(smooth(rotate(q, at["velocity"]), dt), derived, dt, moving)
+    if body > fit + 0.02 and body > 0.9:
+        raise WrongFrame(
+            f"{signal} fits the derivative of {place} in the body frame (correlation {body:.2f}) and not in the world "
+            f'frame ({fit:.2f}). Name it "velocity_body" in columns: it is then turned into the world frame.'
+        )
+    if fit < 0.7:
+        raise WrongFrame(
+            f"{signal} does not follow {place}: its correlation with the derivative is {fit:.2f}. Name columns of one "
+            "world frame, or leave the velocity out: it is then derived from the position."
+        )
+
+
+def check_specific_force(at: Mapping[str, Array], signals: Mapping[str, Signal], moving: Mask) -> None:
+    """Refuse an accelerometer in g, or of a body with z down.
+
+    Raises:
+        WrongUnit: its length is not about 9.8 m/s^2.
+        WrongFrame: it measures -9.8 m/s^2 along z.
+    """
+    if "acceleration" not in at:
+        return
+    signal, force = signals["acceleration"], at["acceleration"][moving]
+    length = float(np.median(np.linalg.norm(force, axis=-1)))
+    if not 4.0 < length < 40.0:
+        scale = "9.80665" if 0.4 < length < 4.0 else "9.80665e-3" if 400.0 < length < 4000.0 else "..."
+        raise WrongUnit(
+            f"In flight {signal} has a median length of {length:.3g} m/s^2, and a drone that hovers measures 9.8. "
+            f'Is it in g? Then write columns={{"acceleration": Columns({signal.columns!r}, scale={scale})}}.'
+        )
+    if np.median(force[:, 2]) < -0.5 * G:
+        raise WrongFrame(
+            f"In flight {signal} measures {np.median(force[:, 2]):.2f} m/s^2 along z, and in our body frame, z up, a "
+            "drone that hovers measures +9.8. If the log is in NED and FRD, write convention=frames.px4()."
+        )
+
+
+def check_rates(
+    at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask
+) -> tuple[str, float | None]:
+    """Hold the gyro against the derivative of the attitude, under every convention that a file may have used.
+
+    Returns:
+        what was found, and by how much the gyro lags the attitude [s], if it can be seen.
+
+    Raises:
+        WrongUnit: the gyro is in degrees or milliradians.
+        WrongQuaternion: another order, or the inverse, fits.
+        WrongFrame: the gyro is of another frame.
+        InconsistentRates: nothing fits.
+    """
+    q, given = at["quaternion"], signals.get("quaternion") or signals["euler"]
+    hypotheses = {
+        "as given": q,
+        "from world to body": q * FLIP,
+        "scalar last": np.roll(q, 1, -1),
+        "scalar last, from world to body": np.roll(q, 1, -1) * FLIP,
+        "scalar first": np.roll(q, -1, -1),
+        "scalar first, from world to body": np.roll(q, -1, -1) * FLIP,
+    }
+    if "angular_velocity" not in signals:
+        _check_by_thrust(at, given, hypotheses, dt, moving)
+        return "no gyro: angular_velocity was derived from the attitude", None
+    signal, gyro = signals["angular_velocity"], at["angular_velocity"]
+    right = smooth(body_rates(q, dt), dt)
+    turning = float(np.sqrt((right[moving] ** 2).mean()))
+    calm = f"{signal} was not checked: the flight turns too slowly ({turning:.2f} rad/s)"
+    if turning < CALM / 5.0:
+        return calm, None
+    trials = {name: (smooth(body_rates(h, dt), dt), smooth(gyro, dt)) for name, h in hypotheses.items()}
+    trials["body y right, z down"] = (right, smooth(gyro * FRD, dt))
+    trials["in the world frame"] = (right, smooth(rotate(q * FLIP, gyro), dt))
+    fits = {name: _compare(b, a, dt, moving) for name, (a, b) in trials.items()}
+    fit, factor, lag = fits["as given"]
+    best = max(fits, key=lambda name: fits[name][0])
+    if fits[best][0] > max(0.5, fit + SURE):
+        told = f"{signal} correlates with the derivative of {given} by {fit:.2f} as given, and by {fits[best][0]:.2f}"
+        if best in hypotheses:
+            raise WrongQuaternion(
+                f"{told} if the quaternion is {best}. We need w x y z, from body to world. {_FIXES[best]}"
+            )
+        if best == "in the world frame":
+            raise WrongFrame(
+                f"{told} if the gyro is in the world frame. Name the rates of the body, or leave them out."
+            )
+        raise WrongFrame(
+            f"{told} if the gyro is of a body with y right and z down. Write scale=(1, -1, -1) in its Columns, or "
+            "convention=frames.px4() if all of the log is in NED and FRD."
+        )
+    for unit, size, scale in (("degrees", 57.3, "np.pi / 180"), ("milliradians", 1000.0, "1e-3")):
+        if size / 3.0 < factor < 3.0 * size and fit > 0.2:
+            raise WrongUnit(
+                f"{signal} is {factor:.3g} times the derivative of {given}: it is in {unit}/s. Write "
+                f'columns={{"angular_velocity": Columns({signal.columns!r}, scale={scale})}}.'
+            )
+    if turning < CALM:
+        return calm, None
+    if fit < 0.5:
+        raise InconsistentRates(
+            f"{signal} does not follow {given}: their correlation is {fit:.2f} at best, also if the quaternion is "
+            "scalar last or inverse, or the gyro in another frame. Name columns that belong together."
+        )
+    if not 1.0 / 3.0 < factor < 3.0:
+        raise WrongUnit(
+            f"{signal} is {factor:.3g} times the derivative of {given}. Give its unit by Columns(names, scale=...)."
+        )
+    return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late", lag
+
+
+def _check_by_thrust(
+    at: Mapping[str, Array], given: Signal, hypotheses: Mapping[str, Array], dt: float, moving: Mask
+) -> None:
+    """Without a gyro: thrust pulls along the body's z, so that must be where the drone accelerates."""
+    pull = smooth(slope(at["velocity"], dt), dt) + (0.0, 0.0, G)
+    pull /= np.linalg.norm(pull, axis=-1, keepdims=True)
+    up = {name: smooth(rotate(h, np.broadcast_to([0.0, 0.0, 1.0], pull.shape)), dt) for name, h in hypotheses.items()}
+    fits = {name: float(np.mean((u * pull)[moving].sum(-1))) for name, u in up.items()}
+    lean = {name: _compare(u[:, :2], pull[:, :2], dt, moving)[0] for name, u in up.items()}
+    best = max(lean, key=lambda name: lean[name] + fits[name])
+    if lean[best] + fits[best] > lean["as given"] + fits["as given"] + 6.0 * SURE and lean[best] > 0.5:
+        raise WrongQuaternion(
+            f"{given} leans where the drone accelerates if it is {best} (correlation {lean[best]:.2f}), and not as "
+            f"given ({lean['as given']:.2f}). We need w x y z, from body to world. {_FIXES[best]}"
+        )
+
+
+def _compare(late: Array, early: Array, dt: float, moving: Mask) -> tuple[float, float, float]:
+    """How well ``late`` follows ``early``, at the best lag: correlation over all axes, factor, and the lag [s]."""
+    reach = round(MAX_LAG / dt)
+    early = np.where(moving[:, None], early - early[moving].mean(0), 0.0)
+    late = np.where(moving[:, None], late - late[moving].mean(0), 0.0)
+    sizes = np.linalg.norm(late), np.linalg.norm(early)
+    if min(sizes) == 0.0:
+        return 0.0, 1.0, 0.0
+    padded = np.pad(late, ((reach, reach), (0, 0)))
+    products = sum(np.convolve(padded[:, k], early[::-1, k], "valid") for k in range(late.shape[1]))
+    best = int(np.argmax(products))
+    shift = 0.0
+    if 0 < best < len(products) - 1:  # the top of the parabola through three values
+        a, b, c = products[best - 1 : best + 2]
+        shift = 0.5 * (a - c) / (a - 2.0 * b + c) if a - 2.0 * b + c < 0.0 else 0.0
+    return float(products[best] / (sizes[0] * sizes[1])), float(sizes[0] / sizes[1]), float((best - reach + shift) * dt)

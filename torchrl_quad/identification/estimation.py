@@ -1,0 +1,376 @@
+"""Find the parameters of a drone from its flights."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
+from torchrl_quad.files import replacing
+from torchrl_quad.identification.errors import TooLittleFlight
+from torchrl_quad.identification.fitting import MAX_ITERATIONS, Linear, Problem, State, bootstrap, covariance, minimise
+from torchrl_quad.identification.log import FlightLog
+from torchrl_quad.identification.parameters import FIELDS, UNKNOWNS, Model, report, unknowns_of
+from torchrl_quad.identification.prediction import (
+    CONSTANT_VELOCITY,
+    ERRORS,
+    PAST,
+    as_params,
+    carrying_speed,
+    differences,
+    predict,
+)
+from torchrl_quad.identification.result import IdentificationResult
+from torchrl_quad.identification.windows import Trajectory, Windows, cut, stream_delay
+
+HORIZONS = (0.1, 0.25, 0.5)
+_BLOCK = 2.0  # [s] of flight that are held out together
+_EVERY_BLOCK = 5  # of which the last is held out
+_DEPENDENT = 3.0  # [s], over which windows are taken to err alike
+_BODY_STEP = 0.02  # [s]
+_MASS = "without a known mass, motion only tells its ratio to the mass, which `ratios` gives"
+
+
+def identify(
+    log: FlightLog | Sequence[FlightLog],
+    drone: str | Path | Mapping | QuadrotorParams = "crazyflie",
+    known: Mapping[str, Any] | None = None,
+    fields: Sequence[str] | None = None,
+    *,
+    past: float = PAST,
+    horizon: float = 0.5,
+    draws: int = 200,
+    seed: int = 0,
+    progress: bool = False,
+    checkpoint: str | Path | None = None,
+) -> IdentificationResult:
+    """Fit a drone to the open-loop predictions of short windows, by gradient through its dynamics.
+
+    Every window starts in a measured state and reads only motor commands, as in :func:`prediction_error`; what is
+    minimised is how far its states at five times lie from the measured ones, robustly. All windows fly at once, and the
+    derivative of each prediction in each unknown makes Gauss-Newton steps. A fifth of the flight is held out.
+
+    Motion only tells ratios: thrust, drag and inertia by the mass. ``known={"mass": 0.03}`` makes numbers of them.
+    Rotor speeds have no scale of their own either: k2 belongs to the speeds that the drone's ``motor_command`` gives.
+    For a drone without one, speed is proportional to command times voltage, so that the prior's thrust carries it.
+
+    Args:
+        log: a flight, or several of the same drone.
+        drone: where to start, and what is kept of it: its geometry, and what the flights do not tell.
+        known: fields that are known by measurement, as ``mass`` [kg] from a scale. They are not fitted.
+        fields: what to fit, of ``FIELDS``; None is everything.
+        past: time before a window from which its constant disturbance follows [s].
+        horizon: length of a window [s].
+        draws: of the bootstrap over windows.
+        seed: of these draws; the rest is deterministic.
+        progress: print a line for each step.
+        checkpoint: a file that each step is written to, and from which a fit of the same flights and settings goes on.
+
+    Raises:
+        UnknownField: a field cannot be fitted.
+        TooShort: no piece of a flight is long enough for a window.
+        TooLittleFlight: there are too few windows for the unknowns.
+        ValueError: the drone is wrong, or a known value.
+    """
+    logs = [log] if isinstance(log, FlightLog) else list(log)
+    if not logs:
+        raise TooLittleFlight("identify needs at least one flight: read_log(path) gives it.")
+    known = dict(known or {})
+    delay = known.pop("command_delay", None)
+    prior = as_params(drone)
+    prior = prior.replace(**known) if known else prior
+    prior, motors = _with_motors(prior, logs, delay)
+    wanted = [x for x in unknowns_of(fields) if x != "stream"]
+    for name in (*known, *(["command_delay"] if delay is not None else [])):
+        wanted = [x for x in wanted if x not in FIELDS.get(name, ())]
+    lagging = any("angular_velocity" in x.onboard for x in logs)
+    moves_streams = lagging and "stream" in unknowns_of(fields)
+    step = min(x.dt * max(1, round(0.01 / x.dt)) for x in logs)
+    windows = cut(logs, horizon, past, 0.5 * horizon, max(1, round(_BODY_STEP / step)), motors.nominal_voltage)
+    held = windows.start * windows.dt // _BLOCK % _EVERY_BLOCK == _EVERY_BLOCK - 1
+    kept = windows.select(torch.nonzero(~held).flatten())
+    if len(kept) < 2 * len(wanted) + 4:
+        raise TooLittleFlight(
+            f"identify: {len(kept)} windows of {horizon:g} s are too few for {len(wanted)} unknowns. Give more flights, "
+            "or fewer fields."
+        )
+    fit = _Fit(Model(prior, motors, ()), kept, logs, moves_streams, progress)
+    fit.file = _Checkpoint(checkpoint, _fingerprint(logs, prior, motors, wanted, past, horizon))
+    state, dropped, two = fit.run(wanted)
+    return fit.result(
+        state,
+        dropped,
+        two,
+        windows.select(torch.nonzero(held).flatten()),
+        has_mass="mass" in known,
+        fields=fields,
+        past=past,
+        horizon=horizon,
+        draws=draws,
+        seed=seed,
+    )
+
+
+class _Fit:
+    """One fit: its windows, and the stages in which unknowns come and go."""
+
+    def __init__(
+        self, model: Model, windows: Windows, logs: list[FlightLog], moves_streams: bool, progress: bool
+    ) -> None:
+        self.model, self.windows, self.logs = model, windows, logs
+        self.moves_streams, self.progress = moves_streams, progress
+        self.file = _Checkpoint(None, "")
+        self.lags = max(1, round(_DEPENDENT / (0.5 * windows.future * windows.dt)))
+
+    def run(self, wanted: list[str]) -> tuple[State, dict[str, str], str]:
+        """Fit what is wanted; leave out what the flights do not tell; then ask for two time constants."""
+        streams = torch.tensor([stream_delay(log) for log in self.logs], dtype=torch.float64)
+        free, dropped = [x for x in wanted if x != "asymmetry"], {}
+        x = self.model.only(free).start
+        while True:
+            state = self.file.resume(f"without {sorted(dropped)}", tuple(free), x, streams)
+            state = self._minimise(state, f"without {sorted(dropped)}")
+            worst = self._least_certain(state)
+            if worst is None:
+                break
+            name, reason = worst
+            dropped[name] = reason
+            if self.progress:
+                print(f"{name}: {reason}")
+            x = state.x[[i for i, other in enumerate(free) if other != name]]
+            free, streams = [other for other in free if other != name], state.streams
+        if "asymmetry" not in wanted or "lag" not in free:
+            return state, dropped, "not asked for"
+        more = self.file.resume(
+            "two time constants", (*free, "asymmetry"), torch.cat((state.x, state.x.new_zeros(1))), state.streams
+        )
+        more = self._minimise(more, "two time constants")
+        _, _, cover, _ = self.uncertainty(more)
+        ratio, error = float(more.x[-1]), float(cover[len(free), len(free)].sqrt())
+        said = (
+            f"rising / falling = {math.exp(ratio):.2f}, 95 % between {math.exp(ratio - 1.96 * error):.2f} and "
+            f"{math.exp(ratio + 1.96 * error):.2f}"
+        )
+        if abs(ratio) > 2.58 * error and abs(ratio) > math.log(1.2):
+            return more, dropped, f"two time constants: {said}"
+        return state, dropped, f"one time constant: {said}"
+
+    def problem(self, state: State) -> Problem:
+        """Its cost, with the unknowns of a state."""
+        return Problem(self.model.only(state.free), self.windows, self.moves_streams, "thrust" in state.free)
+
+    def uncertainty(self, state: State) -> tuple[Problem, Linear, Tensor, Tensor]:
+        """The covariance (n + L, n + L) of the unknowns at the optimum, and the inverse Hessian."""
+        problem = self.problem(state)
+        linear = problem.linearise(state, update_scale=True)
+        cover, bread, scores = covariance(linear, self.windows.log, len(self.logs), self.lags)
+        if len(self.logs) > 2:  # what differs from flight to flight, as the battery does, is uncertain, too
+            sums = scores.new_zeros(len(self.logs), scores.shape[1]).index_add(0, self.windows.log, scores)
+            between = (bread @ (sums.T @ sums) @ bread).diag() * len(self.logs) / (len(self.logs) - 1)
+            n = len(state.x)
+            wider = (between / cover.diag().clamp_min(1e-300)).clamp_min(1.0).sqrt()
+            wider[n:] = 1.0
+            cover = cover * wider[:, None] * wider
+        return problem, linear, cover, bread
+
+    def _minimise(self, state: State, stage: str) -> State:
+        def after(now: State) -> None:
+            self.file.write(stage, now)
+            if self.progress:
+                print(f"step {now.iteration}, cost {now.cost:.4g}, {len(now.free)} unknowns, {stage}")
+
+        return minimise(self.problem(state), state, after, MAX_ITERATIONS)
+
+    def _least_certain(self, state: State) -> tuple[str, str] | None:
+        """The unknown that the flights tell least of, and why, if that is too little."""
+        if not state.free:
+            return None
+        _, _, cover, _ = self.uncertainty(state)
+        half = 1.96 * cover.diag()[: len(state.x)].clamp_min(0.0).sqrt()
+        wide = torch.tensor([UNKNOWNS[name].wide for name in state.free], dtype=half.dtype)
+        excess = half / wide
+        excess = torch.where(cover.diag()[: len(state.x)] > 0, excess, torch.inf)
+        i = int(excess.argmax())
+        unknown = UNKNOWNS[state.free[i]]
+        if excess[i] <= 1.0 and not abs(float(state.x[i])) >= (unknown.high if unknown.scale else math.inf):
+            return None
+        spread = (
+            "nothing in the flights depends on it"
+            if not math.isfinite(float(excess[i]))
+            else (
+                f"its 95 % interval spans a factor of {math.exp(2 * min(float(half[i]), 20.0)):.3g}"
+                if unknown.scale is None
+                else f"its 95 % interval is {2 * float(half[i]) * unknown.scale:.3g} wide"
+            )
+        )
+        correlation = _correlation(cover)[i, : len(state.x)].clone()
+        correlation[i] = 0.0
+        j = int(correlation.abs().argmax())
+        alike = f", and it is hardly told from {state.free[j]} (correlation {float(correlation[j]):.2f})"
+        return unknown.name, f"{spread}{alike if abs(float(correlation[j])) > 0.9 else ''}; it needs {unknown.why}"
+
+    def result(
+        self,
+        state: State,
+        dropped: dict[str, str],
+        two: str,
+        held: Windows,
+        *,
+        has_mass: bool,
+        fields: Sequence[str] | None,
+        past: float,
+        horizon: float,
+        draws: int,
+        seed: int,
+    ) -> IdentificationResult:
+        """Everything that is reported of the optimum."""
+        model = self.model.only(state.free)
+        problem, linear, cover, _ = self.uncertainty(state)
+        n = len(state.x)
+        quantile = 1.96 * (1.0 + 2.5 / max(len(self.windows) - n, 1))  # of Student's distribution, nearly
+        parameters, ratios = report(model, state.x, cover[:n, :n], quantile, has_mass)
+        changes = bootstrap(linear, self.windows.log, len(self.logs), self.lags, draws, seed) if draws else None
+        by_bootstrap = {}
+        if changes is not None:
+            alone, both = report(model, state.x, torch.cov(changes[:, :n].T).reshape(n, n), 1.96, has_mass)
+            by_bootstrap = {name: (entry["low"], entry["high"]) for name, entry in (alone | both).items()}
+        delay = parameters["command_delay"]["value"] if "command_delay" in parameters else self.model.motors.delay
+        params = model.params(state.x)
+        motors = dataclasses.replace(self.model.motors, delay=float(np.clip(delay, -0.1, 0.5)))
+        drone = QuadrotorParams(**params._asdict(), motor_command=motors)
+        half = quantile * cover.diag()[n:].clamp_min(0.0).sqrt() * UNKNOWNS["stream"].scale
+        streams = {
+            log.name: {"value": float(s), "low": float(s - h), "high": float(s + h), "unit": "s"}
+            for log, s, h in zip(self.logs, state.streams, half, strict=True)
+        }
+        return IdentificationResult(
+            drone=drone,
+            prior=self.model.prior,
+            has_mass=has_mass,
+            parameters=parameters,
+            ratios=ratios,
+            stream_delay=streams,
+            bootstrap=by_bootstrap,
+            names=list(state.free),
+            correlation=_correlation(cover[:n, :n]).tolist(),
+            not_identifiable=_refused(dropped, has_mass, fields, parameters),
+            time_constants=two,
+            errors=_errors(self.logs, held, drone, self.model, past, horizon),
+            settings={
+                "past": past,
+                "horizon": horizon,
+                "seed": seed,
+                "windows": len(self.windows),
+                "held_out": len(held),
+                "iterations": state.iteration,
+                "cost": state.cost,
+            },
+            logs=[log.name for log in self.logs],
+            flights=self.logs,
+        )
+
+
+@dataclasses.dataclass
+class _Checkpoint:
+    """A file with the last step of each stage of a fit."""
+
+    path: str | Path | None
+    fingerprint: str
+
+    def resume(self, stage: str, free: tuple[str, ...], x: Tensor, streams: Tensor) -> State:
+        """The last step of a stage, or its start."""
+        found = self._read().get(stage)
+        if found is None or tuple(found["free"]) != free:
+            return State(free, x, streams)
+        tensors = {name: torch.tensor(found[name], dtype=torch.float64) for name in ("x", "streams")}
+        return State(**{**found, **tensors, "free": free})
+
+    def write(self, stage: str, state: State) -> None:
+        """Keep a step."""
+        if self.path is None:
+            return
+        entry = dataclasses.asdict(state) | {"x": state.x.tolist(), "streams": state.streams.tolist()}
+        content = {"fingerprint": self.fingerprint, "stages": {**self._read(), stage: entry}}
+        with replacing(self.path) as temporary:
+            temporary.write_text(json.dumps(content))
+
+    def _read(self) -> dict[str, Any]:
+        if self.path is None or not Path(self.path).is_file():
+            return {}
+        try:
+            content = json.loads(Path(self.path).read_text())
+            return content["stages"] if content["fingerprint"] == self.fingerprint else {}
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{self.path} is no checkpoint of a fit: {error!r}. Delete it, to start anew.") from error
+
+
+def _with_motors(
+    prior: QuadrotorParams, logs: Sequence[FlightLog], delay: float | None
+) -> tuple[QuadrotorParams, MotorCommand]:
+    """The drone with a map from motor commands to rotor speeds: its own, or one whose thrust carries it."""
+    motors = prior.motor_command
+    if motors is None:
+        volts = [float(x.battery_voltage.mean()) for x in logs if x.battery_voltage is not None]
+        nominal = float(np.mean(volts)) if volts else 1.0
+        motors = MotorCommand(float(np.mean([carrying_speed(prior, x, nominal) for x in logs])), nominal)
+    if delay is not None:
+        motors = dataclasses.replace(motors, delay=float(delay))
+    return dataclasses.replace(prior, motor_command=motors), motors
+
+
+def _errors(
+    logs: Sequence[FlightLog], held: Windows, drone: QuadrotorParams, model: Model, past: float, horizon: float
+) -> dict[str, dict[str, dict[float, float]]]:
+    """RMS errors of the predictions in the held-out windows: of the fit, of the prior, and of constant velocity."""
+    horizons = sorted({h for h in HORIZONS if h <= horizon} | {horizon})
+    table = {}
+    for name, one in (("fitted", drone), ("prior", model.prior), (CONSTANT_VELOCITY, CONSTANT_VELOCITY)):
+        windows, flown, seen = predict(logs, one, horizon, past, 0.1)
+        steps = torch.tensor([max(1, round(h / windows.dt)) for h in horizons])
+        inside = windows.start * windows.dt // _BLOCK % _EVERY_BLOCK == _EVERY_BLOCK - 1
+        if not inside.any():
+            return {}
+        parts = [Trajectory(*(x[inside][:, steps] for x in y)) for y in (flown, seen)]
+        rms = differences(*parts).square().sum(-1).mean(0).sqrt()
+        table[name] = {k: dict(zip(horizons, rms[:, i].tolist(), strict=True)) for i, k in enumerate(ERRORS)}
+    return table
+
+
+def _refused(
+    dropped: Mapping[str, str], has_mass: bool, fields: Sequence[str] | None, parameters: Mapping[str, Any]
+) -> dict[str, str]:
+    """Fields that got no number, with the reason."""
+    owner = {unknown: name for name, unknowns in FIELDS.items() for unknown in unknowns}
+    part = {"drag_xy": ".xy", "drag_z": ".z", "roll": ".x", "pitch": ".y"}
+    found = {owner[name] + part.get(name, ""): reason for name, reason in dropped.items()}
+    if not has_mass:
+        found["mass"] = "motion does not tell it: weigh the drone, and give known={'mass': ...}"
+        for name in ("thrust_map", "linear_drag", "inertia"):
+            if fields is None or name in fields:
+                found.setdefault(name, _MASS)
+    return found
+
+
+def _correlation(cover: Tensor) -> Tensor:
+    deviation = cover.diag().clamp_min(1e-300).sqrt()
+    return (cover / deviation[:, None] / deviation).clamp(-1.0, 1.0)
+
+
+def _fingerprint(logs: Sequence[FlightLog], prior: QuadrotorParams, motors: MotorCommand, *settings: Any) -> str:
+    digest = hashlib.sha256(repr((settings, motors)).encode())
+    for value in prior.fields().values():
+        digest.update(value.numpy().tobytes())
+    for log in logs:
+        for column in (log.position, log.quaternion, log.angular_velocity, log.motor_command):
+            digest.update(np.ascontiguousarray(column).tobytes())
+        digest.update(repr(log.segments).encode())
+    return digest.hexdigest()

@@ -1,0 +1,106 @@
+"""The log that a Crazyflie writes to its micro SD card.
+
+Format (``src/deck/drivers/src/usddeck.c`` of the firmware), little-endian: the byte 0xBC; version (1 or 2) and the
+number of kinds of events, 16 bits each; for each kind its id (16 bits), its name and a zero, the number of variables
+(16 bits), and each variable as "name(t)" and a zero, where t is a letter of Python's ``struct``. Then come the events:
+id, time (version 1: 32 bits, ms; version 2: 64 bits, us) and values. The last four bytes are the CRC-32 of all others.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+
+import numpy as np
+
+from torchrl_quad.identification.errors import UnreadableLog
+from torchrl_quad.identification.streams import Array, Stream
+
+_TICKS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}
+_VARIABLE = re.compile(r"(.+)\(([bBhHiIqQfd?])\)")
+
+
+def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
+    """A stream for each kind of event.
+
+    Raises:
+        UnreadableLog: the file has another version, or its header is cut off.
+    """
+    notes = []
+    body = data[:-4]
+    if zlib.crc32(body) != int.from_bytes(data[-4:], "little"):
+        # A card that is pulled out, or a battery that runs empty, leaves a file without its end.
+        notes.append("the checksum of the uSD log does not match: the end of the file may be missing")
+        body = data
+    try:
+        version, kinds = struct.unpack_from("<HH", body, 1)
+        if version not in _TICKS:
+            raise UnreadableLog(f"{name} is a uSD log of version {version}; 1 and 2 are known. Export it as CSV.")
+        records, names, at = {}, {}, 5
+        for _ in range(kinds):
+            (kind,) = struct.unpack_from("<H", body, at)
+            names[kind], at = _text(body, at + 2)
+            (count,) = struct.unpack_from("<H", body, at)
+            at += 2
+            fields = [("id", "<u2"), ("tick", _TICKS[version][0])]
+            for _ in range(count):
+                variable, at = _text(body, at)
+                found = _VARIABLE.fullmatch(variable)
+                if found is None:
+                    raise UnreadableLog(f"{name} has a variable of unknown type, {variable!r}. Export it as CSV.")
+                fields.append((found[1], np.dtype(found[2]).newbyteorder("<")))
+            records[kind] = np.dtype(fields)
+    except (struct.error, ValueError) as error:
+        if isinstance(error, UnreadableLog):
+            raise
+        raise UnreadableLog(f"{name} begins like a uSD log, but its header is cut off. Copy it again.") from error
+    events, left = _events(body, at, records)
+    if left:
+        notes.append(f"the last {left} bytes of the uSD log were not read: they are no whole events")
+    streams = []
+    for kind, rows in events.items():
+        columns = {field: rows[field].astype(float) for field in records[kind].names[2:]}
+        if "stateEstimateZ.quat" in columns:
+            q = decompress_quaternions(rows["stateEstimateZ.quat"])
+            columns |= {f"stateEstimateZ.q{axis}": q[:, k] for k, axis in enumerate("xyzw")}
+        streams.append(Stream(names[kind], rows["tick"] * _TICKS[version][1], columns))
+    return streams, notes
+
+
+def _events(body: bytes, at: int, records: dict[int, np.dtype]) -> tuple[dict[int, np.ndarray], int]:
+    """The events of each kind, and how many bytes at the end are no event."""
+    starts: dict[int, list[int]] = {kind: [] for kind in records}
+    sizes = {kind: record.itemsize for kind, record in records.items()}
+    while at + 2 <= len(body):
+        kind = body[at] | body[at + 1] << 8
+        if kind not in sizes or at + sizes[kind] > len(body):
+            break
+        starts[kind].append(at)
+        at += sizes[kind]
+    data = np.frombuffer(body, np.uint8)
+    rows = {}
+    for kind, begin in starts.items():
+        picked = data[np.array(begin, int)[:, None] + np.arange(sizes[kind])]
+        rows[kind] = np.ascontiguousarray(picked).view(records[kind])[:, 0] if begin else np.empty(0, records[kind])
+    return rows, len(body) - at
+
+
+def decompress_quaternions(compressed: np.ndarray) -> Array:
+    """Quaternions (N, 4), x y z w, of ``stateEstimateZ.quat`` (``quatcompress.h``): the top two bits name the largest
+    component, which is positive; the others follow in ten bits each, a sign and a share of sqrt(1/2) of nine bits."""
+    code = np.asarray(compressed).astype(np.uint64)
+    largest = (code >> np.uint64(30)).astype(int)
+    q = np.zeros((len(code), 4))
+    for k in (3, 2, 1, 0):
+        rows = largest != k
+        part = (code[rows] & np.uint64(0x3FF)).astype(int)
+        q[rows, k] = np.where(part >> 9, -1.0, 1.0) * (part & 0x1FF) / 511.0 * 0.5**0.5
+        code[rows] >>= np.uint64(10)
+    q[np.arange(len(q)), largest] = np.sqrt(np.maximum(1.0 - (q * q).sum(-1), 0.0))
+    return q
+
+
+def _text(body: bytes, at: int) -> tuple[str, int]:
+    end = body.index(b"\0", at)
+    return body[at:end].decode(), end + 1

@@ -100,8 +100,8 @@ def identify(
     kept = windows.select(torch.nonzero(~held).flatten())
     if len(kept) < 2 * len(wanted) + 4:
         raise TooLittleFlight(
-            f"identify: {len(kept)} windows of {horizon:g} s are too few for {len(wanted)} unknowns. Give more flights, "
-            "or fewer fields."
+            f"identify: {len(kept)} windows of {horizon:g} s are too few for {len(wanted)} unknowns. Give more "
+            "flights, or fewer fields."
         )
     fit = _Fit(Model(prior, motors, ()), kept, logs, moves_streams, progress)
     fit.file = _Checkpoint(checkpoint, _fingerprint(logs, prior, motors, wanted, past, horizon))
@@ -234,7 +234,7 @@ class _Fit:
     ) -> IdentificationResult:
         """Everything that is reported of the optimum."""
         model = self.model.only(state.free)
-        problem, linear, cover, _ = self.uncertainty(state)
+        _, linear, cover, _ = self.uncertainty(state)
         n = len(state.x)
         quantile = 1.96 * (1.0 + 2.5 / max(len(self.windows) - n, 1))  # of Student's distribution, nearly
         parameters, ratios = report(model, state.x, cover[:n, :n], quantile, has_mass)
@@ -350,7 +350,7 @@ def _refused(
 ) -> dict[str, str]:
     """Fields that got no number, with the reason."""
     owner = {unknown: name for name, unknowns in FIELDS.items() for unknown in unknowns}
-    part = {"drag_xy": ".xy", "drag_z": ".z", "roll": ".x", "pitch": ".y"}
+    part = {"drag_xy": ".xy", "drag_z": ".z", "roll": ".x", "pitch": ".y", "z_ratio": ".z"}
     found = {owner[name] + part.get(name, ""): reason for name, reason in dropped.items()}
     if not has_mass:
         found["mass"] = "motion does not tell it: weigh the drone, and give known={'mass': ...}"

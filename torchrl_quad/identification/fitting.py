@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -13,18 +12,17 @@ from torch.func import jacfwd
 
 from torchrl_quad.identification.parameters import UNKNOWNS, Model
 from torchrl_quad.identification.prediction import differences
-from torchrl_quad.identification.windows import Push, Trajectory, Windows
+from torchrl_quad.identification.windows import Trajectory, Windows
 
 ROBUST = 3.0  # standard deviations, from which a residual counts less and less
 POINTS = 5  # times in a window at which predictions are compared
 MAX_ITERATIONS = 40
-CONVERGED = 1e-4  # change of the coordinates
-_RELATIVE_NOISE = 1e-6  # of a residual's scale: keeps simulated flights without noise from dividing by zero
+CONVERGED = 1e-3  # change of the coordinates in a step
 
 # What a residual is whitened by at the least: position [m], velocity [m/s], attitude [rad], body rate [rad/s], and
-# the constant force [m/s2] and torque [rad/s2].
+# the constant force [m/s2].
 _FLOOR = (1e-4, 1e-3, 1e-4, 1e-3)
-_PUSH_FLOOR = (1e-3, 1e-2)
+_PUSH_FLOOR = 1e-2
 
 
 @dataclasses.dataclass
@@ -113,11 +111,10 @@ class Problem:
         errors, push, gyro = errors.unflatten(1, (POINTS, 4, 3)), push.unflatten(1, (2, 3)), gyro.unflatten(1, (-1, 3))
         floor = raw.new_tensor(_FLOOR)[:, None]
         spread = (1.4826 * errors.abs().median(0).values).mean(-1, keepdim=True).maximum(floor).expand(-1, -1, 3)
-        least = raw.new_tensor(_PUSH_FLOOR)[:, None]
-        # A push that is the same in all windows, as that of a bent rotor, must not be taken for a spread of zero.
-        pushed = (1.4826 * push.abs().median(0).values).maximum(least)
-        if not self.counts_push:
-            pushed = torch.full_like(pushed, 1e9)
+        # Of the pushes, that along the thrust tells the level of thrust. The others are the drone's trim.
+        pushed = torch.full_like(push[0], torch.inf)
+        if self.counts_push:
+            pushed[0, 2] = (1.4826 * push[:, 0, 2].abs().median()).clamp_min(_PUSH_FLOOR)
         turned = (1.4826 * gyro.abs().median(0).values).mean().clamp_min(_FLOOR[2])
         return torch.cat((spread.flatten(), pushed.flatten(), turned.expand(POINTS * 3)))
 
@@ -273,12 +270,3 @@ def _moved(state: State, step: Tensor) -> State:
         stream.low * stream.scale, stream.high * stream.scale
     )
     return dataclasses.replace(state, x=x, streams=streams)
-
-
-def spread_of_pushes(problem: Problem, state: State) -> Any:
-    """The constant force and torque of the windows (W, 2, 3), for reports."""
-    with torch.no_grad():
-        return residuals(problem.model, problem.windows, state.x, state.x.new_zeros(()), state.streams)[1]
-
-
-__all__: Sequence[str] = ("Linear", "Problem", "Push", "State", "bootstrap", "covariance", "minimise")

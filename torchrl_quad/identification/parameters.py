@@ -21,7 +21,7 @@ FIELDS: dict[str, tuple[str, ...]] = {
     "motor_time_constant": ("lag", "asymmetry"),
     "linear_drag": ("drag_xy", "drag_z"),
     "drag_height": ("height",),
-    "inertia": ("roll", "pitch"),
+    "inertia": ("roll", "pitch", "z_ratio"),
     "yaw_torque_coefficient": ("yaw",),
     "command_delay": ("delay",),
     "stream_delay": ("stream",),
@@ -40,7 +40,7 @@ class Unknown:
     why: str  #: what a flight needs to tell it
 
 
-_LOG = {"low": -7.0, "high": 7.0, "wide": math.log(1.6), "scale": None}
+_LOG = {"low": -7.0, "high": 7.0, "wide": math.log(2.0), "scale": None}
 UNKNOWNS = {
     x.name: x
     for x in (
@@ -52,6 +52,7 @@ UNKNOWNS = {
         Unknown("height", -20.0, 20.0, 2.0, 0.01, "fast flight sideways, and quick turns of the body"),
         Unknown("roll", **_LOG, why="quick rolls"),
         Unknown("pitch", **_LOG, why="quick pitching"),
+        Unknown("z_ratio", **{**_LOG, "wide": math.log(1.5)}, why="quick turns about two axes at once"),
         Unknown("yaw", **_LOG, why="yaw manoeuvres"),
         Unknown("delay", -10.0, 10.0, 2.0, 0.01, "quick changes of the motor commands"),
         Unknown("stream", -100 * MAX_DELAY + 5, 100 * MAX_DELAY - 5, 2.0, 0.01, "quick turns of the body"),
@@ -64,7 +65,7 @@ class Model:
     """A drone as a function of the unknowns: coordinates as a tensor (n), in the order of ``free``.
 
     Motion fixes ratios: thrust, drag and inertia by the mass. The coordinates are those ratios, so that the mass is
-    only a scale. The arm and the ratio of the inertias about z and x are those of the prior.
+    only a scale. The arm is the prior's. So is the ratio of the inertia about z to the others, unless it is free, too.
     """
 
     prior: QuadrotorParams  #: float64; its mass is the known one
@@ -89,6 +90,7 @@ class Model:
             "height": prior.drag_height[0] / UNKNOWNS["height"].scale,
             "roll": (arm[1] * k2 / prior.inertia[0]).log(),
             "pitch": (arm[0] * k2 / prior.inertia[1]).log(),
+            "z_ratio": prior.inertia[2].log() - 0.5 * (prior.inertia[0] * prior.inertia[1]).log(),
             "yaw": (prior.yaw_torque_coefficient[0] * k2 / prior.inertia[2]).log(),
             "delay": prior.mass.new_tensor(self.motors.delay / UNKNOWNS["delay"].scale),
             "stream": prior.mass.new_zeros(()),
@@ -120,8 +122,9 @@ class Model:
         grown = k2 / prior.thrust_map[0]
         jx = arm[1] * k2 / c["roll"].exp() if "roll" in c else prior.inertia[0] * grown
         jy = arm[0] * k2 / c["pitch"].exp() if "pitch" in c else prior.inertia[1] * grown
-        jz = prior.inertia[2] * (jx * jy / (prior.inertia[0] * prior.inertia[1])).sqrt()
-        if {"roll", "pitch"} & set(c):
+        ratio = c["z_ratio"].exp() if "z_ratio" in c else prior.inertia[2] / prior.inertia[:2].prod().sqrt()
+        jz = ratio * (jx * jy).sqrt()
+        if {"roll", "pitch", "z_ratio"} & set(c):
             fields["inertia"] = torch.stack([jx, jy, jz])
         if "yaw" in c:
             inertia = fields["inertia"]
@@ -147,6 +150,7 @@ RATIOS: dict[str, tuple[str, str]] = {
     "arm k2/Jx": ("roll", "s"),
     "arm k2/Jy": ("pitch", "s"),
     "kappa k2/Jz": ("yaw", "s"),
+    "Jz/Jxy": ("z_ratio", ""),
 }
 # Fields by name: the unknowns whose logarithms add up to it, with their factors; unit; whether it needs the mass.
 _SUMS: dict[str, tuple[Mapping[str, float], str, bool]] = {
@@ -159,8 +163,8 @@ _SUMS: dict[str, tuple[Mapping[str, float], str, bool]] = {
     "drag_height": ({"height": 1.0}, "m", False),
     "inertia.x": ({"thrust": 1.0, "roll": -1.0}, "kg m2", True),
     "inertia.y": ({"thrust": 1.0, "pitch": -1.0}, "kg m2", True),
-    "inertia.z": ({"thrust": 1.0, "roll": -0.5, "pitch": -0.5}, "kg m2", True),
-    "yaw_torque_coefficient": ({"yaw": 1.0, "roll": -0.5, "pitch": -0.5}, "m", False),
+    "inertia.z": ({"z_ratio": 1.0, "thrust": 1.0, "roll": -0.5, "pitch": -0.5}, "kg m2", True),
+    "yaw_torque_coefficient": ({"yaw": 1.0, "z_ratio": 1.0, "roll": -0.5, "pitch": -0.5}, "m", False),
     "command_delay": ({"delay": 1.0}, "s", False),
 }
 
@@ -191,8 +195,7 @@ def report(model: Model, x: Tensor, covariance: Tensor, quantile: float, has_mas
     parameters: dict[str, dict[str, Any]] = {}
     two = "asymmetry" in place
     for name, (factors, unit, needs_mass) in _SUMS.items():
-        main = "yaw" if name == "yaw_torque_coefficient" else next(reversed(factors)) if "inertia" in name else None
-        main = main or next(iter(factors))
+        main = next(reversed(factors)) if name in ("inertia.x", "inertia.y") else next(iter(factors))
         if main not in place or (needs_mass and not has_mass):
             continue
         if name.startswith("motor_time_constant") and (name == "motor_time_constant") is two:

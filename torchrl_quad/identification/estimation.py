@@ -35,7 +35,6 @@ from torchrl_quad.identification.windows import Trajectory, Windows, cut, stream
 HORIZONS = (0.1, 0.25, 0.5)
 _BLOCK = 2.0  # [s] of flight that are held out together
 _EVERY_BLOCK = 5  # of which the last is held out
-_DEPENDENT = 3.0  # [s], over which windows are taken to err alike
 _BODY_STEP = 0.02  # [s]
 _MASS = "without a known mass, motion only tells its ratio to the mass, which `ratios` gives"
 
@@ -129,7 +128,8 @@ class _Fit:
         self.model, self.windows, self.logs = model, windows, logs
         self.moves_streams, self.progress = moves_streams, progress
         self.file = _Checkpoint(None, "")
-        self.lags = max(1, round(_DEPENDENT / (0.5 * windows.future * windows.dt)))
+        overlap = 2 * (windows.past + windows.future) // windows.future
+        self.lags = max(overlap, round(4.0 * (len(windows) / 100.0) ** (2.0 / 9.0)))
 
     def run(self, wanted: list[str]) -> tuple[State, dict[str, str], str]:
         """Fit what is wanted; leave out what the flights do not tell; then ask for two time constants."""
@@ -236,7 +236,8 @@ class _Fit:
         model = self.model.only(state.free)
         _, linear, cover, _ = self.uncertainty(state)
         n = len(state.x)
-        quantile = 1.96 * (1.0 + 2.5 / max(len(self.windows) - n, 1))  # of Student's distribution, nearly
+        # Student's distribution, nearly, and the bias of a sum over so many of the lags that there are.
+        quantile = 1.96 * (1.0 + 2.5 / max(len(self.windows) - n, 1) + 1.5 * self.lags / len(self.windows))
         parameters, ratios = report(model, state.x, cover[:n, :n], quantile, has_mass)
         changes = bootstrap(linear, self.windows.log, len(self.logs), self.lags, draws, seed) if draws else None
         by_bootstrap = {}

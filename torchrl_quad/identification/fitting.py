@@ -16,7 +16,7 @@ from torchrl_quad.identification.windows import Trajectory, Windows
 
 ROBUST = 3.0  # standard deviations, from which a residual counts less and less
 POINTS = 5  # times in a window at which predictions are compared
-MAX_ITERATIONS = 40
+MAX_ITERATIONS = 30
 CONVERGED = 1e-3  # change of the coordinates in a step
 
 # What a residual is whitened by at the least: position [m], velocity [m/s], attitude [rad], body rate [rad/s], and
@@ -157,7 +157,8 @@ def minimise(
                 cost=cost,
                 damping=max(before.damping / 6.0, 1e-9),
                 iteration=before.iteration + 1,
-                converged=change < CONVERGED and before.iteration >= 8,
+                converged=before.iteration >= 8
+                and (change < CONVERGED or before.cost - cost < CONVERGED * 0.1 * before.cost),
             )
         if report is not None:
             report(state)

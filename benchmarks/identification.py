@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from report import RESULTS, save
+from report import RESULTS, finished, save
 from scipy.signal import savgol_filter
 from tqdm import tqdm
 
@@ -72,7 +72,10 @@ def simulate_flight(
     controller = make_controller(
         {"mode": "velocity", "max_speed": 4.0},
         load_drone("crazyflie", torch.float64).replace(
-            mass=drone.mass, thrust_map=drone.thrust_map, linear_drag=drone.linear_drag, drag_height=drone.drag_height
+            mass=drone.mass,
+            thrust_map=drone.thrust_map,
+            rate_gain=[16.0, 16.0, 6.0],
+            rate_damping=[0.0, 0.0, 0.0],
         ),
     )
     rotors = Rotors(drone)
@@ -211,7 +214,7 @@ def table(rows: list[dict[str, object]]) -> str:
     """One line for each parameter: worst and median error, how many intervals hold the truth."""
     lines = ["| parameter | wanted | median error | worst | intervals that hold the truth |", "|---|---|---|---|---|"]
     for name in dict.fromkeys(str(row["parameter"]) for row in rows):
-        own = [row for row in rows if row["parameter"] == name and "value" in row]
+        own = [row for row in rows if row["parameter"] == name and row.get("value") not in (None, "")]
         kind, scale, unit = ("error", 1e3, " ms") if name.endswith("delay") else ("relative", 1e2, " %")
         errors = [abs(float(row[kind])) * scale for row in own] or [math.nan]
         wanted = f"{WANTED[name] * scale:g}{unit}" if name in WANTED else ""
@@ -224,13 +227,15 @@ def table(rows: list[dict[str, object]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(10)))
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--output", type=Path, default=RESULTS / "identification.csv")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    rows = [row for seed in tqdm(range(options.seeds)) for row in fit(seed, options.seconds)]
-    save(options.output, rows)
+    rows = [row for row in finished(options.output) if row["seed"] not in map(str, options.seeds)]
+    for seed in tqdm(options.seeds):
+        rows += fit(seed, options.seconds)
+        save(options.output, rows)
     print(table(rows))
 
 

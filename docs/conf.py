@@ -19,7 +19,8 @@ shutil.rmtree(Path(__file__).parent / "_api", ignore_errors=True)  # pages of cl
 project = "torchrl_quad"
 version = release = torchrl_quad.__version__
 root_doc = "docs/index"
-include_patterns = ["docs/**.md", "docs/_api/*.rst", "recipes/README.md", "examples/*", "CONTRIBUTING.md"]
+include_patterns = ["docs/**.md", "docs/_api/*.rst", "recipes/README.md", "CONTRIBUTING.md"]
+include_patterns += ["examples/*", "examples/data/README.md"]
 exclude_patterns = ["docs/_build"]
 extensions = [
     "myst_parser",

@@ -23,7 +23,18 @@ from torchrl_quad.envs import TASKS
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
 PAGES += sorted(path for path in ROOT.glob("docs/**/*.md") if "_build" not in path.parts)
-PARTS = ("adapters", "data", "deploy", "dynamics", "engine", "envs", "modules", "objectives", "render")
+PARTS = (
+    "adapters",
+    "data",
+    "deploy",
+    "dynamics",
+    "engine",
+    "envs",
+    "identification",
+    "modules",
+    "objectives",
+    "render",
+)
 AFTER_TRAINING = ("evaluate", "export")  # recipes that read a checkpoint
 PUBLIC = ["torchrl_quad", *(f"torchrl_quad.{part}" for part in PARTS)]
 # Blocks that are not run: text, data, and Sphinx's directives, except those that hold code.
@@ -214,6 +225,8 @@ def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
     program.write_text(BUDGET.sub(r"\1 = 2", "\n".join(lines)))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WANDB_MODE", "offline")
+    if "examples/data" in program.read_text():
+        (tmp_path / "examples").symlink_to(ROOT / "examples")
     if "metrics.csv" in program.read_text():  # it reads what runs have left
         (tmp_path / "outputs/run").mkdir(parents=True)
         (tmp_path / "outputs/run/metrics.csv").write_text("steps,eval/return,eval/crash,grad/actor\n64,1.0,0.0,2.0\n")

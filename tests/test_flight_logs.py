@@ -9,6 +9,7 @@ from log_writers import G, write_csv
 
 from torchrl_quad.identification import (
     ClockJumpsBack,
+    Columns,
     GapsTooLarge,
     InconsistentRates,
     LogError,
@@ -136,6 +137,10 @@ def test_each_fault_has_its_name_and_its_remedy(fault, table, read):
     with pytest.raises(error, match=message) as caught:
         read(change(table))
     assert isinstance(caught.value, LogError) and isinstance(caught.value, ValueError)
+    if fault == "gyro in degrees":  # what the message says to write
+        told = eval(str(caught.value).split("columns=")[1][:-1], {"Columns": Columns, "np": np})
+        mended = read(change(table), columns=told)
+        np.testing.assert_allclose(mended.angular_velocity, read().angular_velocity, atol=1e-6)
 
 
 def test_without_a_gyro_the_lean_of_the_drone_tells_a_wrong_quaternion(table, read):

@@ -65,6 +65,8 @@ def test_a_mapping_reads_any_table_and_rates_are_matched(tmp_path):
     ):
         with pytest.raises(MissingColumns, match=message):
             read_log(path, {**mapping, **wrong})
+    with pytest.raises(MissingColumns, match="No preset knows"):
+        read_log(path, {"angular_velocity": OURS["angular_velocity"]})
     with pytest.raises(MissingColumns, match="has no motor_command"):
         read_log(path, {k: v for k, v in mapping.items() if k != "motor_command"})
     with pytest.raises(MissingColumns, match="No preset knows.*columns="):

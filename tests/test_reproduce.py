@@ -248,8 +248,8 @@ def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(run
     assert len(rows) == 2 and {row["task"] for row in rows} == {"own_task.CornerEnv", "racing"}
     assert all(row["steps"] == "64" and row["machine"] and float(row["seconds"]) > 0 for row in rows)
     page = (tmp_path / "summary.md").read_text()
-    assert "| racing |  |  |  | 0.0% (0.0%), 0.0 gates, " in page
-    assert re.search(r"\| own_task.CornerEnv \|  \|  \|  \| 0.0% \(0.0%\), \d\.\d\d m, ", page)
+    assert "| racing |  |  |  |  | 0.0% (0.0%), 0.0 gates, " in page
+    assert re.search(r"\| own_task.CornerEnv \|  \|  \|  \|  \| 0.0% \(0.0%\), \d\.\d\d m, ", page)
     monkeypatch.setattr(shipped, "run", lambda *_: pytest.fail("It has been flown."))
     run_main(monkeypatch, shipped, *arguments)
     assert (tmp_path / "summary.md").read_text() == page

@@ -30,21 +30,23 @@ from torchrl_quad.envs.scenery import EPISODE_METRICS
 from torchrl_quad.files import machine
 
 SEEDS = tuple(range(10))
-METHODS = {"bptt": "BPTT", "shac": "SHAC", "abpt": "ABPT", "ppo": "PPO"}
+METHODS = {"bptt": "BPTT", "shac": "SHAC", "abpt": "ABPT", "hybrid": "Hybrid", "ppo": "PPO"}
 TASKS = {  # what is shown of each beside the solved episodes: column, factor, digits, unit
     "hovering": ("position_error", 100, 1, "cm"),
     "tracking": ("tracking_rmse", 100, 1, "cm"),
     "landing": ("landing_speed", 1, 2, "m/s"),
     "racing": ("gates_passed", 1, 1, "gates"),
+    "racing_position": ("gates_passed", 1, 1, "gates"),
 }
+VARIANTS = {"racing_position": ["task=racing", "env.reward=position"]}  # of a task: its overrides
 ADDING = Lock()
 
 
 def fly(task: str, method: str, seed: int, output: Path, data: Path, quick: bool) -> None:
     """Train once, and add the final evaluation to the results."""
     folder = output / task / method / f"seed{seed}"
-    own = [f"task={task}", f"seed={seed}", *(QUICK if quick else ()), "resume=auto", f"hydra.run.dir={folder}"]
-    run([sys.executable, str(RECIPES / f"{method}.py"), *own], folder)
+    own = [f"seed={seed}", *(QUICK if quick else ()), "resume=auto", f"hydra.run.dir={folder}"]
+    run([sys.executable, str(RECIPES / f"{method}.py"), *VARIANTS.get(task, [f"task={task}"]), *own], folder)
     end = folder / "summary.json"
     summary = json.loads(end.read_text()) if end.exists() else {"solved": 0.0, "crash": 1.0}  # it diverged
     seconds = read(folder / "metrics.csv")[-1]["time/processor_seconds"]
@@ -66,6 +68,11 @@ def cell(runs: list[dict[str, str]], metric: str, factor: float, digits: int, un
     return f"{np.mean(solved):.1%} ({min(solved):.1%}), {factor * shown:.{digits}f} {unit}, {seconds:.0f} s{some}"
 
 
+def known(name: str) -> str:
+    """Refuse what is neither a task nor a variant of one."""
+    return name if name in VARIANTS else known_task(name)
+
+
 def first_metric(task: str) -> tuple[str, float, int, str]:
     """Show of a task of your own the metric that its class names first; where it has none, the return."""
     own = [x for x in task_class(task).metric_info.items() if x[0] not in EPISODE_METRICS]
@@ -80,14 +87,14 @@ def summary_table(data: Path) -> str:
     for task in sorted(flown, key=[*TASKS, *flown].index):
         shown = TASKS.get(task) or first_metric(task)
         groups = ([x for x in runs if (x["task"], x["algorithm"]) == (task, method)] for method in METHODS)
-        lines.append([task, *(cell(group, *shown) for group in groups)])
+        lines.append([task.replace("_", ", "), *(cell(group, *shown) for group in groups)])
     return table(["", *METHODS.values()], lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cores", type=int, default=os.cpu_count(), help="runs at the same time")
-    parser.add_argument("--tasks", nargs="+", default=list(TASKS), type=known_task, help=OWN)
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), type=known, help=OWN)
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")

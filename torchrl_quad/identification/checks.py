@@ -129,13 +129,11 @@ def check_specific_force(at: Mapping[str, Array], signals: Mapping[str, Signal],
         )
 
 
-def check_rates(
-    at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask
-) -> tuple[str, float | None]:
+def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> str:
     """Hold the gyro against the derivative of the attitude, under every convention that a file may have used.
 
     Returns:
-        what was found, and by how much the gyro lags the attitude [s], if it can be seen.
+        what was found, with the time by which the gyro lags the attitude.
 
     Raises:
         WrongUnit: the gyro is in degrees or milliradians.
@@ -154,13 +152,13 @@ def check_rates(
     }
     if "angular_velocity" not in signals:
         _check_by_thrust(at, given, hypotheses, dt, moving)
-        return "no gyro: angular_velocity was derived from the attitude", None
+        return "no gyro: angular_velocity was derived from the attitude"
     signal, gyro = signals["angular_velocity"], at["angular_velocity"]
     right = smooth(body_rates(q, dt), dt)
     turning = float(np.sqrt((right[moving] ** 2).mean()))
     calm = f"{signal} was not checked: the flight turns too slowly ({turning:.2f} rad/s)"
     if turning < CALM / 5.0:
-        return calm, None
+        return calm
     trials = {name: (smooth(body_rates(h, dt), dt), smooth(gyro, dt)) for name, h in hypotheses.items()}
     trials["body y right, z down"] = (right, smooth(gyro * FRD, dt))
     trials["in the world frame"] = (right, smooth(rotate(q * FLIP, gyro), dt))
@@ -188,7 +186,7 @@ def check_rates(
                 f'columns={{"angular_velocity": Columns({signal.columns!r}, scale={scale})}}.'
             )
     if turning < CALM:
-        return calm, None
+        return calm
     if fit < 0.5:
         raise InconsistentRates(
             f"{signal} does not follow {given}: their correlation is {fit:.2f} at best, also if the quaternion is "
@@ -198,7 +196,7 @@ def check_rates(
         raise WrongUnit(
             f"{signal} is {factor:.3g} times the derivative of {given}. Give its unit by Columns(names, scale=...)."
         )
-    return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late", lag
+    return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late"
 
 
 def _check_by_thrust(

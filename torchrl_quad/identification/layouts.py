@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -150,7 +150,7 @@ def choose(columns: str | Layout | Mapping[str, object], default: Layout | None)
         default_columns = {q: c for q, c in default.columns.items() if q not in ("quaternion", "euler")}
     else:
         default_columns = dict(default.columns)
-    return Layout(default_columns | chosen, default.convention, default.onboard, time)
+    return replace(default, columns=default_columns | chosen, time=time if "time" in columns else default.time)
 
 
 def _as_columns(quantity: str, names: object) -> Columns:

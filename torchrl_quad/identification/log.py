@@ -38,12 +38,12 @@ class FlightLog:
     quaternion: Array  #: (T, 4), unit norm, without jumps of sign
     velocity: Array  #: (T, 3) [m/s], world frame
     angular_velocity: Array  #: (T, 3) [rad/s], body frame
-    acceleration: Array | None  #: (T, 3) [m/s^2], specific force in the body frame: what an accelerometer measures
+    acceleration: Array | None  #: (T, 3) [m/s^2], what an accelerometer measures, body frame
     motor_command: Array  #: (T, 4), 0 to 1 of the full command; front left, back left, back right, front right
     battery_voltage: Array | None  #: (T,) [V]
     setpoint: Mapping[str, Array] | None  #: what the controller was asked for, by name, held between samples
-    segments: tuple[tuple[int, int], ...]  #: (start, stop) of pieces in flight without gaps: ``position[start:stop]``
-    onboard: tuple[str, ...]  #: fields by another clock than the position: late by an unknown, constant delay
+    segments: tuple[tuple[int, int], ...]  #: pieces in flight without gaps, for ``position[start:stop]``
+    onboard: tuple[str, ...]  #: fields by another clock than the position's, late by an unknown, constant delay
     notes: tuple[str, ...]  #: what was found and done, a sentence each
 
     @property
@@ -83,8 +83,8 @@ def read_log(
         path: a file, or the folder of a ROS 2 bag. Its first bytes say of what kind it is.
         columns: which columns are which quantity: a preset's name ("nanobench", "px4", "crazyflie"), a
             :class:`Layout`, or a mapping from quantities to names or :class:`Columns`, in the order of the convention.
-            By default the kind of file and the header decide. For a CSV file a mapping stands alone; for other kinds
-            it replaces entries of their preset.
+            By default the kind of file and the header decide. A mapping replaces entries of the preset for the file;
+            of a CSV file it describes all, if it names the position.
         convention: the frames and orders of the file, of :mod:`torchrl_quad.deploy.frames`; by default the preset's,
             and for a mapping of a CSV file ours. Its ``xyzw`` and ``motors`` say how quaternions and motors are named.
         onboard: fields that another clock than the position's has stamped; "setpoint" is one.
@@ -124,7 +124,7 @@ def read_log(
     moving = sound if sound.sum() > 10 else on
     check_velocity(at, signals, step, moving)
     check_specific_force(at, signals, moving)
-    note, _ = check_rates(at, signals, step, moving)
+    notes.append(check_rates(at, signals, step, moving))
     segments, found = find_pieces(at, valid, step, path.name, clearance, min_duration)
     setpoint = {q.removeprefix("setpoint."): x for q, x in at.items() if q.startswith("setpoint.")}
     present = {q.partition(".")[0] for q in at}
@@ -143,7 +143,7 @@ def read_log(
         setpoint={name: x[:, 0] if x.shape[-1] == 1 else x for name, x in setpoint.items()} or None,
         segments=segments,
         onboard=tuple(f for f in fields if f in present and (f != "angular_velocity" or f in signals)),
-        notes=tuple(notes + [note] + found),
+        notes=tuple(notes + found),
     )
 
 

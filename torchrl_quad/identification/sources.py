@@ -53,12 +53,9 @@ def read_streams(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list
     for magic, (reader, preset) in readers.items():
         if data.startswith(magic):
             layout = LAYOUTS[preset] if columns is None else choose(columns, LAYOUTS[preset])
-            return (*_swap(reader(data, path.name), layout),)
+            streams, notes = reader(data, path.name)
+            return streams, layout, notes
     return _read_csv(data, path, columns)
-
-
-def _swap(read: tuple[list[Stream], list[str]], layout: Layout) -> tuple[list[Stream], Layout, list[str]]:
-    return read[0], layout, read[1]
 
 
 def _read_csv(data: bytes, path: Path, columns: Asked) -> tuple[list[Stream], Layout, list[str]]:
@@ -85,7 +82,11 @@ def _read_csv(data: bytes, path: Path, columns: Asked) -> tuple[list[Stream], La
             f"{path.name} has {len(table)} rows of {table.shape[1]} numbers under {len(header)} names. Give a CSV file "
             "whose first row names the columns, and whose others are samples."
         )
-    layout = match(header, path.name) if columns is None else choose(columns, None)
+    if columns is None:
+        layout = match(header, path.name)
+    else:  # a mapping without a position changes a preset; one with it describes the whole file
+        partial = isinstance(columns, Mapping) and "position" not in columns
+        layout = choose(columns, match(header, path.name) if partial else None)
     asked = {*layout.time.names, *(n for choices in layout.columns.values() for c in choices for n in c.names)}
     missing = sorted(asked - set(header))
     if (isinstance(columns, Mapping) and missing) or layout.time.names[0] not in header:

@@ -29,6 +29,7 @@ def main(cfg: DictConfig) -> None:
         cfg.fields,
         past=cfg.past,
         horizon=cfg.horizon,
+        iterations=cfg.iterations,
         draws=cfg.draws,
         seed=cfg.seed,
         progress=True,

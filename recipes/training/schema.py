@@ -262,6 +262,7 @@ class Identifying(Section):
     folder: str = Field(description="The folder to write.")
     past: Annotated[Real, Field(ge=0)]
     horizon: Positive
+    iterations: Size
     draws: Count = Field(description="Of the bootstrap over windows; 0 for none.")
     seed: Seed
     threads: Threads

@@ -36,6 +36,7 @@ HORIZONS = (0.1, 0.25, 0.5)
 _BLOCK = 2.0  # [s] of flight that are held out together
 _EVERY_BLOCK = 5  # of which the last is held out
 _BODY_STEP = 0.02  # [s]
+_MOST_WINDOWS = 360  # more would cost more and tell little more, since neighbours overlap
 _MASS = "without a known mass, motion only tells its ratio to the mass, which `ratios` gives"
 
 
@@ -47,6 +48,7 @@ def identify(
     *,
     past: float = PAST,
     horizon: float = 0.5,
+    iterations: int = MAX_ITERATIONS,
     draws: int = 200,
     seed: int = 0,
     progress: bool = False,
@@ -69,6 +71,8 @@ def identify(
         fields: what to fit, of ``FIELDS``; None is everything.
         past: time before a window from which its constant disturbance follows [s].
         horizon: length of a window [s].
+        iterations: at most, of each stage: one follows for every unknown that is dropped, and one for rotors with two
+            time constants.
         draws: of the bootstrap over windows.
         seed: of these draws; the rest is deterministic.
         progress: print a line for each step.
@@ -94,7 +98,9 @@ def identify(
     lagging = any("angular_velocity" in x.onboard for x in logs)
     moves_streams = lagging and "stream" in unknowns_of(fields)
     step = min(x.dt * max(1, round(0.01 / x.dt)) for x in logs)
-    windows = cut(logs, horizon, past, 0.5 * horizon, max(1, round(_BODY_STEP / step)), motors.nominal_voltage)
+    seconds = sum((b - a) * x.dt for x in logs for a, b in x.segments)
+    every = max(0.5 * horizon, seconds / _MOST_WINDOWS)
+    windows = cut(logs, horizon, past, every, max(1, round(_BODY_STEP / step)), motors.nominal_voltage)
     held = windows.start * windows.dt // _BLOCK % _EVERY_BLOCK == _EVERY_BLOCK - 1
     kept = windows.select(torch.nonzero(~held).flatten())
     if len(kept) < 2 * len(wanted) + 4:
@@ -102,7 +108,7 @@ def identify(
             f"identify: {len(kept)} windows of {horizon:g} s are too few for {len(wanted)} unknowns. Give more "
             "flights, or fewer fields."
         )
-    fit = _Fit(Model(prior, motors, ()), kept, logs, moves_streams, progress)
+    fit = _Fit(Model(prior, motors, ()), kept, logs, moves_streams, progress, iterations)
     fit.file = _Checkpoint(checkpoint, _fingerprint(logs, prior, motors, wanted, past, horizon))
     state, dropped, two = fit.run(wanted)
     return fit.result(
@@ -123,10 +129,16 @@ class _Fit:
     """One fit: its windows, and the stages in which unknowns come and go."""
 
     def __init__(
-        self, model: Model, windows: Windows, logs: list[FlightLog], moves_streams: bool, progress: bool
+        self,
+        model: Model,
+        windows: Windows,
+        logs: list[FlightLog],
+        moves_streams: bool,
+        progress: bool,
+        iterations: int,
     ) -> None:
         self.model, self.windows, self.logs = model, windows, logs
-        self.moves_streams, self.progress = moves_streams, progress
+        self.moves_streams, self.progress, self.iterations = moves_streams, progress, iterations
         self.file = _Checkpoint(None, "")
         overlap = 2 * (windows.past + windows.future) // windows.future
         self.lags = max(overlap, round(4.0 * (len(windows) / 100.0) ** (2.0 / 9.0)))
@@ -137,7 +149,8 @@ class _Fit:
         free, dropped = [x for x in wanted if x != "asymmetry"], {}
         x = self.model.only(free).start
         while True:
-            state = self.file.resume(f"without {sorted(dropped)}", tuple(free), x, streams)
+            begun = min(4, self.iterations - 1) if dropped else 0  # near the end already
+            state = self.file.resume(f"without {sorted(dropped)}", tuple(free), x, streams, begun)
             state = self._minimise(state, f"without {sorted(dropped)}")
             worst = self._least_certain(state)
             if worst is None:
@@ -151,7 +164,11 @@ class _Fit:
         if "asymmetry" not in wanted or "lag" not in free:
             return state, dropped, "not asked for"
         more = self.file.resume(
-            "two time constants", (*free, "asymmetry"), torch.cat((state.x, state.x.new_zeros(1))), state.streams
+            "two time constants",
+            (*free, "asymmetry"),
+            torch.cat((state.x, state.x.new_zeros(1))),
+            state.streams,
+            min(4, self.iterations - 1),
         )
         more = self._minimise(more, "two time constants")
         _, _, cover, _ = self.uncertainty(more)
@@ -173,12 +190,13 @@ class _Fit:
         problem = self.problem(state)
         linear = problem.linearise(state, update_scale=True)
         cover, bread, scores = covariance(linear, self.windows.log, len(self.logs), self.lags)
-        if len(self.logs) > 2:  # what differs from flight to flight, as the battery does, is uncertain, too
+        if len(self.logs) > 2 and "thrust" in state.free:
+            # The level of thrust differs from flight to flight, with rotors and battery, more than within one.
             sums = scores.new_zeros(len(self.logs), scores.shape[1]).index_add(0, self.windows.log, scores)
             between = (bread @ (sums.T @ sums) @ bread).diag() * len(self.logs) / (len(self.logs) - 1)
-            n = len(state.x)
-            wider = (between / cover.diag().clamp_min(1e-300)).clamp_min(1.0).sqrt()
-            wider[n:] = 1.0
+            wider = torch.ones_like(between)
+            i = state.free.index("thrust")
+            wider[i] = (between[i] / cover[i, i].clamp_min(1e-300)).clamp_min(1.0).sqrt()
             cover = cover * wider[:, None] * wider
         return problem, linear, cover, bread
 
@@ -188,7 +206,7 @@ class _Fit:
             if self.progress:
                 print(f"step {now.iteration}, cost {now.cost:.4g}, {len(now.free)} unknowns, {stage}")
 
-        return minimise(self.problem(state), state, after, MAX_ITERATIONS)
+        return minimise(self.problem(state), state, after, self.iterations)
 
     def _least_certain(self, state: State) -> tuple[str, str] | None:
         """The unknown that the flights tell least of, and why, if that is too little."""
@@ -287,11 +305,11 @@ class _Checkpoint:
     path: str | Path | None
     fingerprint: str
 
-    def resume(self, stage: str, free: tuple[str, ...], x: Tensor, streams: Tensor) -> State:
+    def resume(self, stage: str, free: tuple[str, ...], x: Tensor, streams: Tensor, begun: int = 0) -> State:
         """The last step of a stage, or its start."""
         found = self._read().get(stage)
         if found is None or tuple(found["free"]) != free:
-            return State(free, x, streams)
+            return State(free, x, streams, iteration=begun)
         tensors = {name: torch.tensor(found[name], dtype=torch.float64) for name in ("x", "streams")}
         return State(**{**found, **tensors, "free": free})
 

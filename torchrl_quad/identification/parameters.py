@@ -40,7 +40,7 @@ class Unknown:
     why: str  #: what a flight needs to tell it
 
 
-_LOG = {"low": -7.0, "high": 7.0, "wide": math.log(2.0), "scale": None}
+_LOG = {"low": -7.0, "high": 7.0, "wide": math.log(3.0), "scale": None}
 UNKNOWNS = {
     x.name: x
     for x in (
@@ -52,7 +52,7 @@ UNKNOWNS = {
         Unknown("height", -20.0, 20.0, 2.0, 0.01, "fast flight sideways, and quick turns of the body"),
         Unknown("roll", **_LOG, why="quick rolls"),
         Unknown("pitch", **_LOG, why="quick pitching"),
-        Unknown("z_ratio", **{**_LOG, "wide": math.log(1.5)}, why="quick turns about two axes at once"),
+        Unknown("z_ratio", **{**_LOG, "wide": math.log(2.0)}, why="quick turns about two axes at once"),
         Unknown("yaw", **_LOG, why="yaw manoeuvres"),
         Unknown("delay", -10.0, 10.0, 2.0, 0.01, "quick changes of the motor commands"),
         Unknown("stream", -100 * MAX_DELAY + 5, 100 * MAX_DELAY - 5, 2.0, 0.01, "quick turns of the body"),

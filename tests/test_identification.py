@@ -47,7 +47,7 @@ def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(b
     wanted = ["thrust_map", "motor_time_constant", "inertia", "yaw_torque_coefficient", "command_delay", "stream_delay"]
     known = {"mass": float(truth.mass), "linear_drag": truth.linear_drag, "drag_height": truth.drag_height}
     file = tmp_path / "checkpoint.json"
-    result = identify(log, start, known, wanted, draws=50, checkpoint=file)
+    result = identify(log, start, known, wanted, draws=50, iterations=12, checkpoint=file)
     found = {**result.parameters, **result.ratios}
     tolerance = {"k2/m": 0.01, "arm k2/Jx": 0.04, "arm k2/Jy": 0.04, "kappa k2/Jz": 0.06}
     for name, most in tolerance.items():
@@ -65,7 +65,7 @@ def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(b
     assert 0.3 < (high - low) / (found["k2/m"]["high"] - found["k2/m"]["low"]) < 2.0
 
     # Going on from a finished fit takes no step, and a fit is the same again.
-    again = identify(log, start, known, wanted, draws=50, checkpoint=file, progress=True)
+    again = identify(log, start, known, wanted, draws=50, iterations=12, checkpoint=file, progress=True)
     assert "step" not in capsys.readouterr().out
     assert again.report() == result.report()
 

@@ -54,4 +54,6 @@ def accelerations(
 
 def _is_set(value: Vector) -> bool:
     """Whether it may differ from zero: False only of a constant of compiled code, to which it is then no cost."""
-    return not (isinstance(value, Components) and value.components == (0.0,))
+    if isinstance(value, Components):
+        (value,) = value.components
+    return not (isinstance(value, float) and value == 0.0)

@@ -1,4 +1,4 @@
-"""Train a policy that sees the trees of a forest and remembers them, through the simulator, and count who comes through."""
+"""Train a policy that sees the trees of a forest and remembers them, and count the drones that come through."""
 
 import torch
 from torchrl.envs.utils import ExplorationType

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
         make_env,
         register_task,
     )
-    from torchrl_quad.modules import make_actor, make_qvalue, make_value
+    from torchrl_quad.modules import make_actor, make_qvalue, make_value, make_visual_actor
     from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss, TrustRegion
     from torchrl_quad.vision import DepthCamera
 
@@ -73,6 +73,7 @@ __all__ = [
     "make_env",
     "make_qvalue",
     "make_value",
+    "make_visual_actor",
     "register_envs",
     "register_task",
     "restart",

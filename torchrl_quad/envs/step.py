@@ -34,6 +34,8 @@ class ControlStep:
         self.safe_state, self.guard = safe_state, Guard(safe_state, env.dynamics, env.task_entries)
         self.task_advances = type(env).advance is not Task.advance
         self.event_names = list(env.events(safe_state, safe_state)) if env.event_discount is not None else []
+        eye = env.disturbances.get("camera")
+        self.constants = frozenset(("metrics",) if eye is None or eye.camera.differentiable else ("metrics", "depth"))
         self.drawn = [key[1] for key in safe_state if isinstance(key, tuple) and key[0] == "drone"]
 
     def __call__(self, state: State, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Transition:

@@ -103,12 +103,12 @@ def table(rows: list[dict[str, Any]]) -> str:
     ]
     lines = [head, ["---"] * len(head)]
     for row in rows:
-        reached = []
+        solved, reached = [], []
         for suffix in ("", ", other drones"):
-            gates, lap = row.get(f"gates{suffix}"), row.get(f"lap [s]{suffix}")
-            cell = f"{float(gates):.1f} gates, lap {float(lap):.2f} s" if gates else ""
-            reached.append(cell or f"{float(row[f'error [cm]{suffix}']):.1f} cm")
-        solved = [f"{float(row[f'solved{suffix}']):.1%}" for suffix in ("", ", other drones")]
+            gates, lap, error = (row.get(f"{name}{suffix}") for name in ("gates", "lap [s]", "error [cm]"))
+            solved.append(f"{float(row[f'solved{suffix}']):.1%}" if row.get(f"solved{suffix}") else "")
+            racing = f"{float(gates):.1f} gates, lap {float(lap):.2f} s" if gates else ""
+            reached.append(racing or (f"{float(error):.1f} cm" if error else ""))
         names = {"geometric": "geometric", "mpc": "MPC"}
         name = names.get(row["policy"], f"{row['policy'].upper()}, learned")
         lines.append([row["task"], name, str(row["starts"]), solved[0], reached[0], f"{float(row['ms per step']):.1f}"])

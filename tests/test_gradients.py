@@ -60,20 +60,29 @@ def test_with_respect_to_every_entry_of_the_initial_state_also_through_resets(ma
 @pytest.mark.parametrize("max_episode_steps", [256, 12])
 def test_with_respect_to_the_parameters_of_the_drone_also_through_resets(max_episode_steps):
     env, actions, state = setup(drone="visfly", max_episode_steps=max_episode_steps)
-    actions, params = actions.detach(), env.params
+    # Rotors that slow down later than they speed up, and drag that turns the drone.
+    actions, params = actions.detach(), env.params.replace(motor_time_constant=[0.03, 0.05], drag_height=0.02)
 
-    def with_params(mass, linear_drag, motor_time_constant, inertia, thrust_map):
+    def with_params(mass, linear_drag, motor_time_constant, inertia, thrust_map, drag_height):
         env.params = params.replace(
             mass=mass,
             linear_drag=linear_drag,
             motor_time_constant=motor_time_constant,
             inertia=inertia,
             thrust_map=thrust_map * torch.tensor([1e-6, 1e-5, 1e-2], dtype=torch.float64),
+            drag_height=drag_height,
         )
         return flight(env, actions, state)
 
     scaled_map = params.thrust_map / torch.tensor([1e-6, 1e-5, 1e-2], dtype=torch.float64)
-    values = (params.mass, params.linear_drag, params.motor_time_constant, params.inertia, scaled_map)
+    values = (
+        params.mass,
+        params.linear_drag,
+        params.motor_time_constant,
+        params.inertia,
+        scaled_map,
+        params.drag_height,
+    )
     values = [value.clone().requires_grad_() for value in values]
     # Inertia is of the order of 1e-3, and so needs a small step; all take the same.
     for i, value in enumerate(values):

@@ -257,6 +257,23 @@ class Exporting(Section):
     threads: Threads
 
 
+class Identifying(Section):
+    """The configuration of identify.py."""
+
+    logs: list[str] = Field(min_length=1, description="The paths of flights of one drone, in a list.")
+    drone: str | dict[str, Any] = Field(description="Where the fit starts: a preset, a YAML file, or a mapping.")
+    mass: Positive | None = Field(description="The mass in kg, from a scale; null where it is not known.")
+    known: dict[str, Any] | None = Field(description="Fields of the drone that are known by measurement.")
+    fields: list[str] | None = Field(description="What to fit; null for everything.")
+    folder: str = Field(description="The folder to write.")
+    past: Annotated[Real, Field(ge=0)]
+    horizon: Positive
+    iterations: Size
+    draws: Count = Field(description="Of the bootstrap over windows; 0 for none.")
+    seed: Seed
+    threads: Threads
+
+
 # -- the check ---------------------------------------------------------------------------------------------------------
 
 
@@ -274,7 +291,8 @@ def check(cfg: DictConfig) -> None:
         name = error.full_key or "a setting"
         raise ValueError(f"{name} is missing: write {name}=... on the command line.") from None
     _refuse_none(values)
-    schema = Exporting if "folder" in values else Flying if "checkpoint" in values else Training
+    kinds = {"logs": Identifying, "folder": Exporting, "checkpoint": Flying}
+    schema = next((kind for name, kind in kinds.items() if name in values), Training)
     if isinstance(values.get("task"), str) and isinstance(values.get("env"), dict):
         schema = _with_options(values["task"], values["env"])
     try:

@@ -250,7 +250,7 @@ def _rate_loop(env: QuadrotorEnv, drone: Mapping[str, Any]) -> dict[str, Any] | 
     if "rotor_speed" not in env.dynamics.sizes:
         return None
     gain, inertia, loss = (np.array(drone[k]) for k in ("rate_gain", "inertia", "rate_damping"))
-    tau = drone["motor_time_constant"]
+    tau = np.mean(drone["motor_time_constant"])  # where it differs up and down, their mean
     frequency = np.sqrt(gain / tau)
     ratio = (1.0 + loss / inertia) / (2.0 * np.sqrt(gain * tau))
     part = 1.0 - 2.0 * ratio**2

@@ -11,6 +11,7 @@ from torchrl_quad.dynamics.modes import (
     VelocityController,
     make_controller,
 )
+from torchrl_quad.dynamics.motors import MotorCommand
 from torchrl_quad.dynamics.parameters import QuadrotorParams, available_drones, load_drone
 from torchrl_quad.dynamics.point_mass import PointMass
 from torchrl_quad.dynamics.quadrotor import Quadrotor, QuadrotorState, control_step, physics_step
@@ -26,6 +27,7 @@ __all__ = [
     "AttitudeController",
     "Dynamics",
     "FlightController",
+    "MotorCommand",
     "PointMass",
     "Quadrotor",
     "QuadrotorParams",

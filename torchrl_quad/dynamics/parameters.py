@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import presets
+from torchrl_quad.dynamics.motors import MotorCommand
 
 _DRONES = resources.files(__package__) / "drones"
 
@@ -35,7 +36,10 @@ _FIELDS = {
     "max_body_rate": ((3,), 1e-2, 1e2),
     "max_thrust_to_weight": ((1,), 1e-1, 1e2),
     "gravity": ((1,), 1e-2, 1e3),
+    "drag_height": ((1,), -1e0, 1e0),
 }
+_OTHER_SHAPES = {"motor_time_constant": (2,)}  # which a field may have as well
+_OPTIONAL = {"drag_height": 0.0}
 LIMITS = {name: (low, high) for name, (_, low, high) in _FIELDS.items()}
 # The fields that only the flight controller reads, from its nominal drone; and those of the drone that flies.
 CONTROLLER_FIELDS = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
@@ -64,7 +68,7 @@ class QuadrotorParams:
     thrust_map: Tensor  #: (3), k2 [N s2], k1 [N s] and k0 [N] of thrust = k2 w^2 + k1 w + k0
     rotor_speed_min: Tensor  #: (1) [rad/s]
     rotor_speed_max: Tensor  #: (1) [rad/s]
-    motor_time_constant: Tensor  #: (1) [s]
+    motor_time_constant: Tensor  #: (1) [s], or (2) for rotors that speed up and slow down at a different pace
     linear_drag: Tensor  #: (3) [N s/m]
     quadratic_drag: Tensor  #: (3) [N s2/m2]
     rate_gain: Tensor  #: (3) [1/s], times the inertia
@@ -72,9 +76,13 @@ class QuadrotorParams:
     max_body_rate: Tensor  #: (3) [rad/s], commanded at full stick
     max_thrust_to_weight: Tensor  #: (1), commanded at full stick
     gravity: Tensor  #: (1) [m/s2]
+    drag_height: Tensor | float = 0.0  #: (1) [m], above the centre of mass, where the drag acts
+    motor_command: MotorCommand | None = None  #: from motor commands of logs to rotor speeds; None where unknown
 
     def __post_init__(self) -> None:
         for name, value in self.fields().items():
+            if name in _OPTIONAL and not isinstance(value, Tensor):
+                value = torch.as_tensor(self.mass).new_tensor(value)
             value = torch.as_tensor(value)
             value = value if value.dim() else value.reshape(1)
             object.__setattr__(self, name, value)
@@ -133,7 +141,8 @@ class QuadrotorParams:
         return len(_FIELDS[name][0])
 
     def _map(self, function) -> QuadrotorParams:
-        return QuadrotorParams(**{name: function(value) for name, value in self.fields().items()})
+        mapped = {name: function(value) for name, value in self.fields().items()}
+        return QuadrotorParams(**mapped, motor_command=self.motor_command)
 
 
 def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torch.float32) -> QuadrotorParams:
@@ -148,12 +157,15 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
         FileNotFoundError: the path does not exist.
     """
     source, values = presets.read("drone", drone, _DRONES)
+    values = {**_OPTIONAL, **values}
+    motors = values.pop("motor_command", None)
     missing = [name for name in _FIELDS if name not in values]
     unknown = sorted(str(name) for name in values if name not in _FIELDS)
     if missing:
-        raise ValueError(f"{source}: missing field {missing[0]!r}. Required: {', '.join(_FIELDS)}.")
+        required = ", ".join(name for name in _FIELDS if name not in _OPTIONAL)
+        raise ValueError(f"{source}: missing field {missing[0]!r}. Required: {required}.")
     if unknown:
-        raise ValueError(f"{source}: unknown field {unknown[0]!r}. Allowed: {', '.join(_FIELDS)}.")
+        raise ValueError(f"{source}: unknown field {unknown[0]!r}. Allowed: {', '.join(_FIELDS)}, motor_command.")
     fields = {}
     for name in _FIELDS:
         try:
@@ -163,7 +175,8 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
                 f"{source}: field {name!r} is not a number or a list of numbers: {values[name]!r}."
             ) from error
         _check(name, fields[name] if fields[name].dim() else fields[name].reshape(1), source)
-    return QuadrotorParams(**fields).to(dtype=dtype)
+    command = None if motors is None else MotorCommand.read(source, motors)
+    return QuadrotorParams(**fields, motor_command=command).to(dtype=dtype)
 
 
 def available_drones() -> list[str]:
@@ -173,7 +186,8 @@ def available_drones() -> list[str]:
 
 def _check(name: str, value: Tensor, source: str) -> None:
     shape, low, high = _FIELDS[name]
-    if value.shape != shape and value.shape[1:] != shape:
+    shapes = (shape, _OTHER_SHAPES.get(name))
+    if value.shape not in shapes and value.shape[1:] not in shapes:
         batched = ("num_envs", *shape)
         raise ValueError(
             f"{source}: field {name!r} has shape {tuple(value.shape)}; it must be {shape} for one drone, "

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.parameters import QuadrotorParams
-from torchrl_quad.dynamics.vector import Vector, along_z, cross, multiply_add
+from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, cross, multiply_add
 
 
 class RigidBodyState(NamedTuple):
@@ -39,10 +39,21 @@ def accelerations(
 ) -> tuple[Vector, Vector]:
     """Linear acceleration (world frame) and angular acceleration (body frame), each (*, 3), under a wrench (*, 4).
 
-    Drag acts on the velocity relative to the wind (*, 3) [m/s], world frame; None is still air.
+    Drag acts on the velocity relative to the wind (*, 3) [m/s], world frame; None is still air. It acts ``drag_height``
+    above the centre of mass, so that a drone that flies forward is pitched up.
     """
     airspeed = state.velocity if wind is None else state.velocity - wind
     velocity_body = quaternion.rotate_inverse(state.quaternion, airspeed)
-    force_body = drag(velocity_body, params) + along_z(wrench[..., :1])
-    linear = quaternion.rotate(state.quaternion, force_body / params.mass) - along_z(params.gravity)
-    return linear, angular_acceleration(state.angular_velocity, wrench[..., 1:], params.inertia)
+    air, torque = drag(velocity_body, params), wrench[..., 1:]
+    if _is_set(params.drag_height):
+        lever, (x, y, z) = params.drag_height, (torque[..., i : i + 1] for i in range(3))
+        torque = cat(x - lever * air[..., 1:2], y + lever * air[..., :1], z)
+    linear = quaternion.rotate(state.quaternion, (air + along_z(wrench[..., :1])) / params.mass)
+    return linear - along_z(params.gravity), angular_acceleration(state.angular_velocity, torque, params.inertia)
+
+
+def _is_set(value: Vector) -> bool:
+    """Whether it may differ from zero: False only of a constant of compiled code, to which it is then no cost."""
+    if isinstance(value, Components):
+        (value,) = value.components
+    return not (isinstance(value, float) and value == 0.0)

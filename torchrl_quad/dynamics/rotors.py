@@ -19,6 +19,8 @@ from torchrl_quad.dynamics.vector import (
     multiply_add,
     unbind,
     unbind_rows,
+    where_positive,
+    width,
 )
 
 
@@ -63,7 +65,10 @@ class Rotors:
 
     def follow(self, speed: Vector, commanded: Vector, dt: float) -> Vector:
         """Rotor speed (*, 4) after dt [s] of first-order lag towards a constant command: exact for any dt."""
-        return multiply_add(commanded, (-dt / self.time_constant).exp(), speed - commanded)
+        remains = (-dt / self.time_constant).exp()
+        if width(remains) > 1:  # one rotor speeds up at the pace of the first, and slows down at that of the second
+            remains = where_positive(commanded - speed, remains[..., :1], remains[..., 1:])
+        return multiply_add(commanded, remains, speed - commanded)
 
 
 def thrust_limits(params: QuadrotorParams) -> tuple[Tensor, Tensor]:

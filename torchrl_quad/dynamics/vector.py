@@ -183,8 +183,15 @@ def where_positive(condition: Vector, a: Vector, b: Vector) -> Vector:
     """a where the condition is above zero, b elsewhere, entry by entry."""
     if isinstance(condition, Tensor):
         return torch.where(condition > 0, a, b)
-    entries = zip(condition.components, a.components, b.components, strict=True)
+    k = len(condition.components)
+    a, b = (x.components * k if len(x.components) == 1 else x.components for x in (a, b))
+    entries = zip(condition.components, a, b, strict=True)
     return Components([torch.where(x > 0, y, z) for x, y, z in entries])
+
+
+def width(x: Vector) -> int:
+    """The number k of entries of a vector (*, k)."""
+    return x.shape[-1] if isinstance(x, Tensor) else len(x.components)
 
 
 def is_same(a: Vector, b: Vector) -> bool:

@@ -43,3 +43,15 @@ class InconsistentRates(LogError):
 
 class NoFlight(LogError):
     """Nothing in the file flies: the motors stand, or the drone stays on the ground."""
+
+
+class TooShort(LogError):
+    """No piece of the flight is long enough to predict anything."""
+
+
+class TooLittleFlight(LogError):
+    """The flights have fewer windows than a fit has unknowns."""
+
+
+class UnknownField(LogError):
+    """A field cannot be identified, or is not known."""

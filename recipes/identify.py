@@ -1,0 +1,44 @@
+"""Fit a drone to logs of its flights: its parameters with intervals, as files that environments and recipes take.
+
+python recipes/identify.py 'logs=[flight1.csv, flight2.csv]' drone=crazyflie mass=0.027
+"""
+
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from training.launch import recipe
+
+from torchrl_quad.identification import identify, read_log
+
+
+@recipe("identify")
+def main(cfg: DictConfig) -> None:
+    torch.set_num_threads(cfg.threads)
+    logs = [read_log(path) for path in cfg.logs]
+    for log in logs:
+        print(log)
+    known = dict(cfg.known or {}) | ({} if cfg.mass is None else {"mass": cfg.mass})
+    folder = Path(cfg.folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    drone = OmegaConf.to_container(cfg.drone) if OmegaConf.is_config(cfg.drone) else cfg.drone
+    result = identify(
+        logs,
+        drone,
+        known,
+        cfg.fields,
+        past=cfg.past,
+        horizon=cfg.horizon,
+        iterations=cfg.iterations,
+        draws=cfg.draws,
+        seed=cfg.seed,
+        progress=True,
+        checkpoint=folder / "checkpoint.json",
+    )
+    result.save(folder)
+    print(result)
+    print(f"{folder}: python recipes/abpt.py env.drone={folder}/drone.yaml env.randomize={folder}/randomization.yaml")
+
+
+if __name__ == "__main__":
+    main()

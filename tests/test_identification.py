@@ -1,0 +1,171 @@
+"""From flights to parameters: simulated flights whose truth is known, and a real one."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_quad import HoveringEnv, load_drone
+from torchrl_quad.dynamics import MotorCommand
+from torchrl_quad.identification import TooLittleFlight, TooShort, UnknownField, identify, prediction_error, read_log
+
+ROOT = Path(__file__).parents[1]
+REAL = ROOT / "examples/data/figure8.csv.gz"
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    import identification
+
+    return identification
+
+
+@pytest.fixture(scope="module")
+def simulated(benchmark):
+    """A noisy flight of eight seconds, simulated in steps of half a sample of the log."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(benchmark, "STEP", 0.005)
+        patch.setattr(benchmark, "CONTROL", 1)
+        patch.setattr(benchmark, "SAMPLE", 2)
+        truth = benchmark.true_drone()
+        return benchmark.simulate_flight(0, truth, seconds=8.0, stream_delay=0.015), truth
+
+
+@pytest.fixture(scope="module")
+def real():
+    return read_log(REAL)
+
+
+def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(benchmark, simulated, tmp_path, capsys):
+    log, truth = simulated
+    start = benchmark.start(0, truth)
+    wanted = ["thrust_map", "motor_time_constant", "inertia", "yaw_torque_coefficient", "command_delay", "stream_delay"]
+    known = {"mass": float(truth.mass), "linear_drag": truth.linear_drag, "drag_height": truth.drag_height}
+    file = tmp_path / "checkpoint.json"
+    result = identify(log, start, known, wanted, draws=50, iterations=12, checkpoint=file)
+    found = {**result.parameters, **result.ratios}
+    tolerance = {"k2/m": 0.01, "arm k2/Jx": 0.04, "arm k2/Jy": 0.04, "kappa k2/Jz": 0.06}
+    for name, most in tolerance.items():
+        value = benchmark.truths(truth)[name]
+        assert found[name]["value"] == pytest.approx(value, rel=most), name
+        assert found[name]["low"] < found[name]["value"] < found[name]["high"]
+    tau = found.get("motor_time_constant", found.get("motor_time_constant.rising"))["value"]
+    assert tau == pytest.approx(0.045, rel=0.2)
+    assert result.stream_delay[log.name]["value"] == pytest.approx(0.015, abs=0.005)
+    assert found["command_delay"]["value"] == pytest.approx(0.012, abs=0.008)
+    before, after = (result.errors[k]["attitude"][0.5] for k in ("prior", "fitted"))
+    assert after < 0.5 * before
+    # The intervals of the bootstrap are about as wide as those of the Jacobian.
+    low, high = result.bootstrap["k2/m"]
+    assert 0.3 < (high - low) / (found["k2/m"]["high"] - found["k2/m"]["low"]) < 2.0
+
+    # Going on from a finished fit takes no step, and a fit is the same again.
+    again = identify(log, start, known, wanted, draws=50, iterations=12, checkpoint=file, progress=True)
+    assert "step" not in capsys.readouterr().out
+    assert again.report() == result.report()
+
+    folder = result.save(tmp_path / "fit", pictures=False)
+    drone = load_drone(folder / "drone.yaml", torch.float64)
+    assert drone.motor_command.delay == pytest.approx(result.drone.motor_command.delay, rel=1e-5)
+    errors = prediction_error(log, folder / "drone.yaml")
+    assert errors["position"] == pytest.approx(prediction_error(log, result)["position"], rel=1e-3)
+    env = HoveringEnv(num_envs=3, drone=str(folder / "drone.yaml"), randomize=str(folder / "randomization.yaml"))
+    assert (env.reset()["state", "drone", "inertia"][:, 0].std() > 0).all()
+    report = json.loads((folder / "report.json").read_text())
+    assert report["parameters"]["inertia.x"]["value"] == found["inertia.x"]["value"]
+
+
+def test_what_a_flight_does_not_tell_gets_no_number_but_a_reason(simulated):
+    log, truth = simulated
+    hover = dataclasses.replace(
+        log,
+        velocity=0.0 * log.velocity,
+        position=0.0 * log.position + [0.0, 0.0, 1.0],
+        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time), 1)),
+        angular_velocity=0.0 * log.angular_velocity,
+        motor_command=0.0 * log.motor_command + 0.5,
+        onboard=(),
+    )
+    result = identify(hover, truth, fields=["thrust_map", "linear_drag", "inertia"], iterations=2, draws=0)
+    assert set(result.ratios) == {"k2/m"}
+    assert result.parameters == {}  # no mass, no numbers that scale with it
+    assert {"mass", "thrust_map", "linear_drag.xy", "linear_drag.z", "inertia.x", "inertia.y"} <= set(
+        result.not_identifiable
+    )
+    assert "nothing in the flights depends on it" in result.not_identifiable["inertia.x"]
+    assert "weigh the drone" in result.not_identifiable["mass"]
+    torch.testing.assert_close(result.drone.linear_drag, truth.linear_drag)
+
+
+def test_predictions_of_a_drone_that_is_right_are_right_and_of_one_that_drifts_are_worked_by_hand(simulated, real):
+    log, truth = simulated
+    errors = prediction_error(log, truth, (0.1, 0.5))
+    wrong = prediction_error(log, truth.replace(inertia=2.0 * truth.inertia), (0.1, 0.5))
+    coasting = prediction_error(log, "constant_velocity", (0.1, 0.5))
+    for name in ("velocity", "attitude", "body_rate"):
+        assert errors[name][0.5] < 0.35 * coasting[name][0.5], name
+        assert name == "velocity" or errors[name][0.5] < 0.5 * wrong[name][0.5], name
+    # A flight along a parabola: constant velocity misses it by g t^2 / 2.
+    time = real.time
+    fall = np.stack((0.0 * time, 0.0 * time, -0.5 * 9.81 * time**2), 1)
+    falling = dataclasses.replace(
+        real,
+        position=fall,
+        velocity=np.gradient(fall, real.dt, axis=0),
+        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)),
+        angular_velocity=np.zeros_like(fall),
+    )
+    missed = prediction_error(falling, "constant_velocity", (0.4,))
+    assert missed["position"][0.4] == pytest.approx(0.5 * 9.81 * 0.16, rel=1e-6)
+    assert missed["velocity"][0.4] == pytest.approx(9.81 * 0.4, rel=1e-6)
+    # A drone that knows no motors carries its weight: along this flight it is not far off after a tenth of a second.
+    plain = dataclasses.replace(load_drone("visfly", torch.float64), motor_command=None)
+    assert prediction_error(real, plain, (0.1,))["position"][0.1] < 0.01
+
+
+def test_bad_input_of_a_fit_is_refused_by_name(real, tmp_path):
+    with pytest.raises(UnknownField, match="cannot fit 'mass'. Choose from: thrust_map"):
+        identify(real, fields=["mass"])
+    with pytest.raises(TooLittleFlight, match="at least one flight"):
+        identify([])
+    short = dataclasses.replace(real, segments=((300, 420),))
+    with pytest.raises(TooShort, match="no piece of the flight is 1.90 s long"):
+        prediction_error(short, "crazyflie")
+    with pytest.raises(TooLittleFlight, match="too few"):
+        identify(dataclasses.replace(real, segments=((300, 600),)))
+    with pytest.raises(ValueError, match=r"horizons and every must be positive \[s\]"):
+        prediction_error(real, "crazyflie", (-0.1,))
+    with pytest.raises(ValueError, match="motor_command: missing key 'nominal_voltage'"):
+        load_drone({**_plain("visfly"), "motor_command": {"speed_per_volt": 500.0}})
+    with pytest.raises(ValueError, match="speed_per_volt must be between"):
+        MotorCommand(-1.0, 3.7)
+    broken = tmp_path / "checkpoint.json"
+    broken.write_text("{")
+    with pytest.raises(ValueError, match="is no checkpoint of a fit"):
+        identify(real, fields=["linear_drag"], checkpoint=broken)
+
+
+def test_the_recipe_fits_a_real_flight_and_draws_it(launch, refused, tmp_path):
+    arguments = [f"logs=[{REAL}]", "mass=0.027", "fields=[linear_drag]", "iterations=2", "draws=5"]
+    said = launch("identify", *arguments, f"folder={tmp_path}/fit")
+    assert "linear_drag.xy" in said
+    names = {path.name for path in (tmp_path / "fit").iterdir()}
+    assert names == {
+        "checkpoint.json",
+        "drone.yaml",
+        "prediction.png",
+        "randomization.yaml",
+        "report.json",
+        "residuals.png",
+    }
+    assert refused("identify", "logs=[none.csv]").startswith("Error: none.csv")
+    assert "mass=-1: it must be greater than 0" in refused("identify", f"logs=[{REAL}]", "mass=-1")
+
+
+def _plain(name):
+    return {key: value.squeeze().tolist() for key, value in load_drone(name).fields().items()}

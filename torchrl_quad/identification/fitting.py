@@ -1,0 +1,273 @@
+"""Damped Gauss-Newton steps on the predictions of all windows at once, and how certain their result is."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.func import jacfwd
+
+from torchrl_quad.identification.parameters import UNKNOWNS, Model
+from torchrl_quad.identification.prediction import differences
+from torchrl_quad.identification.windows import Trajectory, Windows
+
+ROBUST = 3.0  # standard deviations, from which a residual counts less and less
+POINTS = 5  # times in a window at which predictions are compared
+MAX_ITERATIONS = 30
+CONVERGED = 1e-3  # change of the coordinates in a step
+
+# What a residual is whitened by at the least: position [m], velocity [m/s], attitude [rad], body rate [rad/s], and
+# the constant force [m/s2].
+_FLOOR = (1e-4, 1e-3, 1e-4, 1e-3)
+_PUSH_FLOOR = 1e-2
+
+
+@dataclasses.dataclass
+class State:
+    """Where a fit stands; plain tensors, so that it can be saved and resumed."""
+
+    free: tuple[str, ...]
+    x: Tensor  #: (n), coordinates of the drone
+    streams: Tensor  #: (L) [s], delays of the on-board clocks
+    damping: float = 1e-3
+    iteration: int = 0
+    cost: float = math.inf
+    converged: bool = False
+
+
+@dataclasses.dataclass
+class Linear:
+    """Residuals and their derivative at one point, and the weights that both have in the cost."""
+
+    residual: Tensor  #: (W, m), whitened
+    jacobian: Tensor  #: (W, m, n + 1): the coordinates, then the window's stream delay
+    weight: Tensor  #: (W, m)
+
+
+def residuals(
+    model: Model, windows: Windows, x: Tensor, shift: Tensor, streams: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Errors of the predictions (W, POINTS, 4, 3), constant pushes before the windows (W, 2, 3), and gyro (W, p, 3).
+
+    ``shift`` () [s] moves the stream delays of all logs (L), so that one derivative serves each of them.
+    """
+    plant = model.plant(x, (streams + shift)[windows.log])
+    speed = windows.rotor_speed(plant)
+    push = windows.push(plant, speed)
+    seen = windows.measured(plant.stream_delay, torch.arange(0, windows.future + 1, windows.stride))
+    flown = windows.fly(plant, seen.at(0), speed, push)
+    steps = windows.future // windows.stride
+    points = torch.arange(1, POINTS + 1) * steps // POINTS
+    errors = differences(*(Trajectory(*(y[:, points] for y in z)) for z in (flown, seen)))
+    return errors, torch.stack(push, -2), windows.turning(plant.stream_delay, windows.future // POINTS)
+
+
+class Problem:
+    """The windows of some flights and a model whose predictions are to fit them.
+
+    A window starts in its measured state, so its length decides how far errors of the model can grow. Residuals are
+    whitened by their own spread (median) at each time of the window, and count robustly (pseudo-Huber). The constant
+    pushes before the windows are residuals, too: a model that needs none is the better one.
+    """
+
+    def __init__(self, model: Model, windows: Windows, moves_streams: bool, counts_push: bool) -> None:
+        self.model, self.windows = model, windows
+        self.moves_streams, self.counts_push = moves_streams, counts_push
+        self.scale: Tensor | None = None
+
+    def raw(self, x: Tensor, shift: Tensor, streams: Tensor) -> Tensor:
+        """All residuals of each window, (W, m)."""
+        return torch.cat([part.flatten(1) for part in residuals(self.model, self.windows, x, shift, streams)], 1)
+
+    def cost(self, state: State) -> float:
+        """What is minimised, at a state."""
+        raw = self.raw(state.x, state.x.new_zeros(()), state.streams)
+        return float(_pseudo_huber(raw / self.scale).sum()) / len(raw)
+
+    def linearise(self, state: State, update_scale: bool) -> Linear:
+        """Residuals and derivatives at a state."""
+        n = len(state.x)
+
+        def f(z: Tensor) -> tuple[Tensor, Tensor]:
+            raw = self.raw(z[:n], z[n], state.streams)
+            return raw, raw
+
+        jacobian, raw = jacfwd(f, has_aux=True)(torch.cat((state.x, state.x.new_zeros(1))))
+        if update_scale or self.scale is None:
+            self.scale = self._spread(raw)
+        residual = raw / self.scale
+        jacobian = jacobian / self.scale[:, None]
+        jacobian[..., n] *= UNKNOWNS["stream"].scale
+        if not self.moves_streams:
+            jacobian[..., n] = 0.0
+        return Linear(residual, jacobian, (1.0 + (residual / ROBUST).square()).rsqrt())
+
+    def _spread(self, raw: Tensor) -> Tensor:
+        """The standard deviation (m) of each residual, from medians; one for the three axes together."""
+        errors, push, gyro = raw.split((POINTS * 12, 6, POINTS * 3), 1)
+        errors, push, gyro = errors.unflatten(1, (POINTS, 4, 3)), push.unflatten(1, (2, 3)), gyro.unflatten(1, (-1, 3))
+        floor = raw.new_tensor(_FLOOR)[:, None]
+        spread = (1.4826 * errors.abs().median(0).values).mean(-1, keepdim=True).maximum(floor).expand(-1, -1, 3)
+        # Of the pushes, that along the thrust tells the level of thrust. The others are the drone's trim.
+        pushed = torch.full_like(push[0], torch.inf)
+        if self.counts_push:
+            pushed[0, 2] = (1.4826 * push[:, 0, 2].abs().median()).clamp_min(_PUSH_FLOOR)
+        turned = (1.4826 * gyro.abs().median(0).values).mean().clamp_min(_FLOOR[2])
+        return torch.cat((spread.flatten(), pushed.flatten(), turned.expand(POINTS * 3)))
+
+
+def minimise(
+    problem: Problem,
+    state: State,
+    report: Callable[[State], None] | None = None,
+    max_iterations: int = MAX_ITERATIONS,
+) -> State:
+    """Levenberg-Marquardt steps until the coordinates stand still. The scales of the residuals follow the first ones.
+
+    Args:
+        problem: what to minimise.
+        state: where to start, or to go on.
+        report: called after each iteration, with the state there.
+        max_iterations: at most, counted from the start of the state.
+    """
+    while not state.converged and state.iteration < max_iterations:
+        linear = problem.linearise(state, update_scale=state.iteration < 8)
+        state.cost = problem.cost(state)
+        hessian, gradient = normal_equations(linear, problem.windows.log, len(state.streams))
+        moved = None
+        for _ in range(8):
+            step = _solve(hessian, gradient, state.damping)
+            trial = _moved(state, step)
+            cost = problem.cost(trial)
+            if math.isfinite(cost) and cost <= state.cost * (1.0 + 1e-9):
+                moved = trial
+                break
+            state.damping *= 8.0
+        before = state
+        if moved is None:
+            state = dataclasses.replace(state, iteration=state.iteration + 1, converged=True)
+        else:
+            change = float((moved.x - before.x).abs().max()) if len(before.x) else 0.0
+            change = max(change, float((moved.streams - before.streams).abs().max()) / UNKNOWNS["stream"].scale)
+            state = dataclasses.replace(
+                moved,
+                cost=cost,
+                damping=max(before.damping / 6.0, 1e-9),
+                iteration=before.iteration + 1,
+                converged=before.iteration >= 8
+                and (change < CONVERGED or before.cost - cost < CONVERGED * 0.1 * before.cost),
+            )
+        if report is not None:
+            report(state)
+    return state
+
+
+def normal_equations(linear: Linear, log: Tensor, logs: int) -> tuple[Tensor, Tensor]:
+    """Hessian (n + L, n + L) and gradient (n + L) of all windows, with a stream delay for each log."""
+    h, g = per_window(linear)
+    n = linear.jacobian.shape[-1] - 1
+    hessian, gradient = h.new_zeros(n + logs, n + logs), g.new_zeros(n + logs)
+    hessian[:n, :n], gradient[:n] = h[:, :n, :n].sum(0), g[:, :n].sum(0)
+    for k in range(logs):
+        own = log == k
+        hessian[:n, n + k] = hessian[n + k, :n] = h[own, :n, n].sum(0)
+        hessian[n + k, n + k], gradient[n + k] = h[own, n, n].sum(), g[own, n].sum()
+    return hessian, gradient
+
+
+def per_window(linear: Linear) -> tuple[Tensor, Tensor]:
+    """Hessian (W, n + 1, n + 1) and gradient (W, n + 1) of each window."""
+    weighted = linear.jacobian * linear.weight.unsqueeze(-1)
+    hessian = weighted.transpose(1, 2) @ linear.jacobian
+    return hessian, (weighted * linear.residual.unsqueeze(-1)).sum(1)
+
+
+def covariance(linear: Linear, log: Tensor, logs: int, lags: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The covariance (n + L, n + L) of the unknowns, with the inverse Hessian and the scores (W, n + L) behind it.
+
+    It is a sandwich: windows that follow each other err alike, since the air, the battery and the model's own faults
+    stay, so the scores of windows up to ``lags`` apart are summed (Newey and West 1987).
+    """
+    hessian, _ = normal_equations(linear, log, logs)
+    _, g = per_window(linear)
+    n = g.shape[1] - 1
+    scores = g.new_zeros(len(g), n + logs)
+    scores[:, :n] = g[:, :n]
+    scores[torch.arange(len(g)), n + log] = g[:, n]
+    bread = _inverse(hessian)
+    meat = scores.T @ scores
+    for lag in range(1, lags + 1):
+        same = (log[lag:] == log[:-lag]).to(scores).unsqueeze(1)
+        part = (scores[lag:] * same).T @ scores[:-lag]
+        meat += (1.0 - lag / (lags + 1.0)) * (part + part.T)
+    used = int((hessian.diag() > 0).sum())
+    correction = len(g) / max(len(g) - used, 1)
+    return correction * bread @ meat @ bread, bread, scores
+
+
+def bootstrap(linear: Linear, log: Tensor, logs: int, block: int, draws: int, seed: int) -> Tensor:
+    """Changes of the unknowns (draws, n + L) where blocks of windows are drawn anew, with one Gauss-Newton step each.
+
+    Args:
+        linear: at the optimum.
+        log: of each window (W).
+        logs: how many there are.
+        block: windows in a block.
+        draws: how many.
+        seed: of the draws.
+    """
+    h, g = per_window(linear)
+    n = g.shape[1] - 1
+    place = torch.cat((torch.arange(n).expand(len(g), n), (n + log).unsqueeze(1)), 1)
+    hessians, scores = g.new_zeros(len(g), n + logs, n + logs), g.new_zeros(len(g), n + logs)
+    index = torch.arange(len(g))
+    hessians[index[:, None, None], place[:, :, None], place[:, None, :]] = h
+    scores[index[:, None], place] = g
+    generator = torch.Generator().manual_seed(seed)
+    blocks = -(-len(g) // block)
+    changes = []
+    for _ in range(draws):
+        first = torch.randint(len(g), (blocks,), generator=generator)
+        drawn = ((first[:, None] + torch.arange(block)) % len(g)).flatten()[: len(g)]
+        counts = torch.bincount(drawn, minlength=len(g)).to(g)
+        hessian = (counts[:, None, None] * hessians).sum(0)
+        changes.append(-_inverse(hessian) @ (counts[:, None] * scores).sum(0))
+    return torch.stack(changes)
+
+
+def _pseudo_huber(residual: Tensor) -> Tensor:
+    return ROBUST**2 * ((1.0 + (residual / ROBUST).square()).sqrt() - 1.0)
+
+
+def _solve(hessian: Tensor, gradient: Tensor, damping: float) -> Tensor:
+    diagonal = hessian.diag()
+    damped = hessian + torch.diag(damping * diagonal + 1e-9 * diagonal.max().clamp_min(1e-12))
+    return -torch.linalg.solve(damped, gradient)
+
+
+def _inverse(hessian: Tensor) -> Tensor:
+    """The inverse, in units in which the diagonal is one; zero for unknowns that no residual depends on."""
+    d = hessian.diag().clamp_min(0.0).sqrt()
+    used = d > 0
+    unit = torch.where(used, 1.0 / d.clamp_min(1e-300), 0.0)
+    scaled = hessian * unit[:, None] * unit + torch.diag((~used).to(hessian))
+    return torch.linalg.pinv(scaled, hermitian=True, rtol=1e-13) * unit[:, None] * unit
+
+
+def _moved(state: State, step: Tensor) -> State:
+    n = len(state.x)
+    low = state.x.new_tensor([UNKNOWNS[name].low for name in state.free])
+    high = state.x.new_tensor([UNKNOWNS[name].high for name in state.free])
+    is_log = torch.tensor([UNKNOWNS[name].scale is None for name in state.free], dtype=torch.bool)
+    most = torch.where(is_log, 0.7, 2.0).to(state.x)
+    x = state.x + step[:n].clamp(-most, most)
+    centre = torch.where(is_log, state.x, 0.0)
+    x = x.maximum(torch.where(is_log, centre - 7.0, low)).minimum(torch.where(is_log, centre + 7.0, high))
+    stream = UNKNOWNS["stream"]
+    streams = (state.streams + step[n:].clamp(-2.0, 2.0) * stream.scale).clamp(
+        stream.low * stream.scale, stream.high * stream.scale
+    )
+    return dataclasses.replace(state, x=x, streams=streams)

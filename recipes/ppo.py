@@ -19,7 +19,7 @@ from torchrl_quad import differentiable_rollout, make_value
 @recipe("ppo")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    value = make_value(env, **network(cfg, "critic"))
+    value = make_value(env, **network(cfg, "critic", env))
     advantage = GAE(gamma=cfg.gamma, lmbda=cfg.critic.lmbda, value_network=value, vectorized=False)
     loss = ClipPPOLoss(actor, value, **cfg.loss)
     actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor.parameters(), iterations(cfg))
@@ -48,7 +48,7 @@ def main(cfg: DictConfig) -> None:
         update_normalizer(env, data)
         actor_schedule.step()
         critic_schedule.step()
-        run.record(**losses)
+        run.record(**losses.apply(torch.mean))  # some are per step of the horizon where a policy remembers
 
 
 if __name__ == "__main__":

@@ -67,12 +67,18 @@ def sees(cfg: DictConfig, env: EnvBase) -> bool:
     return bool(cfg.actor.get("vision", False)) and "depth" in env.observation_spec
 
 
-def network(cfg: DictConfig, name: str) -> dict[str, Any]:
-    """The options of a network as keywords of ``make_actor``, ``make_value`` and ``make_qvalue``."""
+def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str, Any]:
+    """The options of a network as keywords of ``make_actor``, ``make_value`` and ``make_qvalue``.
+
+    A critic, which is given the environment, also reads where the nearest obstacle is, of which a policy has images.
+    """
     section = cfg[name]
     scale = 1.0 if cfg.normalize else section.input_scale
     activation = getattr(nn, section.activation)
-    return {"num_cells": list(section.num_cells), "activation": activation, "input_scale": scale}
+    options = {"num_cells": list(section.num_cells), "activation": activation, "input_scale": scale}
+    if env is not None and "obstacle" in env.observation_spec:
+        options |= {"in_keys": ["observation", "obstacle"], "input_scale": [scale, 1.0]}
+    return options
 
 
 def actor_parameters(loss: PathwiseLoss) -> list[nn.Parameter]:

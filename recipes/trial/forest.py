@@ -36,7 +36,7 @@ POLICIES = {  # recipe, and what differs from what it ships with
     "bptt": ("bptt", []),
     "shac": ("shac", []),
     "ppo": ("ppo", []),
-    "blind": ("bptt", ["actor.vision=false"]),
+    "blind": ("bptt", ["actor.vision=false", "env.camera=null"]),
     "no memory": ("bptt", ["actor.recurrent=false"]),
     "no velocity": ("bptt", ["env.observe_velocity=false"]),
 }

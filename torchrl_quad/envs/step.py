@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_quad.dynamics import QuadrotorParams
+from torchrl_quad.dynamics import QuadrotorParams, quaternion
 from torchrl_quad.dynamics.parameters import RawParams
 from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine import Transition, nested
@@ -124,6 +124,9 @@ class ControlStep:
             metrics = self.env.metrics(state)
         eye = self.env.disturbances.get("camera")
         seen = {} if eye is None else {"depth": eye.image(state)}
+        if self.env.scene is not None:  # for critics, which may know more than policies
+            distance, away = self.env.scene.nearest(state)
+            seen["obstacle"] = torch.cat((distance, quaternion.rotate_inverse(state["quaternion"], away)), -1)
         return {"observation": self.observe(state), **seen, "metrics": metrics}
 
     def observe(self, state: State) -> Tensor:

@@ -105,7 +105,9 @@ def make_value(
     LayerNorm normalises its hidden layers. The policy follows the critic's gradient, which is far off without it.
 
     A critic may read more than the actor does, such as ``in_keys=("observation", ("state", "rotor_speed"))``. Rotors
-    turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one.
+    turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one. Where there are
+    obstacles, ``"obstacle"`` (*, 4) is the distance from the drone's surface to the nearest [m], and the direction away
+    from it in the body frame: what a policy has images of, a critic can know.
     """
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
     return Critic(net, in_keys=list(in_keys))

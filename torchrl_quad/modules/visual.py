@@ -36,7 +36,7 @@ def make_visual_actor(
     scale_init: float = 0.1,
     learn_scale: bool = True,
     return_log_prob: bool = False,
-) -> VisualActor:
+) -> ProbabilisticActor:
     """A tanh-Gaussian policy of a depth image and vectors, with memory or without.
 
     TorchRL's ConvNet reads the inverse of the depth, 1 / max(depth, 0.3 m), so that what is near counts most. A

@@ -25,10 +25,10 @@ from torchrl_quad import ABPTLoss, VisitedStateBuffer, differentiable_rollout, m
 @recipe("abpt")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    loss = ABPTLoss(actor, make_qvalue(env, **network(cfg, "critic")), **cfg.loss)
+    loss = ABPTLoss(actor, make_qvalue(env, **network(cfg, "critic", env)), **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     target = TargetUpdate(loss, tau=cfg.critic.tau)
-    buffer = VisitedStateBuffer(cfg.buffer.capacity, seed=own_seed(cfg))
+    buffer = VisitedStateBuffer(cfg.buffer.capacity, seed=own_seed(cfg), actor=actor)
 
     actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
     critic_parameters = loss.qvalue_network_params.parameters()

@@ -25,7 +25,7 @@ from torchrl_quad import AHACLoss, differentiable_rollout, make_value, restart
 @recipe("ahac")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    loss = AHACLoss(actor, make_value(env, **network(cfg, "critic")), horizon=cfg.horizon, **cfg.loss)
+    loss = AHACLoss(actor, make_value(env, **network(cfg, "critic", env)), horizon=cfg.horizon, **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
     critic_parameters = loss.value_network_params.parameters()

@@ -15,7 +15,7 @@ from torchrl_quad import HybridLoss, differentiable_rollout, make_value, restart
 @recipe("hybrid")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    loss = HybridLoss(actor, make_value(env, **network(cfg, "critic")), average=mean_of_all, **cfg.loss)
+    loss = HybridLoss(actor, make_value(env, **network(cfg, "critic", env)), average=mean_of_all, **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     actor_optimizer, _ = make_optimizer(cfg.actor, loss.actor_network_params.parameters(), iterations(cfg))
     rate = AdaptiveRate(actor_optimizer, cfg.actor.max_kl, iterations(cfg))

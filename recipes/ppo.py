@@ -5,6 +5,7 @@ python recipes/ppo.py task=hovering seed=0
 
 import torch
 from omegaconf import DictConfig
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from training.building import iterations, make_optimizer, network, set_up, shuffled, update_normalizer
@@ -18,7 +19,7 @@ from torchrl_quad import differentiable_rollout, make_value
 @recipe("ppo")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    value = make_value(env, **network(cfg, "critic"))
+    value = make_value(env, **network(cfg, "critic", env))
     advantage = GAE(gamma=cfg.gamma, lmbda=cfg.critic.lmbda, value_network=value, vectorized=False)
     loss = ClipPPOLoss(actor, value, **cfg.loss)
     actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor.parameters(), iterations(cfg))
@@ -35,7 +36,8 @@ def main(cfg: DictConfig) -> None:
         moved = 0.0  # how far the policy is from the one that flew
         for batch in shuffled(read, cfg.batch_size, cfg.epochs):
             if cfg.actor.max_kl is None or moved < cfg.actor.max_kl:
-                losses = loss(batch)
+                with set_recurrent_mode(True):  # a memory, if there is one, goes through whole horizons
+                    losses = loss(batch)
                 moved = mean_of_all(losses["kl_approx"])
                 loss_actor = losses["loss_objective"] + losses.get("loss_entropy", 0.0)
                 run.optimise("actor", actor_optimizer, loss_actor, cfg.actor.max_grad_norm)
@@ -46,7 +48,7 @@ def main(cfg: DictConfig) -> None:
         update_normalizer(env, data)
         actor_schedule.step()
         critic_schedule.step()
-        run.record(**losses)
+        run.record(**losses.apply(torch.mean))  # some are per step of the horizon where a policy remembers
 
 
 if __name__ == "__main__":

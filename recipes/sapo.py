@@ -23,7 +23,7 @@ from torchrl_quad import SAPOLoss, differentiable_rollout, make_value, restart
 @recipe("sapo")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    loss = SAPOLoss(actor, make_value(env, **network(cfg, "critic")), **cfg.loss)
+    loss = SAPOLoss(actor, make_value(env, **network(cfg, "critic", env)), **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
     critic_parameters = loss.value_network_params.parameters()

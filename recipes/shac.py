@@ -24,7 +24,7 @@ from torchrl_quad import SHACLoss, differentiable_rollout, make_value, restart
 @recipe("shac")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    loss = SHACLoss(actor, make_value(env, **network(cfg, "critic")), **cfg.loss)
+    loss = SHACLoss(actor, make_value(env, **network(cfg, "critic", env)), **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     target = TargetUpdate(loss, tau=cfg.critic.tau)
     actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))

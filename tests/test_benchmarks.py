@@ -16,6 +16,7 @@ SMALL = "num_envs=4 horizon=4 env.max_episode_steps=20 compile=false"
     [
         ("throughput", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 7),
         ("memory", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 1),
+        ("camera", "--primitives 2 --scenes trees --images 2x4x3 --rounds 1", 1),
         ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),
         ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
     ],
@@ -46,9 +47,30 @@ def test_the_benchmark_of_exported_policies_writes_a_table(tmp_path, monkeypatch
     assert all(float(row[pair]) <= 1e-5 for row in rows for pair in ("torch - ONNX", "torch - C", "ONNX - C"))
 
 
+def test_the_benchmark_of_controllers_writes_a_table(tmp_path, monkeypatch):
+    output = tmp_path / "results.csv"
+    arguments = ["--tasks", "hovering", "--starts", "2", "--mpc-starts", "1", "--steps", "2", "--calls", "1"]
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    monkeypatch.setattr(sys, "argv", ["controllers.py", *arguments, "--output", str(output)])
+    module = importlib.import_module("controllers")
+    module.main()
+    with open(output, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["policy"] for row in rows] == ["geometric", "mpc"]
+    assert module.table(rows).count("\n") == 3
+
+
 def test_the_results_that_are_published_name_their_machine():
     published = list((BENCHMARKS / "results").glob("*.csv"))
-    assert {path.stem for path in published} >= {"throughput", "memory", "time_to_solve", "profile", "deployment"}
+    assert {path.stem for path in published} >= {
+        "camera",
+        "throughput",
+        "memory",
+        "time_to_solve",
+        "profile",
+        "deployment",
+        "controllers",
+    }
     for path in published:
         with open(path, newline="") as file:
             assert all(row["machine"] for row in csv.DictReader(file))

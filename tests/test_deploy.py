@@ -244,9 +244,9 @@ def test_a_contract_of_another_version_is_refused(hovering, tmp_path):
         path.write_text(text)
         with pytest.raises(Tampered, match="is no contract of a policy"):
             load_bundle(tmp_path)
-    path.write_text(json.dumps(about | {"version": 2}))
+    path.write_text(json.dumps(about | {"version": 1}))
     with pytest.raises(
-        UnknownContract, match="has version 2, and this torchrl_quad reads version 1. It was written by"
+        UnknownContract, match="has version 1, and this torchrl_quad reads version 2. It was written by"
     ):
         load_bundle(tmp_path)
     about["task"]["rule"] = "dance"  # of a later package, with checksums that fit

@@ -25,6 +25,7 @@ PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/READM
 PAGES += sorted(path for path in ROOT.glob("docs/**/*.md") if "_build" not in path.parts)
 PARTS = (
     "adapters",
+    "controllers",
     "data",
     "deploy",
     "dynamics",
@@ -34,6 +35,7 @@ PARTS = (
     "modules",
     "objectives",
     "render",
+    "vision",
 )
 AFTER_TRAINING = ("evaluate", "export")  # recipes that read a checkpoint
 PUBLIC = ["torchrl_quad", *(f"torchrl_quad.{part}" for part in PARTS)]

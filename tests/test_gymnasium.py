@@ -23,7 +23,7 @@ import torchrl_quad
 from torchrl_quad import load_drone, make_env
 from torchrl_quad.gym import GymEnv, GymVectorEnv
 
-TASKS = ["hovering", "landing", "racing", "tracking"]
+TASKS = ["forest", "hovering", "landing", "racing", "tracking"]
 MODES = list(AutoresetMode)
 HOVERING = "torchrl_quad/Hovering-v0"
 
@@ -121,8 +121,10 @@ def test_spaces_and_types_are_those_that_gymnasium_expects(task):
     assert observation in env.observation_space
     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
     assert observation in env.observation_space
-    assert observation[0] in env.single_observation_space
-    assert (observation.dtype, reward.dtype) == (np.float32, np.float64)
+    parts = observation if task == "forest" else {"observation": observation}  # with an image beside the vector
+    first = {key: x[0] for key, x in parts.items()}
+    assert (first if task == "forest" else first["observation"]) in env.single_observation_space
+    assert {*(x.dtype for x in parts.values())} == {np.dtype(np.float32)} and reward.dtype == np.float64
     assert (
         reward.shape == terminated.shape == truncated.shape == info["success"].shape == info["_success"].shape == (3,)
     )

@@ -15,8 +15,10 @@ UNWRAP = "data.unwrap"  # the one helper that networks and pictures share with d
 ALLOWED = {  # what each part of the package may import of the others: parts, or single modules
     "dynamics": set(),
     "engine": set(),
-    "envs": {"dynamics", "engine"},
-    "render": {"dynamics", "envs", "files", UNWRAP},
+    "vision": {"dynamics", "engine"},
+    "envs": {"dynamics", "engine", "vision"},
+    "controllers": {"dynamics", "envs", UNWRAP},
+    "render": {"dynamics", "envs", "files", "vision", UNWRAP},
     "modules": {UNWRAP},
     "objectives": {UNWRAP},
     "data": set(),
@@ -34,17 +36,19 @@ TORCHRL = {"torch", "torchrl", "tensordict"}
 LIBRARIES = {
     "dynamics": {"torch", "numpy", "yaml"},
     "engine": {"torch", "tensordict"},
+    "vision": {"torch"},
     "envs": TORCHRL | {"numpy"},
+    "controllers": TORCHRL,
     "render": TORCHRL | {"matplotlib", "mpl_toolkits", "plotly", "PIL", "imageio_ffmpeg", "numpy"},
     "modules": TORCHRL,
     "objectives": TORCHRL,
     "data": TORCHRL,
-    "deploy": TORCHRL | {"numpy", "onnx", "onnxruntime"},
+    "deploy": TORCHRL | {"numpy", "onnx", "onnxruntime", "mujoco", "rotorpy", "crazyflow", "jax"},
     "files": set(),
     "diagnostics": TORCHRL,
     "gym": {"gymnasium", "numpy", "torch"},
     "adapters": TORCHRL | {"gymnasium", "numpy", "rsl_rl", "skrl", "stable_baselines3"},
-    "identification": {"torch", "numpy", "yaml", "pyulog", "rosbags", "matplotlib"},
+    "identification": {"torch", "numpy", "yaml", "matplotlib", "pyulog", "rosbags"},
 }
 
 

@@ -80,7 +80,7 @@ def saved(monkeypatch):
 def scenes(monkeypatch):
     """The scenery of each film."""
     scenes = []
-    monkeypatch.setattr(frames, "Scene", lambda *args: scenes.append(args[-1]) or Scene(*args))
+    monkeypatch.setattr(frames, "Scene", lambda *args, **more: scenes.append(args[-1]) or Scene(*args, **more))
     return scenes
 
 
@@ -171,6 +171,25 @@ def test_a_film_keeps_step_with_the_clock_and_shows_the_end(tmp_path, monkeypatc
     assert frames == len(starts) - 1 and seconds == pytest.approx(0.065 * frames, abs=0.01)
     animate_flight(flight, tmp_path / "flight.gif", control_dt=0.005, max_seconds=0.25)
     torch.testing.assert_close(shown[-1][0], flight["next", "state", "position"][:, 49])
+
+
+def test_a_film_of_two_flights_shows_them_side_by_side_in_one_view(tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(
+        Scene,
+        "draw",
+        lambda self, *args, draw=Scene.draw, **kw: shown.append((self, args, kw)) or draw(self, *args, **kw),
+    )
+    one, other = (HoveringEnv(num_envs=2, seed=seed).rollout(12) for seed in (0, 1))
+    animate_flight(one, tmp_path / "flight.gif", beside=other, labels=("left", "right"), size=120)
+    with Image.open(tmp_path / "flight.gif") as film:
+        assert film.size == (240, 120)
+        picture = np.asarray(film.convert("RGB"))
+    assert np.abs(picture[:, :120].astype(int) - picture[:, 120:]).max() > 50
+    (left, drones, words), (right, others, _) = shown[-2:]
+    torch.testing.assert_close(drones[0], one["next", "state", "position"][:, -1])
+    torch.testing.assert_close(others[0], other["next", "state", "position"][:, -1])
+    assert torch.equal(left.low, right.low) and words["text"] == "0.2 s  left"
 
 
 @pytest.mark.parametrize(("value", "drones"), [(torch.nan, [0]), (torch.inf, [0, 1])])

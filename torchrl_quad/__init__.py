@@ -5,6 +5,7 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from torchrl_quad.controllers import MPC, GeometricController
     from torchrl_quad.data import (
         DifferentiableCollector,
         ObservationNormalizer,
@@ -16,27 +17,36 @@ if TYPE_CHECKING:
     from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
     from torchrl_quad.engine import ActionSequence
     from torchrl_quad.envs import (
+        Forest,
+        ForestEnv,
         HoveringEnv,
         LandingEnv,
         QuadrotorEnv,
         RacingEnv,
+        Scene,
         TrackingEnv,
         available_tasks,
         load_track,
         make_env,
         register_task,
     )
-    from torchrl_quad.modules import make_actor, make_qvalue, make_value
+    from torchrl_quad.modules import make_actor, make_qvalue, make_value, make_visual_actor
     from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss, TrustRegion
+    from torchrl_quad.vision import DepthCamera
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "MPC",
     "ABPTLoss",
     "AHACLoss",
     "ActionSequence",
     "BPTTLoss",
+    "DepthCamera",
     "DifferentiableCollector",
+    "Forest",
+    "ForestEnv",
+    "GeometricController",
     "HoveringEnv",
     "HybridLoss",
     "LandingEnv",
@@ -46,6 +56,7 @@ __all__ = [
     "RacingEnv",
     "SAPOLoss",
     "SHACLoss",
+    "Scene",
     "TrackingEnv",
     "TrustRegion",
     "VisitedStateBuffer",
@@ -62,15 +73,16 @@ __all__ = [
     "make_env",
     "make_qvalue",
     "make_value",
+    "make_visual_actor",
     "register_envs",
     "register_task",
     "restart",
 ]
 
 
-_PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "diagnostics")
+_PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "vision", "controllers", "diagnostics")
 # The tasks that ship, and their control steps: what gymnasium registers needs no torch.
-_TASKS = {"hovering": 256, "landing": 256, "racing": 512, "tracking": 512}
+_TASKS = {"forest": 900, "hovering": 256, "landing": 256, "racing": 512, "tracking": 512}
 
 
 def __getattr__(name: str) -> Any:

@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.error import ResetNeeded
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -37,6 +37,9 @@ class GymVectorEnv(VectorEnv):
     ``crash``, ``reward_terms`` and ``metrics`` by name, each (num_envs), with a mask ``_name`` beside every name as in
     gymnasium's own vector environments.
 
+    With a ``camera``, as "torchrl_quad/Forest-v0" has one, the observation is a dictionary of ``observation``, the
+    vector, and ``depth`` (num_envs, 1, height, width) [m].
+
     Observations are clipped to the bounds of their space: the box of the task, 10 for ten times the quaternion, 50 m/s
     and 50 rad/s; 1e6 for a task without ``observation_bounds``.
 
@@ -48,7 +51,7 @@ class GymVectorEnv(VectorEnv):
     the TorchRL environment, to be read: its ``params``, ``hover_action`` and so on.
 
     Args:
-        task: "hovering", "landing", "racing" or "tracking".
+        task: "forest", "hovering", "landing", "racing" or "tracking".
         num_envs: number of drones.
         autoreset_mode: "NextStep", "SameStep" or "Disabled", or the ``AutoresetMode``.
         render_mode: "rgb_array" for pictures, which need matplotlib; None for none.
@@ -89,6 +92,9 @@ class GymVectorEnv(VectorEnv):
         self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
         self._bounds = _bounds(self.torchrl_env)
         self.single_observation_space = Box(-self._bounds, self._bounds, dtype=np.float32)
+        if (camera := self.torchrl_env.camera) is not None:
+            depth = Box(0.0, camera.range, (1, camera.height, camera.width), np.float32)
+            self.single_observation_space = Dict({"observation": self.single_observation_space, "depth": depth})
         self.single_action_space = Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -96,9 +102,7 @@ class GymVectorEnv(VectorEnv):
         self._over = np.zeros(num_envs, dtype=bool)  # whose episode has ended, and has not begun anew
 
     @torch.no_grad()
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode with all drones, or with those of the bool ``options["reset_mask"]`` (num_envs)."""
         super().reset(seed=seed)
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
@@ -113,7 +117,7 @@ class GymVectorEnv(VectorEnv):
         return self._observe(self._now), _info(self._now, mask)
 
     @torch.no_grad()
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Fly one control step with actions (num_envs, 4)."""
         env, over, info = self.torchrl_env, self._over, {}
         actions = _checked(actions, self.action_space.shape)
@@ -165,16 +169,20 @@ class GymVectorEnv(VectorEnv):
         self._now = self.torchrl_env.reset(start, set_state=False)
         self._over = self._over & ~mask
 
-    def _observe(self, outputs: Any) -> np.ndarray:
+    def _observe(self, outputs: Any) -> Any:
         # What is handed out is copied: the next step starts from the same memory.
         observation = outputs["observation"].numpy(force=True).astype(np.float32)
-        return observation.clip(-self._bounds, self._bounds, out=observation)
+        observation.clip(-self._bounds, self._bounds, out=observation)
+        if not isinstance(self.single_observation_space, Dict):
+            return observation
+        depth = outputs["depth"].numpy(force=True).astype(np.float32, order="C")
+        return {"observation": observation, "depth": depth.clip(0.0, self.torchrl_env.camera.range, out=depth)}
 
     def _final(self, after: Any) -> dict[str, Any]:
         over, last = self._over, self._observe(after)
         observations = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(over):
-            observations[i] = last[i]
+            observations[i] = _row(last, i)
         return {
             "final_obs": observations,
             "_final_obs": over.copy(),
@@ -193,7 +201,7 @@ class GymEnv(gymnasium.Env):
     without it, ``GymEnv("hovering")`` flies until ``max_episode_steps``, if given.
 
     Args:
-        task: "hovering", "landing", "racing" or "tracking".
+        task: "forest", "hovering", "landing", "racing" or "tracking".
         **kwargs: as for :class:`GymVectorEnv`, but ``num_envs`` and ``autoreset_mode``.
 
     Raises:
@@ -216,15 +224,13 @@ class GymEnv(gymnasium.Env):
         self.observation_space = self._drones.single_observation_space
         self.action_space = self._drones.single_action_space
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
         super().reset(seed=seed)
         observation, info = self._drones.reset(seed=seed)
-        return observation[0], _first(info)
+        return _row(observation, 0), _first(info)
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Fly one control step with an action (4)."""
         observation, *ends, info = self._drones.step(_checked(action, self.action_space.shape)[None])
         self._steps += 1
@@ -235,7 +241,7 @@ class GymEnv(gymnasium.Env):
                 f'gymnasium.make_vec("torchrl_quad/{self._task.title().replace("_", "")}-v0", num_envs=1024).',
                 stacklevel=2,
             )
-        return observation[0], *(x.item() for x in ends), _first(info)
+        return _row(observation, 0), *(x.item() for x in ends), _first(info)
 
     def render(self) -> np.ndarray | None:
         """A picture (336, 336, 3), uint8; None without ``render_mode="rgb_array"``."""
@@ -270,6 +276,11 @@ def _bounds(env: Any) -> np.ndarray:
     if own is None or len(own) + len(action) != size:
         return np.full(size, _LIMIT, dtype=np.float32)
     return torch.cat((own, action)).numpy(force=True).astype(np.float32)
+
+
+def _row(observation: Any, i: int) -> Any:
+    """The observation of one drone."""
+    return {name: x[i] for name, x in observation.items()} if isinstance(observation, dict) else observation[i]
 
 
 def _array(x: torch.Tensor) -> np.ndarray:

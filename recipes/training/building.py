@@ -16,7 +16,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import SoftUpdate
 
-from torchrl_quad import ObservationNormalizer, TrustRegion, make_actor, make_env
+from torchrl_quad import ObservationNormalizer, TrustRegion, make_actor, make_env, make_visual_actor
 from torchrl_quad.objectives import PathwiseLoss
 from training.processes import cat_all, mean_of_all, rank, world_size
 
@@ -47,19 +47,38 @@ def build_env(cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = Fals
 
 
 def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModuleBase:
-    """Build the policy of a configuration; it writes log-probabilities if the loss needs them."""
+    """Build the policy of a configuration; it writes log-probabilities if the loss needs them.
+
+    It sees where the environment has a camera, unless the configuration blinds it.
+    """
     log_prob = "entropy_bonus" in cfg.loss or cfg.loss.get("alpha", 0) != 0  # of PPO, or of an entropy bonus
     noise = {name: cfg.actor[name] for name in ("scale_init", "noise_correlation")}
     noise["learn_scale"] = cfg.actor.get("learn_scale", True)  # checkpoints from before do not say
-    return make_actor(env, **network(cfg, "actor"), **noise, return_log_prob=log_prob)
+    if not sees(cfg, env):
+        return make_actor(env, **network(cfg, "actor"), **noise, return_log_prob=log_prob)
+    if noise.pop("noise_correlation"):
+        raise ValueError("actor.noise_correlation must be 0 for a policy that sees; actor.vision=false flies it blind.")
+    sight = {name: cfg.actor[name] for name in ("recurrent", "hidden_size")} | {"channels": list(cfg.actor.channels)}
+    return make_visual_actor(env, **network(cfg, "actor"), **noise, **sight, return_log_prob=log_prob)
 
 
-def network(cfg: DictConfig, name: str) -> dict[str, Any]:
-    """The options of a network as keywords of ``make_actor``, ``make_value`` and ``make_qvalue``."""
+def sees(cfg: DictConfig, env: EnvBase) -> bool:
+    """Whether the policy of a configuration reads the images of a camera; checkpoints from before do not say."""
+    return bool(cfg.actor.get("vision", False)) and "depth" in env.observation_spec
+
+
+def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str, Any]:
+    """The options of a network as keywords of ``make_actor``, ``make_value`` and ``make_qvalue``.
+
+    A critic, which is given the environment, also reads where the nearest obstacle is, of which a policy has images.
+    """
     section = cfg[name]
     scale = 1.0 if cfg.normalize else section.input_scale
     activation = getattr(nn, section.activation)
-    return {"num_cells": list(section.num_cells), "activation": activation, "input_scale": scale}
+    options = {"num_cells": list(section.num_cells), "activation": activation, "input_scale": scale}
+    if env is not None and "obstacle" in env.observation_spec:
+        options |= {"in_keys": ["observation", "obstacle"], "input_scale": [scale, 1.0]}
+    return options
 
 
 def actor_parameters(loss: PathwiseLoss) -> list[nn.Parameter]:
@@ -155,7 +174,9 @@ def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDict
 
 
 def shuffled(rollout: TensorDictBase, batch_size: int, epochs: int) -> Iterator[TensorDictBase]:
-    """All steps of a rollout ``epochs`` times, in random batches."""
-    steps = rollout.reshape(-1)
+    """All steps of a rollout ``epochs`` times, in random batches; of a policy that remembers, whole horizons."""
+    remembers, horizon = "is_init" in rollout, rollout.shape[-1]
+    steps = rollout if remembers else rollout.reshape(-1)
+    size = max(batch_size // horizon, 1) if remembers else batch_size
     for _ in range(epochs):
-        yield from steps[torch.randperm(len(steps), device=steps.device)].split(batch_size)
+        yield from steps[torch.randperm(len(steps), device=steps.device)].split(size)

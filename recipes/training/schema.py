@@ -47,22 +47,10 @@ Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 Size = Annotated[int, Field(ge=1, le=10_000_000)]
 Device = Annotated[str, AfterValidator(available_device)]
 Threads = Annotated[int, Field(ge=1, le=1024)]
-Activation = Literal[
-    "CELU",
-    "ELU",
-    "GELU",
-    "Hardswish",
-    "LeakyReLU",
-    "Mish",
-    "PReLU",
-    "ReLU",
-    "SELU",
-    "SiLU",
-    "Sigmoid",
-    "Softplus",
-    "Softsign",
-    "Tanh",
-]  # of torch.nn
+ACTIVATIONS = (
+    "CELU ELU GELU Hardswish LeakyReLU Mish PReLU ReLU SELU SiLU Sigmoid Softplus Softsign Tanh"  # of torch.nn
+)
+Activation = Literal[tuple(ACTIVATIONS.split())]  # type: ignore[valid-type]
 
 
 class Section(BaseModel):
@@ -120,6 +108,12 @@ class Actor(Optimised):
 
     scale_init: Positive = Field(description="The standard deviation of the policy's noise at the start.")
     learn_scale: bool = Field(description="Whether this noise changes with the state and in training.")
+    vision: bool = Field(description="Whether the policy reads the images of a camera, where there is one.")
+    recurrent: bool = Field(description="Whether a policy that sees has a memory.")
+    hidden_size: int = Field(ge=1, le=65_536, description="Numbers in that memory.")
+    channels: list[Annotated[int, Field(ge=1, le=4096)]] = Field(
+        min_length=1, max_length=8, description="Of the convolutions of a policy that sees: [8, 16]."
+    )
     noise_correlation: Annotated[Real, Field(ge=0, lt=1)] = Field(
         description="Of the policy's noise in two steps that follow each other; 0 is white noise."
     )

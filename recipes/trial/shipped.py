@@ -64,7 +64,7 @@ def cell(runs: list[dict[str, str]], metric: str, factor: float, digits: int, un
         return ""
     solved = [float(run["solved"]) for run in runs]
     shown, seconds = (np.nanmedian([float(run.get(key) or "nan") for run in runs]) for key in (metric, "seconds"))
-    some = "" if len(runs) == len(SEEDS) else f", {len(runs)} seeds"
+    some = "" if len(runs) == len(SEEDS) else f", {len(runs)} seed{'s' * (len(runs) > 1)}"
     return f"{np.mean(solved):.1%} ({min(solved):.1%}), {factor * shown:.{digits}f} {unit}, {seconds:.0f} s{some}"
 
 

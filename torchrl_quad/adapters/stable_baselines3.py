@@ -19,6 +19,8 @@ class DronesVecEnv(VecEnv):
 
     ``DronesVecEnv(gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=128, autoreset_mode="SameStep"))``
 
+    A task with a camera has a dictionary of observations, which the policy "MultiInputPolicy" reads.
+
     At the end of an episode ``info`` holds ``terminal_observation``, ``TimeLimit.truncated`` and ``is_success``,
     whether the last state fulfils the task, of which stable-baselines3 logs its success rate.
 
@@ -41,7 +43,7 @@ class DronesVecEnv(VecEnv):
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
-    def reset(self) -> np.ndarray:
+    def reset(self) -> Any:
         """Begin an episode with all drones, from the seed if ``seed()`` has set one."""
         observation, _ = self.env.reset(seed=self._seeds[0])
         self._reset_seeds()
@@ -51,7 +53,7 @@ class DronesVecEnv(VecEnv):
         """Keep the actions (num_envs, 4) for :meth:`step_wait`."""
         self.actions = actions
 
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Fly one control step: observations (num_envs, k), rewards and ends (num_envs), an ``info`` of each drone."""
         observation, reward, terminated, truncated, info = self.env.step(self.actions)
         done, infos = terminated | truncated, [{} for _ in reward]

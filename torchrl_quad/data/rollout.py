@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numbers
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import expand_as_right, unravel_key
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.normalizer import NormalizedPolicy, ObservationNormalizer
+from torchrl_quad.data.unwrap import memory_keys
 
 
 def differentiable_rollout(
@@ -24,7 +27,8 @@ def differentiable_rollout(
 
     Environments that finish are reset on the way. The gradient is cut exactly there, and ``"next"`` keeps the true last
     state. The rollout is the environment's own ``rollout``, so this works for any differentiable TorchRL environment
-    and any stack of transforms.
+    and any stack of transforms. The gradient also goes through the memory of a recurrent actor, which is cleared where
+    an episode begins, and cut there.
 
     Args:
         env: the environment.
@@ -76,7 +80,13 @@ def differentiable_rollout(
             buffer.detach_()
     end = env.step_mdp(rollout[..., -1]).detach().clone()
     written = end.select(*(key for key in actor.out_keys if key != "action"), strict=False).clone()
-    return rollout, env.maybe_reset(end).update(written)  # a reset keeps nothing that it does not know, such as noise
+    carry = env.maybe_reset(end).update(written)  # a reset keeps nothing that it does not know, such as noise
+    done = rollout["next", "done"][..., -1, :]
+    for key in memory_keys(actor):
+        memory = rollout[..., -1].get(unravel_key(("next", key))).detach()
+        carry.set(key, torch.where(expand_as_right(done.squeeze(-1), memory), 0.0, memory))
+        carry.set("is_init", done.clone())
+    return rollout, carry
 
 
 def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> TensorDictBase:

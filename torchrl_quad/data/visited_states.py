@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
-from torchrl_quad.data.unwrap import base_env
+from torchrl_quad.data.unwrap import base_env, memory_keys
 
 
 class VisitedStateBuffer(TensorDictReplayBuffer):
@@ -28,6 +29,8 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         capacity: number of states kept; the oldest go first.
         env: the environment whose Markov state is kept; see :mod:`torchrl_quad.data`.
         state_keys: the entries that make up the Markov state. By default those of ``env``, and "state" without one.
+        actor: a recurrent policy, whose memory is kept beside the state. Without it, and in :meth:`source`, it begins
+            empty in a visited state.
         device: where the states are stored.
         seed: of the buffer's own random generator.
 
@@ -41,6 +44,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         env: EnvBase | None = None,
         *,
         state_keys: Sequence[NestedKey] | None = None,
+        actor: TensorDictModuleBase | None = None,
         device: torch.device | str = "cpu",
         seed: int = 0,
     ) -> None:
@@ -49,6 +53,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         if state_keys is None:
             state_keys = ("state",) if env is None else _state_keys(env)
         self.state_keys = tuple(state_keys)
+        self.memory_keys = () if actor is None else memory_keys(actor)
         super().__init__(
             storage=LazyTensorStorage(capacity, device=device),
             generator=torch.Generator(device=device).manual_seed(seed),
@@ -65,13 +70,13 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         Raises:
             ValueError: the rollout lacks an entry of the state, or its states differ in kind from the buffer's.
         """
-        missing = [key for key in self.state_keys if key not in tensordicts]
+        missing = [key for key in (*self.state_keys, *self.memory_keys) if key not in tensordicts]
         if missing:
             raise ValueError(
                 f"The visited-state buffer keeps {self.state_keys}, and the rollout lacks {missing[0]!r}. Give the "
                 "buffer the environment, VisitedStateBuffer(env=env), or the entries of its Markov state, state_keys."
             )
-        states = tensordicts.select(*self.state_keys).detach().reshape(-1)
+        states = tensordicts.select(*self.state_keys, *self.memory_keys).detach().reshape(-1)
         keep = torch.ones(states.shape[0], dtype=torch.bool, device=states.device)
         for value in states.values(include_nested=True, leaves_only=True):
             keep &= value.reshape(states.shape[0], -1).isfinite().all(-1)
@@ -81,7 +86,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         if not keep.any():
             return torch.zeros(0, dtype=torch.int64)
         if len(self):
-            _require_same(states, self[:1].select(*self.state_keys))
+            _require_same(states, self[:1].select(*self.state_keys, *self.memory_keys))
         return super().extend(states[keep].clone())
 
     def initial_state(self, env: EnvBase, fraction: float = 0.9) -> TensorDictBase:
@@ -98,7 +103,12 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             ValueError: the fraction is not in [0, 1], or the environment's states differ in kind from the buffer's.
             RuntimeError: the buffer is empty.
         """
-        return env.reset(self._mixed(_fresh(env, self.state_keys), fraction), set_state=True)
+        mixed, visited, pick = self._mixed(_fresh(env, self.state_keys), fraction)
+        start = env.reset(mixed, set_state=True)
+        for key, x in visited.select(*self.memory_keys).items(True, True):
+            start.set(key, torch.where(expand_as_right(pick, x), x, 0.0))
+            start.set("is_init", ~pick.unsqueeze(-1))
+        return start
 
     def source(self, env: EnvBase, fraction: float = 0.9) -> Callable[[int], TensorDictBase]:
         """A function for ``env.set_initial_state_source``: resets inside a horizon then start in visited states, too.
@@ -125,22 +135,24 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             )
 
         def draw(n: int) -> TensorDictBase:
-            states = self._mixed(base.sample_start(n).select(*self.state_keys), fraction)
+            states, *_ = self._mixed(base.sample_start(n).select(*self.state_keys), fraction)
             return states.get(self.state_keys[0]) if len(self.state_keys) == 1 else states
 
         return draw
 
-    def _mixed(self, fresh: TensorDictBase, fraction: float) -> TensorDictBase:
+    def _mixed(self, fresh: TensorDictBase, fraction: float) -> tuple[TensorDictBase, TensorDictBase, Tensor]:
+        """States to start from, the visited ones and their memory, and which of them were taken, bool."""
         _require_fraction(fraction)
         if len(self) == 0:
             raise RuntimeError(
                 "The visited-state buffer is empty. Fly a first horizon from env.reset() and extend the buffer with it."
             )
-        visited = self.sample(fresh.numel()).select(*self.state_keys).to(fresh.device)
-        _require_same(fresh.reshape(-1), visited)
-        visited = visited.reshape(fresh.shape)
+        visited = self.sample(fresh.numel()).select(*self.state_keys, *self.memory_keys).to(fresh.device)
+        states = visited.select(*self.state_keys)
+        _require_same(fresh.reshape(-1), states)
         pick = torch.rand(fresh.shape, generator=self._rng, device=self._rng.device) < fraction
-        return visited.where(pick.to(fresh.device), fresh)
+        pick = pick.to(fresh.device)
+        return states.reshape(fresh.shape).where(pick, fresh), visited.reshape(fresh.shape), pick
 
 
 def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictBase:
@@ -148,7 +160,8 @@ def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictB
 
     Beside visited states this is the other way to choose where the next horizon starts: most flights go on through many
     horizons, and some begin anew. The choice draws from torch's global generator, the fresh starts from the
-    environment's own. Transforms that remember, such as StepCounter, begin anew in all environments.
+    environment's own. Those that go on keep the memory of a recurrent policy. Transforms that remember, such as
+    StepCounter or a primer, begin anew in all environments.
 
     Args:
         env: an environment that can be set to a state, also under transforms.
@@ -168,7 +181,10 @@ def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictB
         raise ValueError(f"restart needs the whole state, {keys}, and the carry lacks {missing[0]!r}.")
     fresh = _fresh(env, keys)
     chosen = torch.rand(carry.shape, device=carry.device) < fraction
-    return env.reset(fresh.where(chosen, carry.select(*keys)), set_state=True)
+    start = env.reset(fresh.where(chosen, carry.select(*keys)), set_state=True)
+    if "is_init" in carry and "is_init" not in start:  # a policy remembers, and no transform does it for it
+        start = carry.copy().update(start).set("is_init", carry["is_init"] | chosen.unsqueeze(-1))
+    return start
 
 
 def _state_keys(env: EnvBase) -> tuple[NestedKey, ...]:

@@ -65,7 +65,7 @@ class Bundle:
         options.log_severity_level = 3
         provider = ["CPUExecutionProvider"]
         self._session = onnxruntime.InferenceSession(files["policy.onnx"], options, providers=provider)
-        self._vectors = files["vectors.npz"]
+        self._vectors, self._starts = files["vectors.npz"], files["starts.npz"]
         self.contract, self.on_fault = contract, on_fault
         self.faults: Counter[str] = Counter()
         self.last_fault: Fault | None = None
@@ -138,6 +138,12 @@ class Bundle:
         if len(self.queue):
             self.queue = np.concatenate((self.queue[1:], action[None]))
         return self._half_thrust * (float(action[0]) + 1.0), self._max_rates * action[1:]
+
+    def starts(self) -> dict[str, NDArray[Any]]:
+        """The fresh starts that came with it: ``position``, ``quaternion``, ``velocity`` and ``angular_velocity``, as a
+        call takes them, and what :meth:`reset` takes, each (n, ...). The contract's ``results`` began in them."""
+        with np.load(io.BytesIO(self._starts)) as starts:
+            return dict(starts)
 
     def check(self, tolerance: float = 1e-5) -> float:
         """Run the policy on all observations that came with it.

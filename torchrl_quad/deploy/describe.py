@@ -35,6 +35,7 @@ def _hovering(env: HoveringEnv) -> dict[str, Any]:
         "rule": "target",
         "target": list(env.target),
         "success": f"an episode: mean distance below {env.success_radius} m over its last second, without a crash",
+        "criteria": {"radius": env.success_radius, "window": 1.0},
         "box": _box(env.target, env.box_half_width, env.box_height),
         "inputs": [("to_target", 3, "m", "world", 1.0, "target - position")],
     }
@@ -49,6 +50,7 @@ def _landing(env: LandingEnv) -> dict[str, Any]:
         "rule": "target",
         "target": list(env.target),
         "success": success,
+        "criteria": {"height": env.success_height, "radius": env.success_radius, "speed": env.success_speed},
         "box": _box(env.target, env.box_half_width, env.box_height),
         "inputs": [("to_target", 3, "m", "world", 1.0, "target - position; the target lies on the ground")],
     }
@@ -64,6 +66,7 @@ def _tracking(env: TrackingEnv) -> dict[str, Any]:
         **_harmonics(env),
         "success": f"an episode: root mean square distance below {env.success_radius} m from {env.settling_time} s on, "
         "without a crash",
+        "criteria": {"radius": env.success_radius, "settling_time": env.settling_time},
         "box": _box(numbers(env.centre), numbers(env.half_width), env.ceiling),
         "inputs": [("to_points", 3 * env.lookahead, "m", "world", 1.0, about)],
     }
@@ -75,6 +78,7 @@ def _racing(env: RacingEnv) -> dict[str, Any]:
         "gates": env.track["gates"],
         "gate_radius": env.track["gate_radius"],
         "success": f"an episode: {env.success_gates} gates passed, without a crash",
+        "criteria": {"gates": env.success_gates},
         "box": _box(numbers(env.centre), numbers(env.half_width), env.ceiling),
         "inputs": [
             ("to_gate", 3, "m", "world", 1.0, "centre of the next gate - position"),

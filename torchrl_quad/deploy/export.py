@@ -7,9 +7,7 @@ import io
 import itertools
 import json
 import os
-import re
-import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib import metadata, resources
 from pathlib import Path
 from string import Template
@@ -26,12 +24,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_quad.data import ObservationNormalizer, base_env, differentiable_rollout
 from torchrl_quad.data.normalizer import NormalizedPolicy
 from torchrl_quad.deploy import contract as contracts
-from torchrl_quad.deploy.bundle import load_bundle
+from torchrl_quad.deploy.bundle import QUANTITIES, load_bundle
 from torchrl_quad.deploy.describe import describe, envelope, results, seen_ranges
+from torchrl_quad.deploy.folder import replacing_folder, require_replaceable, restore
 from torchrl_quad.deploy.network import ACTIVATIONS, Layer, write_c, write_onnx
-from torchrl_quad.deploy.tasks import Rule
+from torchrl_quad.deploy.tasks import PROGRESS, Rule
 from torchrl_quad.envs import QuadrotorEnv
-from torchrl_quad.files import is_running
 
 VECTORS, SELF_TEST_VECTORS = 1024, 16
 STARTS = 2_000_000  # seed of the starts, that of recipes/evaluate.py
@@ -61,6 +59,7 @@ def export_policy(
     ``policy.onnx``     ``observation`` (batch, k) to ``action`` (batch, 4), float32, with normaliser and scaling in it
     ``policy.h, .c``    the same in C99, with a self-test
     ``contract.json``   what each number means; :func:`~torchrl_quad.deploy.contract.schema` is its JSON schema
+    ``starts.npz``      the states (num_envs, ...) in which these episodes began, and where in the task
     ``vectors.npz``     1024 visited ``observation`` with the ``action`` that the actor gave
     ``README.md``       how to fly it
     ==================  ================================================================================================
@@ -87,8 +86,8 @@ def export_policy(
         raise ImportError("export_policy needs onnx and onnxruntime: pip install onnx onnxruntime") from error
     env, normalizer = _unwrapped(env, normalizer)
     place = Path(folder).resolve()  # a link stays, what it points to is replaced
-    _require_replaceable(place)
-    _restore(place)
+    require_replaceable(place)
+    restore(place)
     contract = {"version": contracts.VERSION, **describe(env)}
     layers = fold(actor, normalizer)
     width, size = layers[0].weight.shape[1], contract["inputs"][-1]["stop"]
@@ -110,11 +109,12 @@ def export_policy(
     package = {"package": _version(), "weights_sha256": contracts.sha256(weights)}
     contract["origin"] = package | dict(origin or {})
     files = {"policy.onnx": write_onnx(layers), "vectors.npz": _npz(vectors), "README.md": _readme(contract)}
+    files["starts.npz"] = _npz(_starts(flight, contract["task"]["rule"]))
     files |= write_c(layers, contract, *(x[:: VECTORS // SELF_TEST_VECTORS] for x in vectors.values()))
     contract["sha256"] = {name: contracts.sha256(files[name]) for name in contracts.FILES}
     contract["digest"] = contracts.digest(contract)
     files["contract.json"] = (json.dumps(contract, indent=2, allow_nan=False) + "\n").encode()
-    with _replacing_folder(place) as temporary:
+    with replacing_folder(place) as temporary:
         for name, content in files.items():
             with open(temporary / name, "wb") as file:
                 file.write(content)
@@ -206,11 +206,17 @@ def _act(policy: TensorDictModuleBase, env: QuadrotorEnv, observation: Tensor) -
         return policy(seen)["action"].float()
 
 
+def _starts(flight: TensorDictBase, rule: str) -> dict[str, np.ndarray]:
+    """The first states of a flight (num_envs, ...), without what the environment drew beside them."""
+    names = [*QUANTITIES, PROGRESS[rule]]
+    return {name: flight["state", name][:, 0].cpu().numpy() for name in names}
+
+
 def _require_the_same_flight(folder: Path, env: QuadrotorEnv, flight: TensorDictBase) -> None:
     """Fly the bundle through the first episodes of a flight, from what a drone knows, and compare what it observes."""
     bundle = load_bundle(folder)
     bundle.check(TOLERANCE)
-    entry = {"target": "target", "curve": "phase", "gates": "gate"}[bundle.contract["task"]["rule"]]
+    entry = PROGRESS[bundle.contract["task"]["rule"]]
     for i in range(min(REPLAYED, env.num_envs)):
         done = flight[i]["next", "done"].flatten()
         length = int(done.nonzero()[0]) + 1 if done.any() else len(done)
@@ -277,6 +283,7 @@ def _readme(contract: Mapping[str, Any]) -> bytes:
         "inputs": "\n".join(inputs),
         "rule": rules[task["rule"]],
         "success": task["success"],
+        "progress": PROGRESS[task["rule"]],
         "sign": contract["quaternion"]["sign"],
         "queue": (
             "They start as hover actions. After each step drop the oldest four numbers and append the action."
@@ -296,53 +303,3 @@ def _readme(contract: Mapping[str, Any]) -> bytes:
     }
     template = (resources.files(__package__) / "templates" / "README.md").read_text()
     return Template(template).substitute(values).encode()
-
-
-# -- the folder --------------------------------------------------------------------------------------------------------
-
-
-def _restore(folder: Path) -> None:
-    """Bring back a bundle that a killed export had set aside, and delete what else it left behind."""
-    old = folder.with_name(f".{folder.name}.old")
-    if old.exists() and not any(folder.glob("*")):
-        os.replace(old, folder)
-    shutil.rmtree(old, ignore_errors=True)
-    temporary = re.compile(rf"\.{re.escape(folder.name)}\.(\d+)\.new")
-    for other in folder.parent.glob(".*.new"):
-        match = temporary.fullmatch(other.name)
-        if match and not is_running(int(match[1])):
-            shutil.rmtree(other, ignore_errors=True)
-
-
-def _require_replaceable(folder: Path) -> None:
-    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    if folder.is_file() or (names and not (folder / "contract.json").is_file()):
-        raise FileExistsError(f"{folder} exists and is no bundle. Choose another folder, or empty this one.")
-    if others := sorted(names - {*contracts.FILES, "contract.json"}):
-        raise FileExistsError(
-            f"{folder} also holds {', '.join(others)}: an export replaces the folder, and would delete that. Move it "
-            "away, or choose another folder."
-        )
-
-
-@contextlib.contextmanager
-def _replacing_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder that takes the place of ``folder`` when the block ends, and disappears when it raises."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary, old = (folder.with_name(f".{folder.name}.{end}") for end in (f"{os.getpid()}.new", "old"))
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir()
-    try:
-        yield temporary
-        _require_replaceable(folder)  # again: flying took its time
-        if folder.exists():
-            os.replace(folder, old)
-        os.replace(temporary, folder)
-    except BaseException:
-        if old.exists() and not folder.exists():
-            os.replace(old, folder)
-        raise
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if folder.exists():
-            shutil.rmtree(old, ignore_errors=True)

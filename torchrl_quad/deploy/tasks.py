@@ -117,6 +117,8 @@ class Gates:
         return np.concatenate((self.gates[self.gate] - position, self.gates[after] - position))
 
 
+# By rule: what ``reset`` takes, an entry of the environment's state and of a bundle's starts.
+PROGRESS = {"target": "target", "curve": "phase", "gates": "gate"}
 RULES: dict[str, type[Target] | type[Curve] | type[Gates]] = {"target": Target, "curve": Curve, "gates": Gates}
 
 

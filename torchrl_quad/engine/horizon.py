@@ -29,15 +29,18 @@ class Source(Protocol):
 def can_fly(stepper: Stepper, policy: Any, tensordict: TensorDictBase) -> bool:
     """Whether :func:`fly` gives what TorchRL's own loop does.
 
-    So it is if the policy reads nothing but observation, state, and what it has written itself in the step before.
+    So it is if the policy reads nothing but state, observation and the other outputs of a step, and what it has written
+    itself in the step before, which includes the memory of a recurrent one.
     """
     if not isinstance(policy, TensorDictModuleBase) or "_" in policy.out_keys:
         return False
     state = {flat_key("state", *_path(key)) for key in stepper.layout.place}
     needed = {"observation", *stepper.output_layout.place} - {"reward"}
     writes, reads = ({flat_key(*_path(key)) for key in keys} for keys in (policy.out_keys, policy.in_keys))
+    memory = _memory(policy)
+    writes |= {*memory, "is_init"} if memory else set()
     given = set(tensordict.keys(True, True))
-    knows = reads <= state | {"observation"} | writes and "action" in writes
+    knows = reads <= state | needed | writes and "action" in writes
     return knows and needed <= given <= state | needed | writes
 
 
@@ -61,7 +64,11 @@ def fly(
     """
     state, valid = stepper.simulation.guard(state)
     plain = _plain(stepper, policy)
-    before = {key: tensordict.get(key) for key in policy.out_keys if key in tensordict and key != "action"}
+    memory = _memory(policy)
+    own = (*policy.out_keys, *memory, "is_init")
+    before = {key: tensordict.get(key) for key in own if key in tensordict and key != "action"}
+    for key in memory if {"is_init", *memory} <= before.keys() else ():
+        before[key] = torch.where(like(before["is_init"], before[key]), 0.0, before[key])
     if not stepper.is_compiled:
         roots, ends, written = _fly_eager(stepper, source, policy, state, tensordict, valid, steps, before)
     elif plain is None:
@@ -135,15 +142,18 @@ def _call(
     ends: list[Record] = []
     written = []
     kind, done_row, _ = stepper.output_layout.place["done"]
+    reads = any(flat_key(*_path(key)) in stepper.output_layout.place for key in policy.in_keys)
     for t in range(steps):
         root = roots[-1]
-        action, before = _act(stepper, policy, root.observation, stepper.layout.unpack(root.state), before)
-        written.append(before)
+        outputs = {"observation": root.observation, **(stepper.unpack_outputs(root.outputs) if reads else {})}
+        action, now = _act(stepper, policy, outputs, stepper.layout.unpack(root.state), before)
+        written.append(now)
         end = stepper.step_rows(root.state, valid, action, source.noise())
         ends.append(end)
         if t == 0:
             valid = torch.ones_like(valid)  # a step leads to meaningful states
         done = end.outputs[kind][done_row]
+        before = _handed_on(policy, now, done.t())
         if t < steps - 1:
             roots.append(_restarted(stepper, source, end, done) if _may_restart(done) else end)
     return _entries(stepper, _stacked(roots)), _entries(stepper, _stacked(ends), "next"), _over_time(written)
@@ -163,10 +173,11 @@ def _fly_eager(
     outputs = {key: tensordict.get(key) for key in ("observation", *stepper.output_layout.place) if key != "reward"}
     roots, ends, written = [_of_state(state) | outputs], [], []
     for t in range(steps):
-        action, before = _act(stepper, policy, roots[-1]["observation"], state, before)
-        written.append(before)
+        action, now = _act(stepper, policy, roots[-1], state, before)
+        written.append(now)
         state, outputs = stepper.step(state, valid, action, source.noise())
         ends.append(_of_state(state) | flat(outputs))
+        before = _handed_on(policy, now, outputs["done"])
         if t == 0:
             valid = torch.ones_like(valid)  # a step leads to meaningful states
         if t < steps - 1:
@@ -185,17 +196,49 @@ def _fly_eager(
 
 
 def _act(
-    stepper: Stepper, policy: TensorDictModuleBase, observation: Tensor, state: State, before: dict[Any, Tensor]
+    stepper: Stepper, policy: TensorDictModuleBase, outputs: dict[Key, Tensor], state: State, before: dict[Any, Tensor]
 ) -> tuple[Tensor, dict[Any, Tensor]]:
     """The action of a policy that is called, and all that it writes; it sees what it wrote in the step before."""
     handed_on = {key: x for key, x in before.items() if key != "action"}
-    td = TensorDict({**handed_on, "observation": observation}, [len(observation)], observation.device)
-    if any(flat_key(*_path(key)) != "observation" for key in policy.in_keys):
+    reads, observation = {flat_key(*_path(key)) for key in policy.in_keys}, outputs["observation"]
+    read = {key: x for key, x in outputs.items() if key in reads or key == "observation"}
+    td = TensorDict({**handed_on, **nested(read)}, [len(observation)], observation.device)
+    if reads - {"observation"}:
         td["state"] = nested(state)
+    memory = _memory(policy)
+    if memory:
+        td["is_init"] = before.get("is_init", torch.zeros_like(observation[:, :1], dtype=torch.bool))
     td = policy(td)
     action = td.get("action")
     stepper.simulation.check_action(action)
-    return action, {key: td.get(key) for key in policy.out_keys}
+    written = {key: td.get(key) for key in policy.out_keys}
+    for key in memory:
+        after = written[("next", *_path(key))]
+        written[key] = torch.zeros_like(after) if before.get(key) is None else before[key]
+    if memory:
+        written |= {"is_init": td["is_init"], ("next", "is_init"): torch.zeros_like(td["is_init"])}
+    return action, written
+
+
+def _memory(policy: TensorDictModuleBase) -> list[Any]:
+    """The entries in which a recurrent policy remembers: it reads them, and writes them below "next"."""
+    written = {_path(key) for key in policy.out_keys}
+    return [key for key in policy.in_keys if ("next", *_path(key)) in written]
+
+
+def _handed_on(policy: TensorDictModuleBase, written: dict[Any, Tensor], done: Tensor) -> dict[Any, Tensor]:
+    """Of what a policy has written that which it sees in the next step; where an episode ends, bool (n, 1), it forgets.
+
+    The gradient ends there with the memory.
+    """
+    memory = _memory(policy)
+    if not memory:
+        return written
+    before = {key: x for key, x in written.items() if _path(key)[0] != "next"}
+    for key in memory:
+        x = written[("next", *_path(key))]
+        before[key] = torch.where(like(done, x), 0.0, x) if _may_restart(done) else x
+    return before | {"is_init": done}
 
 
 def _over_time(steps: list[dict[Key, Tensor]]) -> dict[Key, Tensor]:

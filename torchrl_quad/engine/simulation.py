@@ -30,6 +30,9 @@ class Simulation(Protocol):
     parameters: tuple[Tensor, ...]
     """Tensors beside state and action that gradients may reach, such as the mass of a drone."""
 
+    constants: frozenset[str]
+    """The outputs that carry no gradient, such as what is only measured."""
+
     def example(self) -> tuple[State, dict[str, Any]]:
         """A state, and outputs of the kind that a step gives; the engine reads names, shapes and types."""
 

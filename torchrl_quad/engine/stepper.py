@@ -51,8 +51,9 @@ class Stepper:
         return self.layout.unpack(state), {**nested(self.unpack_outputs(outputs)), "observation": observation}
 
     def unpack_outputs(self, rows: Rows) -> dict[Any, Tensor]:
-        """The outputs of a step, or of a horizon, by name; metrics have no gradient."""
-        return {key: x.detach() if "metrics" in key else x for key, x in self.output_layout.unpack(rows).items()}
+        """The outputs of a step, or of a horizon, by name; the constants among them without gradient."""
+        constants, outputs = self.simulation.constants, self.output_layout.unpack(rows).items()
+        return {key: x.detach() if (key if isinstance(key, str) else key[0]) in constants else x for key, x in outputs}
 
     def step_rows(self, rows: Rows, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Record:
         """One compiled step on rows, from a state under an action (n, k); the rest is that of :meth:`fly`."""

@@ -16,7 +16,8 @@ from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams, load_dron
 from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compiler, nested
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import checks
-from torchrl_quad.envs.disturbances import Disturbance, choose_disturbances
+from torchrl_quad.envs.disturbances import Disturbance
+from torchrl_quad.envs.options import choose_disturbances
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenery import merge_reset, visible_state
 from torchrl_quad.envs.specs import describe, set_specs
@@ -53,16 +54,17 @@ class QuadrotorEnv(Task, EnvBase):
         integrator: "euler", "semi_implicit_euler" or "rk4".
         max_episode_steps: control steps after which an episode is truncated.
         observe_last_action: append the commands that are still on their way to the observation. Off in the paper.
-        observation_noise: standard deviations of white noise on the observation: a mapping with fields of
-            :class:`~torchrl_quad.envs.disturbances.Sensors`, or one of these.
+        observation_noise: white noise: a mapping, or :class:`~torchrl_quad.envs.disturbances.Sensors`.
         observation_delay: control steps by which the observation of the drone lags behind.
         weights: other weights of reward terms, by name: ``{"velocity": 0.0}``.
         event_discount: discount per control step by which the time of an event counts; None: events have no gradient.
-        randomize: distributions of parameters for another drone in each episode, a mapping or a YAML file; see
-            :class:`~torchrl_quad.envs.disturbances.DroneRandomization`.
+        randomize: another drone in each episode; see :class:`~torchrl_quad.envs.disturbances.DroneRandomization`.
         wind: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.Wind`, or one of these.
         random_start: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.RandomStart`, or one of these.
         disturbances: disturbances of your own; see :class:`~torchrl_quad.envs.disturbances.Disturbance`.
+        scene: obstacles, which drones crash into: a mapping or a YAML file; see :class:`~torchrl_quad.Scene`.
+        camera: adds ``"depth"`` (num_envs, 1, height, width) [m] to what a policy sees: a
+            :class:`~torchrl_quad.DepthCamera`, or a mapping of its fields. Without a scene it sees the ground z = 0.
         compile: compile the step and its first derivative: half a minute the first time; see ``docs/performance.md``.
 
     Raises:
@@ -97,6 +99,8 @@ class QuadrotorEnv(Task, EnvBase):
         wind: Mapping[str, Any] | Disturbance | None = None,
         random_start: Mapping[str, float] | Disturbance | None = None,
         disturbances: Sequence[Disturbance] = (),
+        scene: Any = None,
+        camera: Any = None,
         **unknown: Any,
     ) -> None:
         checks.refuse_unknown(type(self), unknown)
@@ -118,6 +122,7 @@ class QuadrotorEnv(Task, EnvBase):
         self._make_disturbances = functools.partial(
             choose_disturbances, random_start=random_start, randomize=randomize, wind=wind,
             observation_noise=observation_noise, observation_delay=observation_delay, more=disturbances,
+            scene=scene, camera=camera,
         )  # fmt: skip
         self.disturbances = self._make_disturbances(self.nominal, self.dynamics.plant_fields)
         self.randomness = Randomness(self.device, dtype)
@@ -152,10 +157,8 @@ class QuadrotorEnv(Task, EnvBase):
         self._params = params if fits else params.to(device=self.device, dtype=self.dtype)
 
     def set_initial_state_source(self, source: Callable[[int], TensorDictBase] | None) -> None:
-        """Choose where resets start, also through a TransformedEnv.
-
-        ``source(n)`` returns n complete states, the content of ``td["state"]``. None means the task's own starts.
-        """
+        """Choose where resets start, also through a TransformedEnv: ``source(n)`` returns n complete states, the
+        content of ``td["state"]``; None means the task's own starts."""
         checks.check_source(source)
         self.initial_state_source = source
         self.randomness.forget_starts()
@@ -181,8 +184,7 @@ class QuadrotorEnv(Task, EnvBase):
         """Compile the control step and its derivative; the keywords go to torch.compile. Under transforms, compile the
         environment inside, ``TransformedEnv(HoveringEnv(compile=True), ...)``: TransformedEnv's own takes minutes."""
         kwargs.pop("warmup", None)  # TorchRL's option for steps whose input changes its layout: ours never does
-        self._stepper = Stepper(self.control_step, kwargs if has_compiler() else None)
-        return self
+        return self._run(kwargs if has_compiler() else None)
 
     def flies_inside(self, policy: Any) -> bool:
         """Whether :meth:`rollout` flies a policy inside the compiled step, which is fastest, or calls it before each
@@ -191,8 +193,7 @@ class QuadrotorEnv(Task, EnvBase):
 
     def eager(self) -> QuadrotorEnv:
         """Undo :meth:`compile`."""
-        self._stepper = Stepper(self.control_step)
-        return self
+        return self._run(None)
 
     def to(self, device: torch.device | str) -> QuadrotorEnv:
         """Move the environment to a device, where its random generator starts again from its seed."""
@@ -211,20 +212,14 @@ class QuadrotorEnv(Task, EnvBase):
         return self
 
     def render(self, drones: Sequence[int] | None = None, *, size: int = 336) -> Any:
-        """Draw the drones as the last reset, step or rollout left them, with their targets, into one picture.
-
-        TorchRL's ``PixelRenderTransform(drones=[0, 1], size=480)`` calls it, and ``VideoRecorder`` films it.
+        """Draw the drones as the last reset, step or rollout left them; TorchRL's ``PixelRenderTransform`` calls it.
 
         Args:
             drones: indices of those to draw; by default the first six.
-            size: width and height [pixels].
-
-        Returns:
-            the picture (size, size, 3), a numpy array of uint8.
+            size: width and height [pixels] of the picture, a numpy array (size, size, 3) of uint8.
 
         Raises:
             ValueError: there is no state yet, as before the first reset; or an argument is out of its range.
-            ImportError: matplotlib is missing.
         """
         from torchrl_quad.render.frames import draw_frame  # matplotlib is needed only here
 
@@ -235,11 +230,18 @@ class QuadrotorEnv(Task, EnvBase):
     def _connect(self, safe_state: State, options: dict[str, Any] | None = None) -> None:
         """Join what belongs together on one device: the step, what runs it, and its random numbers."""
         self.control_step = ControlStep(self, safe_state)
-        self._stepper = Stepper(self.control_step, options)
+        self._run(options)
         sizes = {name: x.noise_size for name, x in self.disturbances.items()}
         self.randomness.noise_shapes = {name: (self.num_envs, size) for name, size in sizes.items() if size}
         self.randomness.draw_start = functools.partial(draw_start, self)
         self.render_state: State = {}  # positions, quaternions and targets, for render()
+
+    def _run(self, options: dict[str, Any] | None) -> QuadrotorEnv:
+        """Run steps compiled with these options, eager for None; and the camera, which starts use, too, likewise."""
+        self._stepper = Stepper(self.control_step, options)
+        if "camera" in self.disturbances:
+            self.disturbances["camera"].is_compiled = self.is_compiled
+        return self
 
     def reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool | None = None, **options: Any) -> Any:
         """As TorchRL's; of a mask and a state in one tensordict, ``set_state`` says which of them counts."""
@@ -285,16 +287,14 @@ class QuadrotorEnv(Task, EnvBase):
                 state = checks.read_state(start.get("state"), self.control_step.safe_state, "rollout")
                 rollout = fly(self._stepper, self.randomness, policy, state, start, max_steps)
                 checks.require_finite(rollout["action"])
-                last = visible_state(rollout["next", "state"]).items()
-                self._keep_for_render({key: x[:, -1].clone() for key, x in last})  # not the memory of all steps
+                self._keep_for_render(rollout.get(("next", "state"))[:, -1].clone())
                 return rollout
             options |= {"tensordict": start, "auto_reset": False}
         return super().rollout(max_steps, policy, callback, **options)
 
     def _keep_for_render(self, state: State, mask: Tensor | None = None) -> None:
         """Keep what render() draws, detached; with a mask, of the environments in it."""
-        begun = {key: x.detach() for key, x in visible_state(state).items()}
-        self.render_state = merge_reset(self.render_state, begun, mask)
+        self.render_state = merge_reset(self.render_state, visible_state(state), mask)
 
 
 QuadrotorEnv.__signature__ = checks.full_signature(QuadrotorEnv, EnvBase)

@@ -265,7 +265,7 @@ def restore_state(env: Any, state: Any, source: str, mask: Tensor | None = None)
     entries = {key: x.to(step.safe_state[key], copy=True) for key, x in entries.items()}
     if is_traced():
         return entries
-    wrong = step.guard.complaints(entries)
+    wrong = step.complaints(entries)
     for key, (low, high) in {"step": (0, MAX_STEPS), **env.state_bounds()}.items():
         outside = ~((entries[key] >= low) & (entries[key] <= high)).flatten(1).all(1)
         wrong[f"{key!r} must lie between {low} and {high}"] = outside

@@ -47,6 +47,10 @@ class Disturbance:
         """The state as the policy sees it. Rewards, crashes and success use the true one."""
         return state
 
+    def complaints(self, state: State) -> dict[str, Tensor]:
+        """What is wrong with a state to start from, in words, and where it is wrong, bool (n)."""
+        return {}
+
 
 class DroneRandomization(Disturbance):
     """Fly another drone in each episode: any of its parameters, drawn at reset.
@@ -298,33 +302,3 @@ def _is_number(value: Any) -> bool:
 
 def _is_numbers(value: Any, count: int) -> bool:
     return isinstance(value, Sequence) and len(value) == count and all(_is_number(x) for x in value)
-
-
-def choose_disturbances(
-    nominal: QuadrotorParams,
-    plant_fields: Sequence[str],
-    random_start: Any,
-    randomize: Any,
-    wind: Any,
-    observation_noise: Any,
-    observation_delay: int,
-    more: Sequence[Disturbance],
-) -> dict[str, Disturbance]:
-    """The disturbances that an environment's arguments ask for, by name, in the order in which they act."""
-    chosen: dict[str, Disturbance] = {}
-    if random_start:
-        chosen["random_start"] = build(RandomStart, "random_start", random_start)
-    if randomize:
-        chosen["randomize"] = DroneRandomization(randomize, nominal, plant_fields)
-    if wind is not None:
-        chosen["wind"] = build(Wind, "wind", wind)
-    sensors = build(Sensors, "observation_noise", observation_noise or {}, delay=observation_delay)
-    if sensors.noise_size or sensors.delay:
-        chosen["sensors"] = sensors
-    if not isinstance(more, Sequence):
-        raise TypeError(f"disturbances must be a list of Disturbance, got {type(more).__name__}.")
-    for disturbance in more:
-        if not isinstance(disturbance, Disturbance):
-            raise TypeError(f"disturbances: each must be a Disturbance, got {type(disturbance).__name__}.")
-        chosen[f"{type(disturbance).__name__}_{len(chosen)}"] = disturbance
-    return chosen

@@ -10,6 +10,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from torchrl_quad.envs.base import QuadrotorEnv
+from torchrl_quad.envs.forest import ForestEnv
 from torchrl_quad.envs.hovering import HoveringEnv
 from torchrl_quad.envs.landing import LandingEnv
 from torchrl_quad.envs.racing import RacingEnv
@@ -19,6 +20,7 @@ GROUP = "torchrl_quad.tasks"  # the group of entry points by which an installed 
 
 # The tasks that ship, and those that register_task has added.
 TASKS: dict[str, type[QuadrotorEnv]] = {
+    "forest": ForestEnv,
     "hovering": HoveringEnv,
     "landing": LandingEnv,
     "racing": RacingEnv,

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchrl_quad.engine.packing import like
 from torchrl_quad.envs.shapes import Shape, along_the_course, as_points, rings
+from torchrl_quad.vision.primitives import SIZES
 
 
 @dataclass(frozen=True)
@@ -109,15 +111,21 @@ class Scenery:
 
 
 def visible_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The entries of a state that pictures show: ``position``, ``quaternion``, and ``target`` if it is a position."""
+    """The entries of a state that pictures show: ``position``, ``quaternion``, ``target`` if it is a position, and the
+    random obstacles of a scene."""
     shown = {key: state[key] for key in ("position", "quaternion")}
     if "target" in state and state["target"].shape == state["position"].shape:
         shown["target"] = state["target"]
-    return shown
+    nested = state.get("scene", {})
+    for kind in SIZES:
+        obstacles = nested.get(kind, None) if ("scene", kind) not in state else state["scene", kind]
+        if obstacles is not None:
+            shown["scene", kind] = obstacles
+    return {key: x.detach() for key, x in shown.items()}
 
 
 def merge_reset(before: Mapping[str, Tensor], begun: Mapping[str, Tensor], mask: Tensor | None) -> dict[str, Tensor]:
     """The visible state after a reset of the environments in a mask (num_envs, 1), of all of them for None."""
     if mask is None or not before:
         return dict(begun)
-    return {key: torch.where(mask.reshape(-1, 1), x, before[key]) for key, x in begun.items()}
+    return {key: torch.where(like(mask.flatten(), x), x, before[key]) for key, x in begun.items()}

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_quad.dynamics import QuadrotorParams
+from torchrl_quad.dynamics import QuadrotorParams, quaternion
 from torchrl_quad.dynamics.parameters import RawParams
 from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine import Transition, nested
@@ -34,6 +34,8 @@ class ControlStep:
         self.safe_state, self.guard = safe_state, Guard(safe_state, env.dynamics, env.task_entries)
         self.task_advances = type(env).advance is not Task.advance
         self.event_names = list(env.events(safe_state, safe_state)) if env.event_discount is not None else []
+        eye = env.disturbances.get("camera")
+        self.constants = frozenset(("metrics",) if eye is None or eye.camera.differentiable else ("metrics", "depth"))
         self.drawn = [key[1] for key in safe_state if isinstance(key, tuple) and key[0] == "drone"]
 
     def __call__(self, state: State, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Transition:
@@ -76,7 +78,10 @@ class ControlStep:
     def judge(self, before: State, drone: State, valid: Tensor, noise: dict[str, Tensor]) -> Transition:
         """Where the step leads, from the state at its start and where the drone has flown."""
         env = self.env
-        state = self.apply_disturbances({**before, **drone, "step": before["step"] + 1}, noise)
+        state = {**before, **drone, "step": before["step"] + 1}
+        if self.env.scene is not None:
+            state["collided"] = self.env.scene.collided(before, state)
+        state = self.apply_disturbances(state, noise)
         state, meaningful = self.guard(state)
         valid = valid & meaningful
         keep, everywhere = valid.unsqueeze(1), is_true(valid)
@@ -87,6 +92,7 @@ class ControlStep:
                 state[key] = new if everywhere else torch.where(like(keep, new), new, state[key])
         terms = env.reward_terms(state)
         crash, success = env.is_crash(state) | ~keep, env.is_success(state) & keep
+        crash = crash if env.scene is None else crash | state["collided"]
         terminated = crash | success if env.ends_on_success else crash
         if self.event_names:
             terms = {**terms, **self.event_terms(before, state, terms, terminated)}
@@ -116,7 +122,12 @@ class ControlStep:
         """The outputs that any state has, also the first of an episode."""
         with torch.no_grad():
             metrics = self.env.metrics(state)
-        return {"observation": self.observe(state), "metrics": metrics}
+        eye = self.env.disturbances.get("camera")
+        seen = {} if eye is None else {"depth": eye.image(state)}
+        if self.env.scene is not None:  # for critics, which may know more than policies
+            distance, away = self.env.scene.nearest(state)
+            seen["obstacle"] = torch.cat((distance, quaternion.rotate_inverse(state["quaternion"], away)), -1)
+        return {"observation": self.observe(state), **seen, "metrics": metrics}
 
     def observe(self, state: State) -> Tensor:
         """The observation (n, k) as the policy sees it: through sensors, with the commands on their way if wanted."""
@@ -139,6 +150,13 @@ class ControlStep:
     def reset(self, state: State) -> dict[str, Any]:
         """All entries that a reset to a state writes, nested."""
         return {"state": nested(state), **self.at_start(state)}
+
+    def complaints(self, state: State) -> dict[str, Tensor]:
+        """What is wrong with a state to start from, in words, and where it is wrong, bool (n)."""
+        wrong = self.guard.complaints(state)
+        for disturbance in self.env.disturbances.values():
+            wrong |= disturbance.complaints(state)
+        return wrong
 
     # -- for the engine ------------------------------------------------------------------------------------------------
 

@@ -15,6 +15,8 @@ from torchrl_quad.envs.episodes import summarise_episodes
 from torchrl_quad.envs.events import Event
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
+from torchrl_quad.envs.scenes import Scene
+from torchrl_quad.vision import DepthCamera
 
 
 class Task(abc.ABC):
@@ -35,6 +37,9 @@ class Task(abc.ABC):
     ``("drone", field)``           as the field  the randomised parameters, with ``randomize``
     ``mean_wind``, ``wind``        (3)           [m/s], world frame, with ``wind``
     ``measurements``               (d + 1, 13)   sensor readings, oldest first, with noise or delay
+    ``("scene", kind)``            (m, k)        the random obstacles of a ``scene``; see :class:`~torchrl_quad.Scene`
+    ``collided``                   (1)           whether the drone touched an obstacle in this step, with a ``scene``
+    ``images``                     (k, h, w)     of a ``camera`` with rate, delay or noise, oldest first [m]
     =============================  ============  =======================================================================
 
     and the entries that the task adds.
@@ -42,6 +47,7 @@ class Task(abc.ABC):
 
     dynamics: Dynamics  #: the model of the drone
     randomness: Randomness  #: the source of all random numbers
+    disturbances: Mapping[str, Any]  #: wind, sensors and so on by name; see :mod:`~torchrl_quad.envs.disturbances`
 
     # -- what a task defines -------------------------------------------------------------------------------------------
 
@@ -115,6 +121,17 @@ class Task(abc.ABC):
         return summarise_episodes(rollout)
 
     # -- what a task may use -------------------------------------------------------------------------------------------
+
+    @property
+    def scene(self) -> Scene | None:
+        """The obstacles, with the distance to them, if there are any."""
+        return self.disturbances.get("scene")
+
+    @property
+    def camera(self) -> DepthCamera | None:
+        """The depth camera, if there is one."""
+        eye = self.disturbances.get("camera")
+        return None if eye is None else eye.camera
 
     @property
     def nominal(self) -> QuadrotorParams:

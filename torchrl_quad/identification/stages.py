@@ -112,7 +112,7 @@ class Fit:
         return minimise(self.problem(state), state, after, self.iterations)
 
     def _least_certain(self, state: State) -> dict[str, str]:
-        """The unknown that flights tell least of, if that is too little, or all that they tell nothing of; and why."""
+        """The unknown of which flights tell least, if too little, and why; or all of which they tell nothing."""
         if not state.free:
             return {}
         _, _, cover, _ = self.uncertainty(state)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -70,36 +71,12 @@ def make_actor(
             of at least 1, the number of scales is not that of the entries, or the first action is not strictly inside
             the bounds.
     """
-    spec = env.action_spec_unbatched
-    if not isinstance(spec, Bounded):
-        raise ValueError(f"make_actor needs an action with bounds, a Bounded spec; got {type(spec).__name__}.")
-    if len(spec.shape) != 1:
-        raise ValueError(
-            f"make_actor writes one action (k) for each environment, and here it has shape {tuple(spec.shape)}: a "
-            "transform such as MultiAction asks for several actions at once. Leave it out. To hold each action longer, "
-            "give the environment a longer control step, control_dt=0.04."
-        )
-    low, high = spec.space.low, spec.space.high
-    middle = 0.5 * (low + high)
-    if action_init is None:
-        action_init = getattr(_single(env), "neutral_action", middle)
-        action_init = action_init.mean(0) if action_init.dim() > middle.dim() else action_init
-    action_init = torch.as_tensor(action_init).to(middle)
-    if action_init.shape != spec.shape or not ((low < action_init) & (action_init < high)).all():
-        raise ValueError(
-            f"action_init must be {spec.shape[-1]} numbers strictly between {low.tolist()} and {high.tolist()}, got "
-            f"{action_init.tolist()}."
-        )
-    if not 0 < scale_init < math.inf:
-        raise ValueError(f"scale_init must be positive and finite, got {scale_init}.")
+    spec, first = first_action(env, action_init, scale_init, "make_actor")
     if not 0 <= noise_correlation < 1:
         raise ValueError(f"noise_correlation must lie from 0 to below 1, got {noise_correlation}.")
     size = spec.shape[-1]
-    net = _network(env, in_keys, 2 * size if learn_scale else size, num_cells, activation, input_scale)
-    with torch.no_grad():
-        net.mlp[-1].weight.mul_(0.01)
-        net.mlp[-1].bias.zero_()
-        net.mlp[-1].bias[:size] = torch.atanh((action_init - middle) / (0.5 * (high - low)))
+    net = network_of(env, in_keys, 2 * size if learn_scale else size, num_cells, activation, input_scale)
+    start_near(net.mlp[-1], first)
     mapping, read = f"biased_softplus_{scale_init}", list(in_keys)
     if noise_correlation:
         net.head = CorrelatedHead(noise_correlation, size, mapping)
@@ -107,14 +84,8 @@ def make_actor(
     else:
         net.head = GaussianHead(size, mapping)
     params = TensorDictModule(net, in_keys=read, out_keys=["loc", "scale"])
-    bounds = {} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high}
     actor = (CorrelatedActor if noise_correlation else TanhGaussianActor)(
-        params,
-        in_keys=["loc", "scale"],
-        spec=spec,
-        distribution_class=TanhNormal,
-        distribution_kwargs=bounds,
-        return_log_prob=return_log_prob,
+        params, **sampling(spec), return_log_prob=return_log_prob
     )
     if noise_correlation:
         actor.out_keys = [*actor.out_keys, "noise_before", "noise"]
@@ -134,9 +105,11 @@ def make_value(
     LayerNorm normalises its hidden layers. The policy follows the critic's gradient, which is far off without it.
 
     A critic may read more than the actor does, such as ``in_keys=("observation", ("state", "rotor_speed"))``. Rotors
-    turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one.
+    turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one. Where there are
+    obstacles, ``"obstacle"`` (*, 4) is the distance from the drone's surface to the nearest [m], and the direction away
+    from it in the body frame: what a policy has images of, a critic can know.
     """
-    net = _network(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
+    net = network_of(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
     return Critic(net, in_keys=list(in_keys))
 
 
@@ -155,11 +128,58 @@ def make_qvalue(
     wrong. ``action_scale`` multiplies the action at the input, so that the critic relies on the state first.
     """
     in_keys = [*in_keys, "action"]
-    net = _network(env, in_keys, 1, num_cells, activation, input_scale, action_scale, layer_norm=True)
+    net = network_of(env, in_keys, 1, num_cells, activation, input_scale, action_scale, layer_norm=True)
     return Critic(net, in_keys=in_keys)
 
 
-def _network(
+def first_action(env: EnvBase, action_init: Tensor | None, scale_init: float, name: str) -> tuple[Bounded, Tensor]:
+    """The spec of one action, and what the mean of the first actions is before the tanh, (k); checked for ``name``."""
+    spec = env.action_spec_unbatched
+    if not isinstance(spec, Bounded):
+        raise ValueError(f"{name} needs an action with bounds, a Bounded spec; got {type(spec).__name__}.")
+    if len(spec.shape) != 1:
+        raise ValueError(
+            f"{name} writes one action (k) for each environment, and here it has shape {tuple(spec.shape)}: a "
+            "transform such as MultiAction asks for several actions at once. Leave it out. To hold each action longer, "
+            "give the environment a longer control step, control_dt=0.04."
+        )
+    low, high = spec.space.low, spec.space.high
+    middle = 0.5 * (low + high)
+    if action_init is None:
+        action_init = getattr(_single(env), "neutral_action", middle)
+        action_init = action_init.mean(0) if action_init.dim() > middle.dim() else action_init
+    action_init = torch.as_tensor(action_init).to(middle)
+    if action_init.shape != spec.shape or not ((low < action_init) & (action_init < high)).all():
+        raise ValueError(
+            f"action_init must be {spec.shape[-1]} numbers strictly between {low.tolist()} and {high.tolist()}, got "
+            f"{action_init.tolist()}."
+        )
+    if not 0 < scale_init < math.inf:
+        raise ValueError(f"scale_init must be positive and finite, got {scale_init}.")
+    return spec, torch.atanh((action_init - middle) / (0.5 * (high - low)))
+
+
+def start_near(layer: nn.Linear, first: Tensor) -> None:
+    """Let the last layer of a policy begin with actions of mean ``first`` (k), before the tanh, whatever it reads."""
+    with torch.no_grad():
+        layer.weight.mul_(0.01)
+        layer.bias.zero_()
+        layer.bias[: len(first)] = first
+
+
+def sampling(spec: Bounded) -> dict[str, Any]:
+    """How an actor samples a tanh-Gaussian action with these bounds, as keywords of ProbabilisticActor."""
+    low, high = spec.space.low, spec.space.high
+    bounds = {} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high}
+    return {
+        "in_keys": ["loc", "scale"],
+        "spec": spec,
+        "distribution_class": TanhNormal,
+        "distribution_kwargs": bounds,
+    }
+
+
+def network_of(
     env: EnvBase,
     in_keys: Sequence[NestedKey],
     out_features: int,
@@ -168,7 +188,9 @@ def _network(
     input_scale: float | Sequence[float],
     action_scale: float | None = None,
     layer_norm: bool = False,
+    more: int = 0,
 ) -> Network:
+    """A network on entries of an environment; it reads ``more`` numbers first, which are none of these entries."""
     if isinstance(in_keys, str) or not in_keys:
         raise ValueError(f'in_keys must be a list of entries, such as ["observation"]; got {in_keys!r}.')
     specs = [_spec(env, key) for key in in_keys]
@@ -182,7 +204,7 @@ def _network(
         raise ValueError(f"num_cells must be the widths of the hidden layers, such as (64, 64); got {num_cells!r}.")
     norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": cells} for cells in num_cells]}
     mlp = MLP(
-        in_features=sum(spec.shape[-1] for spec in specs),
+        in_features=more + sum(spec.shape[-1] for spec in specs),
         out_features=out_features,
         num_cells=list(num_cells),
         activation_class=activation,
@@ -190,7 +212,8 @@ def _network(
         **(norm if layer_norm else {}),
     )
     dtype = next((spec.dtype for spec in specs if spec.dtype.is_floating_point), None)
-    return Network(mlp.to(dtype), scales, [spec.shape[-1] for spec in specs])
+    widths = [spec.shape[-1] for spec in specs]
+    return Network(mlp.to(dtype), [1.0, *scales] if more else scales, [more, *widths] if more else widths)
 
 
 def _single(env: EnvBase) -> EnvBase:

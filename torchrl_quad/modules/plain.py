@@ -127,7 +127,7 @@ class TanhGaussianActor(ProbabilisticActor):
 
     def plain(self) -> PlainTanhGaussian | None:
         """The policy as pure functions of its present weights; None if somebody has changed its parts, or hooks it."""
-        is_random = _is_random(self)
+        is_random = samples(self)
         network = getattr(self[0], "module", None)
         is_known = is_random is not None and type(self) in (TanhGaussianActor, CorrelatedActor)
         if not is_known or type(network) is not Network or _is_hooked(self) or len(self.module) != 2:
@@ -158,7 +158,7 @@ class CorrelatedActor(TanhGaussianActor):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write loc, scale, action, noise and noise_before, and the log-probability if wanted."""
-        is_random, network = _is_random(self), self[0].module
+        is_random, network = samples(self), self[0].module
         shape, before = (*tensordict.batch_size, network.head.size), tensordict.get("noise", None)
         if before is None or not is_random:
             before = _first_noise(network.mlp[-1].weight.new_zeros(shape), is_random)
@@ -168,7 +168,7 @@ class CorrelatedActor(TanhGaussianActor):
         loc, scale = (self[0](tensordict).get(key) for key in ("loc", "scale"))
         xi = _first_noise(torch.zeros_like(loc.detach()), is_random)
         log_prob_key = self[1].log_prob_key if self[1].return_log_prob else None
-        written = _tanh_gaussian(loc, scale, xi, *_bounds(self), log_prob_key)
+        written = _tanh_gaussian(loc, scale, xi, *bounds_of(self), log_prob_key)
         return tensordict.update(written).set("noise", network.head.next(before, xi))
 
 
@@ -186,7 +186,7 @@ class PlainTanhGaussian:
         self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
         self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
         self.size = self.head.size
-        self.low, self.high = (x if x is None else x.tolist() for x in _bounds(actor))
+        self.low, self.high = (x if x is None else x.tolist() for x in bounds_of(actor))
         mapping = self.head.scale_mapping
         self.signature = (
             *map(str, (self.in_keys, self.out_keys, self.scales, self.activations, self.low, self.high)),
@@ -314,13 +314,13 @@ def _tanh_gaussian(
     return written
 
 
-def _is_random(actor: ProbabilisticActor) -> bool | None:
+def samples(actor: ProbabilisticActor) -> bool | None:
     """Whether it samples, or takes the mode; None where it is asked for something else."""
     kind = exploration_type() or actor[1].default_interaction_type
     return {ExplorationType.RANDOM: True, ExplorationType.DETERMINISTIC: False}.get(kind)
 
 
-def _bounds(actor: ProbabilisticActor) -> tuple[Tensor | None, Tensor | None]:
+def bounds_of(actor: ProbabilisticActor) -> tuple[Tensor | None, Tensor | None]:
     """The least and the greatest action, each (k); None for -1 and 1."""
     bounds = actor[1].distribution_kwargs
     return (bounds["low"], bounds["high"]) if bounds else (None, None)

@@ -43,10 +43,11 @@ def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
 
 
 def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
-    """What a policy of ``make_actor`` writes in the states of a rollout with the noise of the rollout.
+    """What a policy of ``make_actor`` or ``make_visual_actor`` writes in a rollout's states, with the rollout's noise.
 
-    Its values are those of the rollout as long as the policy has not changed. Its gradients reach the policy's
-    parameters alone: neither do earlier states move with them, nor does the noise.
+    A memory comes about anew in these states, from that at the start of the rollout. The values are those of the
+    rollout as long as the policy has not changed. The gradients reach the policy's parameters alone: neither do earlier
+    states move with them, nor does the noise.
 
     Args:
         actor: the policy that flew the rollout.
@@ -55,10 +56,12 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
             actions within 1e-6 of a bound: they count as if they were that far from it.
 
     Raises:
-        NotImplementedError: the policy is another one than ``make_actor`` builds, whose noise is not known.
+        NotImplementedError: the policy is another one than these build, whose noise is not known.
     """
     with params.to_module(actor):
         plain = _plain(actor)
+        if hasattr(plain, "replay"):
+            return plain.replay(tensordict)
         return act(plain, tensordict.select(*plain.in_keys).detach(), plain.drawn_again(tensordict))
 
 
@@ -106,12 +109,13 @@ def location_gradient(
 
 
 def _plain(actor: TensorDictModule) -> Any:
-    plain = actor.plain() if hasattr(actor, "plain") else None
+    make = getattr(actor, "replayed", None) or getattr(actor, "plain", lambda: None)
+    plain = make()
     if not hasattr(plain, "drawn_again"):
         raise NotImplementedError(
-            "Gradients of single actions need a policy as make_actor builds it, whose noise follows from its actions, "
-            "and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed parts, or leave "
-            "clip_action_gradient=None with another loss than AHACLoss and HybridLoss."
+            "Gradients of single actions need a policy of make_actor or make_visual_actor, whose noise follows from "
+            "its actions, and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed parts, or "
+            "leave clip_action_gradient=None with another loss than AHACLoss and HybridLoss."
         )
     return plain
 

@@ -24,6 +24,7 @@ from torchrl_quad.render.canvas import (
     set_scale,
 )
 from torchrl_quad.render.flights import Flight, check_rollout, state_keys
+from torchrl_quad.render.obstacles import with_obstacles
 
 _PAPER = {  # for figures as wide as a page of two columns
     "font.size": 8,
@@ -87,8 +88,10 @@ def plot_flight(
         space.plot(*position[i, flown].T.numpy(), color=color, linewidth=1.2)
         space.scatter(*position[i, 0], color=color, s=14)
         over_time.plot(flight.times[flown], values[i, flown], color=color, linewidth=1.2)
-    draw_scenery(space, flight.scenery)
-    set_box(space, *box(*bounds(position, *flight.scenery.points())), zoom=0.9)
+    alike = len(flight) == 1 or not getattr(getattr(flight.env, "scene", None), "is_random", False)
+    scenery = with_obstacles(flight.scenery, flight.solids(0) if alike else None)
+    draw_scenery(space, scenery)
+    set_box(space, *box(*bounds(position, *scenery.points())), zoom=0.9)
     named = dict(zip(*reversed(space.get_legend_handles_labels()), strict=True))  # a name once
     if named:
         space.legend(named.values(), named.keys(), loc="upper left", frameon=False)
@@ -183,7 +186,7 @@ def _draw_path(space: Any, below: Any, flight: Flight) -> None:
     path.set_array(0.5 * (speed[:-1] + speed[1:]))
     space.add_collection(path)
     space.scatter(*position[0], color=INK, s=10, zorder=6)
-    scenery = flight.scenery
+    scenery = with_obstacles(flight.scenery, flight.solids(0))
     if scenery.gates is not None:
         halo = [withStroke(linewidth=2, foreground="white")]
         for i, centre in enumerate(scenery.gates.tolist(), 1):

@@ -15,6 +15,7 @@ from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.dynamics import FlightController
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.envs.scenery import Scenery, describe_metric, visible_state
+from torchrl_quad.vision import Primitives
 
 
 class Flight:
@@ -81,6 +82,24 @@ class Flight:
         instants = torch.arange(self.rollout.shape[1] + 1).minimum(self.steps[:, None])
         value = torch.cat((start.float(), value), 1).take_along_dim(instants.unsqueeze(-1), 1)
         return value.nan_to_num(math.nan, math.nan, math.nan)
+
+    def solids(self, i: int) -> Primitives | None:
+        """The obstacles in the first episode of an environment, if there are any."""
+        scene = getattr(self.env, "scene", None)
+        if scene is None:
+            return None
+        drawn = self.rollout["next", "state"].get("scene", {})
+        return scene.solids({("scene", kind): x[i : i + 1, 0].to(self.env.device) for kind, x in drawn.items()})
+
+    @property
+    def depth(self) -> Tensor | None:
+        """What the cameras showed (num_envs, time + 1, height, width) [m], as :meth:`state`, if they did."""
+        seen = self.rollout.get(("next", "depth"), None)
+        if seen is None:
+            return None
+        seen = torch.cat((self.rollout.get("depth", seen)[:, :1], seen), 1).squeeze(2)
+        instants = torch.arange(seen.shape[1]).minimum(self.steps[:, None])
+        return seen[torch.arange(len(seen))[:, None], instants].float()
 
     @property
     def distance(self) -> np.ndarray | None:

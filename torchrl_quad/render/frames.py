@@ -14,10 +14,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs.scenery import Scenery
 from torchrl_quad.render.canvas import INK, RED, bounds, box, draw_scenery, drone_colors, make_figure, set_box
 from torchrl_quad.render.flights import Flight, state_keys
+from torchrl_quad.render.obstacles import depth_image, with_obstacles
 
 _INCHES = 4.2
 _ARMS = torch.tensor([[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [0.0, 0.0, 0.0], [1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]])
@@ -31,9 +33,12 @@ class Scene:
         num_drones: how many drones a frame shows.
         size: width and height of a frame [pixels].
         scenery: what to draw beside the drones.
+        image: the height and width of a camera's images [pixels], if a frame shows one.
     """
 
-    def __init__(self, points: Tensor, num_drones: int, size: int, scenery: Scenery) -> None:
+    def __init__(
+        self, points: Tensor, num_drones: int, size: int, scenery: Scenery, image: tuple[int, int] | None = None
+    ) -> None:
         low, high = bounds(points, *scenery.points())
         low[2].clamp_(max=0.0)
         self.low, self.high = box(low, high)
@@ -49,6 +54,12 @@ class Scene:
         self.drones = [space.plot([], [], [], color=color, linewidth=2.5, **animated)[0] for color in colors]
         self.trails = [space.plot([], [], [], color=color, linewidth=1, alpha=0.5, **animated)[0] for color in colors]
         (self.targets,) = space.plot([], [], [], color=RED, marker="*", markersize=8, linestyle="none", **animated)
+        self.image = None
+        if image is not None:
+            inset = self.figure.add_axes((0.66, 0.76, 0.32, 0.22))
+            inset.set(xticks=[], yticks=[])
+            style = {"cmap": "magma", "vmin": 0.0, "vmax": 1.0, "animated": True}
+            self.image = inset.imshow(np.zeros(image), **style)
         self.text = space.text2D(0.04, 0.94, "", transform=space.transAxes, color=INK, **animated)
         self.figure.canvas.draw()
         self.background = self.figure.canvas.copy_from_bbox(self.figure.bbox)
@@ -60,6 +71,7 @@ class Scene:
         target: Tensor | None = None,
         trails: Iterable[Tensor] = (),
         text: str = "",
+        image: Tensor | None = None,
     ) -> np.ndarray:
         """Draw a frame (size, size, 3), uint8.
 
@@ -69,6 +81,7 @@ class Scene:
             target: of each drone (num_drones, 3) [m].
             trails: the line (*, 3) [m] that each drone has flown.
             text: for the corner.
+            image: of a camera (height, width), from 0 to 1.
         """
         bodies = position.unsqueeze(1) + quaternion.rotate(
             attitude.unsqueeze(1), self.arms.to(position.dtype).expand(len(position), -1, -1)
@@ -81,7 +94,10 @@ class Scene:
             self.targets.set_data_3d(*_numpy(target).T)
         self.text.set_text(text)
         self.figure.canvas.restore_region(self.background)
-        for artist in (*self.trails, self.targets, *self.drones, self.text):
+        images = () if self.image is None or image is None else (self.image,)
+        for artist in images:
+            artist.set_data(_numpy(image))
+        for artist in (*self.trails, self.targets, *self.drones, self.text, *images):
             self.figure.draw_artist(artist)
         return np.array(self.figure.canvas.buffer_rgba())[..., :3].copy()
 
@@ -96,8 +112,13 @@ def animate_flight(
     fps: int = 15,
     max_seconds: float = 12.0,
     size: int = 336,
+    beside: TensorDictBase | None = None,
+    labels: tuple[str, str] = ("", ""),
 ) -> None:
     """Film the first episodes of a flight in real time: drones with trails, their targets, and the task's scenery.
+
+    A task with a camera shows what the first drone saw, the nearer the brighter. Where each episode has obstacles of
+    its own, the film shows the first environment alone.
 
     Args:
         rollout: (num_envs, time), of any task.
@@ -109,6 +130,8 @@ def animate_flight(
         fps: frames per second, at least; up to 50, and rounded up so that a frame lasts whole control steps.
         max_seconds: the length of the film, at most.
         size: width and height [pixels], rounded up to an even number.
+        beside: another flight of the same task, (num_envs, time), to film to the right of the first, in the same view.
+        labels: a word for each of the two, in their corners.
 
     Raises:
         ImportError: ``path`` is an MP4, and ``imageio-ffmpeg`` is not installed.
@@ -122,24 +145,44 @@ def animate_flight(
     for name, value in (("control_dt", control_dt), ("fps", fps), ("max_seconds", max_seconds), ("size", size)):
         if not value > 0:
             raise ValueError(f"animate_flight: {name} must be positive, got {value!r}.")
-    flight = Flight("animate_flight", rollout, env, control_dt, state_keys("position", "quaternion"), num_envs)
-    control_dt, target = flight.control_dt, flight.target
-    last = min(max(round(max_seconds / control_dt), 1), rollout.shape[1])  # step
-    position, attitude = flight.state("position"), flight.state("quaternion")
-    scene = Scene(position[:, : last + 1], len(flight), size + size % 2, flight.scenery)
+    scene = getattr(None if env is None else base_env(env), "scene", None)
+    num_envs = 1 if scene is not None and scene.is_random else num_envs
+    needed = state_keys("position", "quaternion")
+    both = [rollout] if beside is None else [rollout, beside]
+    flights = [Flight("animate_flight", x, env, control_dt, needed, num_envs) for x in both]
+    control_dt = flights[0].control_dt
+    last = min(max(round(max_seconds / control_dt), 1), *(x.shape[1] for x in both))  # step
+    paths = [flight.state("position")[:, : last + 1] for flight in flights]
+    view = torch.cat([path.flatten(0, 1) for path in paths])
+    seen = [flight.depth for flight in flights]
+    far = getattr(getattr(flights[0].env, "camera", None), "range", 10.0)
+    scenes = [
+        Scene(
+            view,
+            len(flight),
+            size + size % 2,
+            with_obstacles(flight.scenery, flight.solids(0)),
+            image=None if depth is None else depth.shape[-2:],
+        )
+        for flight, depth in zip(flights, seen, strict=True)
+    ]
+    attitudes = [flight.state("quaternion") for flight in flights]
     trail = max(round(1.0 / control_dt), 1)
     stride = max(int(1.0 / (min(fps, 50) * control_dt) + 1e-6), 1)
     instants = np.append(np.arange(0, last, stride), last)
-    frames = (
-        scene.draw(
-            position[:, t],
-            attitude[:, t],
+
+    def frame(i: int, t: int) -> np.ndarray:
+        target = flights[i].target
+        return scenes[i].draw(
+            paths[i][:, t],
+            attitudes[i][:, t],
             None if target is None else target[:, t],
-            trails=position[:, max(t - trail, 0) : t + 1],
-            text=f"{control_dt * t:.1f} s",
+            trails=paths[i][:, max(t - trail, 0) : t + 1],
+            text=f"{control_dt * t:.1f} s  {labels[i]}".rstrip(),
+            image=None if seen[i] is None else depth_image(seen[i][0, t], far),
         )
-        for t in instants
-    )
+
+    frames = (np.concatenate([frame(i, t) for i in range(len(flights))], 1) for t in instants)
     write(Path(path), frames, control_dt * np.append(instants, instants[-1] + stride))
 
 
@@ -178,26 +221,34 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> N
 
 # The views of each environment, by number of drones and size. They are kept outside the environment, which can be
 # copied and sent to other processes.
-_scenes: weakref.WeakKeyDictionary[EnvBase, dict[tuple[int, int], Scene]] = weakref.WeakKeyDictionary()
+_scenes: weakref.WeakKeyDictionary[EnvBase, dict[tuple[int, int, bytes], Scene]] = weakref.WeakKeyDictionary()
 
 
 def draw_frame(env: EnvBase, drones: Sequence[int] | None, size: int) -> np.ndarray:
     """Draw an environment as it is; see :meth:`~torchrl_quad.envs.QuadrotorEnv.render`."""
     if not env.render_state:
         raise ValueError("render() draws the state after the last reset or step. Call env.reset() first.")
-    chosen = list(range(min(env.num_envs, 6)) if drones is None else drones)
+    alone = env.scene is not None and env.scene.is_random
+    chosen = list(range(min(env.num_envs, 1 if alone else 6)) if drones is None else drones)
     if not chosen or not all(isinstance(i, numbers.Integral) and 0 <= i < env.num_envs for i in chosen):
         raise ValueError(
             f"render: drones are indices from 0 to {env.num_envs - 1}, at least one, such as drones=[0]; got {chosen}."
         )
     if size < 100:
         raise ValueError(f"render: size must be at least 100 pixels, got {size}.")
-    shown = {key: x[chosen].cpu() for key, x in env.render_state.items()}
+    shown = {key: x[chosen].cpu() for key, x in env.render_state.items() if isinstance(key, str)}
+    drawn = {key: x[chosen[:1]] for key, x in env.render_state.items() if not isinstance(key, str)}
     points = [x for key, x in shown.items() if key != "quaternion"]
     scenes = _scenes.setdefault(env, {})
-    scene = scenes.get((len(chosen), size))
+    solids = None if env.scene is None else env.scene.solids(drawn)
+    known = b"".join(_numpy(x).tobytes() for x in drawn.values())  # another episode may have other obstacles
+    scene = scenes.get((len(chosen), size, known))
+    image = None
+    if env.camera is not None:
+        pose = (env.render_state[key][chosen[:1]] for key in ("position", "quaternion"))
+        image = depth_image(env.camera.depth(solids, *pose)[0, 0], env.camera.range)
     if scene is None:  # half a metre of room around all drones, their targets and the scenery
-        everything = [x for key, x in env.render_state.items() if key != "quaternion"]
+        everything = [x for key, x in env.render_state.items() if isinstance(key, str) and key != "quaternion"]
         low, high = bounds(*everything, *env.scenery().points())
         low, high = low - torch.tensor([0.5, 0.5, 0.0]), high + 0.5
     else:  # a side that has become too near moves out by half of the view, so that it need not at every step
@@ -206,8 +257,11 @@ def draw_frame(env: EnvBase, drones: Sequence[int] | None, size: int) -> np.ndar
         low, high = low - room * (low < scene.low), high + room * (high > scene.high)
     if scene is None or (low < scene.low).any() or (high > scene.high).any():
         corners = torch.stack((low, high))
-        scenes[len(chosen), size] = scene = Scene(corners, len(chosen), size, env.scenery())
-    return scene.draw(*shown.values())
+        scenery, pixels = with_obstacles(env.scenery(), solids), None if image is None else image.shape
+        if drawn:
+            scenes.clear()  # of episodes that are over
+        scenes[len(chosen), size, known] = scene = Scene(corners, len(chosen), size, scenery, image=pixels)
+    return scene.draw(*shown.values(), image=image)
 
 
 def _numpy(x: Tensor) -> np.ndarray:

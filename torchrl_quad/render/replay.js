@@ -8,6 +8,8 @@ const { environments, frames, ended, endings } = flight;
 const [position, attitude, lift, target, gate, rings, places, path, rotors] = ["position", "quaternion", "lift", "target",
   "gate", "gates", "places", "curve", "rotors"].map((name) => decoded(flight[name]));
 const shapes = flight.shapes.map((shape) => ({ ...shape, points: decoded(shape.points), faces: decoded(shape.faces) }));
+const obstacles = flight.obstacles.map(({ points, faces }) => ({ points: decoded(points), faces: decoded(faces) }));
+const images = flight.images && Uint8Array.from(atob(flight.images.data), (c) => c.charCodeAt(0));
 const times = Float64Array.from({ length: frames }, (_, k) => flight.start + k * flight.control_dt);
 
 const RED = "#c8452f", ORANGE = "#e8912d", INK = "#222222", PALE = "#dcdfe3";
@@ -212,10 +214,16 @@ function object({ name, points, faces, color, opacity }) {
     lighting: { ambient: 0.75, diffuse: 0.5, specular: 0.05 }, hoverinfo: "skip" };
 }
 
+// The obstacles of the environment that is followed, or else of the first; all may share those of the first.
+function obstacle() {
+  const { points, faces } = obstacles[chosen ?? 0] ?? obstacles[0];
+  return object({ name: "obstacles", points, faces, color: "#3a7d4f", opacity: 0.7 });
+}
+
 // What the task's scenery names.
 function scenery() {
   const named = shapes.filter((shape) => shape.name);
-  return [...shapes.map(object),
+  return [...shapes.map(object), ...(obstacles.length ? [obstacle()] : []),
     ...(named.length ? [labels("names", named.map((shape) => shape.name), named.map((shape) => shape.points))] : []),
     ...(rings ? gates() : []), ...(places ? [markers("places", through(places), "#e9b8ae", "diamond", 5)] : []),
     ...(path ? [line("path", through(path), "#e9b8ae", 2)] : target && !gate ? [course()] : [])];
@@ -354,6 +362,7 @@ function show() {
   const all = (key) => MOVING.map((name) => pens[name][key]);
   Plotly.restyle("space", { x: all("x"), y: all("y"), z: all("z") }, MOVING.map(indexOf));
   moveCursor();
+  showImage();
   element("time").value = Math.round(frame);
   element("clock").textContent = `${seconds(frame)} of ${seconds(frames - 1)}`;
   const counts = new Map();
@@ -363,6 +372,19 @@ function show() {
   }
   element("status").textContent = chosen === null ? Array.from(counts, ([word, count]) => `${count} ${word}`).join(", ")
     : `environment ${chosen}: ${Array.from(counts.keys())}`;
+}
+
+// What the camera of the drone that is followed saw, or else of the first: the nearer the brighter.
+function showImage() {
+  if (!images) return;
+  const { width, height } = flight.images, canvas = element("eye"), context = canvas.getContext("2d");
+  const first = ((chosen ?? 0) * frames + Math.floor(frame)) * width * height;
+  const picture = context.createImageData(width, height);
+  for (let k = 0; k < width * height; k++) {
+    const value = images[first + k];
+    picture.data.set([value, value, value, 255], 4 * k);
+  }
+  context.putImageData(picture, 0, 0);
 }
 
 function seek(to) {
@@ -395,6 +417,10 @@ function choose(i) {
     const { x, y, z } = course();
     Plotly.restyle("space", { x: [x], y: [y], z: [z] }, [indexOf("course")]);
   }
+  if (obstacles.length > 1) {
+    const { x, y, z, i: a, j: b, k: c } = obstacle();
+    Plotly.restyle("space", { x: [x], y: [y], z: [z], i: [a], j: [b], k: [c] }, [indexOf("obstacles")]);
+  }
   drawSeries();
   show();
 }
@@ -408,6 +434,7 @@ function options(id, values, label, value, change) {
   });
 }
 
+if (images) Object.assign(element("eye"), { width: flight.images.width, height: flight.images.height, hidden: false });
 const sizes = [1, 2, 3, 5, 10, 20, 50];
 size = sizes.find((factor) => 2 * arm * factor > 0.05 * extent) ?? 50;
 element("time").max = frames - 1;

@@ -22,6 +22,7 @@ from torchrl_quad.dynamics.rotors import Rotors
 from torchrl_quad.envs.episodes import at_episode_end
 from torchrl_quad.files import replacing
 from torchrl_quad.render.flights import Flight
+from torchrl_quad.render.obstacles import depth_image, obstacle_shapes
 
 _X_FRAME = [[0.053, 0.053], [-0.053, 0.053], [-0.053, -0.053], [0.053, -0.053]]  # [m], of a drone that is not known
 
@@ -37,7 +38,8 @@ def write_replay(
 ) -> None:
     """Write the first episodes of a flight as an HTML page to play, pause, scrub and turn in a browser.
 
-    The page shows the drones with attitude and rotor thrust, trails, and the task's scenery, and over time the reward
+    The page shows the drones with attitude and rotor thrust, trails, and the task's scenery; the obstacles of the
+    environment that is followed, or of the first, and beside the flight what its camera saw; and over time the reward
     terms, the actions, the speed, and the distance to the target (or the height). It is one file of about 5 MB, most
     of it plotly.js, and needs no network. A drone stays where its episode ended, and the page says how it ended:
     "success" if the last state fulfils the task.
@@ -116,6 +118,8 @@ def _content(flight: Flight) -> dict[str, Any]:
             }
             for shape in scenery.shapes
         ],
+        "obstacles": _obstacles(flight),
+        "images": _images(flight, first),
     }
 
     series = _rewards_and_actions(flight)
@@ -138,6 +142,31 @@ def _content(flight: Flight) -> dict[str, Any]:
         for label, lines, options in series
     ]
     return {**content, "panels": panels}
+
+
+def _obstacles(flight: Flight) -> list[dict[str, str]]:
+    """The obstacles of each environment, of the first alone where all share them; none without a scene."""
+    scene = getattr(flight.env, "scene", None)
+    if scene is None:
+        return []
+    found = []
+    for i in range(len(flight) if scene.is_random else 1):
+        shapes = obstacle_shapes(flight.solids(i))
+        points, faces = (shapes[0].points, shapes[0].faces.float()) if shapes else (torch.zeros(0, 3),) * 2
+        found.append({"points": _encoded(points), "faces": _encoded(faces)})
+    return found
+
+
+def _images(flight: Flight, first: int) -> dict[str, Any] | None:
+    """What the cameras showed, as bytes from far to near."""
+    depth = flight.depth
+    if depth is None:
+        return None
+    camera = getattr(flight.env, "camera", None)
+    far = depth.amax().clamp_min(1.0).item() if camera is None else camera.range
+    pixels = (255.0 * depth_image(depth[:, first:], far)).round().to(torch.uint8)
+    data = base64.b64encode(pixels.contiguous().numpy().tobytes()).decode("ascii")
+    return {"height": depth.shape[-2], "width": depth.shape[-1], "data": data}
 
 
 def _rewards_and_actions(flight: Flight) -> list[tuple[str, dict[str, Tensor], dict[str, Any]]]:

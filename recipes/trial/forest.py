@@ -1,0 +1,177 @@
+"""Train policies that see in the middle forest, and fly them through fresh ones, at all speeds and densities.
+
+python recipes/trial/forest.py --cores 2
+python recipes/trial/forest.py --policies bptt blind --seeds 0 --speeds 4 6 --difficulties middle
+
+It may be stopped at any moment. Started again, it skips what is in docs/results/data/forest.csv, and resumes what was
+cut off. docs/seeing.md shows the table and the picture.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+import torch
+from evidence import read
+from reproduce import DATA, QUICK, RECIPES, run, stop, write
+from results import fill
+from tables import table
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType
+from training.building import build_env
+from training.evaluation import load_policy
+
+from torchrl_quad import differentiable_rollout
+from torchrl_quad.files import machine, replacing
+
+POLICIES = {  # recipe, and what differs from what it ships with
+    "bptt": ("bptt", []),
+    "shac": ("shac", []),
+    "ppo": ("ppo", []),
+    "blind": ("bptt", ["actor.vision=false", "env.camera=null"]),
+    "no memory": ("bptt", ["actor.recurrent=false"]),
+    "no velocity": ("bptt", ["env.observe_velocity=false"]),
+}
+SPEEDS, DIFFICULTIES, SEEDS = (2.0, 4.0, 6.0, 8.0), ("easy", "middle", "hard"), tuple(range(5))
+FORESTS, FIRST_FOREST = 256, 3_000_000  # seed of their random numbers: nobody trains or chooses in them
+CHUNK = 50  # control steps between looks at who still flies
+PATIENCE = 2.0  # times the way at the commanded speed, in which a flight must be over
+ADDING = Lock()
+
+
+def success_rates(env: EnvBase, actor: TensorDictModuleBase, steps: int) -> dict[str, float]:
+    """Fly one episode in every environment: the shares that reach the other side, and that crash, of all episodes."""
+    flies, solved, crashed = (torch.full((env.num_envs,), x) for x in (True, False, False))
+    carry = None
+    for _ in range(0, steps, CHUNK):
+        with torch.no_grad():
+            flight, carry = differentiable_rollout(
+                env, actor, carry, CHUNK, exploration_type=ExplorationType.DETERMINISTIC
+            )
+        done, success, crash = (flight["next", name].squeeze(-1) for name in ("done", "success", "crash"))
+        ends = flies & done.any(1)
+        last = done.int().argmax(1, keepdim=True)
+        solved |= ends & success.gather(1, last).squeeze(1)
+        crashed |= ends & crash.gather(1, last).squeeze(1)
+        flies &= ~ends
+        if not flies.any():
+            break
+    return {"solved": solved.double().mean().item(), "crash": crashed.double().mean().item()}
+
+
+def fly(policy: str, seed: int, todo: list[tuple[str, float]], args: argparse.Namespace) -> None:
+    """Train once, then fly through the forests that are wanted, and add each result as it comes."""
+    recipe, overrides = POLICIES[policy]
+    folder = args.output / policy.replace(" ", "_") / f"seed{seed}"
+    own = [f"seed={seed}", *overrides, *args.overrides, *(QUICK if args.quick else ())]
+    own += ["resume=auto", f"hydra.run.dir={folder}"]
+    if not (folder / "summary.json").exists():
+        run([sys.executable, str(RECIPES / f"{recipe}.py"), "task=forest", *own], folder)
+    trained = read(folder / "metrics.csv")[-1]
+    cfg, actor, normalizer = load_policy(folder / "checkpoint.pt")
+    for difficulty, speed in todo:
+        cfg.env.difficulty, cfg.env.speed = difficulty, speed
+        env = build_env(cfg, args.forests, FIRST_FOREST)
+        if normalizer is not None:
+            env.transform.load_state_dict(normalizer)
+        steps = round(PATIENCE * (env.length + max(env.run_up)) / speed / env.control_dt)
+        rates = success_rates(env, actor, min(steps, cfg.env.max_episode_steps))
+        row = {"policy": policy, "seed": seed, "difficulty": difficulty, "speed": speed, "forests": args.forests}
+        row |= {name: f"{x:.6g}" for name, x in rates.items()}
+        row |= {"steps": trained["steps"], "seconds": trained["time/processor_seconds"], "machine": machine()}
+        with ADDING:
+            write(args.data / "forest.csv", [*read(args.data / "forest.csv"), row])
+        print(row, flush=True)
+
+
+def cell(rows: list[dict[str, str]]) -> str:
+    """Write the successes of all seeds: their mean, and the least."""
+    if not rows:
+        return ""
+    solved = [float(row["solved"]) for row in rows]
+    return f"{np.mean(solved):.0%} ({min(solved):.0%}, {len(solved)} seed{'s' * (len(solved) > 1)})"
+
+
+def summary(rows: list[dict[str, str]]) -> str:
+    """Show what each policy reaches in the middle forest, and what its training has cost."""
+    speeds = sorted({float(row["speed"]) for row in rows})
+    lines = []
+    for policy in dict.fromkeys(row["policy"] for row in rows):
+        own = [row for row in rows if (row["policy"], row["difficulty"]) == (policy, "middle")]
+        cost = np.median([float(row["seconds"]) for row in own]) if own else np.nan
+        million = np.median([float(row["steps"]) for row in own]) / 1e6 if own else np.nan
+        cells = (cell([row for row in own if float(row["speed"]) == speed]) for speed in speeds)
+        lines.append([policy, f"{million:.1f}", f"{cost:.0f}", *cells])
+    return table(["", "million steps", "processor seconds", *(f"{speed:g} m/s" for speed in speeds)], lines)
+
+
+def draw(rows: list[dict[str, str]], path: Path) -> None:
+    """Draw success over speed, a panel for each density."""
+    from matplotlib.figure import Figure
+
+    present = [name for name in DIFFICULTIES if any(row["difficulty"] == name for row in rows)]
+    figure = Figure((3.2 * max(len(present), 1) + 1.0, 3.0), layout="constrained")
+    panels = figure.subplots(1, max(len(present), 1), sharey=True, squeeze=False)[0]
+    for name, panel in zip(present, panels, strict=False):
+        for policy in dict.fromkeys(row["policy"] for row in rows):
+            of_speed: dict[float, list[float]] = {}
+            for row in rows:
+                if (row["policy"], row["difficulty"]) == (policy, name):
+                    of_speed.setdefault(float(row["speed"]), []).append(100 * float(row["solved"]))
+            speeds = sorted(of_speed)
+            panel.plot(speeds, [np.mean(of_speed[speed]) for speed in speeds], marker="o", label=policy)
+        panel.set(title=name, xlabel="commanded speed [m/s]", ylim=(0, 100))
+        panel.grid(alpha=0.3)
+    panels[0].set_ylabel("success [%]")
+    panels[-1].legend(fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cores", type=int, default=os.cpu_count(), help="policies at the same time")
+    parser.add_argument("--policies", nargs="+", default=list(POLICIES), choices=list(POLICIES))
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument("--speeds", nargs="+", type=float, default=list(SPEEDS), help="commanded [m/s]")
+    parser.add_argument("--difficulties", nargs="+", default=list(DIFFICULTIES), choices=DIFFICULTIES)
+    parser.add_argument("--forests", type=int, default=FORESTS, help="for each speed and density")
+    parser.add_argument("--overrides", nargs="+", default=[], help="of all recipes, such as total_steps=1_000_000")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
+    parser.add_argument("--output", type=Path, default=Path("outputs/forest"), help="folder of the runs")
+    parser.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
+    args = parser.parse_args()
+    shipped = args.data.resolve() == DATA.resolve()
+    if args.quick and shipped:
+        parser.error("--quick gives no results to keep: name another folder with --data.")
+    torch.set_num_threads(1)
+    names = ("policy", "seed", "difficulty", "speed")
+    kept = {tuple(row[name] for name in names) for row in read(args.data / "forest.csv")}
+    with ThreadPoolExecutor(args.cores) as pool:
+        waiting = []
+        for seed in args.seeds:
+            for policy in args.policies:
+                wanted = [(d, s) for d in args.difficulties for s in args.speeds]
+                todo = [(d, s) for d, s in wanted if (policy, str(seed), d, str(s)) not in kept]
+                if todo:
+                    waiting.append(pool.submit(fly, policy, seed, todo, args))
+        for future in waiting:
+            future.result()
+    rows = read(args.data / "forest.csv")
+    docs = DATA.parents[1] if shipped else args.data
+    draw(rows, docs / "images/forest_success.png")
+    fill(docs / "seeing.md", {"forest": summary(rows)})
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, stop)
+    main()

@@ -1,0 +1,205 @@
+"""Policies that see and remember: gradients through their memory, where it begins anew, and which losses take them."""
+
+import pytest
+import torch
+from torch.func import functional_call
+from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_quad import (
+    ABPTLoss,
+    AHACLoss,
+    BPTTLoss,
+    ForestEnv,
+    HoveringEnv,
+    HybridLoss,
+    SAPOLoss,
+    SHACLoss,
+    TrustRegion,
+    VisitedStateBuffer,
+    differentiable_rollout,
+    make_qvalue,
+    make_value,
+    make_visual_actor,
+    restart,
+)
+
+CAMERA = {"width": 6, "height": 4}
+SMALL = {"channels": (2,), "num_cells": (5,), "hidden_size": 3}
+MEMORY = "recurrent_state"
+
+
+def forest(**options):
+    return ForestEnv(**{"num_envs": 3, "dtype": torch.float64, "camera": CAMERA, "density": 0.02, **options})
+
+
+def actor_for(env, seed=0, **options):
+    torch.manual_seed(seed)
+    actor = make_visual_actor(env, **{**SMALL, **options})
+    with torch.no_grad():
+        for x in actor[0][-1].parameters():
+            x.mul_(30.0)  # the head, which begins near zero: what is seen and remembered shall move the drone
+    return actor
+
+
+def test_the_gradient_goes_through_the_memory():
+    env = forest(camera={**CAMERA, "rate": 50})  # one image for all steps: images themselves carry no gradient
+    actor = actor_for(env)
+    start, names = env.reset(), dict(actor.named_parameters())
+    direction = {name: torch.randn_like(x) for name, x in names.items() if "gru" in name}
+    assert len(direction) == 4
+
+    def value(shift):
+        moved = {name: x + shift * direction.get(name, 0.0) for name, x in names.items()}
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            fly = torch.nn.Module()
+            fly.actor, fly.forward = (
+                actor,
+                lambda: env.rollout(6, actor, tensordict=start.clone(), auto_reset=False, break_when_any_done=False),
+            )
+            flight = functional_call(fly, {f"actor.{name}": x for name, x in moved.items()})
+        return flight["next", "observation"][:, -1].square().sum() + flight["next", MEMORY][:, -1].sum()
+
+    grads = torch.autograd.grad(value(torch.zeros(())), [names[name] for name in direction])
+    slope = sum((g * d).sum() for g, d in zip(grads, direction.values(), strict=True))
+    with torch.no_grad():
+        measured = (value(1e-5) - value(-1e-5)) / 2e-5
+    torch.testing.assert_close(slope, measured, rtol=1e-6, atol=0)
+
+
+def test_a_flight_is_that_of_torchrls_loop_with_its_transforms_and_forgets_where_episodes_begin():
+    env = forest(max_episode_steps=7)
+    actor = actor_for(env)
+    wrapped = TransformedEnv(env, Compose(InitTracker(), actor.make_tensordict_primer()))
+    flights = []
+    for flown in (env, wrapped):
+        env.set_seed(1)
+        torch.manual_seed(1)
+        flight, carry = differentiable_rollout(flown, actor, None, 16)
+        loss = flight["next", "reward"].sum() + flight["next", "observation"].square().sum() + flight["loc"].sum()
+        flights.append((flight, carry, torch.autograd.grad(loss, list(actor.parameters()))))
+    (quick, quick_carry, quick_grad), (slow, slow_carry, slow_grad) = flights
+    assert quick["is_init"][:, [7, 14]].all() and quick["is_init"].sum() == 6
+    for key in (MEMORY, "depth", "action", "loc", ("next", MEMORY), ("next", "reward"), ("next", "is_init")):
+        own = torch.where(slow["is_init"].unsqueeze(-1), 0.0, slow[key]) if key == MEMORY else slow[key]
+        torch.testing.assert_close(quick[key], own)
+    torch.testing.assert_close(quick_grad, slow_grad)
+    torch.testing.assert_close(quick_carry[MEMORY], slow_carry[MEMORY])
+    # What was before an episode has no effect on what is remembered in it.
+    memory = torch.zeros(3, 1, 3, dtype=torch.float64, requires_grad=True)
+    flight, _ = differentiable_rollout(env, actor, env.reset().set(MEMORY, memory), 12)
+    before, after = (torch.autograd.grad(x.sum(), memory, retain_graph=True)[0] for x in flight["loc"].split(7, 1))
+    assert (before != 0).all() and (after == 0).all()
+
+
+def test_a_policy_that_is_called_before_each_compiled_step_remembers_as_in_an_eager_flight(monkeypatch):
+    class Direct:  # what is compiled, without a compiler, which takes a minute
+        def __init__(self, function, options):
+            self.again = function
+
+        def __call__(self, *inputs):
+            return self.again(*inputs)
+
+    monkeypatch.setattr("torchrl_quad.engine.program.Compiled", Direct)
+    monkeypatch.setattr("torch.compiler.nested_compile_region", lambda function: function)
+    env = forest(max_episode_steps=3, dt=0.02)
+    actor, results = actor_for(env), []
+    for _ in range(2):
+        env.set_seed(1)
+        torch.manual_seed(1)
+        _, carry = differentiable_rollout(env, actor, None, 2)
+        flight, _ = differentiable_rollout(env, actor, carry, 4)
+        loss = flight["next", "reward"].sum() + flight["next", "observation"].square().sum() + flight["loc"].sum()
+        results.append((flight[MEMORY], flight["is_init"], torch.autograd.grad(loss, list(actor.parameters()))))
+        env._run({})
+        env.disturbances["camera"].is_compiled = False
+    assert env.is_compiled and not env.flies_inside(actor) and results[0][1].any()
+    torch.testing.assert_close(*results)
+
+
+def test_memory_goes_on_where_a_horizon_does_and_is_kept_with_visited_states():
+    env = forest(num_envs=32, density=0.0)
+    actor = actor_for(env)
+    flight, carry = differentiable_rollout(env, actor, None, 3)
+    torch.testing.assert_close(carry[MEMORY], flight["next", MEMORY][:, -1].detach())
+    begun = restart(env, carry, 0.5)
+    again = begun["is_init"].squeeze(-1)
+    assert 0 < again.sum() < 32 and (begun["state", "step"][again] == 0).all()
+    more, _ = differentiable_rollout(env, actor, begun, 1)
+    assert (more[MEMORY][again] == 0).all()
+    torch.testing.assert_close(more[MEMORY][~again, 0], carry[MEMORY][~again])
+
+    buffer = VisitedStateBuffer(env=env, actor=actor)
+    buffer.extend(flight)
+    start = buffer.initial_state(env, fraction=0.5)
+    fresh = start["is_init"].squeeze(-1)
+    assert (start[MEMORY][fresh] == 0).all() and (start["state", "step"][fresh] == 0).all() and 0 < fresh.sum() < 32
+    visited = start[~fresh]
+    step, place = visited["state", "step"].squeeze(-1), visited["state", "position"]
+    drone = (flight["state", "position"][:, step].transpose(0, 1) == place.unsqueeze(1)).all(-1).int().argmax(1)
+    assert step.unique().numel() == 3
+    torch.testing.assert_close(visited[MEMORY], flight[MEMORY][drone, step].detach())
+    forgets = VisitedStateBuffer(env=env)
+    forgets.extend(flight)
+    assert MEMORY not in forgets.initial_state(env)
+
+
+def test_an_empty_memory_is_none():
+    env = forest()
+    recurrent, plain = actor_for(env), actor_for(env, recurrent=False)
+    assert plain.in_keys == ["depth", "observation"]
+    with torch.no_grad():
+        for x in recurrent[0][1].parameters():
+            x.zero_()
+        plain[0][0].load_state_dict(recurrent[0][0].state_dict())
+        width = SMALL["num_cells"][-1]
+        plain[0][1].module.mlp[-1].weight.copy_(recurrent[0][2].module.mlp[-1].weight[:, :width])
+        plain[0][1].module.mlp[-1].bias.copy_(recurrent[0][2].module.mlp[-1].bias)
+    flights = []
+    for actor in (recurrent, plain):
+        env.set_seed(0)
+        torch.manual_seed(0)
+        flights.append(env.rollout(4, actor, break_when_any_done=False))
+    torch.testing.assert_close(flights[0]["action"], flights[1]["action"])
+    assert (flights[0][MEMORY] == 0).all()
+
+
+@pytest.mark.parametrize("recurrent", [True, False])
+def test_losses_take_a_policy_that_sees(recurrent):
+    env = forest(max_episode_steps=4)
+    actor = actor_for(env, recurrent=recurrent, return_log_prob=True)
+    value, qvalue = (make(env, in_keys=["observation", ("state", "position")]) for make in (make_value, make_qvalue))
+    rollout, _ = differentiable_rollout(env, actor, None, 6)
+    losses = [BPTTLoss(actor, alpha=0.1), SHACLoss(actor, value), ABPTLoss(actor, qvalue), SAPOLoss(actor, value)]
+    for loss in losses:
+        total = sum(x for key, x in loss(rollout).items() if key.startswith("loss_"))
+        grads = torch.autograd.grad(total, list(actor.parameters()), retain_graph=True)
+        assert all(g.isfinite().all() and g.any() for g in grads)
+    for loss in (HybridLoss(actor, value), AHACLoss(actor, value, horizon=6)):
+        loss(rollout)["loss_actor"].backward(retain_graph=True)
+    # A bound that clips nothing leaves the gradient as it is: that of each action, and of the policy in whole memories.
+    grads = [
+        torch.autograd.grad(loss.loss_actor(rollout)[0], list(actor.parameters()), retain_graph=True)
+        for loss in (BPTTLoss(actor), BPTTLoss(actor, clip_action_gradient=1e12))
+    ]
+    torch.testing.assert_close(*grads)
+    bound = TrustRegion(actor, max_kl=1e-3)
+    assert bound.divergence(rollout) < 1e-12
+    with bound.around(rollout), torch.no_grad():
+        for x in actor.parameters():
+            x.add_(0.1)
+    assert bound.divergence(rollout) <= 1e-3
+
+
+def test_what_cannot_be_seen_is_refused():
+    with pytest.raises(ValueError, match="Give it a camera"):
+        make_visual_actor(HoveringEnv(num_envs=1))
+    env = forest(num_envs=1)
+    with pytest.raises(ValueError, match="at least one whole number"):
+        make_visual_actor(env, channels=())
+    with pytest.raises(ValueError, match="at least one layer"):
+        make_visual_actor(env, num_cells=())
+    with pytest.raises(ValueError, match="recurrent=False"):
+        make_visual_actor(env, recurrent=False).make_tensordict_primer()
+    with pytest.raises(ValueError, match="InitTracker"):
+        EnvBase.rollout(env, 2, make_visual_actor(env))

@@ -1,0 +1,276 @@
+"""A bundle flies elsewhere as it does in our own simulator, is judged as our evaluation does, and its mutants fail."""
+
+import contextlib
+import copy
+import csv
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from test_recipes import ROOT
+from torchrl.envs.utils import ExplorationType
+
+from torchrl_quad import differentiable_rollout, load_drone, make_actor, make_env
+from torchrl_quad.deploy import export_policy, load_bundle
+from torchrl_quad.deploy.describe import describe
+from torchrl_quad.deploy.judging import endings, judge
+from torchrl_quad.deploy.replaying import environment
+from torchrl_quad.deploy.simulators import make_simulator
+from torchrl_quad.deploy.simulators.vehicle import ContractLoop, Drone
+from torchrl_quad.deploy.transfer import MUTANTS, fly
+from torchrl_quad.dynamics import FlightController
+
+NAMES = ("position", "quaternion", "velocity", "angular_velocity")
+STEPS = 110
+
+
+def pilot(env, sink=2.0):
+    """A policy by hand, a single layer: fly to the first point that is observed, level and without turning.
+
+    ``sink`` is the stiffness of the height.
+    """
+    actor = make_actor(env, ())
+    (layer,) = (x for x in actor[0].module.mlp if isinstance(x, torch.nn.Linear))
+    with torch.no_grad():
+        weight = torch.zeros_like(layer.weight)
+        x, q, v, w = 0, *(weight.shape[1] - k for k in (10, 6, 3))  # where the quantities begin
+        weight[0, x + 2], weight[0, v + 2] = 0.2 * sink, -0.4
+        for axis, along, sign in ((1, 1, -1.0), (2, 0, 1.0)):  # roll moves along -y, pitch along x
+            weight[axis, x + along], weight[axis, v + along] = sign * 0.8, sign * -1.0
+            weight[axis, q + axis] = -0.6
+        weight[3, q + 3] = -0.3
+        weight[1:4, w : w + 3] += -0.02 * torch.eye(3)
+        layer.weight.copy_(weight)
+        layer.bias[1:4] = 0.0
+    return actor
+
+
+@pytest.fixture(scope="module")
+def hovering(tmp_path_factory):
+    """Drones that begin turned and moving, two steps of delay, and another drone than the nominal one."""
+    torch.set_num_threads(1)
+    start = {"yaw": 0.7, "tilt": 0.2, "velocity": 0.1}
+    env = make_env("hovering", num_envs=8, max_episode_steps=STEPS, seed=0, random_start=start, action_delay=2)
+    env.start_range = (0.2, 0.2, 0.1)
+    env.set_params(env.params.replace(mass=0.47, motor_time_constant=0.03))
+    return export_policy(pilot(env), env, tmp_path_factory.mktemp("hovering") / "policy")
+
+
+# -- physics -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("drone", ["visfly", "crazyflie"])
+def test_the_rate_loop_in_numpy_is_that_of_the_simulator_within_and_beyond_the_limits(drone):
+    params = load_drone(drone, torch.float64)
+    theirs = FlightController(params)
+    ours = Drone({name: x.squeeze().tolist() for name, x in params.fields().items()})
+    draw = torch.Generator().manual_seed(0)
+    spread = torch.logspace(-2, 1, 200, dtype=torch.float64)[:, None]
+    rates, turning = (spread * torch.randn(200, 3, dtype=torch.float64, generator=draw) for _ in range(2))
+    thrust = theirs.half_range * 2 * torch.rand(200, 1, dtype=torch.float64, generator=draw)
+    speed = theirs.hover_speed * (1 + 0.2 * torch.randn(200, 4, dtype=torch.float64, generator=draw))
+    expected = theirs.rotor_speed(type(theirs).setpoint_type(thrust, rates), turning, theirs.rotors.wrench(speed))
+    asked = ContractLoop(ours, 0.001)(thrust[:, 0].numpy(), rates.numpy(), turning.numpy(), speed.numpy())
+    low, high = (x.item() for x in (theirs.rotors.speed(theirs.thrust_min), theirs.rotors.speed(theirs.thrust_max)))
+    saturated = ((expected < 1.001 * low) | (expected > 0.999 * high)).any(1)
+    assert 20 < saturated.sum() < 180
+    np.testing.assert_allclose(asked, expected, rtol=1e-9)
+
+
+def wobble(simulator, contract, steps=400, **options):
+    """Where drones get in open loop, from tilted and fast starts, by commands that change all the time."""
+    draw = np.random.default_rng(0)
+    n, world = 6, make_simulator(simulator, contract, **options)
+    attitude = np.array([1.0, 0, 0, 0]) + 0.4 * draw.standard_normal((n, 4))
+    starts = dict(zip(NAMES, (draw.standard_normal((n, k)) for k in (3, 4, 3, 3)), strict=True))
+    starts["velocity"] *= 3.0
+    starts["position"][:, 2] += 5.0  # Crazyflow has a floor
+    starts["quaternion"] = attitude / np.linalg.norm(attitude, axis=1, keepdims=True)
+    world.reset(starts)
+    for t in range(steps):
+        swing = np.sin(0.02 * t + np.arange(n))
+        world.step(4.5 * (1 + 0.3 * swing), np.stack((swing, -0.5 * swing, 0.4 + 0.2 * swing), 1))
+    return world.state()
+
+
+def test_mujoco_moves_a_drone_as_our_simulator_does(hovering):
+    """At the same small step. The drone that flies is not the one that the rate loop believes in."""
+    contract = load_bundle(hovering).contract
+    contract = {**contract, "control_dt": 0.001, "simulator": {**contract["simulator"], "dt": 0.001}}
+    assert contract["plant"] == {"mass": 0.47, "motor_time_constant": 0.03}
+    expected, found = wobble("torchrl_quad", contract), wobble("mujoco", contract)
+    assert (
+        np.linalg.norm(expected["velocity"], axis=1).min() > 1.0 and np.abs(expected["quaternion"][:, 0]).min() < 0.95
+    )
+    for name in expected:
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-5, atol=1e-4, err_msg=name)
+    shifted = wobble("mujoco", {**contract, "plant": {**contract["plant"], "mass": 0.46}})  # the tolerance is not wide
+    assert np.abs(shifted["position"] - expected["position"]).max() > 1e-3
+
+
+@pytest.mark.slow  # both are optional, and slow to start
+@pytest.mark.filterwarnings("ignore:Attaching a spec with an empty prefix:UserWarning")  # of Crazyflow's own model
+@pytest.mark.parametrize(
+    ("simulator", "changes"),
+    [
+        ("crazyflow", {"quadratic_drag": [0.0, 0.0, 0.0]}),
+        ("rotorpy", {"quadratic_drag": [0.0] * 3, "linear_drag": [0.0] * 3, "thrust_map": [4.1e-7, 0.0, 0.0]}),
+    ],
+)
+def test_other_simulators_move_a_drone_as_ours_does_where_their_models_agree(hovering, simulator, changes):
+    pytest.importorskip(simulator)
+    contract = load_bundle(hovering).contract
+    contract = {**contract, "control_dt": 0.001, "simulator": {**contract["simulator"], "dt": 0.001}}
+    contract |= {"drone": {**contract["drone"], **changes}, "plant": {"mass": 0.47, "motor_time_constant": 0.03}}
+    expected, found = wobble("torchrl_quad", contract), wobble(simulator, contract)
+    for name, tolerance in {"position": 5e-3, "quaternion": 1e-3, "velocity": 5e-3, "angular_velocity": 1e-2}.items():
+        np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=tolerance, err_msg=name)
+    np.testing.assert_allclose(found["rotor_speed"], expected["rotor_speed"], rtol=3e-3)  # of another order in time
+
+
+def test_the_pid_loop_follows_body_rates_without_reading_rotor_speeds(hovering):
+    contract = load_bundle(hovering).contract
+    world = make_simulator("mujoco", contract, "pid")
+    level = {"position": np.zeros((2, 3)), "quaternion": np.eye(4)[[0, 0]]}
+    world.reset({**level, "velocity": np.zeros((2, 3)), "angular_velocity": np.zeros((2, 3))})
+    rates = np.array([[0.5, 0.0, 0.2], [0.0, -0.5, -0.2]])
+    for _ in range(15):
+        world.step(np.full(2, 4.6), rates)
+    np.testing.assert_allclose(world.state()["angular_velocity"], rates, atol=0.06)
+    turning, memory = world.state()["angular_velocity"], copy.deepcopy(world.loop)
+    slow, quick = (loop(np.full(2, 4.6), rates, turning, x) for loop, x in ((world.loop, 0.0), (memory, 2000.0)))
+    np.testing.assert_array_equal(slow, quick)
+
+
+# -- flights -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_bundle_flies_in_mujoco_as_in_ours_and_as_the_environment_flew(hovering):
+    bundle = load_bundle(hovering, on_fault="hover")
+    ours, theirs = fly(bundle, "torchrl_quad"), fly(bundle, "mujoco")
+    results = bundle.contract["results"]
+    assert ours["solved"].mean() == theirs["solved"].mean() == results["solved"] == 1.0
+    assert np.median(ours["position_error"]) == pytest.approx(results["position_error"], rel=0.05)
+    assert np.abs(theirs["position"] - ours["position"]).max() < 0.01
+    assert theirs["faults"] == {} and theirs["simulator"].startswith("MuJoCo")
+    heavy = fly(bundle, "mujoco", "pid", scale={"mass": 1.3}, late=1)
+    assert heavy["position"][:, -1, 2].mean() < theirs["position"][:, -1, 2].mean() - 0.05
+
+
+HARDER = {  # so that some episodes succeed, some do not, and some crash
+    "hovering": {"box_height": 1.7},
+    "tracking": {"success_radius": 1.24, "ceiling": 1.15},
+    "landing": {"success_speed": 0.28, "box_half_width": 0.9},
+    "racing": {"success_gates": 1, "ceiling": 1.5},
+}
+
+
+@pytest.mark.parametrize("task", HARDER)
+def test_flights_are_judged_as_our_evaluation_judges_them(task):
+    env = make_env(task, num_envs=16, max_episode_steps=130, seed=1, random_start={"velocity": 2.0, "tilt": 0.3})
+    vars(env).update(HARDER[task])
+    with torch.no_grad():
+        mode = {"exploration_type": ExplorationType.DETERMINISTIC}
+        flight, _ = differentiable_rollout(env, pilot(env), None, 130, **mode)
+    expected = {name: x.numpy() for name, x in env.episode_metrics(flight).items()}
+    start = flight["state"][:, 0]
+    seen = {name: torch.cat((start[name][:, None], flight["next", "state", name]), 1).numpy() for name in NAMES}
+    seen |= {name: start[name].numpy() for name in ("target", "phase", "gate") if name in start}
+    found = judge(describe(env), seen)
+    assert 0 < expected["solved"].sum() < 16 and 0 < expected["crash"].sum() < 16
+    assert set(found) == set(expected) - {"return", "time_near_gate"}
+    for name, values in found.items():
+        np.testing.assert_allclose(values, expected[name], rtol=1e-4, atol=1e-5, err_msg=name)
+
+
+def test_gates_and_laps_are_counted_from_the_lines_between_positions():
+    contract = describe(make_env("racing", num_envs=1, max_episode_steps=20))
+    gates = np.array(contract["task"]["gates"])
+    order = [3, 3, 0, 1, 1, 2, 3, 0]  # gate 0 is the next one; after steps 2, 3, 5, 6 and 7 another one is passed
+    position = gates[order][None]
+    flight = {"position": position, "velocity": 0 * position, "gate": np.zeros((1, 1), int)}
+    found = judge(contract, flight)
+    assert (len(gates), found["gates_passed"], found["solved"]) == (4, 5, 0)
+    assert found["lap_time"] == pytest.approx((7 - 2) * 0.02)
+
+
+def test_a_state_that_is_not_a_number_is_a_crash(hovering):
+    contract = load_bundle(hovering).contract
+    crash, done = endings(contract, np.array([[1.0, 0.0, 1.5], [np.nan, 0.0, 1.5]]), np.zeros((2, 3)))
+    assert crash.tolist() == [False, True] and not done.any()
+
+
+def test_the_environment_of_a_contract_is_the_one_that_was_exported(tmp_path):
+    for task, options in {"tracking": {"curve": "lemniscate"}, "racing": {}, "landing": {"drone": "crazyflie"}}.items():
+        env = make_env(task, num_envs=2, max_episode_steps=30, **options)
+        contract = describe(env)
+        again = environment(contract, 2)
+        assert {**describe(again), "task": None} == {**contract, "task": None}
+        assert describe(again)["task"].keys() == contract["task"].keys()
+
+
+# -- recipe ------------------------------------------------------------------------------------------------------------
+
+WITHOUT_TORCH = """
+import runpy, sys
+for name in ("torch", "torchrl", "tensordict", "hydra", "onnx"):
+    sys.modules[name] = None
+sys.argv = ["recipes/transfer.py", *sys.argv[1:]]
+runpy.run_path("recipes/transfer.py", run_name="__main__")
+"""
+
+
+def rows(folder):
+    with open(folder / "transfer.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_recipe_flies_without_torch_keeps_a_table_and_finds_mistakes_of_a_port(hovering, tmp_path, launch):
+    settings = [f"bundle={hovering}", f"folder={tmp_path}", "loop=contract"]
+    command = [sys.executable, "-c", WITHOUT_TORCH, *settings]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (first,) = rows(tmp_path)
+    assert (first["mutant"], first["solved"], first["episodes"]) == ("none", "1.0000", "8")
+    printed = launch("transfer", *settings, "mutants=true")
+    assert "MuJoCo" in printed and str(tmp_path / "transfer.csv") in printed
+    table = rows(tmp_path)
+    assert table[0] == first and [row["mutant"] for row in table] == ["none", *MUTANTS][:-1]
+    failed = {row["mutant"] for row in table if float(row["solved"]) <= 0.5}
+    assert failed >= {"xyzw", "yaw", "heading", "motors", "frd"}
+    launch("transfer", *settings, "mutants=true")  # finds all of it there
+    assert rows(tmp_path) == table
+
+
+def test_the_recipe_films_a_flight_beside_ours(hovering, tmp_path, launch, monkeypatch):
+    from training import drawing
+
+    films = []
+    monkeypatch.setattr(drawing, "animate_flight", lambda *args, **options: films.append((args, options)))
+    monkeypatch.setattr(drawing, "replacing", contextlib.nullcontext)
+    changed = ["scale={mass: 1.1}", "late=1"]
+    settings = [f"bundle={hovering}", f"folder={tmp_path}", "episodes=1", "loop=contract", "pictures=true"]
+    assert '{"late": 1, "mass": 1.1}' in launch("transfer", *settings, *changed)
+    (((ours, _), options),) = films
+    assert options["labels"][1].startswith("MuJoCo") and options["beside"].shape == ours.shape == (4, STEPS)
+    np.testing.assert_allclose(options["beside"]["state", "position"], ours["state", "position"], atol=0.01)
+    assert "from the same starts: MuJoCo" in (tmp_path / "transfer_mujoco.html").read_text()
+
+
+def test_the_recipe_says_what_is_wrong(hovering, refused, monkeypatch):
+    bundle = f"bundle={hovering}"
+    assert "bundle is missing: write bundle=FOLDER" in refused("transfer")
+    assert "No bundle at nowhere" in refused("transfer", "bundle=nowhere")
+    assert "Unknown simulator 'gazebo'. Choose from: torchrl_quad, mujoco" in refused(
+        "transfer", bundle, "simulator=gazebo"
+    )
+    assert "mujoco has no rate loop 'own'. Choose from: contract, pid, pd." in refused("transfer", bundle, "loop=own")
+    assert "unknown setting 'bundel=x'. Choose from: bundle=..." in refused("transfer", "bundel=x")
+    assert "episodes=all: episodes must be a int" in refused("transfer", bundle, "episodes=all")
+    assert "late must be at least 0" in refused("transfer", bundle, "late=-1")
+    assert "scale: the drone has no 'rate_gain' to scale" in refused("transfer", bundle, "scale={rate_gain: 2}")
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    monkeypatch.delitem(sys.modules, "torchrl_quad.deploy.simulators.mujoco", raising=False)
+    assert "Flying in mujoco needs mujoco: pip install mujoco" in refused("transfer", bundle)

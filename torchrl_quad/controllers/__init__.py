@@ -1,0 +1,8 @@
+"""Classical controllers, to compare with: policies that learn nothing, and know the drone and the task instead."""
+
+from torchrl_quad.controllers.geometric import GeometricController
+from torchrl_quad.controllers.mpc import MPC
+from torchrl_quad.controllers.policy import Controller
+from torchrl_quad.controllers.references import Motion, follow
+
+__all__ = ["MPC", "Controller", "GeometricController", "Motion", "follow"]

@@ -1,0 +1,137 @@
+"""The geometric controller on SE(3)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import normalize, pad
+
+from torchrl_quad.controllers.policy import Controller, State
+from torchrl_quad.controllers.references import Reference, follow
+from torchrl_quad.dynamics import quaternion
+
+LEAST_LIFT = 0.3  # vertical part of the thrust, in weights: the drone never turns over to dive
+GREATEST_LIFT = 0.9  # of the greatest thrust: there is always some left to go sideways
+
+
+class GeometricController(Controller):
+    r"""Geometric tracking control (Lee, Leok and McClamroch 2010) for thrust and body rates.
+
+    With the errors of position and velocity :math:`e_x = x - x_d` and :math:`e_v = v - v_d`, and the attitude R (body
+    to world), it takes from the paper
+
+    - the force :math:`F = m (-k_x e_x - k_v e_v + g\,e_3 + a_d)`, and from it the thrust :math:`f = F \cdot R e_3`;
+    - the wanted attitude :math:`R_d`, whose third axis is :math:`b_3 = F / |F|` and whose first is next to a heading;
+    - the attitude error :math:`e_R = \frac12 (R_d^T R - R^T R_d)^\vee`, the sine of the angle left to turn.
+
+    Lee's law ends in moments. Actions here are body rates, and the flight controller below turns them into moments:
+
+    .. math:: \Omega_c = R^T R_d \Omega_d - k_R e_R, \qquad
+              M = J K (\Omega_c - \Omega) - D \dot\Omega + \Omega \times J \Omega.
+
+    So the moments are Lee's, with the gains :math:`J K k_R` of :math:`e_R` and :math:`J K` of :math:`e_\Omega`. Missing
+    is his term with :math:`\dot\Omega_d`; the damping D of the rate loop comes in addition. :math:`\Omega_d` follows
+    from the jerk of the reference alone, as the rate at which :math:`a_d + g\,e_3` turns: errors contribute nothing.
+
+    Limits are those of the environment. The error of the position counts up to ``max_error``; F keeps within the
+    greatest thrust and tilt, its vertical part first, and at least 0.3 of the weight; the action is clamped.
+
+    .. code-block:: python
+
+        flight = env.rollout(256, GeometricController(env))
+
+    Args:
+        env: as for :class:`~torchrl_quad.controllers.policy.Controller`.
+        reference: likewise; its derivatives are taken by central differences.
+        position_gain: :math:`k_x` [1/s2].
+        velocity_gain: :math:`k_v` [1/s].
+        attitude_gain: :math:`k_R` [1/s]; None makes this loop half as quick as the rate loop of the drone.
+        max_error: greatest error of the position that counts [m].
+        max_tilt: greatest angle of F from the vertical [rad].
+        heading: angle of :math:`b_1` from world x [rad]; None leaves it where it is.
+
+    Raises:
+        TypeError: this is no quadrotor environment.
+        ValueError: its dynamics or its actions are others, its task has no reference, or a number is not positive.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        *,
+        reference: Reference | None = None,
+        position_gain: float = 10.0,
+        velocity_gain: float = 5.0,
+        attitude_gain: float | None = None,
+        max_error: float = 1.0,
+        max_tilt: float = 1.3,
+        heading: float | None = None,
+    ) -> None:
+        super().__init__(env, reference)
+        for name, value in (
+            ("position_gain", position_gain), ("velocity_gain", velocity_gain), ("attitude_gain", attitude_gain),
+            ("max_error", max_error), ("max_tilt", max_tilt),
+        ):  # fmt: skip
+            if value is not None and not 0.0 < value < math.inf:
+                raise ValueError(f"GeometricController: {name} must be a positive number, got {value!r}.")
+        if max_tilt >= 0.5 * math.pi:
+            raise ValueError(f"GeometricController: max_tilt must be below pi / 2 [rad], got {max_tilt!r}.")
+        self.position_gain, self.velocity_gain, self.max_error = position_gain, velocity_gain, max_error
+        self.max_tilt, self.heading = max_tilt, heading
+        nominal = self.nominal
+        lag = (1.0 + nominal.rate_damping / nominal.inertia) / nominal.rate_gain  # of the rate loop [s]
+        self.attitude_gain = 0.5 / lag if attitude_gain is None else torch.full_like(lag, attitude_gain)
+        self.gravity = pad(nominal.gravity, (2, 0))
+
+    def act(self, state: State, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action for the drone as it will be when the action takes effect."""
+        attitude, times = state["quaternion"], state["position"].new_full((1,), self.lead)
+        wanted = [x[:, 0] for x in follow(self.reference, state, times)]
+        position_error, velocity_error = wanted[0] - state["position"], wanted[1] - state["velocity"]
+        far = torch.linalg.vector_norm(position_error, dim=-1, keepdim=True)
+        position_error = position_error * (self.max_error / far.clamp_min(self.max_error))
+        correction = self.position_gain * position_error + self.velocity_gain * velocity_error
+        force = self.within_limits(correction + wanted[2] + self.gravity)  # per mass [m/s2]
+        up = normalize(force, dim=-1)
+        axes = torch.eye(3).to(attitude).expand(len(attitude), 3, 3)
+        rotation = quaternion.rotate(attitude.unsqueeze(1), axes).mT
+        error = attitude_error(rotation, wanted_rotation(up, self.first_axis(rotation)))
+        steady = wanted[2] + self.gravity
+        turn = torch.linalg.cross(steady, wanted[3]) / steady.square().sum(-1, keepdim=True).clamp_min(1e-6)
+        rates = quaternion.rotate_inverse(attitude, turn) - self.attitude_gain * error
+        thrust = self.nominal.mass * (force * rotation[..., 2]).sum(-1, keepdim=True)
+        action = self.dynamics.controller.encode(torch.cat((thrust, rates), -1))
+        return tensordict.set("action", action.clamp(-1.0, 1.0))
+
+    def within_limits(self, force: Tensor) -> Tensor:
+        """The force per mass (n, 3) [m/s2] that the drone can fly: its vertical part comes first."""
+        gravity = self.nominal.gravity
+        greatest = self.nominal.max_thrust_to_weight * gravity
+        lift = torch.minimum(torch.maximum(force[..., 2:], LEAST_LIFT * gravity), GREATEST_LIFT * greatest)
+        room = torch.minimum((greatest.square() - lift.square()).sqrt(), math.tan(self.max_tilt) * lift)
+        sideways = torch.linalg.vector_norm(force[..., :2], dim=-1, keepdim=True)
+        return torch.cat((force[..., :2] * (room / torch.maximum(sideways, room)), lift), -1)
+
+    def first_axis(self, rotation: Tensor) -> Tensor:
+        """What body x shall be next to, (n, 3): the heading, or where it is now."""
+        if self.heading is None:
+            return rotation[..., 0]
+        ahead = (math.cos(self.heading), math.sin(self.heading), 0.0)
+        return torch.tensor(ahead).to(rotation).expand(rotation.shape[:-1])
+
+
+def wanted_rotation(up: Tensor, ahead: Tensor) -> Tensor:
+    """The rotation (n, 3, 3), body to world, whose body z is ``up`` (n, 3), and whose body x is next to ``ahead``."""
+    left = normalize(torch.linalg.cross(up, ahead), dim=-1)
+    return torch.stack((torch.linalg.cross(left, up), left, up), -1)
+
+
+def attitude_error(rotation: Tensor, wanted: Tensor) -> Tensor:
+    """Lee's attitude error (n, 3), body frame, of rotations (n, 3, 3): about which axis it has turned too far."""
+    difference = wanted.mT @ rotation
+    skew = 0.5 * (difference - difference.mT)
+    return torch.stack((skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]), -1)

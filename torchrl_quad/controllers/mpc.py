@@ -1,0 +1,197 @@
+"""Model predictive control with the simulator as its model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import normalize, pad
+
+from torchrl_quad.controllers.policy import Controller, State
+from torchrl_quad.controllers.references import Reference, follow
+from torchrl_quad.controllers.riccati import feedback
+from torchrl_quad.dynamics import quaternion
+
+# Of the squared residuals: each is the square of what one unit of it weighs, and half of it counts.
+WEIGHTS = {
+    "position": 25.0,  # [1/m2]
+    "attitude": 0.25,  # of the quaternion
+    "velocity": 2.25,  # [s2/m2]
+    "angular_velocity": 0.01,  # [s2/rad2]
+    "action": 0.01,
+    "terminal": 10.0,  # factor of all but the action at the end of the horizon
+}
+SHORTENED = (1.0, 0.5, 0.2, 0.05)  # shares of a step of Gauss-Newton that are tried at once
+ROWS = 4096  # states whose derivatives are taken at once: what fits into the cache of a processor
+
+
+class MPC(Controller):
+    r"""Model predictive control: at each step, plan actions through the physics of the environment, and fly the first.
+
+    The plan minimises the squares of what the drone is away from the reference, over a horizon of H control steps,
+
+    .. math:: \tfrac12 \sum_{t=1}^{H} |x_t - \bar x_t|^2_{Q_t} + \tfrac12 \sum_{t=0}^{H-1} |u_t - \bar u_t|^2_R,
+        \qquad x_{t+1} = f(x_t, u_t), \quad |u_t| \le 1,
+
+    where f is a control step of the nominal drone, with rate loop, mixer and rotor lag, integrated as the environment
+    does it. The reference gives position and velocity; its acceleration gives the attitude, by the shortest turn from
+    the present one, and the thrust. The heading is free.
+
+    A step of Gauss-Newton linearises f along the plan by automatic differentiation, and solves the linear-quadratic
+    problem that is left by Riccati's recursion, within the bounds of the actions: iLQR (Li and Todorov 2004) with
+    control limits (Tassa, Mansard and Todorov 2014). Of some lengths of the step it takes the best, and none where all
+    are worse. The next control step starts from the plan of this one, moved by one step. So a single iteration is
+    usual ("real-time iteration", Diehl 2001).
+
+    The plan stands in the tensordict, under ``plan`` (num_envs, H, 4). A rollout carries it on; in a loop of your own
+    use ``step_mdp``. Where it is missing, or an episode begins, a plan starts from what the reference needs.
+
+    Args:
+        env: as for :class:`~torchrl_quad.controllers.policy.Controller`.
+        horizon: control steps of a plan.
+        iterations: steps of Gauss-Newton in each control step.
+        reference: as for :class:`~torchrl_quad.controllers.policy.Controller`.
+        weights: others than the usual ones, by name: position, attitude, velocity, angular_velocity, action, terminal.
+
+    Raises:
+        TypeError: this is no quadrotor environment.
+        ValueError: its dynamics or its actions are others, its task has no reference, or an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        *,
+        horizon: int = 20,
+        iterations: int = 1,
+        reference: Reference | None = None,
+        weights: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(env, reference)
+        for name, value in (("horizon", horizon), ("iterations", iterations)):
+            if not (isinstance(value, int) and value >= 1):
+                raise ValueError(f"MPC: {name} must be a whole number of at least 1, got {value!r}.")
+        unknown = sorted(set(weights or {}) - set(WEIGHTS))
+        if unknown:
+            raise ValueError(f"MPC: unknown weight {unknown[0]!r}. Choose from: {', '.join(WEIGHTS)}.")
+        self.weights = {**WEIGHTS, **(weights or {})}
+        wrong = [name for name, value in self.weights.items() if not value >= 0 or (name == "action" and value == 0)]
+        if wrong:
+            raise ValueError(f"MPC: the weight {wrong[0]!r} must be positive, got {self.weights[wrong[0]]!r}.")
+        self.out_keys.append("plan")
+        self.horizon, self.iterations = horizon, iterations
+        self.hover_speed, like = self.dynamics.controller.hover_speed, self.nominal.mass
+        self.sizes = dict(self.dynamics.sizes)
+        self.width = sum(self.sizes.values())
+        costs = [like.new_full((k,), self.weights.get(name, 0.0)) for name, k in self.sizes.items()]
+        self.state_cost = torch.cat(costs).repeat(horizon, 1)
+        self.state_cost[-1] *= self.weights["terminal"]
+        self.action_cost = like.new_full((4,), self.weights["action"])
+        self.times = self.lead + self.control_dt * torch.arange(horizon + 1).to(like)
+        self.shares = like.new_tensor(SHORTENED)[:, None, None]
+
+    def act(self, state: State, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the plan and its first action, for the drone as it will be when the action takes effect."""
+        start = self.pack(state)
+        goal, neutral = self.goal(state)
+        actions = self.begin(tensordict.get("plan", None), state, neutral)
+        states = self.predict(start, actions)
+        for _ in range(self.iterations):
+            states, actions = self.improve(states, actions, goal, neutral)
+        tensordict.set("plan", actions.transpose(0, 1).contiguous())
+        return tensordict.set("action", actions[0].clone())
+
+    def goal(self, state: State) -> tuple[Tensor, Tensor]:
+        """Where the states at the end of each step shall be, (H, n, 17), and the actions (H, n, 4) that suit them."""
+        attitude = state["quaternion"]
+        motion = follow(self.reference, state, self.times)
+        force = (motion.acceleration + pad(self.nominal.gravity, (2, 0)).view(-1, 1, 3)).transpose(0, 1)
+        now = quaternion.rotate(attitude, pad(torch.ones_like(attitude[:, :1]), (2, 0))).expand_as(force)
+        up = normalize(force, dim=-1)
+        turn = torch.cat((1.0 + (now * up).sum(-1, keepdim=True), torch.linalg.cross(now, up)), -1)
+        wanted = quaternion.multiply(quaternion.normalize(turn), attitude.expand(*up.shape[:-1], 4))
+        still = torch.zeros_like(up)
+        goal = torch.cat(
+            (motion.position.transpose(0, 1), wanted, motion.velocity.transpose(0, 1), still, torch.ones_like(wanted)),
+            -1,
+        )
+        thrust = self.nominal.mass * torch.linalg.vector_norm(force, dim=-1, keepdim=True)
+        neutral = self.dynamics.controller.encode(pad(thrust, (0, 3))).clamp(-1.0, 1.0)
+        return goal[1:], neutral[:-1]
+
+    def begin(self, plan: Tensor | None, state: State, neutral: Tensor) -> Tensor:
+        """The actions (H, n, 4) to improve: the last plan, moved by a step, or those that suit the reference."""
+        if plan is None or plan.shape != (neutral.shape[1], self.horizon, 4):
+            return neutral
+        plan = plan.detach().transpose(0, 1)
+        goes_on = (state["step"][:, 0] > 0) & plan.isfinite().all(-1).all(0)
+        return torch.where(goes_on[:, None], torch.cat((plan[1:], plan[-1:])), neutral)
+
+    def improve(self, states: Tensor, actions: Tensor, goal: Tensor, neutral: Tensor) -> tuple[Tensor, Tensor]:
+        """One step of Gauss-Newton from a trajectory (H + 1, n, 17) and its actions (H, n, 4); never to a worse one."""
+        steps, gains = feedback(
+            self.linearise(states[:-1], actions),
+            self.state_cost,
+            self.state_cost.unsqueeze(1) * (states[1:] - goal),
+            self.action_cost,
+            self.action_cost * (actions - neutral),
+            -1.0 - actions,
+            1.0 - actions,
+        )
+        state, tried, acted = states[0].expand(len(SHORTENED), -1, -1), [], []
+        for t in range(self.horizon):
+            deviation = (gains[t] @ (state - states[t]).unsqueeze(-1)).squeeze(-1)
+            action = (actions[t] + self.shares * steps[t] + deviation).clamp(-1.0, 1.0)
+            state = self.step(state, action)
+            tried.append(state)
+            acted.append(action)
+        tried, acted = torch.stack(tried, 1), torch.stack(acted, 1)
+        new = torch.cat((tried, states[None, 1:])), torch.cat((acted, actions[None]))  # the last is the old one
+        best = self.cost(*new, goal, neutral).nan_to_num(torch.inf).argmin(0)
+        states_best, actions_best = (x[best, :, torch.arange(len(best))].transpose(0, 1) for x in new)
+        return torch.cat((states[:1], states_best)), actions_best
+
+    def cost(self, states: Tensor, actions: Tensor, goal: Tensor, neutral: Tensor) -> Tensor:
+        """What trajectories cost, (*, n): states (*, H, n, 17) at the end of each step, and actions (*, H, n, 4)."""
+        away = (self.state_cost.unsqueeze(1) * (states - goal).square()).sum(-1)
+        return 0.5 * (away + (self.action_cost * (actions - neutral).square()).sum(-1)).sum(-2)
+
+    # -- the model -----------------------------------------------------------------------------------------------------
+
+    def pack(self, state: Mapping[Any, Tensor]) -> Tensor:
+        """The drone's entries as one state (*, 17), with rotor speeds in units of that of hovering."""
+        entries = {**{name: state[name] for name in self.sizes}, "rotor_speed": state["rotor_speed"] / self.hover_speed}
+        return torch.cat(tuple(entries.values()), -1)
+
+    def step(self, state: Tensor, action: Tensor) -> Tensor:
+        """A control step of the nominal drone, from states (*, n, 17) and actions (*, n, 4)."""
+        entries = dict(zip(self.sizes, state.split(list(self.sizes.values()), -1), strict=True))
+        entries["quaternion"] = quaternion.normalize(entries["quaternion"])  # also of deviations
+        entries["rotor_speed"] = entries["rotor_speed"] * self.hover_speed
+        return self.pack(self.dynamics.control_step(entries, action, self.nominal, None))
+
+    def predict(self, start: Tensor, actions: Tensor) -> Tensor:
+        """Where actions (H, n, 4) lead from states (n, 17): (H + 1, n, 17), the start first."""
+        states = [start]
+        for action in actions:
+            states.append(self.step(states[-1], action))
+        return torch.stack(states)
+
+    def linearise(self, states: Tensor, actions: Tensor) -> Tensor:
+        """The derivatives of :meth:`step` by states (T, n, 17) and actions (T, n, 4): (T, n, 17, 21).
+
+        Each entry of the end has a copy of the inputs, so that one backward pass gives all rows.
+        """
+        k, at_once = self.width, max(1, ROWS // (self.width * states.shape[1]))
+        inputs = torch.cat((states, actions), -1)
+        rows = []
+        for part in inputs.split(at_once):
+            with torch.enable_grad():
+                copies = part.expand(k, *part.shape).clone().requires_grad_()
+                end = self.step(*copies.flatten(0, 1).split((k, 4), -1)).unflatten(0, copies.shape[:2])
+                which = torch.eye(k).to(part)[:, None, None].expand_as(end)
+                rows.append(torch.autograd.grad(end, copies, which)[0])
+        return torch.cat(rows, 1).permute(1, 2, 0, 3).contiguous()

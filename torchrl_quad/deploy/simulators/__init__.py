@@ -1,0 +1,74 @@
+"""Simulators that fly a bundle, each behind the same four methods."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# By name: the module here, its class, and what to install.
+SIMULATORS = {
+    "torchrl_quad": ("ours", "Ours", "torchrl_quad"),
+    "mujoco": ("mujoco", "MuJoCo", "mujoco"),
+    "rotorpy": ("rotorpy", "RotorPy", "rotorpy"),
+    "crazyflow": ("crazyflow", "Crazyflow", "crazyflow"),
+}
+
+
+class Simulator(Protocol):
+    """The protocol of all simulators: many drones at once, in the conventions of the package.
+
+    A class takes the contract, the name of a rate loop, and for each rotor the index of the motor whose command it
+    gets.
+    """
+
+    version: str  #: name and version
+    loops: tuple[str, ...]  #: the rate loops that it can fly with
+
+    def reset(self, starts: Mapping[str, Array]) -> None:
+        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
+
+    def state(self) -> dict[str, Array]:
+        """``position``, ``quaternion``, ``velocity``, ``angular_velocity`` and ``rotor_speed``, each (n, ...)."""
+
+    def step(self, thrust: Array, rates: Array) -> None:
+        """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Go on with these drones alone (n)."""
+
+
+def simulator_class(name: str) -> type[Simulator]:
+    """The class of a simulator by its name.
+
+    Raises:
+        ValueError: it is unknown.
+        ImportError: it is not installed.
+    """
+    if name not in SIMULATORS:
+        raise ValueError(f"Unknown simulator {name!r}. Choose from: {', '.join(SIMULATORS)}.")
+    module, cls, package = SIMULATORS[name]
+    try:
+        return getattr(importlib.import_module(f"{__name__}.{module}"), cls)
+    except ImportError as error:
+        raise ImportError(f"Flying in {name} needs {package}: pip install {package} ({error})") from error
+
+
+def make_simulator(
+    name: str, contract: Mapping[str, Any], loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
+) -> Simulator:
+    """Build a simulator by its name.
+
+    Raises:
+        ValueError: it is unknown, or has no such rate loop.
+        ImportError: it is not installed.
+    """
+    kind = simulator_class(name)
+    if loop not in kind.loops:
+        raise ValueError(f"{name} has no rate loop {loop!r}. Choose from: {', '.join(kind.loops)}.")
+    return kind(contract, loop, motors)

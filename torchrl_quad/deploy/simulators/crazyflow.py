@@ -1,0 +1,120 @@
+"""Fly the drone of a contract in Crazyflow, by its dynamics from first principles, in JAX."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from importlib.metadata import version
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from crazyflow.control import Control
+from crazyflow.dynamics import Dynamics
+from crazyflow.sim import Sim
+from crazyflow.sim.integration import Integrator
+from crazyflow.sim.sim import clip_rotor_vel_cmd
+from numpy.typing import NDArray
+
+from torchrl_quad.deploy import frames
+from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone
+
+RATE = 1000.0  # [Hz], of the physics and of the rate loop
+RPM = 60.0 / (2.0 * np.pi)  # in 1 rad/s
+NAMES = {"position": "pos", "quaternion": "quat", "velocity": "vel", "angular_velocity": "ang_vel"}
+
+
+class Crazyflow:
+    """Drones in worlds of their own, in Crazyflow; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
+
+    Its dynamics take all that a contract says of a drone but quadratic drag, which they do not know. They compute in
+    float32, and hold drones above the ground. Physics and rate loop run at 1 kHz, by symplectic Euler.
+
+    Args:
+        contract: of a bundle. Its ``plant`` flies, its ``drone`` is what the rate loop believes in.
+        loop: "contract", "pid" or "pd".
+        motors: for each rotor the index of the motor whose command it gets.
+    """
+
+    loops = tuple(LOOPS)
+
+    def __init__(
+        self, contract: Mapping[str, Any], loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
+    ) -> None:
+        self.version = f"Crazyflow {version('crazyflow')}"
+        self.substeps = max(round(contract["control_dt"] * RATE), 1)
+        self.rate = round(self.substeps / contract["control_dt"])
+        self.drone = Drone(contract["drone"] | contract["plant"])
+        nominal = Drone(contract["drone"])
+        self.loop, self.hover_speed = LOOPS[loop](nominal, 1.0 / self.rate), nominal.hover_speed
+        self.frame, self.order = frames.crazyflow(), list(motors)
+
+    def reset(self, starts: Mapping[str, Array]) -> None:
+        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
+        n, drone = len(starts["position"]), self.drone
+        self.sim = Sim(
+            n_worlds=n,
+            dynamics=Dynamics.first_principles,
+            control=Control.rotor_vel,
+            integrator=Integrator.symplectic_euler,
+            freq=self.rate,
+        )
+        limits = {"lower": drone.rotor_speed_min * RPM, "upper": drone.rotor_speed_max * RPM}
+        clip = partial(clip_rotor_vel_cmd, dynamics=Dynamics.first_principles, **limits)
+        self.sim.step_pipeline["clip_rotor_vel_cmd"] = clip
+        self.sim.build_step_fn()
+        theirs = {NAMES[name]: x for name, x in self.frame.to(starts).items()}
+        theirs["rotor_vel"] = np.tile(self.frame.to({"motors": self.hover_speed})["motors"] * RPM, (n, 1))
+        data = self.sim.data
+        states = data.states.replace(**{name: jnp.asarray(x, jnp.float32)[:, None] for name, x in theirs.items()})
+        params = data.params.replace(
+            **{k: jnp.asarray(x, jnp.float32) for k, x in _parameters(drone, self.frame).items()}
+        )
+        self.sim.data = data.replace(states=states, params=params)
+        self.flying = np.arange(n)  # the others go on, too, but nobody looks at them
+
+    def state(self) -> dict[str, Array]:
+        """The present states (n, ...)."""
+        states = self.sim.data.states
+        theirs = {name: np.asarray(getattr(states, key), float)[self.flying, 0] for name, key in NAMES.items()}
+        speeds = np.asarray(states.rotor_vel, float)[self.flying, 0] / RPM
+        return {**self.frame.back(theirs), "rotor_speed": self.frame.back({"motors": speeds})["motors"]}
+
+    def step(self, thrust: Array, rates: Array) -> None:
+        """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
+        command = np.array(self.sim.data.controls.rotor_vel)
+        for _ in range(self.substeps):
+            states = self.sim.data.states
+            turning = np.asarray(states.ang_vel, float)[self.flying, 0]
+            speed = self.frame.back({"motors": np.asarray(states.rotor_vel, float)[self.flying, 0] / RPM})["motors"]
+            asked = self.loop(thrust, rates, turning, speed)[:, self.order]
+            command[self.flying, 0] = self.frame.to({"motors": asked})["motors"] * RPM
+            self.sim.rotor_vel_control(jnp.asarray(command))
+            self.sim.step(1)
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Go on with these drones alone (n)."""
+        self.flying = self.flying[chosen]
+        self.loop.keep(chosen)
+
+
+def _parameters(drone: Drone, frame: frames.Convention) -> dict[str, Any]:
+    """Crazyflow's parameters of a drone; lengths of arms are in its mixing matrix."""
+    order = list(frame.motors)
+    k2, k1, k0 = drone.thrust_map
+    curve = np.array([[k0, k1 / RPM, k2 / RPM**2]])
+    x, y = drone.rotor_positions[order].T
+    lag = 1.0 / drone.motor_time_constant
+    return {
+        "mass": drone.mass,
+        "L": [1.0],
+        "prop_inertia": [0.0],
+        "gravity_vec": [0.0, 0.0, -drone.gravity],
+        "J": np.diag(drone.inertia),
+        "J_inv": np.diag(1.0 / drone.inertia),
+        "rpm2thrust": curve,
+        "rpm2torque": curve * drone.yaw_torque_coefficient,
+        "mixing_matrix": [y, -x, drone.rotor_spin[order]],
+        "drag_matrix": -np.diag(drone.linear_drag),
+        "rotor_dyn_coef": [[lag, 0.0, lag, 0.0]],
+    }

@@ -1,0 +1,122 @@
+"""Fly the drone of a contract in MuJoCo: a rigid body with four rotors, built from numbers alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+from numpy.typing import NDArray
+
+from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone
+
+RATE = 1000.0  # [Hz], of the physics and of the rate loop
+FRONT_TO_BACK = ("front_left", "back_left", "back_right", "front_right")
+# qpos of a free joint: position and quaternion (w, x, y, z), body to world. qvel: velocity in the world frame, angular
+# velocity in the body frame. act: the rotor speeds.
+STATE = {"position": slice(1, 4), "quaternion": slice(4, 8), "velocity": slice(8, 11)}
+STATE |= {"angular_velocity": slice(11, 14), "rotor_speed": slice(14, 18)}
+
+
+def model(drone: Drone, timestep: float) -> str:
+    """The drone as MJCF.
+
+    Everything that the motion depends on is said: mass and inertia, gravity, the integrator (semi-implicit Euler), no
+    contact, no fluid. The first four actuators make no force: they are the lag of the rotors, of first order in the
+    speed and exact for any step. The other four push along z at the place of a rotor, by the thrust [N] that is written
+    into them, and turn by its drag torque.
+    """
+    places, spins = drone.rotor_positions.tolist(), drone.rotor_spin.tolist()
+    sites = "".join(
+        f'<site name="{name}" pos="{x!r} {y!r} 0"/>' for name, (x, y) in zip(FRONT_TO_BACK, places, strict=True)
+    )
+    lag = f'dyntype="filterexact" dynprm="{drone.motor_time_constant!r}" gaintype="fixed" gainprm="0" biastype="none"'
+    lags = "".join(f'<general site="{name}" {lag} gear="0 0 1 0 0 0" ctrllimited="false"/>' for name in FRONT_TO_BACK)
+    thrusts = "".join(
+        f'<motor site="{name}" gear="0 0 1 0 0 {spin * drone.yaw_torque_coefficient!r}" ctrllimited="false"/>'
+        for name, spin in zip(FRONT_TO_BACK, spins, strict=True)
+    )
+    inertia = " ".join(map(repr, drone.inertia.tolist()))
+    return f"""<mujoco>
+  <compiler inertiafromgeom="false" balanceinertia="false" boundmass="0" boundinertia="0"/>
+  <option timestep="{timestep!r}" integrator="Euler" gravity="0 0 {-drone.gravity!r}" wind="0 0 0" density="0"
+          viscosity="0">
+    <flag contact="disable" constraint="disable" gravity="enable" actuation="enable" autoreset="disable"/>
+  </option>
+  <worldbody>
+    <body name="drone" pos="0 0 0">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="{drone.mass!r}" diaginertia="{inertia}"/>
+      {sites}
+    </body>
+  </worldbody>
+  <actuator>{lags}{thrusts}</actuator>
+</mujoco>"""
+
+
+class MuJoCo:
+    """Drones that do not know of each other, in MuJoCo; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
+
+    Thrust follows from the speed of the rotors by the contract's thrust map, and drag by its coefficients; both are
+    forces to MuJoCo, held over a step of 1 ms. The rate loop runs at 1 kHz, too.
+
+    Args:
+        contract: of a bundle. Its ``plant`` flies, its ``drone`` is what the rate loop believes in.
+        loop: "contract", "pid" or "pd".
+        motors: for each rotor the index of the motor whose command it gets.
+    """
+
+    loops = tuple(LOOPS)
+
+    def __init__(
+        self, contract: Mapping[str, Any], loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
+    ) -> None:
+        self.version = f"MuJoCo {mujoco.__version__}"
+        self.substeps = max(round(contract["control_dt"] * RATE), 1)
+        timestep = contract["control_dt"] / self.substeps
+        nominal = Drone(contract["drone"])
+        self.drone, self.hover_speed = Drone(contract["drone"] | contract["plant"]), nominal.hover_speed
+        self.loop, self.motors = LOOPS[loop](nominal, timestep), list(motors)
+        self.model = mujoco.MjModel.from_xml_string(model(self.drone, timestep))
+        self.data = mujoco.MjData(self.model)
+        self.rollout = rollout.Rollout(nthread=0)
+        self.inputs = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED)
+
+    def reset(self, starts: Mapping[str, Array]) -> None:
+        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
+        n = len(starts["position"])
+        self.x = np.zeros((n, mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+        for name, at in STATE.items():
+            self.x[:, at] = starts.get(name, self.hover_speed)
+        self._allocate()
+
+    def state(self) -> dict[str, Array]:
+        """The present states (n, ...)."""
+        return {name: self.x[:, at].copy() for name, at in STATE.items()}
+
+    def step(self, thrust: Array, rates: Array) -> None:
+        """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
+        drone, limits = self.drone, (self.drone.rotor_speed_min, self.drone.rotor_speed_max)
+        command, lift, force = self.control[:, 0, :4], self.control[:, 0, 4:8], self.control[:, 0, 14:17]
+        for _ in range(self.substeps):
+            x = self.x
+            speed = x[:, STATE["rotor_speed"]]
+            asked = self.loop(thrust, rates, x[:, STATE["angular_velocity"]], speed)
+            np.clip(asked[:, self.motors], *limits, out=command)
+            lift[:] = drone.thrust(speed)
+            force[:] = drone.drag(x[:, STATE["quaternion"]], x[:, STATE["velocity"]])
+            self.rollout.rollout(self.model, [self.data], x, self.control, control_spec=self.inputs, state=self.after)
+            self.x, self.after = self.after[:, 0], x[:, None]
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Go on with these drones alone (n)."""
+        self.x = self.x[chosen]
+        self.loop.keep(chosen)
+        self._allocate()
+
+    def _allocate(self) -> None:
+        # Of each drone the eight controls, then force and torque on the world, and on the drone.
+        self.control = np.zeros((len(self.x), 1, 8 + 12))
+        self.after = np.zeros((len(self.x), 1, self.x.shape[1]))

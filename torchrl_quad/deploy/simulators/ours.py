@@ -1,0 +1,60 @@
+"""Fly the drone of a contract in the package's own simulator, which needs torch: the flight to compare others with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+
+from torchrl_quad.deploy.simulators.vehicle import Array
+from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams, load_drone
+
+
+class Ours:
+    """The simulator of the contract; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
+
+    Args:
+        contract: of a bundle.
+        loop: "contract", which is a part of this simulator.
+        motors: for each rotor the index of the motor whose command it gets; here each gets its own.
+    """
+
+    loops = ("contract",)
+
+    def __init__(
+        self, contract: Mapping[str, Any], loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
+    ) -> None:
+        if tuple(motors) != (0, 1, 2, 3):
+            raise ValueError("torchrl_quad flies motors as they are: swap them in another simulator.")
+        about = contract["simulator"]
+        self.version = contract["origin"]["package"]
+        nominal, substeps = load_drone(contract["drone"]), round(contract["control_dt"] / about["dt"])
+        self.params: QuadrotorParams = (
+            load_drone(contract["drone"] | contract["plant"]) if contract["plant"] else nominal
+        )
+        kind = DYNAMICS[about["dynamics"]]
+        self.dynamics = kind(nominal, about["dt"], substeps, about["integrator"], "rates")
+        if not contract["plant"]:
+            self.params = self.dynamics.nominal
+
+    def reset(self, starts: Mapping[str, Array]) -> None:
+        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
+        given = {name: torch.from_numpy(x).float() for name, x in starts.items()}
+        self.now = {**self.dynamics.rest(given["position"]), **given}
+
+    def state(self) -> dict[str, Array]:
+        """The present states (n, ...)."""
+        return {name: x.double().numpy() for name, x in self.now.items()}
+
+    @torch.no_grad()
+    def step(self, thrust: Array, rates: Array) -> None:
+        """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
+        command = torch.cat((torch.from_numpy(thrust)[:, None], torch.from_numpy(rates)), 1).float()
+        action = self.dynamics.controller.encode(command)
+        self.now = self.dynamics.control_step(self.now, action, self.params, None)
+
+    def keep(self, chosen: NDArray[Any]) -> None:
+        """Go on with these drones alone (n)."""
+        self.now = {name: x[torch.from_numpy(chosen)] for name, x in self.now.items()}

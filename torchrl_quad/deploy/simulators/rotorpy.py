@@ -1,0 +1,116 @@
+"""Fly the drone of a contract in RotorPy, by its vehicle ``Multirotor``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rotorpy.vehicles.multirotor import Multirotor
+
+from torchrl_quad.deploy import frames
+from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone, damping_ratio
+
+NAMES = {"position": "x", "quaternion": "q", "velocity": "v", "angular_velocity": "w"}
+
+
+class RotorPy:
+    """Drones that do not know of each other, in RotorPy; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
+
+    RotorPy integrates over steps of the contract's simulator, in which commands are held: 5 ms by default. Its vehicle
+    cannot be all that a contract says:
+
+    - thrust is k w^2; k is chosen so that the rotors hover at the contract's speed, and have its limits of thrust;
+    - linear drag acts at the hubs, and grows with the speed of the rotors; it is the contract's in hover;
+    - quadratic drag is -C |v| v with the norm of the velocity, not axis by axis;
+    - gravity is 9.81 m/s2.
+
+    Args:
+        contract: of a bundle. Its ``plant`` flies.
+        loop: "contract", "pid", "pd", or "own": RotorPy's ``cmd_ctbr``, proportional, with the gain that gives the
+            damping of the contract's loop.
+        motors: for each rotor the index of the motor whose command it gets.
+    """
+
+    loops = (*LOOPS, "own")
+
+    def __init__(
+        self, contract: Mapping[str, Any], loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
+    ) -> None:
+        self.version = f"RotorPy {version('rotorpy')}"
+        self.dt = contract["simulator"]["dt"]
+        self.substeps = round(contract["control_dt"] / self.dt)
+        speed = Drone(contract["drone"]).hover_speed
+        nominal, drone = (_squared(x, speed) for x in (contract["drone"], contract["drone"] | contract["plant"]))
+        self.frame, self.hover_speed, self.order = frames.rotorpy(), nominal.hover_speed, list(motors)
+        self.loop = None if loop == "own" else LOOPS[loop](nominal, self.dt)
+        ratio, tau = damping_ratio(nominal), nominal.motor_time_constant
+        gain = float((1.0 / (4.0 * ratio**2 * tau))[:2].mean())
+        kind = "cmd_ctbr" if loop == "own" else "cmd_motor_speeds"
+        solver = {"method": "RK23", "first_step": self.dt}  # half the time of its defaults
+        parameters = _parameters(drone, self.frame) | {"k_w": gain}
+        self.vehicle = Multirotor(parameters, control_abstraction=kind, integrator_kwargs=solver)
+
+    def reset(self, starts: Mapping[str, Array]) -> None:
+        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
+        theirs = self.frame.to(starts)
+        speeds = self.frame.to({"motors": self.hover_speed})["motors"]
+        still = {"wind": np.zeros(3), "rotor_speeds": speeds}
+        n = len(starts["position"])
+        self.now = [{**{NAMES[k]: x[i] for k, x in theirs.items()}, **still} for i in range(n)]
+
+    def state(self) -> dict[str, Array]:
+        """The present states (n, ...)."""
+        theirs = {name: np.stack([x[theirs] for x in self.now]) for name, theirs in NAMES.items()}
+        speeds = self.frame.back({"motors": np.stack([x["rotor_speeds"] for x in self.now])})["motors"]
+        return {**self.frame.back(theirs), "rotor_speed": speeds}
+
+    def step(self, thrust: Array, rates: Array) -> None:
+        """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
+        rates = self.frame.to({"body_rate": rates})["body_rate"]
+        for _ in range(self.substeps):
+            if self.loop is None:
+                commands = [{"cmd_thrust": t, "cmd_w": w} for t, w in zip(thrust, rates, strict=True)]
+            else:
+                state = self.state()
+                speeds = self.loop(thrust, rates, state["angular_velocity"], state["rotor_speed"])[:, self.order]
+                commands = [{"cmd_motor_speeds": x} for x in self.frame.to({"motors": speeds})["motors"]]
+            self.now = [self.vehicle.step(x, c, self.dt) for x, c in zip(self.now, commands, strict=True)]
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Go on with these drones alone (n)."""
+        self.now = [x for x, on in zip(self.now, chosen, strict=True) if on]
+        if self.loop is not None:
+            self.loop.keep(chosen)
+
+
+def _squared(fields: Mapping[str, Any], speed: Array) -> Drone:
+    """The drone with thrust k w^2 that is its own at a speed (4) [rad/s] of the rotors, and with its limits."""
+    drone = Drone(fields)
+    k = float((drone.thrust(speed) / speed**2).mean())
+    least, greatest = (float(np.sqrt(x / k)) for x in drone.thrust_limits)
+    return Drone({**fields, "thrust_map": [k, 0.0, 0.0], "rotor_speed_min": least, "rotor_speed_max": greatest})
+
+
+def _parameters(drone: Drone, frame: frames.Convention) -> dict[str, Any]:
+    """RotorPy's parameters of a drone."""
+    k, order = float(drone.thrust_map[0]), list(frame.motors)
+    at_hover = 4.0 * float(drone.hover_speed.mean())
+    places = np.c_[drone.rotor_positions[order], np.zeros(4)]
+    return {
+        "mass": drone.mass,
+        **{f"I{a}{b}": float(np.diag(drone.inertia)[i, j]) for i, a in enumerate("xyz") for j, b in enumerate("xyz")},
+        **{f"c_D{axis}": float(x) for axis, x in zip("xyz", drone.quadratic_drag, strict=True)},
+        "num_rotors": 4,
+        "rotor_pos": {f"r{i + 1}": place for i, place in enumerate(places)},
+        "rotor_directions": drone.rotor_spin[order],
+        "rotor_speed_min": drone.rotor_speed_min,
+        "rotor_speed_max": drone.rotor_speed_max,
+        "k_eta": k,
+        "k_m": k * drone.yaw_torque_coefficient,
+        "k_d": float(drone.linear_drag[:2].mean()) / at_hover,
+        "k_z": float(drone.linear_drag[2]) / at_hover,
+        "tau_m": drone.motor_time_constant,
+    }

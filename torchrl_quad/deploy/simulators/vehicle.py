@@ -1,0 +1,199 @@
+"""The drone of a contract in numpy, for many drones at once: its rotors, its drag, and two rate loops that fly it.
+
+Arrays are (n, ...), one row for each drone. Nothing here imports torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Drone:
+    """A quadrotor from the fields of a contract's ``drone``: what :class:`~torchrl_quad.QuadrotorParams` documents.
+
+    Attributes:
+        fields: the fields by name, as arrays.
+        allocation: (4, 4), from four rotor thrusts [N] to collective thrust [N] and torque [N m].
+        mixer: its inverse.
+        thrust_limits: the least and the greatest thrust [N] that may be commanded of one rotor.
+        hover_speed: of each rotor (4) [rad/s].
+    """
+
+    def __init__(self, fields: Mapping[str, Any]) -> None:
+        self.fields = {name: np.array(value, float) for name, value in fields.items()}
+        for name, value in self.fields.items():
+            setattr(self, name, value if value.ndim else float(value))
+        k2, k1, k0 = self.thrust_map
+        self.vertex_speed, self.vertex_thrust = -k1 / (2.0 * k2), k0 - k1 * k1 / (4.0 * k2)
+        self.least_root = 1e-6 * (self.rotor_speed_max - self.vertex_speed) ** 2
+        x, y = self.rotor_positions.T
+        self.allocation = np.array([np.ones(4), y, -x, self.yaw_torque_coefficient * self.rotor_spin])
+        self.mixer = np.linalg.inv(self.allocation)
+        least, greatest = self.thrust(np.array([self.rotor_speed_min, self.rotor_speed_max]))
+        self.thrust_limits = max(least, 0.0), greatest
+        self.weight = self.mass * self.gravity
+        self.hover_speed = self.speed(self.mixer[:, 0] * self.weight)
+
+    def thrust(self, speed: Array) -> Array:
+        """Thrust [N] of rotors that turn at a speed [rad/s]."""
+        return self.thrust_map[0] * (speed - self.vertex_speed) ** 2 + self.vertex_thrust
+
+    def speed(self, thrust: Array) -> Array:
+        """Speed [rad/s] at which rotors have a thrust [N]."""
+        squared = (thrust - self.vertex_thrust) / self.thrust_map[0]
+        return np.sqrt(np.maximum(squared, self.least_root)) + self.vertex_speed
+
+    def drag(self, quaternion: Array, velocity: Array) -> Array:
+        """The force of the air (n, 3) [N], world frame, at an attitude (n, 4) and a velocity (n, 3) [m/s]."""
+        body = rotate(quaternion, velocity, back=True)
+        return rotate(quaternion, -(self.linear_drag + self.quadratic_drag * np.abs(body)) * body)
+
+
+def rotate(quaternion: Array, vector: Array, back: bool = False) -> Array:
+    """Vectors (n, 3) from the body frame to the world frame, or back; quaternions (n, 4), w x y z."""
+    w, u = quaternion[:, :1], quaternion[:, 1:]
+    t = 2.0 * _cross(u, vector)
+    return vector + (-w if back else w) * t + _cross(u, t)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross product (n, 3); numpy's own takes five times as long."""
+    ax, ay, az, bx, by, bz = *a.T, *b.T
+    return np.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), 1)
+
+
+class RateLoop(Protocol):
+    """From a collective thrust (n) [N] and body rates (n, 3) [rad/s] to commanded rotor speeds (n, 4) [rad/s]."""
+
+    def __call__(self, thrust: Array, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
+        """The command, from the body rates (n, 3) [rad/s] and rotor speeds (n, 4) [rad/s] of this moment."""
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Go on with these drones alone (n)."""
+
+
+class ContractLoop:
+    """The rate loop of the contract, as the drone was trained with; it knows how fast its rotors turn.
+
+    torque = J K (desired - rate) - D (angular acceleration) + w x J w, where the angular acceleration follows from the
+    rotor speeds. Where rotors saturate it gives up yaw first, then thrust, then roll and pitch.
+
+    Args:
+        drone: the nominal drone.
+        dt: time between two calls [s].
+    """
+
+    def __init__(self, drone: Drone, dt: float) -> None:
+        self.drone, self.dt = drone, dt
+        self.gain = drone.inertia * drone.rate_gain
+        self.share, self.per_share = drone.mixer[:, 0], 1.0 / drone.mixer[:, 0]
+        least, greatest = drone.thrust_limits
+        lowest, highest = (least * self.per_share).max(), (greatest * self.per_share).min()
+        self.middle, self.half_span = 0.5 * (highest + lowest), 0.5 * (highest - lowest)
+        self.yaw_share, self.tiny = drone.mixer[:, 3] * self.per_share, 1e-6 * drone.weight
+
+    def __call__(self, thrust: Array, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
+        """The command; see :class:`RateLoop`."""
+        return self.mix(thrust, self.torque(rates, angular_velocity, rotor_speed))
+
+    def torque(self, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
+        """The torque to ask for (n, 3) [N m]."""
+        drone = self.drone
+        gyroscopic = _cross(angular_velocity, drone.inertia * angular_velocity)
+        believed = drone.thrust(rotor_speed) @ drone.allocation[1:].T
+        acceleration = (believed - gyroscopic) / drone.inertia
+        return gyroscopic + self.gain * (rates - angular_velocity) - drone.rate_damping * acceleration
+
+    def mix(self, collective: Array, torque: Array) -> Array:
+        """Rotor speeds (n, 4) [rad/s] for a collective thrust (n) [N] and a torque (n, 3) [N m], within the limits."""
+        drone, collective = self.drone, collective[:, None]
+        thrust = np.concatenate((collective, torque), 1) @ drone.mixer.T
+        limited = np.clip(thrust, *drone.thrust_limits)
+        beyond = (limited != thrust).any(1)
+        if beyond.any():
+            limited[beyond] = self._within_limits(thrust[beyond], collective[beyond], torque[beyond, 2:])
+        return drone.speed(limited)
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Nothing to choose from: it has no memory."""
+
+    def _within_limits(self, thrust: Array, collective: Array, yaw_torque: Array) -> Array:
+        # In units of collective thrust, of which every rotor has its share.
+        yaw = self.yaw_share * yaw_torque
+        tilt = thrust * self.per_share - yaw - collective
+        least, greatest = tilt.min(1, keepdims=True), tilt.max(1, keepdims=True)
+        shrink = np.minimum(2.0 * self.half_span / np.maximum(greatest - least, self.tiny), 1.0)
+        highest = self.middle + self.half_span - greatest * shrink
+        lowest = self.middle - self.half_span - least * shrink
+        level = np.maximum(np.minimum(collective, highest), lowest) + tilt * shrink
+        used = (level - self.middle) * np.sign(self.yaw_share)
+        used = np.where(yaw_torque > 0.0, used.max(1, keepdims=True), -used.min(1, keepdims=True))
+        reach = np.maximum(np.abs(yaw_torque) * np.abs(self.yaw_share).max(), self.tiny)
+        level = level + yaw * np.clip((self.half_span - used) / reach, 0.0, 1.0)
+        return np.clip(level * self.share, *self.drone.thrust_limits)
+
+
+class PIDLoop(ContractLoop):
+    """A PID rate loop as firmware has it: it reads a gyro, and knows no rotor speed, no inertial coupling and no model.
+
+    Its gains follow from the contract by a rule. P is the contract's gain times the inertia, and D the contract's
+    damping, but of the measured body rate: with a perfect derivative the loop would have the bandwidth and the damping
+    of the contract's ``rate_loop``. The derivative passes a low-pass filter of first order at 100 Hz. I is P times a
+    tenth of the bandwidth; the integral is held while a rotor saturates. Mixer and limits are those of the contract.
+    """
+
+    cutoff = 100.0  # [Hz], of the derivative
+    integral_share = 0.1  # of the bandwidth
+
+    def __init__(self, drone: Drone, dt: float) -> None:
+        super().__init__(drone, dt)
+        self.integral_gain = self.gain * self.integral_share * bandwidth(drone)
+        self.smoothing = 1.0 - np.exp(-2.0 * np.pi * self.cutoff * dt)
+        self.integral, self.derivative, self.before = np.zeros(3), np.zeros(3), None
+
+    def __call__(self, thrust: Array, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
+        """The command; see :class:`RateLoop`. The rotor speeds are not read."""
+        if self.before is None:
+            self.before = angular_velocity
+        error = rates - angular_velocity
+        change = (angular_velocity - self.before) / self.dt
+        self.derivative = self.derivative + self.smoothing * (change - self.derivative)
+        self.before = angular_velocity
+        torque = self.gain * error + self.integral - self.drone.rate_damping * self.derivative
+        asked = np.concatenate((thrust[:, None], torque), 1) @ self.drone.mixer.T
+        low, high = self.drone.thrust_limits
+        fits = ((asked >= low) & (asked <= high)).all(1, keepdims=True)
+        self.integral = self.integral + fits * self.integral_gain * error * self.dt
+        return self.mix(thrust, torque)
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Go on with these drones alone."""
+        if self.before is not None:
+            self.integral, self.derivative = self.integral[chosen], self.derivative[chosen]
+            self.before = self.before[chosen]
+
+
+class PDLoop(PIDLoop):
+    """The same without the integral, which firmware holds back while the setpoint moves fast."""
+
+    integral_share = 0.0
+
+
+def damping_ratio(drone: Drone) -> Array:
+    """Of the contract's rate loop, a second-order system about each axis (3); see its ``rate_loop``."""
+    return (1.0 + drone.rate_damping / drone.inertia) / (2.0 * np.sqrt(drone.rate_gain * drone.motor_time_constant))
+
+
+def bandwidth(drone: Drone) -> Array:
+    """At which the answer of the contract's rate loop to a sine has fallen by 3 dB (3) [rad/s]."""
+    part = 1.0 - 2.0 * damping_ratio(drone) ** 2
+    return np.sqrt(drone.rate_gain / drone.motor_time_constant) * np.sqrt(part + np.sqrt(part**2 + 1.0))
+
+
+LOOPS: dict[str, type[ContractLoop]] = {"contract": ContractLoop, "pid": PIDLoop, "pd": PDLoop}

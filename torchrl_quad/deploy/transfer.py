@@ -1,0 +1,166 @@
+"""Fly a bundle in a simulator, through its contract and without torch, and judge the flights.
+
+.. code-block:: python
+
+    flight = fly("outputs/policy", "mujoco")
+    print(flight["solved"].mean())
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_quad.deploy.bundle import QUANTITIES, Bundle, load_bundle
+from torchrl_quad.deploy.judging import endings, judge
+from torchrl_quad.deploy.simulators import make_simulator
+from torchrl_quad.deploy.tasks import PROGRESS
+
+Array = NDArray[np.float64]
+# Fields of the rate loop, which does not know the true drone.
+OF_THE_LOOP = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A mistake in a port, made on purpose: flown, it must fail."""
+
+    about: str
+    quaternion: tuple[int, ...] = (0, 1, 2, 3)  #: the order in which the bundle gets the entries of the quaternion
+    attitude: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)  #: times the quaternion that the bundle gets
+    measured: tuple[float, ...] = (1.0, 1.0, 1.0)  #: times the body rates that the bundle gets
+    commanded: tuple[float, ...] = (1.0, 1.0, 1.0)  #: times the body rates that it commands
+    motors: tuple[int, ...] = (0, 1, 2, 3)  #: for each rotor the motor whose command it gets
+    delay: int | None = None  #: control steps until a command takes effect, instead of the contract's
+    keeps_queue: bool = True  #: whether the bundle knows the commands on their way
+
+
+MUTANTS = {
+    "xyzw": Mutant("quaternion as x y z w", quaternion=(1, 2, 3, 0)),
+    "yaw": Mutant("yaw rate commanded with the other sign", commanded=(1, 1, -1)),
+    "heading": Mutant("heading counted clockwise", attitude=(1, 1, 1, -1)),
+    "motors": Mutant("front motors swapped", motors=(3, 1, 2, 0)),
+    "frd": Mutant("rates commanded in FRD", commanded=(1, -1, -1)),
+    "frd_gyro": Mutant("rates measured in FRD", measured=(1, -1, -1)),
+    "delay": Mutant("commands take effect at once", delay=0),
+    "queue": Mutant("the commands on their way are not kept", keeps_queue=False),
+}
+
+
+def fly(
+    folder: str | Path | Bundle,
+    simulator: str,
+    loop: str = "contract",
+    mutant: Mutant | None = None,
+    *,
+    scale: Mapping[str, float] | None = None,
+    late: int = 0,
+    episodes: int | None = None,
+) -> dict[str, Any]:
+    """Fly a bundle from its fresh starts, one episode each, in a simulator.
+
+    The simulator applies the contract's ``action_delay``: the hover command is on its way at the start. It reports
+    states as late as the contract's ``observation_delay``, and otherwise exactly.
+
+    Args:
+        folder: a bundle.
+        simulator: one of ``torchrl_quad.deploy.simulators.SIMULATORS``.
+        loop: the rate loop: "contract", "pid", "pd", or "own", that of the simulator.
+        mutant: a mistake to make.
+        scale: fields of the drone that flies, times a factor: ``{"mass": 1.2}``. The rate loop does not know of it.
+        late: control steps by which commands take effect later than the contract says.
+        episodes: of the starts, how many; by default all.
+
+    Returns:
+        by name: the states (n, time + 1, ...), the first of which is the start, the last one repeated after the end of
+        an episode; ``action`` (n, time, 4); what :func:`~torchrl_quad.deploy.judging.judge` finds (n); ``simulator``,
+        name and version; ``faults``, the bundle's refusals by name.
+    """
+    bundle = folder if isinstance(folder, Bundle) else load_bundle(folder, on_fault="hover")
+    contract, mutant = other_drone(bundle.contract, scale or {}), mutant or Mutant("none")
+    starts = {name: x[:episodes] for name, x in bundle.starts().items()}
+    n, steps = len(starts["position"]), contract["task"]["max_episode_steps"]
+    world = make_simulator(simulator, contract, loop, mutant.motors)
+    world.reset({name: starts[name] for name in QUANTITIES})
+    pilots = [_pilot(bundle, {k: x[i] for k, x in starts.items()}) for i in range(n)]
+    delay = late + (contract["action_delay"] if mutant.delay is None else mutant.delay)
+    queue = deque([np.tile(_hover(contract), (n, 1))] * delay)
+    state = world.state()
+    seen = deque([state] * (contract["observation_delay"] + 1), contract["observation_delay"] + 1)
+    flight = {name: np.repeat(x[:, None], steps + 1, 1) for name, x in state.items()}
+    flight["action"] = np.tile(bundle.action.astype(float), (n, steps, 1))
+    alive = np.arange(n)
+    for t in range(1, steps + 1):
+        command = np.empty((len(alive), 4))
+        for k, i in enumerate(alive):
+            command[k] = _ask(pilots[i], {name: seen[0][name][k] for name in QUANTITIES}, mutant)
+            flight["action"][i, t - 1] = pilots[i].action
+        queue.append(command)
+        now = queue.popleft()
+        world.step(now[:, 0], now[:, 1:] * mutant.commanded)
+        state = world.state()
+        for name, x in state.items():
+            flight[name][alive, t:] = x[:, None]
+        seen.append(state)
+        on = ~np.logical_or(*endings(contract, state["position"], state["velocity"]))
+        if not on.all():
+            alive = alive[on]
+            queue = deque(x[on] for x in queue)
+            seen = deque(({k: x[on] for k, x in y.items()} for y in seen), seen.maxlen)
+            world.keep(on)
+        if not len(alive):
+            break
+    progress = PROGRESS[contract["task"]["rule"]]
+    flight[progress] = starts[progress]
+    faults = sum((pilot.faults for pilot in pilots), Counter())
+    return {**flight, **judge(contract, flight), "simulator": world.version, "faults": dict(faults)}
+
+
+def other_drone(contract: Mapping[str, Any], scale: Mapping[str, float]) -> dict[str, Any]:
+    """The contract with another drone in its ``plant``: fields times a factor.
+
+    Raises:
+        ValueError: a field is unknown, or belongs to the rate loop.
+    """
+    drone, plant = contract["drone"] | contract["plant"], dict(contract["plant"])
+    fields = [name for name in drone if name not in OF_THE_LOOP]
+    for name, factor in scale.items():
+        if name not in fields:
+            raise ValueError(f"scale: the drone has no {name!r} to scale. Choose from: {', '.join(fields)}.")
+        plant[name] = (factor * np.array(drone[name], float)).tolist()
+    return {**contract, "plant": plant}
+
+
+def _hover(contract: dict[str, Any]) -> Array:
+    """The command (4) that hovers: N, rad/s."""
+    output, action = contract["output"], np.array(contract["output"]["hover_action"])
+    most = np.array(output["body_rate"]["range"])[:, 1]
+    return np.append(0.5 * output["thrust"]["range"][1] * (action[0] + 1.0), most * action[1:])
+
+
+def _pilot(bundle: Bundle, start: dict[str, Any]) -> Bundle:
+    """Another bundle of the same policy, with a flight and a memory of its own."""
+    pilot = copy.copy(bundle)
+    pilot.rule, pilot.faults = copy.copy(bundle.rule), Counter()
+    entry = PROGRESS[bundle.contract["task"]["rule"]]
+    value = start[entry]
+    pilot.reset(**{entry: value if value.size > 1 else value.item()})
+    return pilot
+
+
+def _ask(pilot: Bundle, state: dict[str, Array], mutant: Mutant) -> Array:
+    """The command (4) of a bundle in a state, N and rad/s."""
+    if not mutant.keeps_queue:
+        pilot.queue = np.tile(pilot._hover, (len(pilot.queue), 1))
+    attitude = state["quaternion"] * mutant.attitude
+    seen = {"quaternion": attitude[list(mutant.quaternion)], "age": 0.0}
+    seen["angular_velocity"] = state["angular_velocity"] * mutant.measured
+    thrust, rates = pilot({**state, **seen})
+    return np.array([thrust, *rates])

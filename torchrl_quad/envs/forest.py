@@ -1,0 +1,308 @@
+"""The forest task."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from torchrl_quad.dynamics import quaternion
+from torchrl_quad.engine.simulation import State
+from torchrl_quad.envs.base import QuadrotorEnv
+from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.envs.randomness import Randomness
+from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
+from torchrl_quad.envs.scenes import ELSEWHERE, MAX_OBSTACLES, Scene, left_out
+from torchrl_quad.envs.terms import norm, outside
+from torchrl_quad.vision import DepthCamera, has_way
+
+#: Trees per square metre, and the least gap between two of them [m].
+DIFFICULTIES = {"easy": (0.04, 1.5), "middle": (0.08, 1.2), "hard": (0.12, 0.9)}
+CAMERA = {"width": 16, "height": 12, "range": 10.0}
+PLACES = 12  # that are tried for a tree before it is left out
+
+
+class ForestEnv(QuadrotorEnv):
+    """Fly through a forest, from one side to the other, at a commanded speed, and touch nothing.
+
+    =============================  ====  ====================================================================
+    observation                    size  unit
+    =============================  ====  ====================================================================
+    velocity                       3     m/s, body frame; not with ``observe_velocity=False``
+    10 up                          3     the world's z axis in the body frame
+    command                        3     m/s, body frame: the commanded speed, in the direction of the target
+    =============================  ====  ====================================================================
+
+    Beside it ``"depth"`` (num_envs, 1, height, width) [m], as the camera sees it. The trees are upright cylinders, 6 m
+    high, with radii from 0.1 to 0.4 m, on 30 m by 16 m of ground. Each episode draws them anew.
+
+    Reward, with the velocity v, the command c, the distance d from the drone's surface to the nearest obstacle or the
+    ground [m], the direction N away from that, and h(x) = (|x|^2 + 0.25)^(1/2) - 0.5:
+
+    - speed: 0.1 (1 - h(v - c) / h(c)): nothing for a drone that stands still, the most for one that flies as commanded;
+    - clearance: -0.1 log(1 + exp((0.3 - d) / 0.1)) 0.1 / 0.3;
+    - closing: -0.05 max(-N v, 0) exp(-d / 0.5), the speed towards the nearest surface, where it is near;
+    - smoothness: -0.005 |w|^2, with the angular velocity w;
+    - heading: -0.05 (1 - cos), with the horizontal angle from the body's x axis to the command;
+    - collision: -10 for a crash, and finish: 10 on the other side. These two carry no gradient.
+
+    Start: level and at rest, 1 m to 2 m before the forest, within 4 m of its middle, 1.2 m to 1.8 m high. State added:
+    ``target`` (3) [m], straight ahead, 2 m behind the forest and 1.5 m high; ``speed`` (1) [m/s], the commanded one.
+
+    End: success on the other side of the forest; crash when the drone touches a tree or the ground, when it is 8 m from
+    the middle, 4 m before the forest, or 4 m high; truncated after ``max_episode_steps``, 900. Success of an episode:
+    that it ended in success.
+
+    Metrics: ``distance``, how far the drone has come in the forest [m]; ``flown_speed``, towards the target [m/s], its
+    mean over an episode; ``clearance``, d of the trees and the ground [m], the least of an episode.
+
+    Args:
+        num_envs: number of drones that fly in parallel.
+        difficulty: "easy", "middle" or "hard": 0.04, 0.08 or 0.12 trees per square metre, at least 1.5 m, 1.2 m or
+            0.9 m from each other.
+        density: of trees [1/m^2], in the place of that of the difficulty. Trees that find no place are left out.
+        gap: between the surfaces of any two trees, at least [m], in the place of that of the difficulty. Since it is
+            wider than the drone, there always is a way through.
+        speed: the least and the greatest commanded speed [m/s], or one for all.
+        observe_velocity: whether the policy observes its velocity.
+        camera: as for :class:`~torchrl_quad.envs.QuadrotorEnv`; a mapping changes the camera of 16 x 12 pixels, 90
+            degrees and 10 m. None flies blind.
+        scene: other obstacles than a random forest, as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
+        max_episode_steps: control steps after which an episode is truncated.
+        **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
+
+    Raises:
+        ValueError: an option is out of its range, or the scene leaves no way through.
+    """
+
+    length, half_width, ceiling = 30.0, 8.0, 4.0  # [m]
+    run_up = (1.0, 2.0)  # [m], from the start to the forest
+    before = 4.0  # [m], before the forest
+    start_half_width = 4.0  # [m]
+    cruise_height, start_height = 1.5, 0.3  # [m], of the target, and how far from it drones start
+    margin, softness, nearness = 0.3, 0.1, 0.5  # [m], of the rewards for clearance and for the closing speed
+    weights = {
+        "speed": 0.1,
+        "clearance": 0.1,
+        "closing": 0.05,
+        "smoothness": 0.005,
+        "heading": 0.05,
+        "collision": 10.0,
+        "finish": 10.0,
+    }
+    ends_on_success = True
+    metric_info = {
+        **EPISODE_METRICS,
+        "distance": Metric("distance flown", "m"),
+        "flown_speed": Metric("speed", "m/s"),
+        "clearance": Metric("least clearance", "m"),
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 64,
+        *,
+        difficulty: str = "middle",
+        density: float | None = None,
+        gap: float | None = None,
+        speed: float | Sequence[float] = (2.0, 8.0),
+        observe_velocity: bool = True,
+        camera: DepthCamera | Mapping[str, Any] | None = CAMERA,
+        scene: Scene | str | Path | Mapping | None = None,
+        max_episode_steps: int = 900,
+        **kwargs: Any,
+    ) -> None:
+        if difficulty not in DIFFICULTIES:
+            raise ValueError(f"Unknown difficulty {difficulty!r}. Choose from: {', '.join(DIFFICULTIES)}.")
+        preset = DIFFICULTIES[difficulty]
+        density, gap = (own if own is not None else usual for own, usual in zip((density, gap), preset, strict=True))
+        speeds = [speed, speed] if isinstance(speed, int | float) else speed
+        is_range = isinstance(speeds, Sequence) and len(speeds) == 2
+        is_range = is_range and all(isinstance(x, int | float) and 0.1 <= x <= 30.0 for x in speeds)
+        if not (is_range and speeds[0] <= speeds[1]):
+            raise ValueError(f"speed must be one speed, or the least and the greatest, 0.1 to 30 m/s; got {speed!r}.")
+        self.speeds, self.observe_velocity = tuple(speeds), observe_velocity
+        if isinstance(camera, Mapping):
+            camera = {**CAMERA, **camera}
+        scene = Forest(density, gap, self.length, self.half_width) if scene is None else scene
+        super().__init__(num_envs, camera=camera, scene=scene, max_episode_steps=max_episode_steps, **kwargs)
+
+    def set_up(self) -> None:
+        self.centre = self.tensor([0.5 * (self.length - self.before), 0.0, 0.0])
+        self.extent = self.tensor([0.5 * (self.length + self.before) + 1.0, self.half_width])
+        fixed, top = self.scene.touchable, self.ceiling
+        if not fixed.count:
+            return
+        start = self.tensor([-self.run_up[0], 0.0, self.cruise_height])
+        goal = self.tensor([self.length, 0.0, self.cruise_height])
+        low = self.tensor([-self.before, -self.half_width, self.scene.radius])
+        high, radius = self.tensor([self.length + 1.0, self.half_width, top]), self.scene.radius
+        if not has_way(fixed, start, goal, low, high, radius):
+            raise ValueError(
+                f"{self.scene.source}: the obstacles leave no way from (x, y, z) = (-1, 0, 1.5) to (30, 0, 1.5) m, "
+                f"within {self.half_width:g} m to both sides and below {top:g} m, for a drone of radius {radius:.3g} m."
+                " Take some away, or open a gap."
+            )
+
+    def initial_state(self, n: int) -> State:
+        across, along, up = self.uniform(3, n, 1)
+        x = -0.5 * (self.run_up[0] + self.run_up[1]) + 0.5 * (self.run_up[1] - self.run_up[0]) * along
+        y, z = self.start_half_width * across, self.cruise_height + self.start_height * up
+        target = torch.cat((torch.full_like(x, self.length + 2.0), y, torch.full_like(z, self.cruise_height)), -1)
+        low, high = self.speeds
+        speed = low + (high - low) * 0.5 * (self.uniform(n, 1) + 1.0)
+        return {**self.hover_state(torch.cat((x, y, z), -1)), "target": target, "speed": speed}
+
+    def command(self, state: State) -> Tensor:
+        """The commanded velocity (n, 3) [m/s], world frame."""
+        way = state["target"] - state["position"]
+        return state["speed"] * way / norm(way).clamp_min(1.0)
+
+    def observe(self, state: State) -> Tensor:
+        q = state["quaternion"]
+        command = quaternion.rotate_inverse(q, self.command(state))
+        parts = 10.0 * quaternion.up_in_body(q), command
+        if self.observe_velocity:
+            parts = quaternion.rotate_inverse(q, state["velocity"]), *parts
+        return torch.cat(parts, -1)
+
+    def observation_bounds(self) -> Tensor:
+        velocity = 3 * (50.0,) if self.observe_velocity else ()
+        return self.tensor((*velocity, *3 * (10.0,), *3 * (self.speeds[1],)))
+
+    def reward_terms(self, state: State) -> State:
+        velocity, command, weights = state["velocity"], self.command(state), self.weights
+        distance, away = self.scene.nearest(state)
+        closing = (-(away * velocity).sum(-1, keepdim=True)).clamp_min(0.0)
+        terms = {
+            "speed": 1.0 - _gentle(velocity - command) / _gentle(command),
+            "clearance": -self.softness * softplus((self.margin - distance) / self.softness) / self.margin,
+            "closing": -closing * torch.exp(-distance.clamp_min(0.0) / self.nearness),
+            "smoothness": -state["angular_velocity"].square().sum(-1, keepdim=True),
+            "heading": self.heading(state) - 1.0,
+            "collision": -self.is_crash(state).to(self.dtype),
+            "finish": self.is_success(state).to(self.dtype),
+        }
+        return {name: weights[name] * term for name, term in terms.items()}
+
+    def heading(self, state: State) -> Tensor:
+        """The cosine of the horizontal angle from the body's x axis to the target, (n, 1)."""
+        ahead = torch.zeros_like(state["position"]) + self.tensor([1.0, 0.0, 0.0])
+        nose = quaternion.rotate(state["quaternion"], ahead)[..., :2]
+        way = (state["target"] - state["position"])[..., :2]
+        return (nose * way).sum(-1, keepdim=True) / (norm(nose) * norm(way)).clamp_min(0.1)
+
+    def is_crash(self, state: State) -> Tensor:
+        position = state["position"]
+        left = outside(position, self.centre, self.extent, self.ceiling)
+        return left | (position[..., 2:] < self.scene.radius) | state["collided"]
+
+    def is_success(self, state: State) -> Tensor:
+        return (state["position"][..., :1] >= self.length) & ~self.is_crash(state)
+
+    def metrics(self, state: State) -> State:
+        command = self.command(state)
+        along = (state["velocity"] * command).sum(-1, keepdim=True) / norm(command).clamp_min(1e-6)
+        distance = state["position"][..., :1].clamp(0.0, self.length)
+        return {"distance": distance, "flown_speed": along, "clearance": self.scene.nearest(state)[0]}
+
+    def state_bounds(self) -> dict[Any, tuple[float, float]]:
+        return {"speed": (0.0, math.inf)}
+
+    def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
+        """Takes ``flown_speed`` as the mean over the episode [m/s], and ``clearance`` as its least value [m]."""
+        first, measured = first_episode(rollout), rollout["next", "metrics"]
+        speed = (measured["flown_speed"] * first).sum(1) / first.sum(1)
+        clearance = torch.where(first, measured["clearance"], math.inf).amin(1)
+        own = {"flown_speed": speed.squeeze(-1), "clearance": clearance.squeeze(-1)}
+        return {**super().episode_metrics(rollout), **own}
+
+    def scenery(self) -> Scenery:
+        return Scenery(progress="distance", success=self.length)
+
+
+class Forest(Scene):
+    """A random forest on flat ground: another one in each episode, whose trees keep a gap between each other.
+
+    Trees are drawn evenly over the ground. One that finds no place among 12 that is far enough from the trees before it
+    is left out. Since the gaps are wider than the drone, the trees made thicker by its radius do not touch each other.
+    What does not touch encloses nothing: there is a way through.
+
+    Args:
+        density: trees per square metre.
+        gap: the least distance between the surfaces of two trees [m].
+        length: of the forest, along x from 0 [m].
+        half_width: to both sides of y = 0 [m].
+        radius: the least and the greatest radius of a tree [m].
+        height: of all trees [m].
+        **options: as for :class:`~torchrl_quad.Scene`.
+
+    Raises:
+        ValueError: a value is out of its range, or there are more than 1000 trees; (in use) the drone is as wide as the
+            gap.
+    """
+
+    is_drawn_elsewhere = True
+
+    def __init__(
+        self,
+        density: float,
+        gap: float,
+        length: float = 30.0,
+        half_width: float = 8.0,
+        *,
+        radius: Sequence[float] = (0.1, 0.4),
+        height: float = 6.0,
+        **options: Any,
+    ) -> None:
+        numbers = {"density": density, "gap": gap, "length": length, "half_width": half_width, "height": height}
+        for name, value in numbers.items():
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not (is_number and 0 <= value < math.inf and (value > 0 or name == "density")):
+                least = "zero or more trees per square metre" if name == "density" else "positive [m]"
+                raise ValueError(f"forest: {name} must be {least}, got {value!r}.")
+        self.trees = round(density * 2.0 * half_width * length)
+        if self.trees > MAX_OBSTACLES:
+            raise ValueError(f"forest: density={density:g} makes {self.trees:,} trees; {MAX_OBSTACLES:,} are the most.")
+        self.gap, self.length, self.half_width, self.tree_radius, self.height = gap, length, half_width, radius, height
+        super().__init__(ground=True, source="forest", **options)
+
+    def bound(self, nominal: Any) -> Scene:
+        own = super().bound(nominal)
+        if self.gap <= 2.0 * own.radius:
+            raise ValueError(
+                f"forest: a drone of radius {own.radius:.3g} m does not fit through gaps of {self.gap:g} m, so the "
+                f"trees could leave no way through. Give a gap of more than {2.0 * own.radius:.3g} m."
+            )
+        return own
+
+    def draw(self, random: Randomness, state: State) -> dict[str, Tensor]:
+        n, m = len(state["position"]), self.trees
+        if not m:
+            return {}
+        low, high = self.tree_radius
+        radius = low + (high - low) * 0.5 * (random.uniform(n, m, 1) + 1.0)
+        tries = random.uniform(n, m, PLACES, 2) * random.tensor([0.5 * self.length, self.half_width])
+        x, y = (tries + random.tensor([0.5 * self.length, 0.0])).unbind(-1)  # (n, m, places)
+        crowded = []
+        for i in range(m):  # each takes the first of its places that is far enough from the trees before it
+            apart = radius[:, :i] + radius[:, i : i + 1] + self.gap
+            dx, dy = (u[:, i, None] - u[:, :i, :1] for u in (x, y))  # (n, i, places)
+            is_free = (dx.square().add_(dy.square()) >= apart.square()).all(1)
+            found = is_free.any(1, keepdim=True)
+            place = is_free.to(torch.uint8).argmax(1, keepdim=True)
+            for u in (x, y):
+                u[:, i, :1] = torch.where(found, u[:, i].gather(1, place), ELSEWHERE)
+            crowded.append(~found)
+        place, rest = torch.stack((x[..., 0], y[..., 0]), -1), torch.full_like(radius, self.height)
+        trees = torch.cat((place, torch.zeros_like(radius), radius, rest), -1)
+        return {"cylinders": left_out(trees, torch.cat(crowded, 1))}
+
+
+def _gentle(x: Tensor) -> Tensor:
+    """h(x): the square of short vectors (n, 3), the length of long ones, (n, 1)."""
+    return (x.square().sum(-1, keepdim=True) + 0.25).sqrt() - 0.5

@@ -1,0 +1,200 @@
+"""Policies that see: a convolutional network on depth images, memory in a GRU, and the tanh-Gaussian head."""
+
+from __future__ import annotations
+
+import numbers
+from collections.abc import Sequence
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data import Unbounded
+from torchrl.envs import EnvBase, TensorDictPrimer
+from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, set_recurrent_mode
+
+from torchrl_quad.modules.networks import OBSERVATION, first_action, network_of, sampling, start_near
+from torchrl_quad.modules.plain import GaussianHead, Network, PlainTanhGaussian, bounds_of, samples
+
+MEMORY = "recurrent_state"
+NEAREST = 0.3  # [m], of what a policy tells apart
+
+
+def make_visual_actor(
+    env: EnvBase,
+    num_cells: Sequence[int] = (64,),
+    *,
+    in_keys: Sequence[NestedKey] = OBSERVATION,
+    image_key: NestedKey = "depth",
+    channels: Sequence[int] = (8, 16),
+    recurrent: bool = True,
+    hidden_size: int = 64,
+    activation: type[nn.Module] = nn.ELU,
+    input_scale: float | Sequence[float] = 1.0,
+    action_init: Tensor | None = None,
+    scale_init: float = 0.1,
+    learn_scale: bool = True,
+    return_log_prob: bool = False,
+) -> ProbabilisticActor:
+    """A tanh-Gaussian policy of a depth image and vectors, with memory or without.
+
+    TorchRL's ConvNet reads the inverse of the depth, 1 / max(depth, 0.3 m), so that what is near counts most. A
+    multi-layer perceptron reads what it finds, beside the vectors. Its output goes to TorchRL's GRUModule, and both
+    outputs to the head. What is not said here is as for :func:`~torchrl_quad.make_actor`.
+
+    The policy of a recurrent network also reads ``recurrent_state`` (*, 1, hidden_size) and ``is_init`` (*, 1), and
+    writes ``("next", "recurrent_state")``. Environments of this package that fly without transforms hand the memory on,
+    with its graph, and clear it where an episode begins. Others need TorchRL's transforms:
+
+    .. code-block:: python
+
+        env = TransformedEnv(env, Compose(InitTracker(), actor.make_tensordict_primer()))
+
+    Args:
+        env: any TorchRL environment with an image, for the sizes of its entries.
+        num_cells: widths of the layers between the convolutions and the memory, or the head.
+        in_keys: the vectors that it reads beside the image, each (*, k).
+        image_key: the entry of the image, (*, channels, height, width) [m].
+        channels: of each convolution, 3 x 3, which halves height and width.
+        recurrent: whether it has a memory.
+        hidden_size: numbers in the memory.
+        activation: of convolutions and hidden layers.
+        input_scale: multiplies the vectors; a number, or one for each of ``in_keys``.
+        action_init: as for :func:`~torchrl_quad.make_actor`.
+        scale_init: as there.
+        learn_scale: as there.
+        return_log_prob: as there.
+
+    Raises:
+        ValueError: the environment has no such image, or a width is not a whole number of at least 1; or as for
+            :func:`~torchrl_quad.make_actor`.
+    """
+    known = dict(env.observation_spec.items(True, True))
+    if image_key not in known or known[image_key].ndim != len(env.batch_size) + 3:
+        raise ValueError(
+            f"make_visual_actor reads an image (channels, height, width) from {image_key!r}, and the environment has "
+            f'none there. Give it a camera, camera={{"width": 16, "height": 12}}, or choose image_key from: '
+            f"{', '.join(map(str, known))}."
+        )
+    if not channels or not all(isinstance(n, numbers.Integral) and n >= 1 for n in (*channels, hidden_size)):
+        raise ValueError(
+            "channels must be a list of at least one whole number, such as (8, 16), and hidden_size a whole number of "
+            f"at least 1; got {channels!r} and {hidden_size!r}."
+        )
+    spec, first = first_action(env, action_init, scale_init, "make_visual_actor")
+    image, size = known[image_key], len(first)
+    height, width = image.shape[-2:]
+    for _ in channels:
+        height, width = (height + 1) // 2, (width + 1) // 2
+    eyes = ConvNet(
+        in_features=image.shape[-3],
+        num_cells=list(channels),
+        kernel_sizes=3,
+        strides=2,
+        paddings=1,
+        depth=len(channels),
+        activation_class=activation,
+        device=env.device,
+    ).to(image.dtype)
+    if not num_cells:
+        raise ValueError("num_cells must name at least one layer between the convolutions and the head; got none.")
+    trunk = network_of(
+        env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale, more=channels[-1] * height * width
+    )
+    seen = TensorDictModule(Sight(eyes, trunk, activation()), in_keys=[image_key, *in_keys], out_keys=["seen"])
+    parts, widths = [seen], [num_cells[-1]]
+    if recurrent:
+        memory = GRUModule(
+            input_size=num_cells[-1],
+            hidden_size=hidden_size,
+            python_based=True,
+            device=env.device,
+            in_keys=["seen", MEMORY],
+            out_keys=["recalled", ("next", MEMORY)],
+        ).to(image.dtype)
+        parts.append(memory)
+        widths.append(hidden_size)
+    outputs = 2 * size if learn_scale else size
+    last = MLP(sum(widths), outputs, num_cells=[], device=env.device).to(image.dtype)
+    start_near(last[-1], first)
+    head = Network(last, [1.0] * len(widths), widths)
+    head.head = GaussianHead(size, f"biased_softplus_{scale_init}")
+    parts.append(TensorDictModule(head, in_keys=["seen", "recalled"][: len(widths)], out_keys=["loc", "scale"]))
+    return VisualActor(TensorDictSequential(*parts), **sampling(spec), return_log_prob=return_log_prob)
+
+
+class Sight(nn.Module):
+    """What a policy sees: features (*, k) of an image and of vectors.
+
+    Args:
+        eyes: the convolutions.
+        trunk: reads what they return, and the vectors.
+        activation: of the features.
+    """
+
+    def __init__(self, eyes: ConvNet, trunk: Network, activation: nn.Module) -> None:
+        super().__init__()
+        self.eyes, self.trunk, self.activation = eyes, trunk, activation
+
+    def forward(self, depth: Tensor, *vectors: Tensor) -> Tensor:
+        """The features (*, k) of a depth image (*, 1, height, width) [m] and of vectors (*, k_i)."""
+        return self.activation(self.trunk(self.eyes(depth.clamp_min(NEAREST).reciprocal()), *vectors))
+
+
+class VisualActor(ProbabilisticActor):
+    """What :func:`~torchrl_quad.make_visual_actor` builds."""
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
+        """Write loc, scale and action, the memory, and the log-probability if wanted.
+
+        Raises:
+            ValueError: nobody says where episodes begin.
+        """
+        if "is_init" in self.in_keys and "is_init" not in tensordict:
+            raise ValueError(
+                "A policy with memory reads 'is_init', which says where episodes begin. Fly it by "
+                "differentiable_rollout, or by env.rollout(..., break_when_any_done=False), on an environment without "
+                "transforms; or give the environment TorchRL's: TransformedEnv(env, Compose(InitTracker(), "
+                "actor.make_tensordict_primer()))."
+            )
+        return super().forward(tensordict, **kwargs)
+
+    def replayed(self) -> Replay | None:
+        """The policy as losses let it act again in a whole rollout, or None where it explores in another way."""
+        return None if samples(self) is None else Replay(self)
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """TorchRL's transform that gives an environment the memory of this policy, in its precision.
+
+        Raises:
+            ValueError: the policy has no memory.
+        """
+        for part in self.modules():
+            if isinstance(part, GRUModule):
+                weight = part.gru.weight_hh_l0
+                spec = Unbounded((1, weight.shape[-1]), dtype=weight.dtype, device=weight.device)
+                return TensorDictPrimer({MEMORY: spec}, expand_specs=True)
+        raise ValueError("This policy has no memory: it was built with recurrent=False, and needs no primer.")
+
+
+class Replay(PlainTanhGaussian):
+    """A policy that sees, in the states of a rollout that it has flown. Its memory comes about anew in them."""
+
+    def __init__(self, actor: VisualActor) -> None:
+        head, sample = actor[0][-1].module.head, actor[1]
+        self.actor, self.head, self.size, self.rho = actor, head, head.size, None
+        self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
+        self.low, self.high = (x if x is None else x.tolist() for x in bounds_of(actor))
+
+    def replay(self, tensordict: TensorDictBase) -> dict[Any, Tensor]:
+        """What it writes in the states of a rollout (*, horizon), with the noise of the rollout.
+
+        Single steps (n) that are no rollout are each remembered as they were flown.
+        """
+        has_time = tensordict.ndim > 1 or tensordict.names[-1] == "time"
+        with set_recurrent_mode(has_time):
+            read = self.actor.get_dist_params(tensordict.select(*self.actor.in_keys).detach())
+        noise = self.drawn_again(tensordict).view_as(tensordict["action"])
+        return self._squash(read["loc"], read["scale"], noise, self.log_prob_key)

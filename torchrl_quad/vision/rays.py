@@ -1,0 +1,274 @@
+"""Where rays meet solids: closed forms, fused by the compiler into one loop without intermediate results.
+
+A ray enters a convex solid once and leaves it once. What it meets is the entry that lies before the exit; a ray that
+begins within a solid meets it at once.
+"""
+
+from __future__ import annotations
+
+import functools
+import types
+
+import torch
+from torch import Tensor
+
+from torchrl_quad.dynamics import quaternion
+from torchrl_quad.dynamics.vector import is_traced
+from torchrl_quad.engine.compiling import Compiled
+from torchrl_quad.vision.primitives import KINDS, Primitives
+
+CHUNK = 2**16  # so many pairs of a ray and a solid are looked at together in an eager flight: they fit into a cache
+TINY = 1e-9  # a ray whose direction has less than this along an axis runs beside that axis
+GRAZING = 0.05  # the least cosine between a ray and a normal that derivatives know; without it they had no bound
+
+
+def cast_rays(
+    solids: Primitives,
+    position: Tensor,
+    attitude: Tensor,
+    plane: Tensor,
+    far: float,
+    differentiable: bool = False,
+    *,
+    fused: bool = False,
+) -> Tensor:
+    """How far rays fly until they meet a solid, as a multiple of their direction, (n, p), at most ``far``.
+
+    The direction of ray p is (1, ``plane[0, p]``, ``plane[1, p]``) in the frame of the eye: the multiple is the depth
+    along the eye's x axis [m].
+
+    Args:
+        solids: of n scenes.
+        position: of the eye (n, 3) [m], world frame.
+        attitude: of the eye (n, 4), a unit quaternion, to the world.
+        plane: where the rays pass the plane x = 1 in the frame of the eye (2, p): y to the left, z upwards.
+        far: what is further away is not seen [m].
+        fused: compile the rays into one loop, as a compiled step does in any case; it takes seconds the first time.
+        differentiable: with the derivative in position and attitude. It is that of the surface that is seen; what
+            jumps, as an edge does that comes before another surface, has none. At a grazing ray it is limited.
+    """
+    solids = Primitives(*(x.detach() for x in solids))
+    inputs = position.detach(), attitude.detach(), plane, *solids._replace(boxes=_with_axes(solids.boxes))
+    inputs, fused = [x.contiguous() for x in inputs], fused or is_traced()
+    if not differentiable:
+        return _cast(*inputs, far=far) if fused else _chunks(False, inputs, far)[0]
+    depth, index = _cast_which(*inputs, far=far) if fused else _chunks(True, inputs, far)
+    return _attached(solids, position, attitude, plane, depth, index, far)
+
+
+def directions(attitude: Tensor, plane: Tensor) -> tuple[Tensor, ...]:
+    """The directions of the rays in the world, three components (n, p)."""
+    w, x, y, z = (q.unsqueeze(-1) for q in attitude.unbind(-1))
+    u, v = plane
+    return (
+        (1.0 - 2.0 * (y * y + z * z)) + 2.0 * (x * y - w * z) * u + 2.0 * (x * z + w * y) * v,
+        2.0 * (x * y + w * z) + (1.0 - 2.0 * (x * x + z * z)) * u + 2.0 * (y * z - w * x) * v,
+        2.0 * (x * z - w * y) + 2.0 * (y * z + w * x) * u + (1.0 - 2.0 * (x * x + y * y)) * v,
+    )
+
+
+def meet(
+    position: Tensor,
+    attitude: Tensor,
+    plane: Tensor,
+    spheres: Tensor,
+    cylinders: Tensor,
+    boxes: Tensor,
+    planes: Tensor,
+    *,
+    far: float,
+    which: bool = False,
+) -> tuple[Tensor, ...]:
+    """The depth of each ray (n, p), and with ``which`` the index of the solid that it meets, in the order of kinds."""
+    rays = tuple(d.unsqueeze(1) for d in directions(attitude, plane))  # (n, 1, p)
+    kinds = (_meet_spheres, spheres), (_meet_cylinders, cylinders), (_meet_boxes, boxes), (_meet_planes, planes)
+    depth, index, first = None, None, 0
+    for function, solids in kinds:
+        if not solids.shape[1]:
+            continue
+        entry, exit = function(solids, position, rays)
+        entry = entry.clamp_min(0.0)
+        met = torch.where((exit > entry) & (entry < far), entry, far)  # NaN, where a ray misses, is not greater
+        least = met.amin(1)
+        if which:
+            mine = met.argmin(1) + first
+            index = mine if depth is None else torch.where(least < depth, mine, index)
+        depth = least if depth is None else torch.minimum(depth, least)
+        first += solids.shape[1]
+    return (depth, index) if which else (depth,)
+
+
+def _meet_spheres(x: Tensor, position: Tensor, rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    ox, oy, oz = _from(x, position)
+    dx, dy, dz = rays
+    scale = 1.0 / (dx * dx + dy * dy + dz * dz)
+    middle = -(ox * dx + oy * dy + oz * dz) * scale
+    px, py, pz = ox + middle * dx, oy + middle * dy, oz + middle * dz  # where the ray comes closest to the centre
+    half = ((x[..., 3:] * x[..., 3:] - (px * px + py * py + pz * pz)) * scale).sqrt()
+    return middle - half, middle + half
+
+
+def _meet_cylinders(x: Tensor, position: Tensor, rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    ox, oy, oz = _from(x, position)
+    dx, dy, dz = rays
+    scale = 1.0 / (dx * dx + dy * dy).clamp_min(TINY * TINY)
+    middle = -(ox * dx + oy * dy) * scale
+    across = ox * dy - oy * dx
+    half = (x[..., 3:4] * x[..., 3:4] * scale - (across * scale) * (across * scale)).sqrt()
+    floor, ceiling = (height * _inverse(dz) for height in (-oz, x[..., 4:] - oz))
+    entry = torch.maximum(middle - half, torch.minimum(floor, ceiling))
+    return entry, torch.minimum(middle + half, torch.maximum(floor, ceiling))
+
+
+def _meet_boxes(x: Tensor, position: Tensor, rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    offset, entry, exit = _from(x, position), None, None
+    for number in range(3):
+        axis = x[..., 6 + 3 * number : 9 + 3 * number].unsqueeze(-1).unbind(-2)
+        scale = _inverse(sum(a * d for a, d in zip(axis, rays, strict=True)))
+        middle = -sum(a * o for a, o in zip(axis, offset, strict=True)) * scale
+        half = x[..., 3 + number : 4 + number] * scale.abs()
+        entry = middle - half if entry is None else torch.maximum(entry, middle - half)
+        exit = middle + half if exit is None else torch.minimum(exit, middle + half)
+    return entry, exit
+
+
+def _meet_planes(x: Tensor, position: Tensor, rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    normal = x[..., :3].unsqueeze(-1).unbind(-2)
+    height = (x[..., :3] * position.unsqueeze(1)).sum(-1, keepdim=True) - x[..., 3:]
+    towards = -sum(a * d for a, d in zip(normal, rays, strict=True))
+    entry = height * _inverse(towards)
+    # A half-space has no end: rays that fly away from it never enter, those below it are in it already.
+    return torch.where(height > 0.0, entry, 0.0), torch.where((towards > 0.0) | (height <= 0.0), torch.inf, -torch.inf)
+
+
+def _with_axes(boxes: Tensor) -> Tensor:
+    """The boxes with their three axes in the world (9) instead of their attitude; the compiler would not share them."""
+    axes = torch.eye(3, dtype=boxes.dtype, device=boxes.device)
+    axes = quaternion.rotate(boxes[..., None, 6:], axes.expand(*boxes.shape[:2], 3, 3))
+    return torch.cat((boxes[..., :6], axes.flatten(2)), -1)
+
+
+def _from(x: Tensor, position: Tensor) -> tuple[Tensor, ...]:
+    """The eye from the point that a solid is given by, three components (n, m, 1)."""
+    return tuple((position.unsqueeze(1) - x[..., :3]).unsqueeze(-1).unbind(-2))
+
+
+def _inverse(x: Tensor) -> Tensor:
+    """One over x, at most 1e9 in size."""
+    return 1.0 / torch.where(x.abs() < TINY, TINY, x)
+
+
+def _attached(
+    solids: Primitives, position: Tensor, attitude: Tensor, plane: Tensor, depth: Tensor, index: Tensor, far: float
+) -> Tensor:
+    """The same depth, with its derivative in the pose of the eye.
+
+    The point that is met stays on its surface, whose normal is N. So N (o + t d) is constant, and a change of the
+    origin o and of the direction d changes the depth t by -N (do + t dd) / (N d).
+    """
+    rays = torch.stack(directions(attitude, plane), -1)
+    with torch.no_grad():
+        point, normal, first = position.unsqueeze(1) + depth.unsqueeze(-1) * rays, None, 0
+        for (_, gradient), x in zip(KINDS.values(), solids, strict=True):
+            m = x.shape[1]
+            if m:
+                own = (index - first).clamp(0, m - 1).unsqueeze(-1).expand(-1, -1, x.shape[-1])
+                mine = x.expand(len(index), -1, -1).gather(1, own)
+                mine = torch.stack(torch.broadcast_tensors(*gradient(mine, point)), -1)
+                normal = mine if normal is None else torch.where((index >= first).unsqueeze(-1), mine, normal)
+            first += m
+        length = rays.square().sum(-1).sqrt()
+        slope = (normal * rays).sum(-1)
+        slope = torch.minimum(slope, -GRAZING * length)  # a surface that is seen faces the eye
+        seen = (depth < far) & (depth > 0.0)
+    moved = (position - position.detach()).unsqueeze(1) + depth.unsqueeze(-1) * (rays - rays.detach())
+    return depth - torch.where(seen, (normal * moved).sum(-1) / slope, 0.0)
+
+
+# -- how it runs -------------------------------------------------------------------------------------------------------
+
+
+def _chunks(which: bool, inputs: list[Tensor], far: float) -> tuple[Tensor, ...]:
+    """Eager: some scenes after the others, so that what lies between stays in the cache."""
+    position, attitude, plane, *solids = inputs
+    pairs = max(x.shape[1] for x in solids) * plane.shape[1]
+    step = max(1, CHUNK // max(pairs, 1))
+    parts = []
+    for i in range(0, len(position), step):
+        some = slice(i, i + step)
+        own = (x if len(x) == 1 else x[some] for x in solids)
+        parts.append(meet(position[some], attitude[some], plane, *own, far=far, which=which))
+    return tuple(torch.cat(x) for x in zip(*parts, strict=True))
+
+
+class _Kernel:
+    """The rays of one kind of scene and eye, compiled into one loop."""
+
+    def __init__(self, far: float, which: bool) -> None:
+        self.far, self.which = far, which
+        # Inductor would store what two expressions share, which costs more than to compute it again.
+        keep = dict.fromkeys(("realize_reads_threshold", "realize_acc_reads_threshold"), 10_000)
+        keep |= {"realize_opcount_threshold": 10_000, "unroll_reductions_threshold": 1}
+        self.compiled = Compiled(types.MethodType(_Kernel.cast, self), {"options": keep})
+        self.is_ready = False
+
+    def cast(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        return meet(*inputs, far=self.far, which=self.which)
+
+    def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        # Only tensors of one kind come here, and the function reads nothing that could change.
+        outputs = self.compiled.again(*inputs) if self.is_ready else self.compiled(*inputs)
+        self.is_ready = True
+        return outputs
+
+
+@functools.cache
+def _kernel(far: float, which: bool, *kind: object) -> _Kernel:
+    return _Kernel(far, which)
+
+
+def _fused(which: bool, inputs: list[Tensor], far: float) -> tuple[Tensor, ...]:
+    kind = tuple((x.shape, x.dtype, x.device) for x in inputs)
+    with torch.no_grad():
+        return _kernel(far, which, kind)(*(x.contiguous() for x in inputs))
+
+
+@torch.library.custom_op("torchrl_quad::cast_rays", mutates_args=())
+def _cast(
+    position: Tensor,
+    attitude: Tensor,
+    plane: Tensor,
+    spheres: Tensor,
+    cylinders: Tensor,
+    boxes: Tensor,
+    planes: Tensor,
+    far: float,
+) -> Tensor:
+    """The depth; a function of its own for the compiler, which would tear it apart within a step."""
+    return _fused(False, [position, attitude, plane, spheres, cylinders, boxes, planes], far)[0]
+
+
+@_cast.register_fake
+def _(position, attitude, plane, spheres, cylinders, boxes, planes, far):
+    return position.new_empty(len(position), plane.shape[1])
+
+
+@torch.library.custom_op("torchrl_quad::cast_rays_which", mutates_args=())
+def _cast_which(
+    position: Tensor,
+    attitude: Tensor,
+    plane: Tensor,
+    spheres: Tensor,
+    cylinders: Tensor,
+    boxes: Tensor,
+    planes: Tensor,
+    far: float,
+) -> tuple[Tensor, Tensor]:
+    """The depth, and which solid is seen."""
+    return _fused(True, [position, attitude, plane, spheres, cylinders, boxes, planes], far)
+
+
+@_cast_which.register_fake
+def _(position, attitude, plane, spheres, cylinders, boxes, planes, far):
+    shape = len(position), plane.shape[1]
+    return position.new_empty(shape), position.new_empty(shape, dtype=torch.int64)

@@ -47,6 +47,7 @@ NOISE = {"position": 1e-3, "attitude": 3e-3, "gyro": 2e-2, "bias": 1e-2, "voltag
 def true_drone() -> QuadrotorParams:
     """A drone like a Crazyflie that carries markers."""
     drone = load_drone("crazyflie", torch.float64).replace(
+        rotor_speed_max=2270.0,
         mass=0.033,
         inertia=[1.9e-5, 2.1e-5, 3.3e-5],
         thrust_map=[2.7e-8, 0.0, 0.0],
@@ -69,15 +70,16 @@ def simulate_flight(
     drone = true_drone() if drone is None else drone
     random = np.random.default_rng(seed)
     total, motors = round(seconds / STEP), drone.motor_command
-    controller = make_controller(
-        {"mode": "velocity", "max_speed": 4.0},
-        load_drone("crazyflie", torch.float64).replace(
-            mass=drone.mass,
-            thrust_map=drone.thrust_map,
-            rate_gain=[16.0, 16.0, 6.0],
-            rate_damping=[0.0, 0.0, 0.0],
-        ),
+    # It believes in a lighter drone, and is so gentle that samples at 100 Hz hold what it does.
+    believed = drone.replace(
+        inertia=[1.4e-5, 1.4e-5, 2.17e-5],
+        yaw_torque_coefficient=0.006,
+        rate_gain=[16.0, 16.0, 6.0],
+        rate_damping=[0.0, 0.0, 0.0],
+        max_body_rate=[6.0, 6.0, 6.0],
+        max_thrust_to_weight=2.0,
     )
+    controller = make_controller({"mode": "velocity", "max_speed": 4.0}, believed)
     rotors = Rotors(drone)
     hover = (drone.mass * drone.gravity / (4.0 * drone.thrust_map[:1])).sqrt().expand(1, 4)
     state = QuadrotorState(

@@ -255,6 +255,10 @@ def test_every_command_runs(command, launch, request, monkeypatch, capsys, tmp_p
         installs(words)
     elif program in ("python", "torchrun") and Path(script).stem in (*RECIPES, *AFTER_TRAINING):
         recipe(program, words, launch, tmp_path)
+    elif program == "python" and script == "recipes/identify.py":
+        monkeypatch.chdir(ROOT)  # where the flight is
+        arguments = [word for word in words if "=" in word and not word.startswith("iterations=")]
+        launch("identify", *arguments, f"folder={tmp_path}", "iterations=1", "draws=0")
     elif program == "python" and script.startswith("examples/"):
         assert ROOT / script in EXAMPLES and words == [script]  # which have a test of their own
     elif program == "python" and script.startswith(("recipes/", "benchmarks/")):

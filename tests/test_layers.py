@@ -48,7 +48,7 @@ LIBRARIES = {
     "diagnostics": TORCHRL,
     "gym": {"gymnasium", "numpy", "torch"},
     "adapters": TORCHRL | {"gymnasium", "numpy", "rsl_rl", "skrl", "stable_baselines3"},
-    "identification": {"torch", "numpy", "yaml", "pyulog", "rosbags"},
+    "identification": {"torch", "numpy", "yaml", "matplotlib", "pyulog", "rosbags"},
 }
 
 

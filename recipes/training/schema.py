@@ -47,22 +47,10 @@ Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 Size = Annotated[int, Field(ge=1, le=10_000_000)]
 Device = Annotated[str, AfterValidator(available_device)]
 Threads = Annotated[int, Field(ge=1, le=1024)]
-Activation = Literal[
-    "CELU",
-    "ELU",
-    "GELU",
-    "Hardswish",
-    "LeakyReLU",
-    "Mish",
-    "PReLU",
-    "ReLU",
-    "SELU",
-    "SiLU",
-    "Sigmoid",
-    "Softplus",
-    "Softsign",
-    "Tanh",
-]  # of torch.nn
+ACTIVATIONS = (
+    "CELU ELU GELU Hardswish LeakyReLU Mish PReLU ReLU SELU SiLU Sigmoid Softplus Softsign Tanh"  # of torch.nn
+)
+Activation = Literal[tuple(ACTIVATIONS.split())]  # type: ignore[valid-type]
 
 
 class Section(BaseModel):

@@ -36,7 +36,7 @@ def draw_prediction(
             continue
         windows, flown, seen = predict([log], one, horizon, every=horizon)
         count = min(len(windows), round(seconds / horizon))
-        time = windows.dt * (windows.start[:count, None] + np.arange(windows.future + 1)).numpy()
+        time = windows.dt * (windows.start[:count, None].numpy() + np.arange(windows.future + 1))
         for (row, _, scale), (left, right) in zip(_ROWS, axes, strict=True):
             for k, ax in enumerate((left, right)):
                 real, guess = (_component(x, row, k)[:count] * scale for x in (seen, flown))

@@ -57,14 +57,13 @@ class Fit:
             state = self.file.resume(f"without {sorted(dropped)}", tuple(free), x, streams, begun)
             state = self._minimise(state, f"without {sorted(dropped)}")
             worst = self._least_certain(state)
-            if worst is None:
+            if not worst:
                 break
-            name, reason = worst
-            dropped[name] = reason
+            dropped |= worst
             if self.progress:
-                print(f"{name}: {reason}")
-            x = state.x[[i for i, other in enumerate(free) if other != name]]
-            free, streams = [other for other in free if other != name], state.streams
+                print("\n".join(f"{name}: {reason}" for name, reason in worst.items()))
+            x = state.x[[i for i, name in enumerate(free) if name not in worst]]
+            free, streams = [name for name in free if name not in worst], state.streams
         if "asymmetry" not in wanted or "lag" not in free:
             return state, dropped, "not asked for"
         more = self.file.resume(
@@ -112,33 +111,32 @@ class Fit:
 
         return minimise(self.problem(state), state, after, self.iterations)
 
-    def _least_certain(self, state: State) -> tuple[str, str] | None:
-        """The unknown that the flights tell least of, and why, if that is too little."""
+    def _least_certain(self, state: State) -> dict[str, str]:
+        """The unknown of which flights tell least, if too little, and why; or all of which they tell nothing."""
         if not state.free:
-            return None
+            return {}
         _, _, cover, _ = self.uncertainty(state)
         half = 1.96 * cover.diag()[: len(state.x)].clamp_min(0.0).sqrt()
         wide = torch.tensor([UNKNOWNS[name].wide for name in state.free], dtype=half.dtype)
         excess = half / wide
-        excess = torch.where(cover.diag()[: len(state.x)] > 0, excess, torch.inf)
+        untold = cover.diag()[: len(state.x)] <= 0
+        if untold.any():
+            why = {name: UNKNOWNS[name].why for name, none in zip(state.free, untold, strict=True) if none}
+            return {name: f"nothing in the flights depends on it; it needs {need}" for name, need in why.items()}
         i = int(excess.argmax())
         unknown = UNKNOWNS[state.free[i]]
         if excess[i] <= 1.0 and not abs(float(state.x[i])) >= (unknown.high if unknown.scale else math.inf):
-            return None
-        spread = (
-            "nothing in the flights depends on it"
-            if not math.isfinite(float(excess[i]))
-            else (
-                f"its 95 % interval spans a factor of {math.exp(2 * min(float(half[i]), 20.0)):.3g}"
-                if unknown.scale is None
-                else f"its 95 % interval is {2 * float(half[i]) * unknown.scale:.3g} wide"
-            )
-        )
+            return {}
+        if unknown.scale is None:
+            spread = f"its 95 % interval spans a factor of {math.exp(2 * min(float(half[i]), 20.0)):.3g}"
+        else:
+            spread = f"its 95 % interval is {2 * float(half[i]) * unknown.scale:.3g} wide"
         correlation = _correlation(cover)[i, : len(state.x)].clone()
         correlation[i] = 0.0
         j = int(correlation.abs().argmax())
         alike = f", and it is hardly told from {state.free[j]} (correlation {float(correlation[j]):.2f})"
-        return unknown.name, f"{spread}{alike if abs(float(correlation[j])) > 0.9 else ''}; it needs {unknown.why}"
+        told = alike if abs(float(correlation[j])) > 0.9 else ""
+        return {unknown.name: f"{spread}{told}; it needs {unknown.why}"}
 
     def result(
         self,

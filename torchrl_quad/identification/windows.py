@@ -252,9 +252,15 @@ def rotation_vector(to: Tensor, of: Tensor) -> Tensor:
     return turn[..., 1:] * (2.0 * torch.atan2(sine, turn[..., :1]) / sine)
 
 
+def unheld(series: np.ndarray) -> np.ndarray:
+    """A series (T) that was held between samples of a slower one, drawn straight between them: no longer late."""
+    fresh = np.flatnonzero(np.diff(series, prepend=np.nan) != 0)
+    return np.interp(np.arange(len(series)), fresh, series[fresh])
+
+
 def _columns(log: FlightLog, dt: float, nominal_voltage: float) -> np.ndarray:
     """Position, velocity, attitude, rates and volts (T, 17), a sample every dt [s]: means of quicker samples."""
-    voltage = np.full(len(log.time), nominal_voltage) if log.battery_voltage is None else log.battery_voltage
+    voltage = np.full(len(log.time), nominal_voltage) if log.battery_voltage is None else unheld(log.battery_voltage)
     volts = log.motor_command * voltage[:, None]
     columns = np.concatenate((log.position, log.velocity, log.quaternion, log.angular_velocity, volts), 1)
     n = round(dt / log.dt)

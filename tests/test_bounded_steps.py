@@ -160,7 +160,7 @@ def test_what_cannot_be_clipped_is_refused(env):
     with torch.no_grad():
         loss.loss_actor(rollout)
     other = TensorDictSequential(actor)
-    with pytest.raises(NotImplementedError, match="need a policy as make_actor builds it"):
+    with pytest.raises(NotImplementedError, match="need a policy of make_actor or make_visual_actor"):
         BPTTLoss(other, clip_action_gradient=5.0).loss_actor(flight(env, other))
 
 

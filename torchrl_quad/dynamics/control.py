@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
-from torchrl_quad.dynamics.rigid_body import gyroscopic_torque
+from torchrl_quad.dynamics.rigid_body import drag, drag_moment, gyroscopic_torque
 from torchrl_quad.dynamics.rotors import Rotors, thrust_limits
 from torchrl_quad.dynamics.vector import (
     Vector,
@@ -64,6 +65,7 @@ class FlightController:
         self.mixer = _inverse(self.rotors.allocation)
         self.thrust_min, self.thrust_max = thrust_limits(nominal)
         self.gain = nominal.inertia * nominal.rate_gain
+        self.knows_moment = bool((nominal.drag_height != 0).any())
         weight = nominal.mass * nominal.gravity
         self.tiny = 1e-6 * weight
         # What a rotor contributes to collective thrust; its limits, and the thrust it has for yaw, in these units.
@@ -111,23 +113,33 @@ class FlightController:
     def command(self, setpoint: Any, state: Any, wrench: Vector) -> Vector:
         """Commanded rotor speed (*, 4) [rad/s] for a setpoint, the drone's state, and the present wrench (*, 4)."""
         rates = self.rate_setpoint(setpoint, state.quaternion, state.velocity)
-        return self.rotor_speed(rates, state.angular_velocity, wrench)
+        moment = None
+        if self.knows_moment:
+            moment = drag_moment(
+                drag(quaternion.rotate_inverse(state.quaternion, state.velocity), self.nominal), self.nominal
+            )
+        return self.rotor_speed(rates, state.angular_velocity, wrench, moment)
 
     def rate_setpoint(self, setpoint: Any, attitude: Vector, velocity: Vector) -> Setpoint:
         """Thrust and body rates for a setpoint, at an attitude (*, 4) and a velocity (*, 3) [m/s], world frame."""
         return setpoint
 
-    def rotor_speed(self, setpoint: Setpoint, angular_velocity: Vector, wrench: Vector) -> Vector:
+    def rotor_speed(
+        self, setpoint: Setpoint, angular_velocity: Vector, wrench: Vector, moment: Vector | None = None
+    ) -> Vector:
         """Commanded rotor speed (*, 4) [rad/s] for a setpoint, the body rates (*, 3), and the present wrench (*, 4).
 
         Torque = J K (desired rate - rate) - D (angular acceleration) + w x J w, where the angular acceleration follows
         from the wrench that the controller believes the rotors to exert. The paper prints a derivative of the desired
-        rate as well; a setpoint that is held for a control step has none.
+        rate as well; a setpoint that is held for a control step has none. The rotors also hold against the moment
+        (*, 3) of a drag above the centre of mass, which firmware leaves to an integral.
         """
         inertia = self.nominal.inertia
-        gyroscopic = gyroscopic_torque(angular_velocity, inertia)
-        acceleration = (wrench[..., 1:] - gyroscopic) / inertia
-        torque = multiply_add(gyroscopic, self.gain, setpoint.body_rate - angular_velocity)
+        held = gyroscopic_torque(angular_velocity, inertia)
+        if moment is not None:
+            held = held - moment
+        acceleration = (wrench[..., 1:] - held) / inertia
+        torque = multiply_add(held, self.gain, setpoint.body_rate - angular_velocity)
         torque = torque - self.nominal.rate_damping * acceleration
         thrust = matvec(self.mixer, cat(setpoint.thrust, torque))
         return self.rotors.speed(self._within_limits(thrust, setpoint.thrust, torque[..., 2:]))

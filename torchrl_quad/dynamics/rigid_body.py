@@ -46,10 +46,15 @@ def accelerations(
     velocity_body = quaternion.rotate_inverse(state.quaternion, airspeed)
     air, torque = drag(velocity_body, params), wrench[..., 1:]
     if _is_set(params.drag_height):
-        lever, (x, y, z) = params.drag_height, (torque[..., i : i + 1] for i in range(3))
-        torque = cat(x - lever * air[..., 1:2], y + lever * air[..., :1], z)
+        torque = torque + drag_moment(air, params)
     linear = quaternion.rotate(state.quaternion, (air + along_z(wrench[..., :1])) / params.mass)
     return linear - along_z(params.gravity), angular_acceleration(state.angular_velocity, torque, params.inertia)
+
+
+def drag_moment(air: Vector, params: QuadrotorParams) -> Vector:
+    """The torque (*, 3) [N m], body frame, of a drag (*, 3) [N] that acts above the centre of mass."""
+    x, y = air[..., :1] * params.drag_height, air[..., 1:2] * params.drag_height
+    return cat(-y, x, x * 0.0)
 
 
 def _is_set(value: Vector) -> bool:

@@ -201,7 +201,7 @@ def test_allocation_is_r_cross_f_for_any_layout():
 
 @pytest.mark.parametrize("name", available_drones())
 def test_a_body_rate_command_turns_the_drone_that_way(name):
-    params = drone(name, drag_height=0.0)  # the torque of drag disturbs a loop that has no integral
+    params = drone(name, drag_height=0.0)  # a drag moment that changes with the speed disturbs the loop
     controller = FlightController(params)
     for axis in range(3):
         action = controller.hover_action.clone().expand(1, 4).clone()

@@ -170,7 +170,7 @@ def main() -> None:
         "constant velocity": CONSTANT_VELOCITY,
         "preset before": old_preset(),
         **published(),
-        "preset": "crazyflie",
+        "preset, fitted on all eight": "crazyflie",
         "fitted": result.drone,
     }
     rows = []

@@ -42,6 +42,7 @@ def commands(env, steps, spread=0.2):
     return (env.hover_action.expand(steps, n, 4) + spread * random).requires_grad_()
 
 
+@pytest.mark.slow  # a minute and more of compiling
 def test_a_compiled_step_sees_what_an_eager_one_sees_with_the_same_gradients():
     camera = {"width": 6, "height": 4, "rate": 2, "delay": 3, "noise": 0.02, "dropout": 0.1, "differentiable": True}
     made = {"num_envs": 4, "camera": camera, "dtype": torch.float64, "density": 0.02, "max_episode_steps": 6, **OPTIONS}

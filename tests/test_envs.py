@@ -236,7 +236,7 @@ def test_the_signature_of_a_task_names_every_argument(task, own):
 
 def test_make_env_builds_by_name_and_lists_the_names():
     assert isinstance(make_env("hovering", num_envs=2), HoveringEnv)
-    with pytest.raises(ValueError, match="Unknown task 'hover'. Choose from: hovering"):
+    with pytest.raises(ValueError, match="Unknown task 'hover'. Choose from: forest, hovering"):
         make_env("hover")
 
 

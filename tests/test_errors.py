@@ -55,12 +55,12 @@ def near(state, **other):
         (
             "tracking",
             {"curves": "circle"},
-            r"Did you mean 'curve'\? Choose from: action_delay, compile, control, control_dt, cur",
+            r"Did you mean 'curve'\? Choose from: action_delay, camera, compile, control, control_dt, cur",
         ),
         (
             "hovering",
             {"xyz": 1},
-            r"unexpected keyword argument 'xyz'. Choose from: action_delay, compile, .* seed, weights, wind.$",
+            r"unexpected keyword argument 'xyz'. Choose from: action_delay, camera, compile, .* seed, weights, wind.$",
         ),
     ],
 )
@@ -124,7 +124,7 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
 
 @pytest.mark.parametrize("task", ["hover", None, ["hovering"]])
 def test_an_unknown_task_is_refused_with_the_known_ones(task):
-    with pytest.raises(ValueError, match="Unknown task .*. Choose from: hovering, landing, racing, tracking."):
+    with pytest.raises(ValueError, match="Unknown task .*. Choose from: forest, hovering, landing, racing, tracking."):
         make_env(task)
 
 

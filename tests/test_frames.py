@@ -188,7 +188,9 @@ def test_the_view_holds_the_scenery_whatever_the_drones_do(task, monkeypatch):
     from torchrl_quad.render import frames
 
     scenes = []
-    monkeypatch.setattr(frames, "Scene", lambda *a, scene=frames.Scene: scenes.append(scene(*a)) or scenes[-1])
+    monkeypatch.setattr(
+        frames, "Scene", lambda *a, scene=frames.Scene, **k: scenes.append(scene(*a, **k)) or scenes[-1]
+    )
     env = make_env(task, num_envs=1)
     env.reset()
     env.render()

@@ -23,10 +23,20 @@ class Drone:
         mixer: its inverse.
         thrust_limits: the least and the greatest thrust [N] that may be commanded of one rotor.
         hover_speed: of each rotor (4) [rad/s].
+
+    Raises:
+        ValueError: its drag acts above its centre of mass, or its rotors have two time constants.
     """
 
     def __init__(self, fields: Mapping[str, Any]) -> None:
         self.fields = {name: np.array(value, float) for name, value in fields.items()}
+        unknown = {"drag_height": self.fields.get("drag_height", np.zeros(1)).any()}
+        unknown["two motor_time_constants"] = self.fields["motor_time_constant"].size > 1
+        if any(unknown.values()):
+            raise ValueError(
+                f"Other simulators do not fly drones with {' and '.join(x for x in unknown if unknown[x])}. Export the "
+                "policy of a drone without: env.drone with drag_height: 0 and one motor_time_constant."
+            )
         for name, value in self.fields.items():
             setattr(self, name, value if value.ndim else float(value))
         k2, k1, k0 = self.thrust_map

@@ -46,7 +46,9 @@ class IdentificationResult:
     correlation: Sequence[Sequence[float]]  #: between the unknowns
     not_identifiable: Mapping[str, str]  #: by field, the reason
     time_constants: str  #: what the flights say about rotors that speed up and slow down at a different pace
-    errors: Mapping[str, Mapping[str, Mapping[float, float]]]  #: in held-out windows: model, quantity, horizon [s]
+    errors: Mapping[
+        str, Mapping[str, Mapping[float, float]]
+    ]  #: by model, quantity and horizon [s], in held-out windows
     settings: Mapping[str, Any]  #: of the fit
     logs: Sequence[str]  #: names of the flights
     flights: Sequence[FlightLog] = dataclasses.field(repr=False, default=())  #: for pictures

@@ -26,7 +26,7 @@ each_task = pytest.mark.parametrize("task", TASKS)
 
 @cache
 def env_of(task, dtype=torch.float64):
-    open_ground = {"density": 0.0} if task == "forest" else {}  # states are drawn anywhere, also where trees would stand
+    open_ground = {"density": 0.0} if task == "forest" else {}  # states are drawn where trees would stand, too
     return make_env(task, num_envs=N, dtype=dtype, max_episode_steps=50, **open_ground)
 
 

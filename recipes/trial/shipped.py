@@ -87,7 +87,8 @@ def summary_table(data: Path) -> str:
     for task in sorted(flown, key=[*TASKS, *flown].index):
         shown = TASKS.get(task) or first_metric(task)
         groups = ([x for x in runs if (x["task"], x["algorithm"]) == (task, method)] for method in METHODS)
-        lines.append([task.replace("_", ", ") if task in VARIANTS else task, *(cell(group, *shown) for group in groups)])
+        label = task.replace("_", ", ") if task in VARIANTS else task
+        lines.append([label, *(cell(group, *shown) for group in groups)])
     return table(["", *METHODS.values()], lines)
 
 

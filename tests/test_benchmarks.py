@@ -16,7 +16,10 @@ SMALL = "num_envs=4 horizon=4 env.max_episode_steps=20 compile=false"
     [
         ("throughput", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 7),
         ("memory", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 1),
-        ("camera", "--primitives 2 --scenes trees --images 2x4x3 --rounds 1", 1),
+        pytest.param(
+            *("camera", "--primitives 2 --scenes trees --images 2x4x3 --rounds 1", 1),
+            marks=pytest.mark.slow,  # it compiles
+        ),
         ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),
         ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
     ],

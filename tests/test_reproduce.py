@@ -57,6 +57,7 @@ def run_here(launch, no_pictures):
     return run
 
 
+@pytest.mark.slow
 def test_a_shrunken_matrix_runs_and_goes_on_where_it_was_stopped(run_here, monkeypatch, tmp_path):
     in_own_process = reproduce.run  # of one of the runs; the others save the time to start
 

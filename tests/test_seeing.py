@@ -92,6 +92,7 @@ def test_a_flight_is_that_of_torchrls_loop_with_its_transforms_and_forgets_where
     assert (before != 0).all() and (after == 0).all()
 
 
+@pytest.mark.slow  # it compiles
 def test_a_policy_that_is_called_before_each_compiled_step_remembers_as_in_an_eager_flight(monkeypatch):
     class Direct:  # what is compiled, without a compiler, which takes a minute
         def __init__(self, function, options):

@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from report import RESULTS, finished, save
+from report import RESULTS, save
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_quad import MPC, GeometricController
-from torchrl_quad.files import replacing
+from torchrl_quad.files import read_rows, replacing
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 from training.building import build_env
@@ -131,14 +131,14 @@ def main() -> None:
     trained = [(cfg.task, cfg.algorithm, path) for path in args.checkpoints for cfg in [load_policy(Path(path))[0]]]
     jobs = [(task, name, path) for task, name, path in trained if task in args.tasks]
     jobs += [(task, name, None) for name in args.controllers for task in args.tasks]
-    rows = finished(args.output)
+    rows = read_rows(args.output)
     for job in jobs:
         if not any((row["task"], row["policy"]) == job[:2] for row in rows):
             rows.append(measure(*job, args))
             order = ["hovering", "tracking", "landing", "racing"]
             save(args.output, sorted(rows, key=lambda row: (order.index(row["task"]), row["policy"])))
     if args.output == RESULTS / "controllers.csv":
-        text = re.sub(f"{MARKER}.*?{END}", lambda _: f"{MARKER}\n\n{table(finished(args.output))}\n\n{END}",
+        text = re.sub(f"{MARKER}.*?{END}", lambda _: f"{MARKER}\n\n{table(read_rows(args.output))}\n\n{END}",
                       PAGE.read_text(), flags=re.DOTALL)  # fmt: skip
         with replacing(PAGE) as temporary:
             temporary.write_text(text)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from report import RESULTS, finished, save
+from report import RESULTS, save
 from scipy.signal import savgol_filter
 from tqdm import tqdm
 
@@ -25,6 +25,7 @@ from torchrl_quad.dynamics.modes import make_controller
 from torchrl_quad.dynamics.quadrotor import QuadrotorState
 from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
 from torchrl_quad.dynamics.rotors import Rotors
+from torchrl_quad.files import read_rows
 from torchrl_quad.identification import FlightLog, identify
 
 STEP = 0.001  # [s], of the simulated truth
@@ -234,7 +235,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=RESULTS / "identification.csv")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    rows = [row for row in finished(options.output) if row["seed"] not in map(str, options.seeds)]
+    rows = [row for row in read_rows(options.output) if row["seed"] not in map(str, options.seeds)]
     for seed in tqdm(options.seeds):
         rows += fit(seed, options.seconds)
         save(options.output, rows)

@@ -31,14 +31,6 @@ def save(path: Path, rows: list[dict[str, Any]], **about: Any) -> None:
     print(f"\n{path}: {about}")
 
 
-def finished(path: Path) -> list[dict[str, Any]]:
-    """The rows that a CSV file of results holds already."""
-    if not path.exists():
-        return []
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def in_own_process(function: Callable[..., Any], *arguments: Any) -> Any:
     """What a function returns in a fresh process, whose memory and modules are its own."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:

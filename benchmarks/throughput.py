@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from report import RESULTS, finished, save
+from report import RESULTS, save
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -40,6 +40,7 @@ from torchrl_quad import ActionSequence, differentiable_rollout, make_actor, mak
 from torchrl_quad.engine import Stepper, Transition
 from torchrl_quad.engine.policy import GivenActions
 from torchrl_quad.engine.simulation import State
+from torchrl_quad.files import read_rows
 
 
 class Physics:
@@ -199,7 +200,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=RESULTS / "throughput.csv")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    rows = finished(args.output)
+    rows = read_rows(args.output)
     for mode, n in tqdm(list(itertools.product(args.modes, args.num_envs))):
         if not any(row["num_envs"] == str(n) and row["mode"] == mode for row in rows):
             rows += measure(n, mode, args.task, args.horizon, args.rounds, args.device)

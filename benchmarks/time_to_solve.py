@@ -17,8 +17,10 @@ import tempfile
 import time
 from pathlib import Path
 
-from report import RESULTS, finished, save
+from report import RESULTS, save
 from tqdm import tqdm
+
+from torchrl_quad.files import read_rows
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -57,7 +59,7 @@ def main() -> None:
     parser.add_argument("--overrides", nargs="*", default=["eval.interval=5"])
     parser.add_argument("--output", type=Path, default=RESULTS / "time_to_solve.csv")
     args = parser.parse_args()
-    rows = finished(args.output)
+    rows = read_rows(args.output)
     with tempfile.TemporaryDirectory() as cache:
         # "warm" follows "cold", and finds its cache.
         for algorithm, seed, mode in tqdm(list(itertools.product(args.algorithms, args.seeds, args.modes))):

@@ -30,7 +30,7 @@ from torchrl_quad.deploy import Bundle, load_bundle
 from torchrl_quad.deploy.judging import PRECISION
 from torchrl_quad.deploy.simulators import make_simulator, simulator_class
 from torchrl_quad.deploy.transfer import MUTANTS, fly
-from torchrl_quad.files import machine, replacing
+from torchrl_quad.files import machine, read_rows, replacing
 
 SETTINGS = {
     "bundle": (str, None),
@@ -81,7 +81,7 @@ def measure(bundle: Bundle, cfg: dict, loop: str, mutant: str | None, path: Path
         "drone": json.dumps(about, sort_keys=True) if about else "nominal",
         "episodes": str(min(starts, cfg["episodes"] or starts)),
     }
-    rows = read(path)
+    rows = read_rows(path)
     if any(all(row[name] == flown[name] for name in KEY) for row in rows):
         return
     begin = time.perf_counter()
@@ -100,24 +100,16 @@ def measure(bundle: Bundle, cfg: dict, loop: str, mutant: str | None, path: Path
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     row = {"task": task, **flown, **result}
-    rows = [*read(path), row]  # again: flying took its time
+    rows = [*read_rows(path), row]  # again: flying took its time
     with replacing(path) as temporary, open(temporary, "w", newline="") as file:
         writer = csv.DictWriter(file, list(row))
         writer.writeheader()
         writer.writerows(rows)
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    """The flights that are there."""
-    if not path.exists():
-        return []
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def show(path: Path, bundle: str) -> None:
     """Print the flights of a bundle as a table."""
-    rows = [dict(zip(SHOWN, SHOWN, strict=True)), *(row for row in read(path) if row["bundle"] == bundle)]
+    rows = [dict(zip(SHOWN, SHOWN, strict=True)), *(row for row in read_rows(path) if row["bundle"] == bundle)]
     widths = [max(len(row[name]) for row in rows) for name in SHOWN]
     for row in rows:
         print("  ".join(row[name].rjust(width) for name, width in zip(SHOWN, widths, strict=True)))

@@ -1,8 +1,9 @@
-"""Files that are complete or not there, and the name of the machine that results in them come from."""
+"""Files that are complete or not there, tables in them, and the name of the machine that results come from."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import os
 import platform
 import re
@@ -62,3 +63,12 @@ def _delete_leftovers(path: Path) -> None:
         match = name.fullmatch(other.name)
         if match and not is_running(int(match[1])):
             other.unlink(missing_ok=True)
+
+
+def read_rows(path: str | Path) -> list[dict[str, str]]:
+    """Read the rows of a CSV file; no rows where there is no file."""
+    path = Path(path)
+    if not path.exists():
+        return []
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))

@@ -18,7 +18,6 @@ import sys
 from pathlib import Path
 
 import torch
-from evidence import read
 from matrix import VARIANTS
 from omegaconf import DictConfig, OmegaConf
 from reproduce import RECIPES, write
@@ -31,6 +30,7 @@ from tqdm import tqdm
 
 from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss, differentiable_rollout, make_qvalue, make_value
 from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.files import read_rows as read
 from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.objectives.pathwise import discounts
 

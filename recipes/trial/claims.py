@@ -20,9 +20,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from evidence import NotRunError, Part, Results, beats, bootstrap, deviation, gap, mean, read, roughness
+from evidence import NotRunError, Part, Results, beats, bootstrap, deviation, gap, mean, roughness
 from matrix import EXPERIMENTS, SEEDS, TASKS
 from matrix import METHODS as METHOD_VARIANTS
+
+from torchrl_quad.files import read_rows as read
 
 METHODS = tuple(METHOD_VARIANTS)
 FIRST_ORDER = ("abpt", "shac", "bptt")

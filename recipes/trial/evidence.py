@@ -11,7 +11,6 @@ Each is a ``Part`` with a bootstrap over seeds.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -20,20 +19,14 @@ from pathlib import Path
 import numpy as np
 from matrix import SEEDS, TASKS
 
+from torchrl_quad.files import read_rows as read
+
 RESAMPLES = 4_000
 LEVEL = {"hovering": 0.98, "tracking": 0.98, "landing": 0.9, "racing": 0.9}
 
 
 class NotRunError(Exception):
     """A claim needs a run that is missing."""
-
-
-def read(path: Path) -> list[dict[str, str]]:
-    """Read the rows of a CSV file; no rows where there is no file."""
-    if not path.exists():
-        return []
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from threading import Lock
 
 import numpy as np
 import torch
-from evidence import read
 from reproduce import DATA, QUICK, RECIPES, run, stop, write
 from results import fill
 from tables import table
@@ -31,6 +30,7 @@ from training.evaluation import load_policy
 
 from torchrl_quad import differentiable_rollout
 from torchrl_quad.files import machine, replacing
+from torchrl_quad.files import read_rows as read
 
 POLICIES = {  # recipe, and what differs from what it ships with
     "bptt": ("bptt", []),

@@ -23,7 +23,6 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
 from audits import audit_tasks
-from evidence import read
 from hydra import compose, initialize_config_dir
 from matrix import DYNAMICS, EVALUATIONS, EXPERIMENTS, LEARNING_RATES, SEEDS, TASKS, VARIANTS, Job, jobs, search_jobs
 from omegaconf import DictConfig
@@ -31,6 +30,7 @@ from tqdm import tqdm
 
 from torchrl_quad.envs import task_class
 from torchrl_quad.files import machine, replacing
+from torchrl_quad.files import read_rows as read
 
 RECIPES = Path(__file__).parents[1]
 sys.path += [str(RECIPES), os.getcwd()]  # the recipes' code, and tasks of your own

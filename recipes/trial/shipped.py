@@ -20,7 +20,6 @@ from pathlib import Path
 from threading import Lock
 
 import numpy as np
-from evidence import read
 from reproduce import DATA, OWN, QUICK, RECIPES, known_task, run, stop, write
 from results import fill
 from tables import table
@@ -28,6 +27,7 @@ from tables import table
 from torchrl_quad.envs import task_class
 from torchrl_quad.envs.scenery import EPISODE_METRICS
 from torchrl_quad.files import machine
+from torchrl_quad.files import read_rows as read
 
 SEEDS = tuple(range(10))
 METHODS = {"bptt": "BPTT", "shac": "SHAC", "abpt": "ABPT", "hybrid": "Hybrid", "ppo": "PPO"}

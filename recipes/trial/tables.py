@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 from claims import METHODS, PUBLISHED, Verdict
-from evidence import NotRunError, Part, Results, read
+from evidence import NotRunError, Part, Results
 from hydra import compose, initialize_config_dir
 from matrix import EXPERIMENTS, LEARNING_RATES, TASKS, VARIANTS
 from omegaconf import DictConfig, OmegaConf
 from reproduce import RECIPES, best_learning_rate
+
+from torchrl_quad.files import read_rows as read
 
 COLUMNS = {  # of the tables of ends: heading, column of the curves, factor, digits
     "return": ("return", 1, 2),

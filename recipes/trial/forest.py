@@ -36,8 +36,8 @@ POLICIES = {  # recipe, and what differs from what it ships with
     "bptt": ("bptt", []),
     "shac": ("shac", []),
     "hybrid": ("hybrid", []),
-    "ppo": ("ppo", []),
-    "ppo, four times as long": ("ppo", ["total_steps=6_553_600"]),
+    "ppo": ("ppo", ["total_steps=720_000"]),  # about the seconds of BPTT
+    "ppo, four times as long": ("ppo", ["total_steps=2_880_000"]),
     "blind": ("bptt", ["actor.vision=false", "env.camera=null"]),
     "no memory": ("bptt", ["actor.recurrent=false"]),
     "no velocity": ("bptt", ["env.observe_velocity=false"]),

@@ -316,7 +316,7 @@ def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):
 @pytest.mark.parametrize(
     ("track", "message"),
     [
-        ("monza", "Unknown track 'monza'. Choose from: visfly; or give the path"),
+        ("monza", "Unknown track 'monza'. Choose from: six_gates, visfly; or give the path"),
         ({"gates": [[0, 0, 1]]}, "track: a track needs at least two gates, got 1"),
         ({"gate": []}, "unknown key 'gate'. Allowed: gates, starts, gate_radius"),
         ({}, "gates must be a list of points"),

@@ -70,8 +70,9 @@ class RacingEnv(QuadrotorEnv):
 
     Args:
         num_envs: number of drones that fly in parallel.
-        track: "visfly", the path of a YAML file, or a mapping, with ``gates``, a list of at least two centres [m]; and,
-            if wanted, ``starts``, as many points [m] (by default half way between gates), and ``gate_radius`` [m].
+        track: "visfly", "six_gates", the path of a YAML file, or a mapping, with ``gates``, a list of at least two
+            centres [m]; and, if wanted, ``starts``, as many points [m] (by default half way between gates), and
+            ``gate_radius`` [m].
         reward: "velocity" or "position".
         gate_bonus: "binary", "log" or "reciprocal".
         max_episode_steps: control steps after which an episode is truncated.

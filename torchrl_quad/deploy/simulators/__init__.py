@@ -65,9 +65,16 @@ def make_simulator(
     """Build a simulator by its name.
 
     Raises:
-        ValueError: it is unknown, or has no such rate loop.
+        ValueError: it is unknown, has no such rate loop, or cannot show the policy of the contract what it needs.
         ImportError: it is not installed.
     """
+    task = contract["task"]["name"]
+    if contract["camera"] or task == "forest":
+        why = "its policy reads images, and they have no camera" if contract["camera"] else "they have no trees"
+        raise ValueError(
+            f"The simulators here cannot fly this bundle of the task {task!r}: {why}. Fly it in the package's own "
+            "environment: python recipes/evaluate.py checkpoint=..."
+        )
     kind = simulator_class(name)
     if loop not in kind.loops:
         raise ValueError(f"{name} has no rate loop {loop!r}. Choose from: {', '.join(kind.loops)}.")

@@ -17,9 +17,10 @@ from torch import nn
 from torchrl.envs import RewardSum, TransformedEnv
 
 import torchrl_quad
-from torchrl_quad import HoveringEnv, RacingEnv, TrackingEnv, make_actor, make_env
+from torchrl_quad import ForestEnv, HoveringEnv, RacingEnv, TrackingEnv, make_actor, make_env, make_visual_actor
 from torchrl_quad.deploy import (
     MissingQuantity,
+    NegativeDepth,
     NotFinite,
     NotUnitQuaternion,
     StaleState,
@@ -28,7 +29,7 @@ from torchrl_quad.deploy import (
     load_bundle,
 )
 from torchrl_quad.deploy.describe import _harmonics
-from torchrl_quad.deploy.tasks import Curve, Gates
+from torchrl_quad.deploy.tasks import Course, Curve, Gates
 from torchrl_quad.envs import TASKS
 
 ROOT = Path(__file__).parent.parent
@@ -87,6 +88,56 @@ def test_each_fault_has_a_name_and_changes_nothing_or_hovers_and_is_counted(fold
     assert hovering.faults  # readable after the flight
 
 
+@pytest.fixture(scope="module")
+def seeing(tmp_path_factory):
+    env = HoveringEnv(num_envs=64, max_episode_steps=16, camera={"width": 3, "height": 2, "rate": 3, "delay": 2})
+    actor = make_visual_actor(env, num_cells=(4,), channels=(2,), hidden_size=2)
+    with torch.no_grad():
+        actor[0][-1].module.mlp[-1].weight.mul_(30.0)
+    return export_policy(actor, env, tmp_path_factory.mktemp("seeing") / "policy")
+
+
+IMAGE = [[0.0, 2.0, 12.0], [1.0, 3.0, 10.0]]
+
+
+def pixel(value):
+    return [[0.0, value, 12.0], [1.0, 3.0, 10.0]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "message", "changes"),
+    [
+        (MissingQuantity, "lacks 'depth': give position, .*, depth, depth_age and age", {"depth": None}),
+        (MissingQuantity, "lacks 'depth_age', the time since the image was taken", {"depth_age": None}),
+        (MissingQuantity, r"depth must have shape \(2, 3\) or \(1, 2, 3\), got \(3, 2\)", {"depth": [[1, 1]] * 3}),
+        (MissingQuantity, "depth must be 6 numbers, got 'far'", {"depth": "far"}),
+        (MissingQuantity, "whole numbers, uint16: give metres. Are they milli", {"depth": np.ones((2, 3), np.uint16)}),
+        (NotFinite, "Not finite: depth. Give 0 for a pixel that measures nothing", {"depth": pixel(math.nan)}),
+        (NotFinite, "Not finite: depth. .* and the range for far", {"depth": pixel(math.inf)}),
+        (NotFinite, "Not finite: depth_age", {"depth_age": math.nan}),
+        (NegativeDepth, "depth must not be negative, got -0.1 m", {"depth": pixel(-0.1)}),
+        (StaleState, "The image is 0.11 s old; the contract allows 0 to 0.1 s", {"depth_age": 0.11}),
+        (StaleState, "The image is -1 s old", {"depth_age": -1}),
+        (StaleState, "The state is 1 s old", {"age": 1}),
+    ],
+)
+def test_each_fault_of_an_image_has_a_name_and_leaves_the_memory_as_it_was(seeing, kind, message, changes):
+    bundle, untouched = load_bundle(seeing, on_fault="hover"), load_bundle(seeing)
+    state = resting(depth=IMAGE, depth_age=0.1)
+    first = bundle(state)
+    assert not np.array_equal(bundle.memory, [0, 0]) and bundle.memory.dtype == np.float32
+    memory = bundle.memory.copy()
+    bundle({key: x for key, x in (state | changes).items() if x is not None})
+    assert bundle.faults == {kind.__name__: 1} and re.search(message, str(bundle.last_fault))
+    np.testing.assert_array_equal(bundle.memory, memory)
+    np.testing.assert_allclose(bundle.action, bundle.contract["output"]["hover_action"])
+    assert untouched(state)[0] == first[0] != bundle(state)[0] == untouched(state)[0]
+    bundle.reset()
+    np.testing.assert_array_equal(bundle.memory, [0, 0])
+    clipped = np.minimum(IMAGE, 10.0)[None]  # what is beyond the range counts as the range
+    assert bundle(state | {"depth": clipped})[0] == first[0]
+
+
 def test_an_action_that_is_not_finite_is_a_fault(folder, monkeypatch):
     class Broken:
         def run(self, *_):
@@ -127,12 +178,24 @@ def test_gates_are_passed_in_their_order_on_the_line_between_two_positions():
     gates.advance(None, np.array([5.0, 0, 1]))  # where it was is unknown
     gates.advance(np.array([4.0, 0.31, 1]), np.array([6.0, 0.31, 1]))
     assert gates.gate == 1
-    np.testing.assert_array_equal(gates.relative(np.array([4.0, 0, 1])), [1, 0, 0, -4, 0, 0])
+    found = gates.inputs(np.array([4.0, 0, 1]))
+    np.testing.assert_array_equal(np.stack([found["to_gate"], found["to_gate_after"]]), [[1, 0, 0], [-4, 0, 0]])
     gates.advance(np.array([4.0, 0, 1]), np.array([4.8, 0, 1]))
     assert (gates.gate, gates.passed) == (0, 2)
     for gate in (2, -1, True, 0.5):
         with pytest.raises(ValueError, match="gate must be a whole number from 0 to 1"):
             gates.reset(gate)
+
+
+def test_a_course_commands_its_speed_towards_the_target_and_less_within_a_metre_of_it():
+    course = Course({"target": [32, 0, 1.5], "speed": 5.0})
+    np.testing.assert_allclose(course.inputs(np.array([29.0, 4.0, 1.5]))["command"], [3, -4, 0])
+    np.testing.assert_allclose(course.inputs(np.array([31.5, 0.0, 1.5]))["command"], [2.5, 0, 0])
+    course.reset(target=[0, 0, 0], speed=2)
+    np.testing.assert_allclose(course.inputs(np.array([0.0, 0.0, 9.0]))["command"], [0, 0, -2])
+    for speed in (0, -1, math.nan, math.inf, "fast"):
+        with pytest.raises(ValueError, match="speed must be a positive number"):
+            course.reset(speed=speed)
 
 
 def test_a_race_with_noise_and_delay_is_exported_though_gates_are_counted_from_true_positions(tmp_path):
@@ -172,7 +235,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path):
             export_policy(policy, env, tmp_path / "policy", **options)
 
     module = TensorDictModule(nn.Linear(13, 4), in_keys=["observation"], out_keys=["action"])
-    refuses("exports what make_actor builds, .* This TensorDictModule is something else", module)
+    refuses("exports what make_actor and make_visual_actor build, .* This TensorDictModule is something else", module)
     refuses(
         r"reads \['observation', \('state', 'rotor_speed'\)\]. A drone can give it",
         make_actor(env, in_keys=["observation", ("state", "rotor_speed")]),
@@ -183,7 +246,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path):
     )
     hooked = make_actor(env)
     hooked[0].module.mlp.register_forward_hook(lambda *_: None)
-    refuses("exports what make_actor builds", hooked)
+    refuses("exports what make_actor and make_visual_actor build", hooked)
     refuses("observes something else than the contract says, by", env=Backwards(num_envs=16, max_episode_steps=8))
     refuses("the policy reads 13 numbers, the environment observes 40", env=make_env("tracking", num_envs=2))
     refuses("the curve has corners", env=TrackingEnv(num_envs=2, curve=corner, period=4.0))
@@ -192,6 +255,23 @@ def test_what_cannot_be_exported_is_refused(tmp_path):
     with torch.no_grad():
         broken[0].module.mlp[0].bias[0] = math.nan
     refuses("the weights of the policy, or its normaliser, are not finite", broken)
+    forest = ForestEnv(num_envs=2, camera={"width": 6, "height": 5})
+    seen, hooked, deeper = (make_visual_actor(forest) for _ in range(3))
+    refuses("for images of another size; the environment has no camera", seen)
+    narrow = HoveringEnv(num_envs=2, camera={"width": 9, "height": 5})
+    refuses("for images of another size; the environment shows it 9 x 5 pixels", seen, narrow)
+    hooked[0][1].gru.register_forward_hook(lambda *_: None)
+    deeper[0][1].gru = nn.GRU(64, 64, 2, batch_first=True)
+    for changed in (hooked, deeper):
+        refuses(
+            "exports what make_actor and make_visual_actor build, .* This VisualActor is something", changed, forest
+        )
+    refuses(
+        r"reads \['depth', \('state', 'velocity'\)\]. A drone can give it",
+        make_visual_actor(forest, in_keys=[("state", "velocity")]),
+        forest,
+    )
+    refuses("cannot write ELU.alpha=0.5", make_visual_actor(forest, activation=functools.partial(nn.ELU, 0.5)), forest)
     other = HoveringEnv(num_envs=2, control="attitude")
     refuses("exports thrust and body rates alone, control=\"rates\"; got 'attitude'", env=other)
     assert not (tmp_path / "policy").exists()
@@ -254,13 +334,17 @@ def test_the_package_imports_its_parts_when_they_are_asked_for():
 
 
 def test_the_recipe_exports_the_best_policy_of_a_run_with_its_results(train, launch, refused, tmp_path):
-    train("bptt", tmp_path, "normalize=true", "task=racing")
+    train("bptt", tmp_path, "normalize=true", "task=forest", "env.camera={width: 6, height: 5}", "env.density=0.02")
     printed = launch("export", f"checkpoint={tmp_path}/checkpoint.pt")
-    assert re.search(r"policy: flies racing; its actions differ by at most \d\.\de-0[6-9]", printed)
+    assert re.search(r"policy: flies forest; its actions differ by at most \d\.\de-0[6-9]", printed)
     about = load_bundle(tmp_path / "policy").contract
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert about["results"] == {key: summary[key] for key in about["results"]}
     assert about["origin"]["checkpoint_sha256"] == contract.sha256((tmp_path / "checkpoint.pt").read_bytes())
+    assert about["memory"] > 0 and about["camera"]["range"] == 10.0
+    assert "cannot fly this bundle of the task 'forest': its policy reads images, and they have no camera" in refused(
+        "transfer", f"bundle={tmp_path}/policy", "simulator=torchrl_quad"
+    )
     assert "folder is unknown" not in refused("export", f"checkpoint={tmp_path}/none.pt")
     assert "episodes=0" in refused("export", f"checkpoint={tmp_path}/checkpoint.pt", "episodes=0")
 

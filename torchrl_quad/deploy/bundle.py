@@ -233,7 +233,7 @@ class Bundle:
             name = "depth" if math.isfinite(age) else "depth_age"
             raise NotFinite(f"Not finite: {name}. Give 0 for a pixel that measures nothing, and the range for far.")
         if depth.min() < 0.0:
-            raise NegativeDepth(f"depth must not be negative, got {depth.min():g} m. 0 is a pixel without measurement.")
+            raise NegativeDepth(f"depth must not be negative, got {depth.min():g} m. Write 0 for nothing measured.")
         if not 0.0 <= age <= self._max_depth_age:
             raise StaleState(f"The image is {age:g} s old; the contract allows 0 to {self._max_depth_age:g} s.")
         return np.minimum(depth, self._camera["range"]).astype(np.float32).reshape(1, 1, height, width)

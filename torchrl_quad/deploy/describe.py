@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -290,9 +291,10 @@ def _disturbances(env: QuadrotorEnv) -> dict[str, Any]:
 
 
 def _is_plain(x: Any) -> bool:
-    """Whether it is a number, or a sequence of numbers."""
-    parts = x if isinstance(x, list | tuple) and not hasattr(x, "_fields") else [x]
-    return all(isinstance(part, bool | int | float | np.number) for part in parts)
+    """Whether it is a number, or numbers in an array; the obstacles of a scene are not."""
+    with contextlib.suppress(ValueError, TypeError):
+        return np.asarray(x).dtype.kind in "fiub"
+    return False
 
 
 def _rate_loop(env: QuadrotorEnv, drone: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -1,19 +1,17 @@
 """From policy to drone: what is exported flies as the policy did, says what it needs, and refuses what it cannot."""
 
 import ctypes
-import functools
 import io
 import json
 import os
 import shutil
-import subprocess
 
 import jsonschema
 import numpy as np
 import onnxruntime
 import pytest
 import torch
-from deploying import TASKS, build, resting
+from deploying import TASKS, build, by_hand, compiled, resting, run_c
 from flying import fly
 from torch import nn
 from torchrl.envs import TransformedEnv
@@ -27,24 +25,10 @@ from torchrl_quad.deploy import (
     contract,
     export_policy,
     load_bundle,
-    transfer,
 )
 from torchrl_quad.deploy import TamperedBundle as Tampered
 from torchrl_quad.deploy.network import ACTIVATIONS, Layer, Network, write_c, write_onnx
 from torchrl_quad.deploy.tasks import PROGRESS, progress_of
-
-GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
-
-
-@pytest.fixture(scope="module")
-def export_once(tmp_path_factory):
-    @functools.cache
-    def export_once(task):
-        torch.set_num_threads(1)
-        env, actor = build(task)
-        return env, actor, export_policy(actor, env, tmp_path_factory.mktemp(task) / "policy")
-
-    return export_once
 
 
 @pytest.fixture(params=TASKS)
@@ -55,38 +39,6 @@ def exported(request, export_once):
 @pytest.fixture
 def hovering(export_once):
     return export_once("hovering")[2]
-
-
-def compiled(folder, out):
-    subprocess.run([*GCC, str(folder / "policy.c"), "-o", str(out), "-lm"], check=True)
-    return ctypes.CDLL(str(out))
-
-
-def run_c(library, given):
-    """Actions in C for what a policy reads, by name, each (n, ...); the memory (n, m) becomes that of the next step."""
-    pointer, action = ctypes.POINTER(ctypes.c_float), np.zeros(4, np.float32)
-    rows = []
-    for i in range(len(given["observation"])):
-        reads = [given[name][i].ctypes.data_as(pointer) for name in ("observation", "depth", "memory") if name in given]
-        assert library.policy_action(*reads, action.ctypes.data_as(pointer)) == 0
-        rows.append(action.copy())
-    return np.stack(rows)
-
-
-def by_hand(actor, observation, depth=None, memory=None):
-    """The mean action and the memory after it, from the weights; torch's own recurrent cell is not TorchRL's."""
-    if depth is None:
-        return torch.tanh(actor[0].module.mlp(observation)[:, :4]), None
-    sight, x = actor[0][0].module, 1 / depth.clamp(min=0.3)
-    for eye in list(sight.eyes)[:-1:2]:
-        x = nn.functional.elu(nn.functional.conv2d(x, eye.weight, eye.bias, 2, 1))
-    (layer,), last = sight.trunk.mlp, actor[0][-1].module.mlp[-1]
-    x = nn.functional.elu(layer(torch.cat((x.flatten(1), 0.3 * observation), 1)))
-    if memory is not None:
-        gru = actor[0][1].gru
-        memory = torch.gru_cell(x, memory, gru.weight_ih_l0, gru.weight_hh_l0, gru.bias_ih_l0, gru.bias_hh_l0)
-        x = torch.cat((x, memory), 1)
-    return torch.tanh(last(x)[:, :4]), memory
 
 
 # -- the same policy ---------------------------------------------------------------------------------------------------
@@ -161,12 +113,6 @@ def test_a_bundle_flies_the_environment_as_the_actor_does(exported):
     assert (torch.stack(actions).std(0) > 1e-3).any()
 
 
-def test_no_simulator_flies_what_sees_or_what_flies_through_a_forest(export_once):
-    for task, why in (("forest", "images"), ("forest, blind", "no trees"), ("hovering, without memory", "no camera")):
-        with pytest.raises(ValueError, match=f"cannot fly this bundle of the task .*: .*{why}"):
-            transfer.fly(export_once(task)[2], "torchrl_quad")
-
-
 def test_a_gate_that_is_passed_during_a_fault_counts_afterwards(export_once):
     bundle = load_bundle(export_once("racing")[2], on_fault="hover")
     gate = np.array(bundle.contract["task"]["gates"][0])
@@ -221,19 +167,6 @@ def test_c_answers_what_is_not_finite_with_the_hover_action_and_decodes_commands
     thrust, rates = ctypes.c_float(), (ctypes.c_float * 3)()
     library.policy_command((ctypes.c_float * 4)(-1 / 3, 0.5, -1.0, 0.25), ctypes.byref(thrust), rates)
     assert [thrust.value, *rates] == pytest.approx([0.46 * 9.81, 1.0, -2.0, 0.5])
-
-
-def test_c_leaves_the_memory_as_it_was_where_it_reads_what_is_not_finite(export_once, tmp_path):
-    library = compiled(export_once("forest")[2], tmp_path / "policy.so")
-    floats, inf = (lambda *x: (ctypes.c_float * len(x))(*x)), float("inf")
-    for observation, depth, kept in ((inf, 1.0, 0.5), (0.0, inf, 0.5), (0.0, float("nan"), 0.5), (0.0, 1.0, inf)):
-        memory, action = floats(0.1, 0.2, 0.3, kept), floats(0, 0, 0, 0)
-        images = floats(*29 * [1.0], depth)
-        assert library.policy_action(floats(*8 * [0.0], observation), images, memory, action) == 1
-        assert list(memory) == pytest.approx([0.1, 0.2, 0.3, kept]) and action[0] == pytest.approx(-1 / 3)
-    memory = floats(0.1, 0.2, 0.3, 0.5)
-    assert library.policy_action(floats(*9 * [0.0]), floats(*30 * [1.0]), memory, action) == 0
-    assert memory[3] != 0.5
 
 
 # -- the folder --------------------------------------------------------------------------------------------------------

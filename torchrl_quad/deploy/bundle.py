@@ -273,8 +273,8 @@ class Bundle:
         for name in self._names:
             if name.removesuffix(IN_BODY) not in names:
                 raise UnknownContract(
-                    f"The contract's policy reads {name!r}; this torchrl_quad knows {', '.join(sorted(names))}. Use the "
-                    f"one that exported it: {self.contract['origin']['package']}."
+                    f"The contract's policy reads {name!r}; this torchrl_quad knows {', '.join(sorted(names))}. Use "
+                    f"the one that exported it: {self.contract['origin']['package']}."
                 )
 
 

@@ -241,7 +241,7 @@ def _camera(camera: Any) -> dict[str, Any]:
     """A depth camera, in numbers alone."""
     lens, habits = ("width", "height", "field_of_view"), ("range", "along_ray", "rate", "delay", "noise", "dropout")
     mount = camera.mount(torch.zeros((), dtype=torch.float64))
-    place = {"position": list(map(float, camera.position)), "quaternion": numbers(mount)}
+    place = {"position": list(map(float, camera.position)), "quaternion": numbers(mount + 0.0)}
     return {k: getattr(camera, k) for k in lens} | place | {k: getattr(camera, k) for k in habits}
 
 

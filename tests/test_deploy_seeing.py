@@ -21,6 +21,8 @@ from torchrl_quad.deploy import (
     load_bundle,
     transfer,
 )
+from torchrl_quad.deploy.judging import judge
+from torchrl_quad.deploy.replaying import environment
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +92,10 @@ def test_no_simulator_flies_what_sees_or_what_flies_through_a_forest(export_once
     for task, why in (("forest", "images"), ("forest, blind", "no trees"), ("hovering, without memory", "no camera")):
         with pytest.raises(ValueError, match=f"cannot fly this bundle of the task .*: .*{why}"):
             transfer.fly(export_once(task)[2], "torchrl_quad")
+    forest = load_bundle(export_once("forest, blind")[2]).contract
+    for refused, why in ((environment, "no trees"), (lambda about: judge(about, {}), "'forest' has obstacles to hit")):
+        with pytest.raises(ValueError, match=why):
+            refused(forest)
 
 
 def test_a_policy_that_sees_otherwise_than_it_was_built_is_refused(tmp_path):

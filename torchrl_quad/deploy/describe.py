@@ -24,6 +24,10 @@ _BODY: Inputs = [
     ("velocity", 3, "m/s", "world", 1.0, "velocity"),
     ("angular_velocity", 3, "rad/s", "body", 1.0, "body rates"),
 ]
+_SIGN = (
+    "q and -q are one attitude, and give different actions. The first quaternion of a flight has w >= 0; each further "
+    "one has the sign that brings it nearer to the one before."
+)
 
 
 def numbers(x: Any) -> Any:
@@ -199,8 +203,7 @@ def describe(env: QuadrotorEnv, sees: bool = False, memory: int = 0) -> dict[str
         "quaternion": {
             "order": "wxyz",
             "frame": "body (x forward, y left, z up) to world (z up)",
-            "sign": "q and -q are one attitude, and give different actions. The first quaternion of a flight has "
-            "w >= 0; each further one has the sign that brings it nearer to the one before.",
+            "sign": _SIGN if _BODY[0] in layout else "q and -q are one attitude, and give the same action.",
         },
         "action_queue": {"length": env.action_delay, "observed": env.observe_last_action},
         "output": {
@@ -239,10 +242,9 @@ def describe(env: QuadrotorEnv, sees: bool = False, memory: int = 0) -> dict[str
 
 def _camera(camera: Any) -> dict[str, Any]:
     """A depth camera, in numbers alone."""
-    lens, habits = ("width", "height", "field_of_view"), ("range", "along_ray", "rate", "delay", "noise", "dropout")
-    mount = camera.mount(torch.zeros((), dtype=torch.float64))
-    place = {"position": list(map(float, camera.position)), "quaternion": numbers(mount + 0.0)}
-    return {k: getattr(camera, k) for k in lens} | place | {k: getattr(camera, k) for k in habits}
+    fields = {k: v for k, v in vars(camera).items() if k not in ("pitch", "differentiable")}
+    mount = numbers(camera.mount(torch.zeros((), dtype=torch.float64)) + 0.0)
+    return fields | {"position": list(map(float, camera.position)), "quaternion": mount}
 
 
 def _inputs(layout: Inputs) -> list[dict[str, Any]]:

@@ -41,7 +41,7 @@ REPLAYED = 2  # environments whose first episode the bundle flies again
 MOST_NUMBERS = 10_000_000  # that a part of a flight observes; a forest is flown in several parts
 NEVER_JUDGED = (("depth",), ("state", "images"), ("state", "scene"))  # entries that take most of a flight's memory
 TOLERANCE = 1e-5  # of an action
-MEMORY_TOLERANCE = 1e-4  # of an action in an episode: rounding errors go on in the memory; trained policies: 4e-7
+MEMORY_TOLERANCE = 1e-4  # of an action within an episode: rounding errors go on in the memory
 OBSERVATION_TOLERANCE = 1e-3  # of an entry of the observation: float32 adds up a phase less exactly than a bundle
 
 

@@ -27,10 +27,11 @@ def main(cfg: DictConfig) -> None:
         # Both gradients of one horizon, and what they are worth.
         rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         data = loss.write_targets(rollout)
+        read = data.exclude("state", "next")  # which minibatches do not read
 
         # Several passes over it, until the policy has moved far enough.
         moved = 0.0
-        for batch in shuffled(data, cfg.batch_size, cfg.epochs):
+        for batch in shuffled(read, cfg.batch_size, cfg.epochs):
             losses = loss(batch)
             if moved < rate.limit(iteration):
                 moved = max(moved, mean_of_all(losses["kl"]).item())

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from scipy.stats import mannwhitneyu
 
 from torchrl_quad import BPTTLoss, differentiable_rollout, make_actor, make_env
 
@@ -20,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "recipes/trial"))
 
 import ascent
 import claims
+import comparison
 import matrix
 import reproduce
 import shipped
@@ -251,6 +253,10 @@ def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(run
     page = (tmp_path / "summary.md").read_text()
     assert "| racing |  |  |  |  | 0.0% (0.0%), 0.0 gates, " in page
     assert re.search(r"\| own_task.CornerEnv \|  \|  \|  \|  \| 0.0% \(0.0%\), \d\.\d\d m, ", page)
+    assert "| racing | PPO | 1 | " in page
+    curves = reproduce.read(tmp_path / "shipped_curves.csv")
+    assert {row["task"] for row in curves} == {"own_task.CornerEnv", "racing"} and curves[-1]["steps"] == "64"
+    assert (tmp_path / "results/shipped.png").stat().st_size > 10_000
     monkeypatch.setattr(shipped, "run", lambda *_: pytest.fail("It has been flown."))
     run_main(monkeypatch, shipped, *arguments)
     assert (tmp_path / "summary.md").read_text() == page
@@ -260,6 +266,33 @@ def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(run
     for refused in (["--quick"], ["--tasks", "own_task.CornerEnv"], ["--tasks", "window"]):
         with pytest.raises(SystemExit):
             run_main(monkeypatch, shipped, *refused)
+
+
+def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom():
+    assert comparison.interquartile_mean([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 100.0]) == 3.5
+    ours, theirs = [3.0, 1.0, 2.0], [2.0, 0.0, 2.0, 1.0]
+    expected = mannwhitneyu(ours, theirs).statistic / 12
+    assert comparison.improvement(ours, theirs) == pytest.approx(expected)
+    assert comparison.interval([2.0, 2.0, 2.0]) == (2.0, 2.0)
+    low, high = comparison.interval([1.0, 2.0, 3.0, 4.0])
+    assert 1.0 <= low < 2.5 < high <= 4.0
+    flown = {  # by method: return, solved and seconds of each seed
+        "bptt": [(9.0, 1.0, 3), (9.2, 0.98, 3), (9.1, 1.0, 3)],  # quick, but not with every seed
+        "shac": [(9.0, 1.0, 5), (9.1, 1.0, 5), (9.2, 0.99, 5)],
+        "ppo": [(9.5, 1.0, 40), (9.6, 1.0, 40), (9.7, 1.0, 40)],
+        "abpt": [(99.0, 1.0, 1), (99.0, 1.0, 1)],  # too few to be compared
+    }
+    names = ("return", "solved", "seconds", "steps")
+    rows = [
+        {"task": "hovering", "algorithm": method} | dict(zip(names, map(str, (*x, 1e6)), strict=True))
+        for method, seeds in flown.items()
+        for x in seeds
+    ]
+    made = [comparison.choice_table, comparison.reached_table, comparison.improvement_table]
+    choice, table, beaten = (make(rows, shipped.METHODS, shipped.TASKS) for make in made)
+    assert "| hovering | SHAC: 9.1, 99.0%, 5 s | PPO: 9.6, 100.0%, 40 s | BPTT, SHAC, PPO |" in choice
+    assert "| hovering | ABPT | 2 | 99 | 100.0% (100.0%) |  | 1.0 | 1 |" in table
+    assert "| PPO | 1.00, 1 | 1.00, 1 |  |  |  |" in beaten and "| BPTT |  | 0.50, 1 |" in beaten
 
 
 def test_a_task_of_your_own_is_flown_with_all_that_the_paper_flies_on_each_of_its_tasks():

@@ -35,7 +35,9 @@ from torchrl_quad.files import read_rows as read
 POLICIES = {  # recipe, and what differs from what it ships with
     "bptt": ("bptt", []),
     "shac": ("shac", []),
-    "ppo": ("ppo", []),
+    "hybrid": ("hybrid", []),
+    "ppo": ("ppo", ["total_steps=720_000"]),  # about the seconds of BPTT
+    "ppo, four times as long": ("ppo", ["total_steps=2_880_000"]),
     "blind": ("bptt", ["actor.vision=false", "env.camera=null"]),
     "no memory": ("bptt", ["actor.recurrent=false"]),
     "no velocity": ("bptt", ["env.observe_velocity=false"]),
@@ -70,7 +72,7 @@ def success_rates(env: EnvBase, actor: TensorDictModuleBase, steps: int) -> dict
 def fly(policy: str, seed: int, todo: list[tuple[str, float]], args: argparse.Namespace) -> None:
     """Train once, then fly through the forests that are wanted, and add each result as it comes."""
     recipe, overrides = POLICIES[policy]
-    folder = args.output / policy.replace(" ", "_") / f"seed{seed}"
+    folder = args.output / policy.replace(",", "").replace(" ", "_") / f"seed{seed}"
     own = [f"seed={seed}", *overrides, *args.overrides, *(QUICK if args.quick else ())]
     own += ["resume=auto", f"hydra.run.dir={folder}"]
     if not (folder / "summary.json").exists():
@@ -79,7 +81,7 @@ def fly(policy: str, seed: int, todo: list[tuple[str, float]], args: argparse.Na
     cfg, actor, normalizer = load_policy(folder / "checkpoint.pt")
     for difficulty, speed in todo:
         cfg.env.difficulty, cfg.env.speed = difficulty, speed
-        env = build_env(cfg, args.forests, FIRST_FOREST)
+        env = build_env(cfg, args.forests, FIRST_FOREST, compile=not args.quick)
         if normalizer is not None:
             env.transform.load_state_dict(normalizer)
         steps = round(PATIENCE * (env.length + max(env.run_up)) / speed / env.control_dt)

@@ -1,10 +1,11 @@
 """Train the losses on TorchRL's own pendulum: are they what they say on an environment that is not ours?
 
-python recipes/trial/pendulum.py --losses shac sapo ahac abpt abpt-simulated --seeds 0 1 2
+python recipes/trial/pendulum.py --losses shac sapo ahac abpt abpt-simulated hybrid --seeds 0 1 2
 
 The task is that of gymnasium's Pendulum-v1: 200 steps from a random angle, under a torque too weak to lift the pendulum
 at once. The return is the mean over 256 episodes without exploration noise. Random actions reach about -1200, and a
-policy that swings it up about -150. All losses have the same networks, rates and number of steps.
+policy that swings it up about -150. All losses have the same networks, rates and number of steps. The hybrid has the
+settings of its recipe instead, and as many steps.
 """
 
 from __future__ import annotations
@@ -14,17 +15,20 @@ import sys
 import time
 
 import torch
-from tables import table
+from tables import table  # whose import makes the recipes' code known
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, PendulumEnv, RewardScaling, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import SoftUpdate
+from training.building import AdaptiveRate, shuffled
 
 from torchrl_quad import (
     ABPTLoss,
     AHACLoss,
     BPTTLoss,
+    HybridLoss,
     SAPOLoss,
     SHACLoss,
     differentiable_rollout,
@@ -43,6 +47,7 @@ LOSSES = {
     "ahac": lambda env, actor: AHACLoss(actor, make_value(env), horizon=HORIZON),
     "abpt": lambda env, actor: ABPTLoss(actor, make_qvalue(env)),
     "abpt-simulated": lambda env, actor: ABPTLoss(actor, make_qvalue(env), simulated_steps=1),
+    "hybrid": lambda env, actor: HybridLoss(actor, make_value(env, num_cells=(128, 128))),
 }
 
 
@@ -109,18 +114,57 @@ def train(name: str, seed: int, total_steps: int) -> tuple[float, float, float]:
         if critic:
             data = loss.write_value_target(rollout.detach()).reshape(-1)
             for _ in range(8):
-                critic_optimizer.zero_grad()
-                learn(data[torch.randint(len(data), (512,))])[0].backward()
-                torch.nn.utils.clip_grad_norm_(critic, 1.0)
-                critic_optimizer.step()
+                optimise(critic_optimizer, learn(data[torch.randint(len(data), (512,))])[0], 1.0)
                 if target:
                     target.step()
         if name == "ahac":
             loss.adapt_horizon(metadata["stiffness"])
         steps += rollout.numel()
-        fresh = starts(env, ENVS // 2)  # an episode of the pendulum has no end of its own: half of them start afresh
-        going_on = carry.select(*fresh.keys())[torch.randperm(ENVS)[: ENVS - len(fresh)]]
-        carry = torch.cat((fresh, going_on))
+        carry = start_some(env, carry)
+    return before, mean_return(actor), time.process_time() - start
+
+
+def optimise(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
+    """Take a step down the gradient of a loss, of bounded norm."""
+    optimizer.zero_grad()
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_([x for group in optimizer.param_groups for x in group["params"]], max_grad_norm)
+    optimizer.step()
+
+
+def start_some(env: EnvBase, carry: TensorDictBase) -> TensorDictBase:
+    """Let half of the pendulums start afresh: an episode has no end of its own."""
+    fresh = starts(env, len(carry) // 2)
+    going_on = carry.select(*fresh.keys())[torch.randperm(len(carry))[: len(carry) - len(fresh)]]
+    return torch.cat((fresh, going_on))
+
+
+def train_hybrid(seed: int, total_steps: int) -> tuple[float, float, float]:
+    """As :func:`train`, with the loop and the settings of recipes/hybrid.py."""
+    torch.manual_seed(seed)
+    env, envs, horizon, batch_size = make_pendulum(seed), min(128, ENVS), 2 * HORIZON, 1024
+    actor = make_actor(env, scale_init=0.2, learn_scale=False, noise_correlation=0.9)
+    loss = LOSSES["hybrid"](env, actor)
+    loss.make_value_estimator(gamma=0.99, lmbda=0.95)
+    actor_optimizer = torch.optim.Adam(loss.actor_network_params.parameters(), 1e-3, betas=(0.9, 0.99))
+    critic_optimizer = torch.optim.Adam(loss.value_network_params.parameters(), 3e-3, betas=(0.9, 0.99))
+    iterations = -(-total_steps // (envs * horizon))
+    rate = AdaptiveRate(actor_optimizer, 0.25, iterations)
+
+    before, start = mean_return(actor), time.process_time()
+    carry = starts(env, envs)
+    for iteration in range(iterations):
+        critic_optimizer.param_groups[0]["lr"] = 3e-3 * (1.0 - 0.99 * iteration / iterations)
+        rollout, carry = differentiable_rollout(env, actor, carry, horizon)
+        moved = 0.0
+        for batch in shuffled(loss.write_targets(rollout).exclude("next"), batch_size, 5):
+            losses = loss(batch)
+            if moved < rate.limit(iteration):
+                moved = max(moved, losses["kl"].item())
+                optimise(actor_optimizer, losses["loss_actor"], 0.5)
+            optimise(critic_optimizer, losses["loss_value"], 1.0)
+        rate.step(iteration, moved)
+        carry = start_some(env, carry)
     return before, mean_return(actor), time.process_time() - start
 
 
@@ -135,7 +179,7 @@ def main() -> None:
     for name in args.losses:
         runs = []
         for seed in args.seeds:
-            runs.append(train(name, seed, args.steps))
+            runs.append(train_hybrid(seed, args.steps) if name == "hybrid" else train(name, seed, args.steps))
             print(f"{name}, seed {seed}: {runs[-1][1]:.0f}", file=sys.stderr)
         before, after, seconds = zip(*runs, strict=True)
         returns = ", ".join(f"{x:.0f}" for x in after)

@@ -5,6 +5,7 @@ python recipes/trial/shipped.py --tasks mypackage.WindowEnv --data FOLDER   # a 
 
 It may be stopped at any moment. Started again, it skips what is in docs/results/data/shipped.csv, and resumes what was
 cut off. The README shows each method on each task: the episodes solved over all seeds, and by the worst of them.
+docs/choosing.md compares the methods.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from pathlib import Path
 from threading import Lock
 
 import numpy as np
-from reproduce import DATA, OWN, QUICK, RECIPES, known_task, run, stop, write
+from comparison import choice_table, draw, improvement_table, reached_table
+from matrix import EVALUATIONS
+from reproduce import CURVE, DATA, OWN, QUICK, RECIPES, known_task, run, stop, write
 from results import fill
 from tables import table
 
@@ -54,8 +57,20 @@ def fly(task: str, method: str, seed: int, output: Path, data: Path, quick: bool
     about = {"task": task, "algorithm": method, "seed": seed, "machine": machine(), "flown": flown, "seconds": seconds}
     summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}
     with ADDING:
+        key = {"task": task, "algorithm": method, "seed": str(seed)}
+        curves = [point for point in read(data / "shipped_curves.csv") if key.items() - point.items()]
+        write(data / "shipped_curves.csv", [*curves, *(key | point for point in curve(folder))])
         others = read(data / "shipped.csv")
         write(data / "shipped.csv", [*others, about | {k: v for k, v in summary.items() if k not in about}])
+
+
+def curve(folder: Path) -> list[dict[str, str]]:
+    """Give the curve of a run, thinned to some forty points."""
+    points = [row for row in read(folder / "metrics.csv") if row.get("eval/return")]
+    kept = points[:: max(-(-len(points) // EVALUATIONS), 1)]
+    kept += [] if kept[-1:] == points[-1:] else points[-1:]
+    names = ("steps", "seconds", "return", "solved")
+    return [{name: f"{float(point[CURVE[name]]):.6g}" for name in names} for point in kept]
 
 
 def cell(runs: list[dict[str, str]], metric: str, factor: float, digits: int, unit: str) -> str:
@@ -80,16 +95,18 @@ def first_metric(task: str) -> tuple[str, float, int, str]:
     return name, metric.scale, 2, metric.unit or metric.label
 
 
-def summary_table(data: Path) -> str:
-    """Show what the recipes reach as they ship."""
+def blocks(data: Path) -> dict[str, str]:
+    """Make the tables of what the recipes reach as they ship: that of the README, and those of docs/choosing.md."""
     runs, lines = read(data / "shipped.csv"), []
     flown = dict.fromkeys(x["task"] for x in runs)
-    for task in sorted(flown, key=[*TASKS, *flown].index):
-        shown = TASKS.get(task) or first_metric(task)
+    shown = {task: TASKS.get(task) or first_metric(task) for task in sorted(flown, key=[*TASKS, *flown].index)}
+    for task in shown:
         groups = ([x for x in runs if (x["task"], x["algorithm"]) == (task, method)] for method in METHODS)
         label = task.replace("_", ", ") if task in VARIANTS else task
-        lines.append([label, *(cell(group, *shown) for group in groups)])
-    return table(["", *METHODS.values()], lines)
+        lines.append([label, *(cell(group, *shown[task]) for group in groups)])
+    compared = {"choice": choice_table, "reached": reached_table, "improvement": improvement_table}
+    made = {name: make(runs, METHODS, shown) for name, make in compared.items()}
+    return {"summary": table(["", *METHODS.values()], lines)} | made
 
 
 def main() -> None:
@@ -112,8 +129,12 @@ def main() -> None:
         waiting = [pool.submit(fly, *job, args.output, args.data, args.quick) for job in todo if job not in kept]
         for future in waiting:
             future.result()
-    page = DATA.parents[2] / "README.md" if args.data.resolve() == DATA.resolve() else args.data / "summary.md"
-    fill(page, {"summary": summary_table(args.data)})
+    shipped = args.data.resolve() == DATA.resolve()
+    pages = (DATA.parents[2] / "README.md", DATA.parents[1] / "choosing.md") if shipped else (args.data / "summary.md",)
+    curves = read(args.data / "shipped_curves.csv")
+    draw(curves, METHODS, list(TASKS if shipped else args.tasks), pages[-1].parent / "results/shipped.png")
+    for page in pages:
+        fill(page, blocks(args.data))
 
 
 if __name__ == "__main__":

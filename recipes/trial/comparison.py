@@ -1,0 +1,150 @@
+"""Compare the recipes as they ship: which method to take on which task, with intervals over the seeds.
+
+shipped.py calls this after its flights. It flies nothing by itself. The conventions are those of Agarwal et al. 2021,
+"Deep reinforcement learning at the edge of the statistical precipice": interquartile means, percentile intervals of the
+bootstrap over seeds, and the probability that one method improves on another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import bootstrap, trim_mean
+from tables import table
+
+from torchrl_quad.files import replacing
+
+Row = Mapping[str, str]
+Shown = tuple[str, float, int, str]  # of a task: column, factor, digits, unit
+RELIABLE = 0.99  # of the episodes, solved by the worst seed
+ENOUGH = 3  # seeds, for an interval
+COLORS = {"bptt": "#3b9c5a", "shac": "#2f6db5", "abpt": "#c8452f", "hybrid": "#8a4fb0", "ppo": "#7d7d7d"}
+
+
+def interquartile_mean(values: Sequence[float], axis: int = 0) -> float:
+    """The mean of the middle half, without the quarter below and the quarter above it."""
+    return trim_mean(values, 0.25, axis=axis)
+
+
+def interval(values: Sequence[float]) -> tuple[float, float]:
+    """The 95 % interval of the interquartile mean, by percentiles of 2000 bootstrap samples."""
+    if len(set(values)) == 1:
+        return values[0], values[0]
+    found = bootstrap(
+        (values,), interquartile_mean, n_resamples=2000, method="percentile", rng=np.random.default_rng(0)
+    ).confidence_interval
+    return found.low, found.high
+
+
+def improvement(ours: Sequence[float], theirs: Sequence[float]) -> float:
+    """The probability that a seed of ours has more than a seed of theirs; half of it where they are equal."""
+    gap = np.subtract.outer(ours, theirs)
+    return float(np.mean((gap > 0) + 0.5 * (gap == 0)))
+
+
+def column(rows: Sequence[Row], name: str) -> list[float]:
+    """Read a column, as numbers; what was not measured is left out."""
+    return [float(row[name]) for row in rows if row.get(name)]
+
+
+def grouped(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Group the rows by task and method."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["task"], row["algorithm"]), []).append(row)
+    return groups
+
+
+def reached_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping[str, Shown]) -> str:
+    """Show what every method reaches on every task, and what it takes."""
+    groups, lines = grouped(rows), []
+    for task, (name, factor, digits, unit) in shown.items():
+        for method, label in methods.items():
+            own = groups.get((task, method))
+            if not own:
+                continue
+            returns, solved, metric = (column(own, x) for x in ("return", "solved", name))
+            mean = f"{interquartile_mean(returns):.4g}"
+            if len(returns) >= ENOUGH:
+                mean += " ({:.4g} to {:.4g})".format(*interval(returns))
+            precise = f"{factor * interquartile_mean(metric):.{digits}f} {unit}" if metric else ""
+            cost = f"{np.median(column(own, 'steps')) / 1e6:.1f}", f"{np.median(column(own, 'seconds')):.0f}"
+            share = f"{np.mean(solved):.1%} ({min(solved):.1%})"
+            lines.append([task.replace("_", ", "), label, str(len(own)), mean, share, precise, *cost])
+    head = ["task", "", "seeds", "return (95 % interval)", "solved (worst seed)", "", "million steps", "seconds"]
+    return table(head, lines)
+
+
+def choice_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping[str, Shown]) -> str:
+    """Show for each task the quickest method that works with every seed, and the one of the highest return."""
+    groups, lines = grouped(rows), []
+    for task in shown:
+        flown = {method: groups[task, method] for method in methods if len(groups.get((task, method), ())) >= ENOUGH}
+        if not flown:
+            continue
+        worst = {method: min(column(own, "solved")) for method, own in flown.items()}
+        returns = {method: interquartile_mean(column(own, "return")) for method, own in flown.items()}
+        seconds = {method: np.median(column(own, "seconds")) for method, own in flown.items()}
+        reliable = [method for method in flown if worst[method] >= RELIABLE]
+        quick = min(reliable, key=seconds.get, default=None)
+        most = max(returns, key=returns.get)
+        said = {x: f"{methods[x]}: {returns[x]:.4g}, {worst[x]:.1%}, {seconds[x]:.0f} s" for x in flown}
+        cells = [said.get(x, "none") for x in (quick, most)]
+        lines.append([task.replace("_", ", "), *cells, ", ".join(methods[x] for x in flown)])
+    return table(["task", "quickest that works with every seed", "highest return", "compared"], lines)
+
+
+def improvement_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping[str, Shown]) -> str:
+    """Show how probable it is that the method of a row has a higher return than that of a column, over the tasks."""
+    groups, lines = grouped(rows), []
+    for ours, label in methods.items():
+        cells = []
+        for theirs in methods:
+            both = [
+                [column(groups[task, method], "return") for method in (ours, theirs)]
+                for task in shown
+                if all(len(groups.get((task, method), ())) >= ENOUGH for method in (ours, theirs))
+            ]
+            values = [improvement(*pair) for pair in both]
+            cells.append(f"{np.mean(values):.2f}, {len(values)}" if values and ours != theirs else "")
+        lines.append([label, *cells])
+    return table(["", *methods.values()], lines)
+
+
+def draw(curves: Sequence[Row], methods: Mapping[str, str], tasks: Sequence[str], path: Path) -> None:
+    """Draw the return over steps and over seconds: interquartile means over the seeds, and their intervals."""
+    from matplotlib.figure import Figure
+
+    runs: dict[tuple[str, str], dict[str, list[Row]]] = {}
+    for point in curves:
+        runs.setdefault((point["task"], point["algorithm"]), {}).setdefault(point["seed"], []).append(point)
+    tasks = [task for task in tasks if any((task, method) in runs for method in methods)]
+    if not tasks:
+        return
+    figure = Figure((3.2 * len(tasks) + 0.6, 5.2), layout="constrained")
+    panels = figure.subplots(2, len(tasks), squeeze=False)
+    lines = {}
+    for row, time in enumerate(("steps", "seconds")):
+        for panel, task in zip(panels[row], tasks, strict=True):
+            for method in methods:
+                if (task, method) not in runs:
+                    continue
+                seeds = [[column(points, x) for x in (time, "return")] for points in runs[task, method].values()]
+                grid = np.linspace(0.0, np.median([t[-1] for t, _ in seeds]), 100)
+                values = np.array([np.interp(grid, t, y, left=np.nan) for t, y in seeds])
+                grid, values = (x[..., np.isfinite(values).all(0)] for x in (grid, values))
+                (lines[method],) = panel.plot(grid, interquartile_mean(values), color=COLORS[method])
+                if len(seeds) >= ENOUGH:
+                    low, high = np.transpose([interval(x) for x in values.T])
+                    panel.fill_between(grid, low, high, color=COLORS[method], alpha=0.2, linewidth=0)
+            panel.grid(alpha=0.3)
+            panel.set(xlabel={"steps": "control steps", "seconds": "processor seconds"}[time])
+            panel.set_title("" if row else task.replace("_", ", "))
+        panels[row, 0].set_ylabel("return")
+    names = [methods[method] for method in lines]
+    figure.legend(lines.values(), names, loc="outside lower center", ncols=len(names), frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)

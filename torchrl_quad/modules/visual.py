@@ -194,6 +194,8 @@ class VisualActor(ProbabilisticActor):
             return None
         if self[1].distribution_class is not TanhNormal or type(self[0]) is not TensorDictSequential:
             return None
+        if len(self[0].module) not in (2, 3):
+            return None
         seen, *memory, last = self[0].module
         sight, head = (getattr(part, "module", None) for part in (seen, last))
         if type(sight) is not Sight or not _is_network(head, GaussianHead) or not _is_network(sight.trunk, nn.Identity):
@@ -205,7 +207,7 @@ class VisualActor(ProbabilisticActor):
             return None
         if len(head.mlp) != 1 or not _is_linear(head.mlp[0]) or any(scale != 1.0 for scale in head.scales):
             return None
-        if len(memory) > 1 or (memory and not _is_memory(memory[0])):
+        if memory and not _is_memory(memory[0]):
             return None
         reads, keys = ["seen", "recalled"][: len(memory) + 1], [list(part.in_keys) for part in (last, *memory)]
         if keys != [reads, *([["seen", MEMORY, "is_init"]] if memory else [])] or len(head.scales) != len(reads):

@@ -26,7 +26,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
-from torchrl_quad import ObservationNormalizer, differentiable_rollout, make_actor, make_env
+from torchrl_quad import ObservationNormalizer, differentiable_rollout, make_actor, make_env, make_visual_actor
 from torchrl_quad.deploy import export_policy, load_bundle
 from torchrl_quad.envs import TASKS
 
@@ -39,7 +39,7 @@ def build(source: str) -> tuple[EnvBase, TensorDictModuleBase]:
     """The environment and the policy of a checkpoint, or of a task, untrained."""
     if source in TASKS:
         env = make_env(source, num_envs=ENVS, seed=7)
-        return env, make_actor(env)
+        return env, (make_visual_actor if "depth" in env.observation_spec else make_actor)(env)
     from training.building import build_env
     from training.evaluation import load_policy
 
@@ -54,11 +54,16 @@ def normalized(env: EnvBase, actor: TensorDictModuleBase) -> EnvBase:
     """The environment behind a normaliser; the first layer of the policy changes so that it does the same as before."""
     env = TransformedEnv(env, ObservationNormalizer(env))
     env.transform.update(fly(env.base_env, actor))
-    network, normalizer = actor[0].module, env.transform
-    first = network.mlp[0]
-    first.bias.add_(first.weight @ (network.scales[0] * normalizer.loc))
-    first.weight.mul_(normalizer.scale)
+    network, normalizer = actor[0][0].module.trunk if sees(actor) else actor[0].module, env.transform
+    first, size = network.mlp[0], len(normalizer.loc)  # the observation is the last that it reads
+    first.bias.add_(first.weight[:, -size:] @ (network.scales[-1] * normalizer.loc))
+    first.weight[:, -size:].mul_(normalizer.scale)
     return env
+
+
+def sees(actor: TensorDictModuleBase) -> bool:
+    """Whether a policy reads images."""
+    return "depth" in actor.in_keys
 
 
 @torch.no_grad()
@@ -86,21 +91,26 @@ def measure(source: str, with_normalizer: bool, count: int, calls: int) -> dict[
     env = normalized(env, actor) if with_normalizer else env
     flight = fly(env, actor)
     at = torch.linspace(0, flight.numel() - 1, count).long()
-    visited, expected = (flight[key].flatten(0, 1)[at] for key in ("observation", "action"))
-    raw = (env.transform.undo(visited) if with_normalizer else visited).numpy()
+    names = {"observation": "observation", "depth": "depth", "recurrent_state": "memory"}
+    read = {name: flight[key].flatten(0, 1)[at] for key, name in names.items() if key in actor.in_keys}
+    expected = flight["action"].flatten(0, 1)[at]
+    if with_normalizer:
+        read["observation"] = env.transform.undo(read["observation"])
+    raw = {name: np.ascontiguousarray(x.flatten(1) if name == "memory" else x) for name, x in read.items()}
     with tempfile.TemporaryDirectory() as name:
         folder = export_policy(actor, env, Path(name) / "policy")
         bundle = load_bundle(folder)
         library = Path(name) / "policy.so"
         subprocess.run([*GCC, str(folder / "policy.c"), "-o", str(library), "-lm"], check=True)
         policy = ctypes.CDLL(str(library)).policy_action
-    by_onnx = bundle._session.run(None, {"observation": raw})[0]
+    by_onnx = bundle._session.run(None, raw)[0]
     by_c, pointer = np.empty((count, 4), np.float32), ctypes.POINTER(ctypes.c_float)
-    for x, y in zip(raw, by_c, strict=True):
-        policy(x.ctypes.data_as(pointer), y.ctypes.data_as(pointer))
-    ends = [x.ctypes.data_as(pointer) for x in (raw[0], by_c[0])]
+    for *x, y in zip(*raw.values(), by_c, strict=True):
+        ends = [z.ctypes.data_as(pointer) for z in (*x, y)]
+        policy(*ends)
     still = {"position": [1.0, 0.0, 1.4], "quaternion": [1.0, 0, 0, 0], "velocity": np.zeros(3)}
-    state = {**still, "angular_velocity": np.zeros(3), "age": 0.0}
+    image = {"depth": raw["depth"][0], "depth_age": 0.0} if sees(actor) else {}
+    state = {**still, "angular_velocity": np.zeros(3), "age": 0.0, **image}
     return {
         "task": bundle.contract["task"]["name"],
         "policy": "untrained" if source in TASKS else "trained",

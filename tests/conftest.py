@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from browsing import browser, open_page  # noqa: F401, fixtures
+from deploying import export_once  # noqa: F401, a fixture
 
 from torchrl_quad import HoveringEnv
 from torchrl_quad.envs.scenery import Scenery

@@ -1,11 +1,22 @@
 """Small policies to export, and a state to fly them from."""
 
+import ctypes
+import functools
+import subprocess
+
+import numpy as np
+import pytest
 import torch
+from torch import nn
 from torchrl.envs import TransformedEnv
 
-from torchrl_quad import ObservationNormalizer, make_actor, make_env
+from torchrl_quad import ObservationNormalizer, make_actor, make_env, make_visual_actor
+from torchrl_quad.deploy import export_policy
 
-TASKS = {  # with all that observations may hold, spread over the tasks
+GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
+CAMERA = {"width": 6, "height": 5, "pitch": 0.2, "rate": 2, "delay": 1, "noise": 0.02, "dropout": 0.05}
+SIZES = {"num_cells": (7,), "channels": (2, 3)}
+TASKS = {  # with all that policies may read, spread over the tasks
     "hovering": {},
     "tracking": {"curve": "lemniscate", "observe_last_action": True, "action_delay": 2},
     "landing": {
@@ -16,20 +27,33 @@ TASKS = {  # with all that observations may hold, spread over the tasks
         "random_start": {"tilt": 0.5, "yaw": 3.0},
     },
     "racing": {"action_delay": 0},
+    "forest": {"camera": CAMERA, "density": 0.05, "random_start": {"tilt": 0.5, "yaw": 3.0, "velocity": 3.0}},
+    "forest, blind": {
+        "camera": {"width": 4, "height": 3},
+        "density": 0.01,
+        "observe_velocity": False,
+        "observe_last_action": True,
+    },
+    "hovering, without memory": {"camera": {"width": 5, "height": 4, "position": [0.1, 0, 0], "along_ray": True}},
 }
-NORMALIZED = ("tracking", "racing")
+NORMALIZED = ("tracking", "racing", "forest")
 
 
-def build(task, num_envs=16):
+def build(name, num_envs=16):
     """An environment whose policy is untrained but moves, with its normaliser if it has one."""
     torch.manual_seed(0)
-    env = make_env(task, num_envs=num_envs, max_episode_steps=48, **TASKS[task])
-    if task in NORMALIZED:
+    env = make_env(name.split(",")[0], num_envs=num_envs, **{"max_episode_steps": 48, **TASKS[name]})
+    if name in NORMALIZED:
         env = TransformedEnv(env, ObservationNormalizer(env))
         env.transform.update(env.rollout(20, break_when_any_done=False))
-    actor = make_actor(env, (16, 16))
+    if "depth" in env.observation_spec and "blind" not in name:
+        actor = make_visual_actor(env, **SIZES, hidden_size=4, recurrent="without" not in name, input_scale=0.3)
+        last = actor[0][-1].module.mlp[-1]
+    else:
+        actor = make_actor(env, (16, 16))
+        last = actor[0].module.mlp[-1]
     with torch.no_grad():
-        actor[0].module.mlp[-1].weight.add_(0.3 * torch.randn_like(actor[0].module.mlp[-1].weight))
+        last.weight.add_(0.3 * torch.randn_like(last.weight))
     return env, actor
 
 
@@ -37,3 +61,46 @@ def resting(**changes):
     """A level drone at rest near the target of hovering, as a bundle takes it."""
     still = {"position": [1, 0, 1.4], "quaternion": [1, 0, 0, 0], "velocity": [0, 0, 0], "angular_velocity": [0, 0, 0]}
     return {**still, "age": 0.0, **changes}
+
+
+@pytest.fixture(scope="session")
+def export_once(tmp_path_factory):
+    @functools.cache
+    def export_once(task):
+        torch.set_num_threads(1)
+        env, actor = build(task)
+        return env, actor, export_policy(actor, env, tmp_path_factory.mktemp(task) / "policy")
+
+    return export_once
+
+
+def compiled(folder, out):
+    subprocess.run([*GCC, str(folder / "policy.c"), "-o", str(out), "-lm"], check=True)
+    return ctypes.CDLL(str(out))
+
+
+def run_c(library, given):
+    """Actions in C for what a policy reads, by name, each (n, ...); the memory (n, m) becomes that of the next step."""
+    pointer, action = ctypes.POINTER(ctypes.c_float), np.zeros(4, np.float32)
+    rows = []
+    for i in range(len(given["observation"])):
+        reads = [given[name][i].ctypes.data_as(pointer) for name in ("observation", "depth", "memory") if name in given]
+        assert library.policy_action(*reads, action.ctypes.data_as(pointer)) == 0
+        rows.append(action.copy())
+    return np.stack(rows)
+
+
+def by_hand(actor, observation, depth=None, memory=None):
+    """The mean action and the memory after it, from the weights; torch's own recurrent cell is not TorchRL's."""
+    if depth is None:
+        return torch.tanh(actor[0].module.mlp(observation)[:, :4]), None
+    sight, x = actor[0][0].module, 1 / depth.clamp(min=0.3)
+    for eye in list(sight.eyes)[:-1:2]:
+        x = nn.functional.elu(nn.functional.conv2d(x, eye.weight, eye.bias, 2, 1))
+    (layer,), last = sight.trunk.mlp, actor[0][-1].module.mlp[-1]
+    x = nn.functional.elu(layer(torch.cat((x.flatten(1), 0.3 * observation), 1)))
+    if memory is not None:
+        gru = actor[0][1].gru
+        memory = torch.gru_cell(x, memory, gru.weight_ih_l0, gru.weight_hh_l0, gru.bias_ih_l0, gru.bias_hh_l0)
+        x = torch.cat((x, memory), 1)
+    return torch.tanh(last(x)[:, :4]), memory

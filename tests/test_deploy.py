@@ -1,41 +1,34 @@
 """From policy to drone: what is exported flies as the policy did, says what it needs, and refuses what it cannot."""
 
 import ctypes
-import functools
 import io
 import json
 import os
 import shutil
-import subprocess
 
 import jsonschema
 import numpy as np
 import onnxruntime
 import pytest
 import torch
-from deploying import TASKS, build, resting
+from deploying import TASKS, build, by_hand, compiled, resting, run_c
 from flying import fly
 from torch import nn
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad import HoveringEnv
+from torchrl_quad.deploy import (
+    StaleState,
+    UnknownContract,
+    WrongActions,
+    contract,
+    export_policy,
+    load_bundle,
+)
 from torchrl_quad.deploy import TamperedBundle as Tampered
-from torchrl_quad.deploy import UnknownContract, WrongActions, contract, export_policy, load_bundle
-from torchrl_quad.deploy.network import ACTIVATIONS, Layer, write_c, write_onnx
-
-GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
-
-
-@pytest.fixture(scope="module")
-def export_once(tmp_path_factory):
-    @functools.cache
-    def export_once(task):
-        torch.set_num_threads(1)
-        env, actor = build(task)
-        return env, actor, export_policy(actor, env, tmp_path_factory.mktemp(task) / "policy")
-
-    return export_once
+from torchrl_quad.deploy.network import ACTIVATIONS, Layer, Network, write_c, write_onnx
+from torchrl_quad.deploy.tasks import PROGRESS, progress_of
 
 
 @pytest.fixture(params=TASKS)
@@ -48,60 +41,71 @@ def hovering(export_once):
     return export_once("hovering")[2]
 
 
-def compiled(folder, out):
-    subprocess.run([*GCC, str(folder / "policy.c"), "-o", str(out), "-lm"], check=True)
-    return ctypes.CDLL(str(out))
-
-
-def run_c(library, observation):
-    pointer, action = ctypes.POINTER(ctypes.c_float), np.zeros(4, np.float32)
-    rows = []
-    for x in np.ascontiguousarray(observation):
-        assert library.policy_action(x.ctypes.data_as(pointer), action.ctypes.data_as(pointer)) == 0
-        rows.append(action.copy())
-    return np.stack(rows)
-
-
 # -- the same policy ---------------------------------------------------------------------------------------------------
 
 
 def test_torch_onnx_and_c_agree_and_the_contract_fits_its_schema(exported, tmp_path):
     env, actor, folder = exported
-    vectors = np.load(folder / "vectors.npz")
-    observation, expected = vectors["observation"], vectors["action"]
-    assert len(observation) >= 1000 and np.abs(expected - expected.mean(0)).max() > 0.1
-    seen = torch.from_numpy(observation)
-    seen = env.transform.normalize(seen) if isinstance(env, TransformedEnv) else seen
+    vectors = dict(np.load(folder / "vectors.npz"))
+    expected, after = vectors.pop("action"), vectors.pop("next_memory", None)
+    sees = "depth" in vectors
+    assert len(expected) == (256 if sees else 1024) and (np.abs(expected - expected.mean(0)).max(0) > 0.1).any()
+    seen = {name: torch.from_numpy(x) for name, x in vectors.items()}
+    if isinstance(env, TransformedEnv):
+        seen["observation"] = env.transform.normalize(seen["observation"])
     with torch.no_grad():
-        action = torch.tanh(actor[0].module.mlp(seen)[:, :4])  # the mean, by hand
+        action, memory = by_hand(actor, **seen)
     np.testing.assert_allclose(action, expected, rtol=0, atol=1e-5)
+    if after is not None:
+        np.testing.assert_allclose(memory, after, rtol=0, atol=1e-5)
+        assert vectors["memory"][0].any() < vectors["memory"][1].any() and np.abs(after - vectors["memory"]).max() > 0.1
+    assert not sees or vectors["depth"].std() > 0.1
     assert load_bundle(folder).check() <= 1e-5
     library = compiled(folder, tmp_path / "policy.so")
     library.policy_self_test.restype = ctypes.c_float
     assert 0.0 < library.policy_self_test() <= 1e-5
-    np.testing.assert_allclose(run_c(library, observation), expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(run_c(library, vectors), expected, rtol=0, atol=1e-5)
+    if after is None:
+        return
+    np.testing.assert_allclose(vectors.pop("memory"), after, rtol=0, atol=1e-5)
+    session = onnxruntime.InferenceSession(folder / "policy.onnx", providers=["CPUExecutionProvider"])
+    hand, onnx, c = torch.zeros(1, 4), np.zeros((1, 4), np.float32), np.zeros((1, 4), np.float32)
+    for i in range(30):  # each keeps a memory of its own
+        given = {name: x[i : i + 1] for name, x in vectors.items()}
+        with torch.no_grad():
+            action, hand = by_hand(actor, **{name: x[i : i + 1] for name, x in seen.items()} | {"memory": hand})
+        by_onnx, onnx = session.run(None, given | {"memory": onnx})
+        for found in (by_onnx, run_c(library, given | {"memory": c})):
+            np.testing.assert_allclose(found, action, rtol=0, atol=1e-5)
+    assert np.abs(onnx - c).max() < 1e-5 and hand.abs().max() > 0.1
     jsonschema.validate(json.loads((folder / "contract.json").read_text()), contract.schema())
 
 
 def test_a_bundle_flies_the_environment_as_the_actor_does(exported):
-    """From named quantities, with quaternions of any sign; it commands what the environment decodes."""
+    """From named quantities, with quaternions of any sign; it commands what the environment decodes. Faults between
+    two steps change neither task nor memory."""
     env, actor, folder = exported
     base, bundle, draw = getattr(env, "base_env", env), load_bundle(folder), np.random.default_rng(0)
-    start = env.reset()
-    td, entry = start, {"tracking": "phase", "racing": "gate"}.get(bundle.contract["task"]["name"], "target")
-    begin = td["state", entry][0].numpy()
-    bundle.reset(**{entry: begin if begin.size > 1 else begin.item()})
-    actions = []
-    for _ in range(40):
+    td, rule = env.reset(), bundle.contract["task"]["rule"]
+    bundle.reset(**progress_of(rule, {key: td["state", key][0].numpy() for key in PROGRESS[rule]}))
+    memory, actions = torch.zeros(16, 1, bundle.contract["memory"]), []
+    for t in range(40):
         seen = {key: td["state", key] for key in base.control_step.safe_state}
         for disturbance in base.disturbances.values():
             seen = disturbance.observe(seen)
         state = {k: seen[k][0].numpy() for k in ("position", "quaternion", "velocity", "angular_velocity")}
         state["quaternion"] = state["quaternion"] * draw.choice([-1.0, 1.0]) * (1 + 1e-4)
+        state |= {"depth": td["depth"][0].numpy() * 1.0, "depth_age": 0.001} if "depth" in td else {}
+        if t % 7 == 3:
+            with pytest.raises(StaleState):
+                bundle(state | {"age": 1.0})
         thrust, rates = bundle(state | {"age": 0.001})
         with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-            td = actor(td)
+            td = actor(td.set("recurrent_state", memory).set("is_init", torch.zeros(16, 1, dtype=torch.bool)))
         actions.append(td["action"])
+        if memory.numel():
+            memory = td["next", "recurrent_state"]
+            np.testing.assert_allclose(bundle.memory, memory[0, 0], rtol=0, atol=1e-4)
         np.testing.assert_allclose(bundle.action, td["action"][0], rtol=0, atol=2e-3)
         command = base.dynamics.controller.setpoint(torch.from_numpy(bundle.action))
         np.testing.assert_allclose([thrust, *rates], torch.cat(command).numpy(), rtol=1e-5, atol=1e-6)
@@ -139,7 +143,7 @@ def test_every_activation_is_written_alike_as_onnx_and_c(tmp_path):
     library = compiled(tmp_path, tmp_path / "policy.so")
     for name in ACTIVATIONS:
         expected = getattr(nn, name)()(torch.from_numpy(x))
-        content = write_onnx([Layer(one, zero, name), Layer(small, zero, "Tanh")])
+        content = write_onnx(Network([Layer(one, zero, name), Layer(small, zero, "Tanh")]))
         session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
         found = session.run(None, {"observation": x[:, None]})[0][:, 0]
         np.testing.assert_allclose(found, torch.tanh(0.02 * expected), rtol=0, atol=1e-6, err_msg=name)
@@ -152,7 +156,7 @@ def test_c_answers_what_is_not_finite_with_the_hover_action_and_decodes_commands
     one, four = np.ones((8, 13), np.float32), np.ones((4, 8), np.float32)
     layers = [Layer(one, one[:, 0], "ReLU"), Layer(four, four[:, 0], "Tanh")]  # both hide NaN or infinity
     about = json.loads((hovering / "contract.json").read_text())
-    for name, content in write_c(layers, about, one[:1], four[:1, :4]).items():
+    for name, content in write_c(Network(layers), about, {"observation": one[:1], "action": four[:1, :4]}).items():
         (tmp_path / name).write_bytes(content)
     library = compiled(tmp_path, tmp_path / "policy.so")
     action = (ctypes.c_float * 4)()
@@ -168,9 +172,13 @@ def test_c_answers_what_is_not_finite_with_the_hover_action_and_decodes_commands
 # -- the folder --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("task", ["landing", "tracking"])
-def test_the_same_policy_gives_the_same_bytes_and_leaves_the_environment_as_it_was(export_once, task, tmp_path):
+@pytest.mark.parametrize("task", ["landing", "tracking", "forest"])
+def test_the_same_policy_gives_the_same_bytes_and_leaves_the_environment_as_it_was(
+    export_once, task, tmp_path, monkeypatch
+):
     env, actor, folder = export_once(task)
+    if task == "forest":  # now flown in parts
+        monkeypatch.setattr("torchrl_quad.deploy.export.MOST_NUMBERS", 30_000)
     base = getattr(env, "base_env", env)
     if base.disturbances:  # noise drawn ahead, and starts of a visited state, are handed on too
         base.rollout(3)
@@ -246,14 +254,22 @@ def test_a_contract_of_another_version_is_refused(hovering, tmp_path):
             load_bundle(tmp_path)
     path.write_text(json.dumps(about | {"version": 1}))
     with pytest.raises(
-        UnknownContract, match="has version 1, and this torchrl_quad reads version 2. It was written by"
+        UnknownContract, match="has version 1, and this torchrl_quad reads version 3. It was written by"
     ):
         load_bundle(tmp_path)
     about["task"]["rule"] = "dance"  # of a later package, with checksums that fit
     path.write_text(json.dumps(about | {"digest": contract.digest(about)}))
     for name in contract.FILES:
         (tmp_path / name).write_bytes((hovering / name).read_bytes())
-    with pytest.raises(UnknownContract, match="follows the rule 'dance'; this torchrl_quad knows target, curve, gates"):
+    with pytest.raises(
+        UnknownContract, match="follows the rule 'dance'; this torchrl_quad knows target, course, curve"
+    ):
+        load_bundle(tmp_path)
+    about["task"]["rule"], about["inputs"][0]["name"] = "target", "smell"
+    path.write_text(json.dumps(about | {"digest": contract.digest(about)}))
+    with pytest.raises(
+        UnknownContract, match="reads 'smell'; this torchrl_quad knows action_queue, angular_velocity, "
+    ):
         load_bundle(tmp_path)
 
 

@@ -28,7 +28,7 @@ from torchrl_quad.deploy import (
     load_bundle,
 )
 from torchrl_quad.deploy.describe import _harmonics
-from torchrl_quad.deploy.tasks import Curve, Gates
+from torchrl_quad.deploy.tasks import Course, Curve, Gates
 from torchrl_quad.envs import TASKS
 
 ROOT = Path(__file__).parent.parent
@@ -127,12 +127,24 @@ def test_gates_are_passed_in_their_order_on_the_line_between_two_positions():
     gates.advance(None, np.array([5.0, 0, 1]))  # where it was is unknown
     gates.advance(np.array([4.0, 0.31, 1]), np.array([6.0, 0.31, 1]))
     assert gates.gate == 1
-    np.testing.assert_array_equal(gates.relative(np.array([4.0, 0, 1])), [1, 0, 0, -4, 0, 0])
+    found = gates.inputs(np.array([4.0, 0, 1]))
+    np.testing.assert_array_equal(np.stack([found["to_gate"], found["to_gate_after"]]), [[1, 0, 0], [-4, 0, 0]])
     gates.advance(np.array([4.0, 0, 1]), np.array([4.8, 0, 1]))
     assert (gates.gate, gates.passed) == (0, 2)
     for gate in (2, -1, True, 0.5):
         with pytest.raises(ValueError, match="gate must be a whole number from 0 to 1"):
             gates.reset(gate)
+
+
+def test_a_course_commands_its_speed_towards_the_target_and_less_within_a_metre_of_it():
+    course = Course({"target": [32, 0, 1.5], "speed": 5.0})
+    np.testing.assert_allclose(course.inputs(np.array([29.0, 4.0, 1.5]))["command"], [3, -4, 0])
+    np.testing.assert_allclose(course.inputs(np.array([31.5, 0.0, 1.5]))["command"], [2.5, 0, 0])
+    course.reset(target=[0, 0, 0], speed=2)
+    np.testing.assert_allclose(course.inputs(np.array([0.0, 0.0, 9.0]))["command"], [0, 0, -2])
+    for speed in (0, -1, math.nan, math.inf, "fast"):
+        with pytest.raises(ValueError, match="speed must be a positive number"):
+            course.reset(speed=speed)
 
 
 def test_a_race_with_noise_and_delay_is_exported_though_gates_are_counted_from_true_positions(tmp_path):
@@ -172,7 +184,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path):
             export_policy(policy, env, tmp_path / "policy", **options)
 
     module = TensorDictModule(nn.Linear(13, 4), in_keys=["observation"], out_keys=["action"])
-    refuses("exports what make_actor builds, .* This TensorDictModule is something else", module)
+    refuses("exports what make_actor and make_visual_actor build, .* This TensorDictModule is something else", module)
     refuses(
         r"reads \['observation', \('state', 'rotor_speed'\)\]. A drone can give it",
         make_actor(env, in_keys=["observation", ("state", "rotor_speed")]),
@@ -183,7 +195,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path):
     )
     hooked = make_actor(env)
     hooked[0].module.mlp.register_forward_hook(lambda *_: None)
-    refuses("exports what make_actor builds", hooked)
+    refuses("exports what make_actor and make_visual_actor build", hooked)
     refuses("observes something else than the contract says, by", env=Backwards(num_envs=16, max_episode_steps=8))
     refuses("the policy reads 13 numbers, the environment observes 40", env=make_env("tracking", num_envs=2))
     refuses("the curve has corners", env=TrackingEnv(num_envs=2, curve=corner, period=4.0))
@@ -254,13 +266,17 @@ def test_the_package_imports_its_parts_when_they_are_asked_for():
 
 
 def test_the_recipe_exports_the_best_policy_of_a_run_with_its_results(train, launch, refused, tmp_path):
-    train("bptt", tmp_path, "normalize=true", "task=racing")
+    train("bptt", tmp_path, "normalize=true", "task=forest", "env.camera={width: 6, height: 5}", "env.density=0.02")
     printed = launch("export", f"checkpoint={tmp_path}/checkpoint.pt")
-    assert re.search(r"policy: flies racing; its actions differ by at most \d\.\de-0[6-9]", printed)
+    assert re.search(r"policy: flies forest; its actions differ by at most \d\.\de-0[6-9]", printed)
     about = load_bundle(tmp_path / "policy").contract
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert about["results"] == {key: summary[key] for key in about["results"]}
     assert about["origin"]["checkpoint_sha256"] == contract.sha256((tmp_path / "checkpoint.pt").read_bytes())
+    assert about["memory"] > 0 and about["camera"]["range"] == 10.0
+    assert "cannot fly this bundle of the task 'forest': its policy reads images, and they have no camera" in refused(
+        "transfer", f"bundle={tmp_path}/policy", "simulator=torchrl_quad"
+    )
     assert "folder is unknown" not in refused("export", f"checkpoint={tmp_path}/none.pt")
     assert "episodes=0" in refused("export", f"checkpoint={tmp_path}/checkpoint.pt", "episodes=0")
 

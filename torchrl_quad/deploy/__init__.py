@@ -11,6 +11,7 @@ from torchrl_quad.deploy.bundle import Bundle, load_bundle
 from torchrl_quad.deploy.contract import (
     Fault,
     MissingQuantity,
+    NegativeDepth,
     NotFinite,
     NotUnitQuaternion,
     StaleState,
@@ -26,6 +27,7 @@ __all__ = [
     "Bundle",
     "Fault",
     "MissingQuantity",
+    "NegativeDepth",
     "NotFinite",
     "NotUnitQuaternion",
     "StaleState",

@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-VERSION = 2  # of the contract; raise it when a reader of the older one would misunderstand the new one
+VERSION = 3  # of the contract; raise it when a reader of the older one would misunderstand the new one
 FILES = ("README.md", "policy.c", "policy.h", "policy.onnx", "starts.npz", "vectors.npz")  # beside contract.json
 
 
@@ -42,7 +42,11 @@ class NotUnitQuaternion(Fault):
 
 
 class StaleState(Fault):
-    """The state was measured longer ago than the contract allows, or has an age below zero."""
+    """The state, or its image, was measured longer ago than the contract allows, or has an age below zero."""
+
+
+class NegativeDepth(Fault):
+    """A pixel of the image is below zero."""
 
 
 def schema() -> dict[str, Any]:

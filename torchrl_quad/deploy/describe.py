@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -12,11 +13,21 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
-from torchrl_quad.envs import HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv
+from torchrl_quad.envs import ForestEnv, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv
 from torchrl_quad.envs.disturbances import DroneRandomization, Sensors, Wind
 from torchrl_quad.envs.scenery import describe_metric
 
 MAX_HARMONICS = 64  # of a curve
+Inputs = list[tuple[str, int, str, str, float, str]]  # of each name, size, unit, frame, scale and meaning
+_BODY: Inputs = [
+    ("quaternion", 4, "1", "body to world", 10.0, "attitude (w, x, y, z), unit norm"),
+    ("velocity", 3, "m/s", "world", 1.0, "velocity"),
+    ("angular_velocity", 3, "rad/s", "body", 1.0, "body rates"),
+]
+_SIGN = (
+    "q and -q are one attitude, and give different actions. The first quaternion of a flight has w >= 0; each further "
+    "one has the sign that brings it nearer to the one before."
+)
 
 
 def numbers(x: Any) -> Any:
@@ -37,7 +48,7 @@ def _hovering(env: HoveringEnv) -> dict[str, Any]:
         "success": f"an episode: mean distance below {env.success_radius} m over its last second, without a crash",
         "criteria": {"radius": env.success_radius, "window": 1.0},
         "box": _box(env.target, env.box_half_width, env.box_height),
-        "inputs": [("to_target", 3, "m", "world", 1.0, "target - position")],
+        "inputs": [("to_target", 3, "m", "world", 1.0, "target - position"), *_BODY],
     }
 
 
@@ -52,7 +63,7 @@ def _landing(env: LandingEnv) -> dict[str, Any]:
         "success": success,
         "criteria": {"height": env.success_height, "radius": env.success_radius, "speed": env.success_speed},
         "box": _box(env.target, env.box_half_width, env.box_height),
-        "inputs": [("to_target", 3, "m", "world", 1.0, "target - position; the target lies on the ground")],
+        "inputs": [("to_target", 3, "m", "world", 1.0, "target - position; the target lies on the ground"), *_BODY],
     }
 
 
@@ -68,7 +79,7 @@ def _tracking(env: TrackingEnv) -> dict[str, Any]:
         "without a crash",
         "criteria": {"radius": env.success_radius, "settling_time": env.settling_time},
         "box": _box(numbers(env.centre), numbers(env.half_width), env.ceiling),
-        "inputs": [("to_points", 3 * env.lookahead, "m", "world", 1.0, about)],
+        "inputs": [("to_points", 3 * env.lookahead, "m", "world", 1.0, about), *_BODY],
     }
 
 
@@ -83,27 +94,50 @@ def _racing(env: RacingEnv) -> dict[str, Any]:
         "inputs": [
             ("to_gate", 3, "m", "world", 1.0, "centre of the next gate - position"),
             ("to_gate_after", 3, "m", "world", 1.0, "centre of the gate after that - position"),
+            *_BODY,
         ],
     }
 
 
+def _forest(env: ForestEnv) -> dict[str, Any]:
+    inputs: Inputs = [
+        ("up_in_body", 3, "1", "body", 10.0, "the world's z axis"),
+        (
+            "command_in_body",
+            3,
+            "m/s",
+            "body",
+            1.0,
+            "speed x way / max(length of way, 1 m), with way = target - position",
+        ),
+    ]
+    if env.observe_velocity:
+        inputs.insert(0, ("velocity_in_body", 3, "m/s", "body", 1.0, "velocity"))
+    return {
+        "rule": "course",
+        "target": [env.length + env.run_out, 0.0, env.cruise_height],
+        "speed": 0.5 * sum(env.speeds),
+        "speeds": list(map(float, env.speeds)),
+        "success": f"an episode: x >= {env.length} m, without having touched a tree or the ground",
+        "criteria": {"distance": env.length},
+        "box": _box(numbers(env.centre), numbers(env.extent), env.ceiling, env.scene.radius),
+        "inputs": inputs,
+    }
+
+
 _TASKS: dict[type[QuadrotorEnv], tuple[str, Callable[[Any], dict[str, Any]]]] = {
+    ForestEnv: ("forest", _forest),
     HoveringEnv: ("hovering", _hovering),
     LandingEnv: ("landing", _landing),
     RacingEnv: ("racing", _racing),
     TrackingEnv: ("tracking", _tracking),
 }
-_BODY = [
-    ("quaternion", 4, "1", "body to world", 10.0, "attitude (w, x, y, z), unit norm"),
-    ("velocity", 3, "m/s", "world", 1.0, "velocity"),
-    ("angular_velocity", 3, "rad/s", "body", 1.0, "body rates"),
-]
 
 
-def _box(centre: Any, half_width: Any, height: float) -> dict[str, list[float]]:
+def _box(centre: Any, half_width: Any, height: float, ground: float = 0.0) -> dict[str, list[float]]:
     half = np.broadcast_to(half_width, 2)
     low, high = ([float(np.round(c + s * h, 6)) for c, h in zip(centre, half, strict=False)] for s in (-1, 1))
-    return {"low": [*low, 0.0], "high": [*high, float(height)]}
+    return {"low": [*low, float(np.round(ground, 6))], "high": [*high, float(height)]}
 
 
 def _harmonics(env: TrackingEnv) -> dict[str, Any]:
@@ -131,8 +165,13 @@ def _harmonics(env: TrackingEnv) -> dict[str, Any]:
 # -- the contract ------------------------------------------------------------------------------------------------------
 
 
-def describe(env: QuadrotorEnv) -> dict[str, Any]:
+def describe(env: QuadrotorEnv, sees: bool = False, memory: int = 0) -> dict[str, Any]:
     """What a contract says of an environment, before anything has flown.
+
+    Args:
+        env: the environment.
+        sees: whether the policy reads the images of its camera.
+        memory: numbers that the policy keeps.
 
     Raises:
         ValueError: it is none of the tasks that a bundle can compute, or flies what a contract cannot say yet.
@@ -147,7 +186,8 @@ def describe(env: QuadrotorEnv) -> dict[str, Any]:
         raise ValueError(f'export_policy exports thrust and body rates alone, control="rates"; got {env.control!r}.')
     name, describe_task = _TASKS[kind]
     task = describe_task(env)
-    box, layout = task.pop("box"), [*task.pop("inputs"), *_BODY]
+    box, layout = task.pop("box"), task.pop("inputs")
+    camera = env.camera if sees else None
     if env.observe_last_action:
         about = "commands on their way, oldest first, each (thrust, roll rate, pitch rate, yaw rate)"
         layout.append(("action_queue", 4 * env.action_delay, "1", "action", 1.0, about))
@@ -158,11 +198,12 @@ def describe(env: QuadrotorEnv) -> dict[str, Any]:
     return {
         "task": {"name": name, "max_episode_steps": env.max_episode_steps, **task},
         "inputs": _inputs(layout),
+        "camera": None if camera is None else _camera(camera),
+        "memory": memory,
         "quaternion": {
             "order": "wxyz",
             "frame": "body (x forward, y left, z up) to world (z up)",
-            "sign": "q and -q are one attitude, and give different actions. The first quaternion of a flight has "
-            "w >= 0; each further one has the sign that brings it nearer to the one before.",
+            "sign": _SIGN if _BODY[0] in layout else "q and -q are one attitude, and give the same action.",
         },
         "action_queue": {"length": env.action_delay, "observed": env.observe_last_action},
         "output": {
@@ -191,6 +232,7 @@ def describe(env: QuadrotorEnv) -> dict[str, Any]:
         },
         "limits": {
             "max_state_age": round((1 + sensors.delay) * env.control_dt, 9),
+            "max_depth_age": camera and round((camera.rate + camera.delay) * env.control_dt, 9),
             "quaternion_norm_error": 1e-3,
             "max_value": 1e6,
         },
@@ -198,7 +240,14 @@ def describe(env: QuadrotorEnv) -> dict[str, Any]:
     }
 
 
-def _inputs(layout: list[tuple[str, int, str, str, float, str]]) -> list[dict[str, Any]]:
+def _camera(camera: Any) -> dict[str, Any]:
+    """A depth camera, in numbers alone."""
+    fields = {k: v for k, v in vars(camera).items() if k not in ("pitch", "differentiable")}
+    mount = numbers(camera.mount(torch.zeros((), dtype=torch.float64)) + 0.0)
+    return fields | {"position": list(map(float, camera.position)), "quaternion": mount}
+
+
+def _inputs(layout: Inputs) -> list[dict[str, Any]]:
     entries, start = [], 0
     for name, size, unit, frame, scale, meaning in layout:
         about = {"unit": unit, "frame": frame, "scale": scale, "meaning": meaning}
@@ -233,12 +282,21 @@ def _randomized(env: QuadrotorEnv) -> dict[str, Any]:
 def _disturbances(env: QuadrotorEnv) -> dict[str, Any]:
     described = {}
     for name, x in env.disturbances.items():
+        if x is env.disturbances.get("camera"):
+            continue  # a field of its own
         fields = {} if isinstance(x, DroneRandomization) else vars(x)
-        plain = {k: numbers(np.asarray(v)) for k, v in fields.items() if np.asarray(v).dtype.kind in "fiub"}
+        plain = {k: numbers(np.asarray(v)) for k, v in fields.items() if _is_plain(v)}
         described[name] = {"kind": type(x).__name__, **plain}
         if isinstance(x, Wind | Sensors):
             described[name]["about"] = str(type(x).__doc__).splitlines()[0]
     return described
+
+
+def _is_plain(x: Any) -> bool:
+    """Whether it is a number, or numbers in an array; the obstacles of a scene are not."""
+    with contextlib.suppress(ValueError, TypeError):
+        return np.asarray(x).dtype.kind in "fiub"
+    return False
 
 
 def _rate_loop(env: QuadrotorEnv, drone: Mapping[str, Any]) -> dict[str, Any] | None:

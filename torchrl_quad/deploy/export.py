@@ -8,10 +8,9 @@ import itertools
 import json
 import os
 from collections.abc import Mapping
-from importlib import metadata, resources
+from importlib import metadata
 from pathlib import Path
-from string import Template
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,21 +19,29 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import set_recurrent_mode
 
 from torchrl_quad.data import ObservationNormalizer, base_env, differentiable_rollout
 from torchrl_quad.data.normalizer import NormalizedPolicy
+from torchrl_quad.data.unwrap import memory_keys
 from torchrl_quad.deploy import contract as contracts
 from torchrl_quad.deploy.bundle import QUANTITIES, load_bundle
 from torchrl_quad.deploy.describe import describe, envelope, results, seen_ranges
 from torchrl_quad.deploy.folder import replacing_folder, require_replaceable, restore
-from torchrl_quad.deploy.network import ACTIVATIONS, Layer, write_c, write_onnx
-from torchrl_quad.deploy.tasks import PROGRESS, Rule
+from torchrl_quad.deploy.folding import fold
+from torchrl_quad.deploy.network import write_c, write_onnx
+from torchrl_quad.deploy.page import write_page
+from torchrl_quad.deploy.tasks import PROGRESS, Rule, progress_of
 from torchrl_quad.envs import QuadrotorEnv
 
 VECTORS, SELF_TEST_VECTORS = 1024, 16
+IMAGES, SELF_TEST_IMAGES = 256, 4  # the same with images, which are large
 STARTS = 2_000_000  # seed of the starts, that of recipes/evaluate.py
 REPLAYED = 2  # environments whose first episode the bundle flies again
+MOST_NUMBERS = 10_000_000  # that a part of a flight observes; a forest is flown in several parts
+NEVER_JUDGED = (("depth",), ("state", "images"), ("state", "scene"))  # entries that take most of a flight's memory
 TOLERANCE = 1e-5  # of an action
+MEMORY_TOLERANCE = 1e-4  # of an action within an episode: rounding errors go on in the memory
 OBSERVATION_TOLERANCE = 1e-3  # of an entry of the observation: float32 adds up a phase less exactly than a bundle
 
 
@@ -46,26 +53,31 @@ def export_policy(
     *,
     origin: Mapping[str, str] | None = None,
 ) -> Path:
-    """Write a policy of :func:`~torchrl_quad.make_actor` as a folder that flies without torch, or replace that folder.
+    """Write a policy as a folder that flies without torch, or replace that folder.
 
-    The deterministic policy flies one episode from a fresh start in each environment, and further ones until there are
-    1024 observations. The contract takes its ranges and results from this flight. Then the bundle flies two episodes
-    again from the named quantities of the state, and must observe what the environment did. The same policy and
-    environment give the same bytes. The environment draws afterwards as if nothing had been exported.
+    The policy is one of :func:`~torchrl_quad.make_actor` or :func:`~torchrl_quad.make_visual_actor`. Without noise it
+    flies one episode from a fresh start in each environment, and further ones until there are 1024 observations. The
+    contract takes its ranges and results from this flight. Then the bundle flies two episodes again, from the named
+    quantities of the state and the images. It must observe what the environment did, and act and remember as the policy
+    does. The same policy and environment give the same bytes. The environment draws afterwards as if nothing had been
+    exported.
 
     ==================  ================================================================================================
     file                holds
     ==================  ================================================================================================
-    ``policy.onnx``     ``observation`` (batch, k) to ``action`` (batch, 4), float32, with normaliser and scaling in it
+    ``policy.onnx``     ``observation`` (batch, k) to ``action`` (batch, 4), float32, with normaliser and scaling in it;
+                        of a policy that sees also ``depth`` (batch, 1, height, width), of one that remembers
+                        ``memory`` (batch, m) to ``next_memory``
     ``policy.h, .c``    the same in C99, with a self-test
     ``contract.json``   what each number means; :func:`~torchrl_quad.deploy.contract.schema` is its JSON schema
     ``starts.npz``      the states (num_envs, ...) in which these episodes began, and where in the task
-    ``vectors.npz``     1024 visited ``observation`` with the ``action`` that the actor gave
+    ``vectors.npz``     1024 visited ``observation`` (256 of a policy that sees) and the ``action`` that the actor gave;
+                        ``depth``, ``memory`` and ``next_memory`` of a policy that has them
     ``README.md``       how to fly it
     ==================  ================================================================================================
 
     Args:
-        actor: the policy; it must read the observation alone.
+        actor: the policy; it must read the observation alone, or beside it the image.
         env: one of the package's tasks, or a TransformedEnv with an ObservationNormalizer alone.
         folder: where to write. Its parent is made if it is missing.
         normalizer: what the actor reads the observation through; by default that of the TransformedEnv, if it is one.
@@ -88,9 +100,12 @@ def export_policy(
     place = Path(folder).resolve()  # a link stays, what it points to is replaced
     require_replaceable(place)
     restore(place)
-    contract = {"version": contracts.VERSION, **describe(env)}
-    layers = fold(actor, normalizer)
-    width, size = layers[0].weight.shape[1], contract["inputs"][-1]["stop"]
+    camera = env.camera
+    network = fold(actor, normalizer, camera and (camera.height, camera.width))
+    reads = network.reads
+    contract = {"version": contracts.VERSION}
+    contract |= describe(env, sees="depth" in reads, memory=reads.get("memory", (0,))[0])
+    (width,), size = reads["observation"], contract["inputs"][-1]["stop"]
     shape = env.observation_spec["observation"].shape
     if not width == size == shape[-1]:
         raise ValueError(
@@ -98,19 +113,19 @@ def export_policy(
             f"{type(env).__name__} is known to observe {size}."
         )
     policy = actor if normalizer is None else NormalizedPolicy(actor, normalizer)
-    flight = _fly(env, policy)
-    visited = flight["observation"].flatten(0, 1)
-    observation = visited[torch.linspace(0, len(visited) - 1, VECTORS).long()].float()
-    vectors = {"observation": observation.cpu().numpy(), "action": _act(policy, env, observation).cpu().numpy()}
+    count, self_test = (IMAGES, SELF_TEST_IMAGES) if "depth" in reads else (VECTORS, SELF_TEST_VECTORS)
+    flight = _fly(env, policy, count)
+    vectors = _vectors(policy, env, flight.chosen)
+    visited = flight.whole["observation"].flatten(0, 1)
     contract["inputs"] = seen_ranges(contract["inputs"], visited.float().cpu().numpy())
-    contract["safety"]["seen"] = envelope(flight)
-    contract["results"] = results(env, flight)
-    weights = b"".join(x.tobytes() for layer in layers for x in layer[:2])
+    contract["safety"]["seen"] = envelope(flight.whole)
+    contract["results"] = results(env, flight.whole)
+    weights = b"".join(x.tobytes() for x in network.weights())
     package = {"package": _version(), "weights_sha256": contracts.sha256(weights)}
     contract["origin"] = package | dict(origin or {})
-    files = {"policy.onnx": write_onnx(layers), "vectors.npz": _npz(vectors), "README.md": _readme(contract)}
-    files["starts.npz"] = _npz(_starts(flight, contract["task"]["rule"]))
-    files |= write_c(layers, contract, *(x[:: VECTORS // SELF_TEST_VECTORS] for x in vectors.values()))
+    files = {"policy.onnx": write_onnx(network), "vectors.npz": _npz(vectors), "README.md": write_page(contract)}
+    files["starts.npz"] = _npz(_starts(flight.whole, contract["task"]["rule"]))
+    files |= write_c(network, contract, {name: x[:: count // self_test] for name, x in vectors.items()})
     contract["sha256"] = {name: contracts.sha256(files[name]) for name in contracts.FILES}
     contract["digest"] = contracts.digest(contract)
     files["contract.json"] = (json.dumps(contract, indent=2, allow_nan=False) + "\n").encode()
@@ -119,50 +134,8 @@ def export_policy(
             with open(temporary / name, "wb") as file:
                 file.write(content)
                 os.fsync(file.fileno())
-        _require_the_same_flight(temporary, env, flight)
+        _require_the_same_flight(temporary, env, policy, flight.replayed)
     return Path(folder)
-
-
-def fold(actor: TensorDictModuleBase, normalizer: ObservationNormalizer | None = None) -> list[Layer]:
-    """The layers of a policy's mean action, in float32, with the normaliser and the input's scale in the first.
-
-    Raises:
-        ValueError: the policy is not one that :func:`~torchrl_quad.make_actor` builds, or reads more than observations.
-    """
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        plain = actor.plain() if hasattr(actor, "plain") and not isinstance(actor, NormalizedPolicy) else None
-    if plain is None:
-        raise ValueError(
-            "export_policy exports what make_actor builds, with its parts as they are and without hooks: a "
-            f"tanh-Gaussian multi-layer perceptron. This {type(actor).__name__} is something else; build the policy "
-            "with make_actor(env, ...), and load your weights into it."
-        )
-    if plain.in_keys != ["observation"]:
-        raise ValueError(
-            f'export_policy: the policy reads {plain.in_keys}. A drone can give it the "observation" alone: train it '
-            "with in_keys=['observation']."
-        )
-    if plain.low is not None:
-        raise ValueError(f"export_policy: actions must lie from -1 to 1, got {plain.low} to {plain.high}.")
-    names = [type(activation).__name__ for activation in plain.activations]
-    for name, activation in zip(names, plain.activations, strict=True):
-        if name not in ACTIVATIONS or repr(activation) != repr(type(activation)()):
-            raise ValueError(
-                f"export_policy cannot write {activation} as ONNX and C. Choose from: {', '.join(ACTIVATIONS)}, with "
-                "their default arguments."
-            )
-    values = [x.detach().double().cpu().numpy() for x in plain.weights]
-    weights, biases = values[::2], values[1::2]
-    weights[0] = weights[0] * plain.scales[0]
-    if normalizer is not None:
-        loc, scale = (x.double().cpu().numpy() for x in (normalizer.loc, normalizer.scale))
-        weights[0] = weights[0] / scale
-        biases[0] = biases[0] - weights[0] @ loc
-    weights[-1], biases[-1] = weights[-1][: plain.size], biases[-1][: plain.size]  # the rest is the noise's
-    if not all(np.isfinite(x).all() for x in (*weights, *biases)):
-        raise ValueError("export_policy: the weights of the policy, or its normaliser, are not finite.")
-    layers = zip(weights, biases, [*names, "Tanh"], strict=True)
-    return [Layer(w.astype(np.float32), b.astype(np.float32), name) for w, b, name in layers]
 
 
 def _unwrapped(
@@ -183,55 +156,104 @@ def _unwrapped(
     return base_env(env), normalizer
 
 
+class _Flight(NamedTuple):
+    """A deterministic flight from fresh starts."""
+
+    whole: TensorDictBase  #: (num_envs, time), without what nobody judges
+    replayed: TensorDictBase  #: (REPLAYED, time), everything
+    chosen: TensorDictBase  #: (n), what the policy reads in single steps
+
+
 @torch.no_grad()
-def _fly(env: QuadrotorEnv, policy: TensorDictModuleBase) -> TensorDictBase:
-    """A deterministic flight (num_envs, time) from fresh starts; the environment then goes on as if there was none."""
+def _fly(env: QuadrotorEnv, policy: TensorDictModuleBase, count: int) -> _Flight:
+    """Fly, and choose single steps; the environment then goes on as if there was no flight."""
     steps = max(env.max_episode_steps, -(-VECTORS // env.num_envs))
+    chosen = torch.linspace(0, env.num_envs * steps - 1, count).long()
+    drone, step = chosen // steps, chosen % steps
+    keys = [key for key in policy.in_keys if key != "is_init"]
+    mode = {"exploration_type": ExplorationType.DETERMINISTIC}
     random, source = env.random_state(), env.initial_state_source
+    parts: list[tuple[TensorDictBase, ...]] = []
     try:
         env.set_initial_state_source(None)
         env.randomness.seed(STARTS)
-        flight, _ = differentiable_rollout(env, policy, None, steps, exploration_type=ExplorationType.DETERMINISTIC)
+        carry, begin = env.reset(), 0
+        longest = max(1, MOST_NUMBERS // sum(x.numel() for x in carry.values(True, True)))
+        while begin < steps:
+            part, carry = differentiable_rollout(env, policy, carry, min(longest, steps - begin), **mode)
+            end = begin + part.shape[1]
+            here = ((begin <= step) & (step < end)).nonzero().squeeze(-1)
+            heavy = [key for name in NEVER_JUDGED for key in (name, ("next", *name))]
+            read = part.select(*keys)[drone[here], step[here] - begin]
+            parts.append((part.exclude(*heavy).clone(), part[:REPLAYED].clone(), read.set("place", here)))
+            begin = end
     finally:
         env.set_initial_state_source(source)
         env.set_random_state(random)
-    return flight
+    whole, replayed, read = zip(*parts, strict=True)
+    read = torch.cat(read)
+    return _Flight(torch.cat(whole, 1), torch.cat(replayed, 1), read[read["place"].argsort()])
 
 
 @torch.no_grad()
-def _act(policy: TensorDictModuleBase, env: QuadrotorEnv, observation: Tensor) -> Tensor:
-    """What the policy does (n, 4), as it is and not folded."""
-    seen = TensorDict({"observation": observation.to(env.dtype)}, [len(observation)], env.device)
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        return policy(seen)["action"].float()
+def _act(policy: TensorDictModuleBase, env: QuadrotorEnv, seen: Mapping[Any, Tensor]) -> TensorDictBase:
+    """What the policy does, as it is and not folded, with what it reads: in single steps (n), or in an episode
+    (1, time), in which its memory comes about anew."""
+    shape = seen["observation"].shape[:-1]
+    given = TensorDict({key: x.to(env.device, env.dtype) for key, x in seen.items()}, shape, env.device)
+    if "is_init" in policy.in_keys:
+        given["is_init"] = torch.zeros((*shape, 1), dtype=torch.bool, device=env.device)
+        given["is_init"][:, 0] = len(shape) > 1
+    with set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(len(shape) > 1):
+        return policy(given)
+
+
+def _vectors(policy: TensorDictModuleBase, env: QuadrotorEnv, chosen: TensorDictBase) -> dict[str, np.ndarray]:
+    """What the policy reads and writes in single steps, float32, by the names that its ONNX has for it."""
+    seen = {key: chosen[key].float() for key in policy.in_keys if key != "is_init"}
+    acted, memory = _act(policy, env, seen), memory_keys(policy)
+    vectors = {name: seen[name] for name in ("observation", "depth") if name in seen}
+    vectors |= {"memory": seen[memory[0]].flatten(1)} if memory else {}
+    vectors |= {"action": acted["action"]}
+    vectors |= {"next_memory": acted["next", memory[0]].flatten(1)} if memory else {}
+    return {name: x.float().cpu().numpy() for name, x in vectors.items()}
 
 
 def _starts(flight: TensorDictBase, rule: str) -> dict[str, np.ndarray]:
     """The first states of a flight (num_envs, ...), without what the environment drew beside them."""
-    names = [*QUANTITIES, PROGRESS[rule]]
+    names = [*QUANTITIES, *PROGRESS[rule]]
     return {name: flight["state", name][:, 0].cpu().numpy() for name in names}
 
 
-def _require_the_same_flight(folder: Path, env: QuadrotorEnv, flight: TensorDictBase) -> None:
-    """Fly the bundle through the first episodes of a flight, from what a drone knows, and compare what it observes."""
+def _require_the_same_flight(
+    folder: Path, env: QuadrotorEnv, policy: TensorDictModuleBase, flights: TensorDictBase
+) -> None:
+    """Fly the bundle through the first episodes of flights, from what a drone knows.
+
+    Compare what it observes with what the environment did, and what it then does and remembers with what the policy
+    does, in the same order, with the same observations.
+    """
     bundle = load_bundle(folder)
     bundle.check(TOLERANCE)
-    entry = PROGRESS[bundle.contract["task"]["rule"]]
-    for i in range(min(REPLAYED, env.num_envs)):
-        done = flight[i]["next", "done"].flatten()
+    for flight in flights:
+        done = flight["next", "done"].flatten()
         length = int(done.nonzero()[0]) + 1 if done.any() else len(done)
-        episode = flight[i, :length]
+        episode = flight[:length]
         seen = {key: episode["state", key] for key in env.control_step.safe_state}
         for disturbance in env.disturbances.values():
             seen = disturbance.observe(seen)
-        start = seen[entry][0].cpu().numpy()
-        bundle.reset(**{entry: start if start.size > 1 else start.item()})
-        states = {k: seen[k].cpu().numpy() for k in ("position", "quaternion", "velocity", "angular_velocity")}
+        rule = bundle.contract["task"]["rule"]
+        bundle.reset(**progress_of(rule, {key: seen[key][0].cpu().numpy() for key in PROGRESS[rule]}))
+        states = {k: seen[k].cpu().numpy() for k in QUANTITIES}
+        states |= {"depth": episode["depth"].cpu().numpy()} if bundle.contract["camera"] else {}
         true = episode["state", "position"].cpu().numpy()
         if not np.array_equal(true, states["position"]):
             _go_by(bundle.rule, true)  # the environment counts gates from there, a bundle from what it measures
+        observed, acted = [], []
         for t in range(length):
-            bundle({name: x[t] for name, x in states.items()} | {"age": 0.0})
+            bundle({name: x[t] for name, x in states.items()} | {"age": 0.0, "depth_age": 0.0})
+            observed.append(bundle.observation)
+            acted.append(bundle.action)
             gap = np.abs(bundle.observation - episode["observation"][t].float().cpu().numpy()).max()
             if not gap <= OBSERVATION_TOLERANCE:
                 raise ValueError(
@@ -239,6 +261,14 @@ def _require_the_same_flight(folder: Path, env: QuadrotorEnv, flight: TensorDict
                     f"in step {t}. A contract describes the package's own observations and rules; this environment has "
                     "others."
                 )
+        read = {key: episode[key] for key in policy.in_keys if key != "is_init"}
+        read["observation"] = torch.from_numpy(np.stack(observed))
+        again = _act(policy, env, {key: x[None] for key, x in read.items()})["action"][0].float().cpu().numpy()
+        gap = np.abs(np.stack(acted) - again).max()
+        if not gap <= MEMORY_TOLERANCE:
+            raise ValueError(
+                f"export_policy: the bundle acts otherwise than the policy, by {gap:.3g} within an episode."
+            )
 
 
 def _go_by(rule: Rule, positions: np.ndarray) -> None:
@@ -257,49 +287,3 @@ def _version() -> str:
     with contextlib.suppress(metadata.PackageNotFoundError):
         return f"torchrl_quad {metadata.version('torchrl_quad')}"
     return "torchrl_quad"
-
-
-def _readme(contract: Mapping[str, Any]) -> bytes:
-    """The page for people who have not read ours."""
-    task, output = contract["task"], contract["output"]
-    columns = ("name", "scale", "unit", "frame", "meaning")
-    inputs = [
-        " | ".join((f"| {x['start']} to {x['stop'] - 1}", *(f"{x[column]}" for column in columns), "")).rstrip()
-        for x in contract["inputs"]
-    ]
-    rules = {
-        "target": "The target is `task.target`; give another one if you like, the policy sees the difference alone.",
-        "curve": "The point moves along the curve of `task`: offset + sum over k = 1, 2, ... of cosine[k-1] "
-        "cos(k phase) + sine[k-1] sin(k phase). The phase starts anywhere, and grows by 2 pi control_dt / period in "
-        "each control step after the first. Point i = 1, 2, ... has the phase + 2 pi i lookahead_interval / period.",
-        "gates": "A gate is passed when the straight line between the measured positions of two control steps comes "
-        "nearer to its centre than `task.gate_radius`; training counted with true positions. The observation of that "
-        "step is already about the gate after it. After the last gate comes the first.",
-    }
-    queue = contract["action_queue"]
-    values = {
-        "task": task["name"],
-        "size": contract["inputs"][-1]["stop"],
-        "inputs": "\n".join(inputs),
-        "rule": rules[task["rule"]],
-        "success": task["success"],
-        "progress": PROGRESS[task["rule"]],
-        "sign": contract["quaternion"]["sign"],
-        "queue": (
-            "They start as hover actions. After each step drop the oldest four numbers and append the action."
-            if queue["observed"]
-            else "This policy does not observe the commands on their way."
-        ),
-        "max_thrust": f"{output['thrust']['range'][1]:.6g}",
-        "weight": f"{output['thrust']['weight']:.6g}",
-        "rates": ", ".join(f"{high:g}" for _, high in output["body_rate"]["range"]),
-        "hover": ", ".join(f"{x:.6g}" for x in output["hover_action"]),
-        "control_dt": f"{contract['control_dt']:g}",
-        "delay": contract["action_delay"],
-        "delay_seconds": f"{contract['action_delay'] * contract['control_dt']:g}",
-        "age": f"{contract['limits']['max_state_age']:g}",
-        "fields": contracts.schema_table(),
-        "package": contract["origin"]["package"],
-    }
-    template = (resources.files(__package__) / "templates" / "README.md").read_text()
-    return Template(template).substitute(values).encode()

@@ -85,8 +85,13 @@ def judge(contract: Mapping[str, Any], flight: Flight) -> dict[str, Array]:
     Returns:
         by name, each (n): ``solved`` and ``crash``, 0 or 1; and the metrics of the task that are in SI units:
         ``position_error``, ``tracking_rmse``, ``landing_speed``, ``gates_passed`` and ``lap_time``, of those it has.
+
+    Raises:
+        ValueError: the task has obstacles, which nobody can judge without them.
     """
     task, limits = contract["task"], contract["task"]["criteria"]
+    if task["name"] not in PRECISION:
+        raise ValueError(f"judge knows the tasks {', '.join(PRECISION)}; {task['name']!r} has obstacles to hit.")
     steps, crash = episode_steps(contract, flight)
     target, passed = targets(contract, flight)
     number = np.arange(flight["position"].shape[1])  # of each state, 0 at the start

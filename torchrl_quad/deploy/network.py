@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import itertools
+import math
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from importlib import resources
 from string import Template
 from typing import Any, NamedTuple
@@ -12,6 +15,8 @@ from numpy.typing import NDArray
 
 OPSET, IR_VERSION = 20, 10  # onnxruntime reads both since 1.18
 LIMIT = np.float32(1.0 - 1e-6)  # of the action; TorchRL's TanhNormal keeps as far from -1 and 1
+
+Array = NDArray[np.float32]
 
 # By the name of a torch.nn activation with its default arguments: the ONNX operator (with those of its attributes that
 # are not ONNX's defaults), and the C expression of x.
@@ -33,37 +38,120 @@ ACTIVATIONS: dict[str, tuple[str, str]] = {
 
 
 class Layer(NamedTuple):
-    """A layer: activation(weight x + bias)."""
+    """A layer: activation(weight x + bias). That of an eye is a convolution, which halves height and width."""
 
-    weight: NDArray[np.float32]  #: (out, in)
-    bias: NDArray[np.float32]  #: (out)
+    weight: Array  #: (out, in), of an eye (out, in, 3, 3)
+    bias: Array  #: (out)
     activation: str  #: one of ``ACTIVATIONS``; the last layer's is Tanh, and the action is clamped to ``LIMIT``
 
 
-def write_onnx(layers: list[Layer]) -> bytes:
-    """The network as ONNX: ``observation`` (batch, k) to ``action`` (batch, 4), both float32, with a free batch axis.
+class Memory(NamedTuple):
+    """A gated recurrent unit as torch writes it: rows for the reset gate, the update gate, and the new value."""
 
-    The same layers give the same bytes.
+    weight: Array  #: (3 m, in), of what it reads
+    bias: Array  #: (3 m)
+    own_weight: Array  #: (3 m, m), of the memory itself
+    own_bias: Array  #: (3 m)
+
+
+class Network(NamedTuple):
+    """A policy: layers, and of a policy that sees the eyes before them and a memory beside the last one."""
+
+    layers: list[Layer]  #: the first reads what the eyes found, then the observation; the last one answers
+    eyes: Sequence[Layer] = ()
+    image: tuple[int, int] = (0, 0)  #: height and width
+    nearest: float = 0.0  #: the eyes read 1 / max(depth, nearest) [m]
+    memory: Memory | None = None  #: reads what the last layer reads, which then reads the memory, too
+
+    @property
+    def images(self) -> list[tuple[int, int, int]]:
+        """Channels, height and width of the image, and of what each eye makes of it."""
+        found = [(1, *self.image)]
+        for eye in self.eyes:
+            _, height, width = found[-1]
+            found.append((len(eye.bias), (height + 1) // 2, (width + 1) // 2))
+        return found
+
+    @property
+    def found(self) -> int:
+        """How many numbers the eyes give."""
+        return math.prod(self.images[-1]) if self.eyes else 0
+
+    @property
+    def reads(self) -> dict[str, tuple[int, ...]]:
+        """The shapes of what it reads, by name, without the batch."""
+        shapes: dict[str, tuple[int, ...]] = {"observation": (self.layers[0].weight.shape[1] - self.found,)}
+        shapes |= {"depth": self.images[0]} if self.eyes else {}
+        return shapes | ({"memory": (self.memory.own_weight.shape[1],)} if self.memory else {})
+
+    def weights(self) -> Iterator[Array]:
+        """All weights and biases, in the order in which they are used."""
+        for layer in (*self.eyes, *self.layers[:-1]):
+            yield from layer[:2]
+        yield from self.memory or ()
+        yield from self.layers[-1][:2]
+
+
+# -- ONNX --------------------------------------------------------------------------------------------------------------
+
+
+def write_onnx(network: Network) -> bytes:
+    """The network as ONNX, all float32, with a free batch axis. The same weights give the same bytes.
+
+    It reads ``observation`` (batch, k), ``depth`` (batch, 1, height, width) and ``memory`` (batch, m), of those that
+    there are, and returns ``action`` (batch, 4) and ``next_memory``.
     """
     import onnx  # only who exports needs it
     from onnx import TensorProto, helper, numpy_helper
 
-    nodes, constants, x = [], [], "observation"
-    for i, layer in enumerate(layers):
-        for name, value in (("weight", layer.weight), ("bias", layer.bias)):
-            constants.append(numpy_helper.from_array(value, f"{name}_{i}"))
-        nodes.append(helper.make_node("Gemm", [x, f"weight_{i}", f"bias_{i}"], [f"sum_{i}"], transB=1))
-        x = f"layer_{i}"
-        if layer.activation == "SiLU":
-            nodes.append(helper.make_node("Sigmoid", [f"sum_{i}"], [f"gate_{i}"]))
-            nodes.append(helper.make_node("Mul", [f"sum_{i}", f"gate_{i}"], [x]))
+    nodes: list[Any] = []
+    constants: list[Any] = []
+
+    def add(operator: str, reads: Sequence[str], name: str, **options: Any) -> str:
+        nodes.append(helper.make_node(operator, [*reads], [name] if operator != "GRU" else ["", name], **options))
+        return name
+
+    def constant(name: str, value: Any, dtype: Any = np.float32) -> str:
+        constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
+        return name
+
+    def run(layer: Layer, x: str, suffix: str) -> str:
+        own = [constant(f"{name}_{suffix}", value) for name, value in zip(("weight", "bias"), layer, strict=False)]
+        if layer.weight.ndim == 4:
+            total = add("Conv", [x, *own], f"sum_{suffix}", strides=[2, 2], pads=[1, 1, 1, 1])
         else:
-            nodes.append(helper.make_node(ACTIVATIONS[layer.activation][0], [f"sum_{i}"], [x]))
-    for name, limit in (("low", -LIMIT), ("high", LIMIT)):
-        constants.append(numpy_helper.from_array(np.array(limit, np.float32), name))
-    nodes.append(helper.make_node("Clip", [x, "low", "high"], ["action"]))
-    sizes = {"observation": layers[0].weight.shape[1], "action": len(layers[-1].bias)}
-    ends = [[helper.make_tensor_value_info(k, TensorProto.FLOAT, ["batch", n])] for k, n in sizes.items()]
+            total = add("Gemm", [x, *own], f"sum_{suffix}", transB=1)
+        if layer.activation == "SiLU":
+            return add("Mul", [total, add("Sigmoid", [total], f"gate_{suffix}")], f"layer_{suffix}")
+        return add(ACTIVATIONS[layer.activation][0], [total], f"layer_{suffix}")
+
+    x = "observation"
+    if network.eyes:
+        seen = add("Max", ["depth", constant("nearest", network.nearest)], "clamped")
+        seen = add("Reciprocal", [seen], "inverse")
+        for i, eye in enumerate(network.eyes):
+            seen = run(eye, seen, f"eye_{i}")
+        x = add("Concat", [add("Flatten", [seen], "found"), x], "seen", axis=1)
+    for i, layer in enumerate(network.layers[:-1]):
+        x = run(layer, x, f"{i}")
+    if network.memory:
+        at = constant("axis", [0], np.int64)
+        weight, bias, own_weight, own_bias = map(_update_first, network.memory)
+        parts = {"memory_weight": weight, "memory_own_weight": own_weight, "memory_bias": np.append(bias, own_bias)}
+        sequence, before = add("Unsqueeze", [x, at], "sequence"), add("Unsqueeze", ["memory", at], "before")
+        reads = [sequence, *(constant(name, value[None]) for name, value in parts.items()), "", before]
+        size = network.memory.own_weight.shape[1]
+        after = add("GRU", reads, "after", hidden_size=size, linear_before_reset=1)
+        x = add("Concat", [x, add("Squeeze", [after, at], "next_memory")], "recalled", axis=1)
+    x = run(network.layers[-1], x, f"{len(network.layers) - 1}")
+    add("Clip", [x, constant("low", -LIMIT), constant("high", LIMIT)], "action")
+    shapes = network.reads
+    written = {"action": (len(network.layers[-1].bias),)}
+    written |= {"next_memory": shapes["memory"]} if network.memory else {}
+    ends = [
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape]) for name, shape in side.items()]
+        for side in (shapes, written)
+    ]
     graph = helper.make_graph(nodes, "policy", *ends, constants)
     opset = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(graph, producer_name="torchrl_quad", ir_version=IR_VERSION, opset_imports=opset)
@@ -71,58 +159,128 @@ def write_onnx(layers: list[Layer]) -> bytes:
     return model.SerializeToString(deterministic=True)
 
 
-def write_c(
-    layers: list[Layer], contract: Mapping[str, Any], observation: NDArray[np.float32], action: NDArray[np.float32]
-) -> dict[str, bytes]:
-    """The network as C99: the files ``policy.h`` and ``policy.c``, with vectors (n, k) and (n, 4) for its self-test."""
-    output, steps, x = contract["output"], [], "observation"
-    for i, layer in enumerate(layers):
-        y = "action" if i == len(layers) - 1 else ("one", "two")[i % 2]
-        rows, columns = layer.weight.shape
-        steps.append(f"    sum(weight_{i}, bias_{i}, {columns}, {x}, {rows}, {y});")
-        steps.append(f"    for (int i = 0; i < {rows}; ++i) {y}[i] = {_function(layer.activation)}({y}[i]);")
-        x = y
-    names = sorted({layer.activation for layer in layers})
-    rates = [high for _, high in output["body_rate"]["range"]]
+def _update_first(rows: Array) -> Array:
+    """The rows of a recurrent unit in the order of ONNX: update gate, reset gate, new value."""
+    reset, update, new = np.split(rows, 3)
+    return np.concatenate((update, reset, new))
+
+
+# -- C -----------------------------------------------------------------------------------------------------------------
+
+
+def write_c(network: Network, contract: Mapping[str, Any], vectors: Mapping[str, Array]) -> dict[str, bytes]:
+    """The network as C99: the files ``policy.h`` and ``policy.c``.
+
+    Args:
+        network: the policy.
+        contract: of its bundle.
+        vectors: for the self-test, (n, ...) by name: what the ONNX of the network reads and writes.
+    """
+    output, reads = contract["output"], network.reads
+    names = sorted({layer.activation for layer in (*network.eyes, *network.layers)})
+    tests = {f"test_{name}": _rows(x.reshape(len(x), -1)) for name, x in vectors.items()}
+    others = [name for name in reads if name != "observation"]
+    parameters = {"depth": " const float depth[POLICY_DEPTH],", "memory": f"\n{18 * ' '}float memory[POLICY_MEMORY],"}
+    arguments = {"depth": "test_depth + n * POLICY_DEPTH", "memory": "memory"}
     values = {
         "task": contract["task"]["name"],
         "version": contract["version"],
-        "observation": observation.shape[1],
         "control_dt": _float(contract["control_dt"]),
         "action_delay": contract["action_delay"],
         "hover_action": _floats(output["hover_action"]),
         "max_thrust": _float(output["thrust"]["range"][1]),
-        "max_rates": _floats(rates),
+        "max_rates": _floats(high for _, high in output["body_rate"]["range"]),
         "limit": _float(LIMIT),
-        "width": max(len(layer.bias) for layer in layers),
         "activations": "\n".join(
             f"static float {_function(name)}(float x) {{ return {ACTIVATIONS[name][1]}; }}" for name in names
         ),
-        "weights": "\n".join(_constants(layers)),
-        "layers": "\n".join(steps),
-        "vectors": len(observation),
-        "test_observation": _rows(observation),
-        "test_action": _rows(action),
+        "weights": "\n".join(_constants(network)),
+        "vectors": len(vectors["action"]),
+        "parameters": "".join(parameters[name] for name in others),
+        "arguments": "".join(f", {arguments[name]}" for name in others),
+        **{name: math.prod(shape) for name, shape in reads.items()},
+        **tests,
+        **_sizes(network),
+        "layers": "\n".join(f"    {line}" for line in _steps(network)),
     }
-    templates = resources.files(__package__) / "templates"
-    return {
-        name: Template((templates / name).read_text()).substitute(values).encode() for name in ("policy.h", "policy.c")
-    }
+    return {name: fill_in(name, values, others).encode() for name in ("policy.h", "policy.c")}
 
 
-def _constants(layers: list[Layer]) -> Iterator[str]:
-    for i, layer in enumerate(layers):
+def fill_in(template: str, values: Mapping[str, Any], features: Collection[str]) -> str:
+    """A file from its template. Lines that begin with ``@name`` stay, without it, where there is such a feature."""
+    lines = []
+    for line in (resources.files(__package__) / "templates" / template).read_text().splitlines(keepends=True):
+        marked = re.match(r"@(\w+) ?", line)
+        if marked is None or marked[1] in features:
+            lines.append(line[marked.end() if marked else 0 :])
+    return Template("".join(lines)).substitute(values)
+
+
+def _sizes(network: Network) -> dict[str, int]:
+    """Of the image, and how many floats the C code needs between its steps."""
+    between = [layer.weight.shape[0] for layer in network.layers]
+    between += [math.prod(image) for image in network.images] if network.eyes else []
+    (rows, columns), recalled = network.image, network.layers[-1].weight.shape[1]
+    return {"rows": rows, "columns": columns, "width": max(between), "found": network.found, "recalled": recalled}
+
+
+def _steps(network: Network) -> Iterator[str]:
+    """The statements of the C code, one for each part of the network."""
+    places = itertools.cycle(("one", "two"))
+    x = "observation"
+    if network.eyes:
+        x = next(places)
+        yield f"for (int i = 0; i < POLICY_DEPTH; ++i) {x}[i] = 1.0f / fmaxf(depth[i], {_float(network.nearest)});"
+        images = network.images
+        for i, (eye, (channels, height, width), after) in enumerate(
+            zip(network.eyes, images, images[1:], strict=False)
+        ):
+            y = "seen" if i == len(network.eyes) - 1 else next(places)
+            own = f"eye_weight_{i}, eye_bias_{i}"
+            yield f"convolve({own}, {channels}, {height}, {width}, {x}, {after[0]}, {y});"
+            yield _activate(eye, y, math.prod(after))
+            x = y
+        yield f"for (int i = 0; i < POLICY_OBSERVATION; ++i) seen[{network.found} + i] = observation[i];"
+    for i, layer in enumerate(network.layers):
+        is_last = i == len(network.layers) - 1
+        if is_last and network.memory:
+            size, own = len(layer.weight[0]) - network.memory.own_weight.shape[1], "memory_weight, memory_bias"
+            yield f"remember({own}, own_weight, own_bias, {size}, recalled, memory, recalled + {size});"
+            x = "recalled"
+        reads_memory = network.memory and i == len(network.layers) - 2
+        y = "action" if is_last else "recalled" if reads_memory else next(places)
         rows, columns = layer.weight.shape
-        # One row for each input: the inner loop then runs along memory.
-        yield f"static const float weight_{i}[{columns * rows}] = {{\n{_rows(layer.weight.T)}\n}};"
-        yield f"static const float bias_{i}[{rows}] = {{{_floats(layer.bias)}}};"
+        yield f"sum(weight_{i}, bias_{i}, {columns}, {x}, {rows}, {y});"
+        yield _activate(layer, y, rows)
+        x = y
+
+
+def _activate(layer: Layer, x: str, size: int) -> str:
+    return f"for (int i = 0; i < {size}; ++i) {x}[i] = {_function(layer.activation)}({x}[i]);"
+
+
+def _constants(network: Network) -> Iterator[str]:
+    for i, eye in enumerate(network.eyes):
+        yield _constant(f"eye_weight_{i}", eye.weight.reshape(-1, 9))  # a row for each kernel
+        yield _constant(f"eye_bias_{i}", eye.bias)
+    for i, layer in enumerate(network.layers):
+        yield _constant(f"weight_{i}", layer.weight.T)  # one row for each input: the inner loop runs along memory
+        yield _constant(f"bias_{i}", layer.bias)
+    if network.memory:
+        for name, value in zip(("memory_weight", "memory_bias", "own_weight", "own_bias"), network.memory, strict=True):
+            yield _constant(name, value.T)
+
+
+def _constant(name: str, value: Array) -> str:
+    text = f"{{\n{_rows(value)}\n}}" if value.ndim == 2 else f"{{{_floats(value)}}}"
+    return f"static const float {name}[{value.size}] = {text};"
 
 
 def _function(activation: str) -> str:
     return f"{activation.lower()}_of"
 
 
-def _rows(values: NDArray[np.float32]) -> str:
+def _rows(values: Array) -> str:
     return ",\n".join(f"    {_floats(row)}" for row in values)
 
 

@@ -11,13 +11,19 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_quad.deploy.judging import episode_steps, targets
+from torchrl_quad.deploy.simulators import require_open_air
 from torchrl_quad.envs import QuadrotorEnv, make_env
 
 STATES = ("position", "quaternion", "velocity", "angular_velocity", "rotor_speed")
 
 
 def environment(contract: Mapping[str, Any], num_envs: int = 1) -> QuadrotorEnv:
-    """The environment of a contract, with its drone and its task, and without what made training harder."""
+    """The environment of a contract, with its drone and its task, and without what made training harder.
+
+    Raises:
+        ValueError: the policy sees, or flies through obstacles, which a contract does not hold.
+    """
+    require_open_air(contract)
     task, about = contract["task"], contract["simulator"]
     options = {name: about[name] for name in ("dt", "dynamics", "integrator")}
     options |= {name: contract[name] for name in ("control_dt", "action_delay", "drone")}

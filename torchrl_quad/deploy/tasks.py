@@ -1,7 +1,7 @@
 """What a task computes outside the network, for one drone, in numpy: where the target is, and how the flight goes on.
 
 A rule is built from the section ``task`` of a contract. :class:`~torchrl_quad.deploy.Bundle` resets it, advances it
-once in each control step after the first, and asks it for the first entries of the observation.
+once in each control step after the first, and asks it for its entries of the observation.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class Rule(Protocol):
     def advance(self, before: Vector | None, position: Vector | None) -> None:
         """One control step later; from where the drone was to where it is (3) [m], None where that is unknown."""
 
-    def relative(self, position: Vector) -> Vector:
-        """The entries of the observation that depend on the task, for a drone at a position (3) [m]."""
+    def inputs(self, position: Vector) -> dict[str, Vector]:
+        """What the task adds to the observation of a drone at a position (3) [m]: vectors by name, world frame."""
 
 
 class Target:
@@ -43,9 +43,33 @@ class Target:
     def advance(self, before: Vector | None, position: Vector | None) -> None:
         """Nothing changes."""
 
-    def relative(self, position: Vector) -> Vector:
-        """target - position (3) [m]."""
-        return self.target - position
+    def inputs(self, position: Vector) -> dict[str, Vector]:
+        """``to_target``: target - position (3) [m]."""
+        return {"to_target": self.target - position}
+
+
+class Course:
+    """A target to fly to at a commanded speed: the forest."""
+
+    def __init__(self, task: Mapping[str, Any]) -> None:
+        self.task = task
+        self.reset()
+
+    def reset(self, target: ArrayLike | None = None, speed: float | None = None) -> None:
+        """Start anew, with a target (3) [m] and a speed [m/s] of your own, or those of the contract."""
+        self.target = _point("target", self.task["target"] if target is None else target)
+        speed = self.task["speed"] if speed is None else speed
+        if not (isinstance(speed, int | float | np.number) and 0.0 < speed < math.inf):
+            raise ValueError(f"speed must be a positive number [m/s], got {speed!r}.")
+        self.speed = float(speed)
+
+    def advance(self, before: Vector | None, position: Vector | None) -> None:
+        """Nothing changes."""
+
+    def inputs(self, position: Vector) -> dict[str, Vector]:
+        """``command`` (3) [m/s]: the speed, in the direction of the target, and less within 1 m of it."""
+        way = self.target - position
+        return {"command": self.speed / max(math.sqrt(float(way @ way)), 1.0) * way}
 
 
 class Curve:
@@ -78,9 +102,9 @@ class Curve:
         angles = np.multiply.outer(phase, self.harmonics)
         return self.offset + np.concatenate((np.cos(angles), np.sin(angles)), -1) @ self.amplitudes
 
-    def relative(self, position: Vector) -> Vector:
-        """The next points of the curve - position (3 n) [m], nearest first."""
-        return (self.points(self.phase + self.ahead) - position).ravel()
+    def inputs(self, position: Vector) -> dict[str, Vector]:
+        """``to_points``: the next points of the curve - position (3 n) [m], nearest first."""
+        return {"to_points": (self.points(self.phase + self.ahead) - position).ravel()}
 
 
 class Gates:
@@ -111,15 +135,25 @@ class Gates:
         if float(gap @ gap) < self.radius**2:
             self.gate, self.passed = (self.gate + 1) % len(self.gates), self.passed + 1
 
-    def relative(self, position: Vector) -> Vector:
-        """Next gate - position, and the gate after that - position (6) [m]."""
+    def inputs(self, position: Vector) -> dict[str, Vector]:
+        """``to_gate`` and ``to_gate_after`` (3) [m]: centre of the next gate, and of the one after it, - position."""
         after = (self.gate + 1) % len(self.gates)
-        return np.concatenate((self.gates[self.gate] - position, self.gates[after] - position))
+        return {"to_gate": self.gates[self.gate] - position, "to_gate_after": self.gates[after] - position}
 
 
-# By rule: what ``reset`` takes, an entry of the environment's state and of a bundle's starts.
-PROGRESS = {"target": "target", "curve": "phase", "gates": "gate"}
-RULES: dict[str, type[Target] | type[Curve] | type[Gates]] = {"target": Target, "curve": Curve, "gates": Gates}
+# By rule: what ``reset`` takes, entries of the environment's state and of a bundle's starts.
+PROGRESS = {"target": ("target",), "curve": ("phase",), "gates": ("gate",), "course": ("target", "speed")}
+RULES: dict[str, type[Target] | type[Course] | type[Curve] | type[Gates]] = {
+    "target": Target,
+    "course": Course,
+    "curve": Curve,
+    "gates": Gates,
+}
+
+
+def progress_of(rule: str, start: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """What the ``reset`` of a rule takes, from the entries of one start: vectors, and numbers."""
+    return {name: start[name] if start[name].size > 1 else start[name].item() for name in PROGRESS[rule]}
 
 
 def _point(name: str, value: ArrayLike) -> Vector:

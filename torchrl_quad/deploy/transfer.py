@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torchrl_quad.deploy.bundle import QUANTITIES, Bundle, load_bundle
 from torchrl_quad.deploy.judging import endings, judge
 from torchrl_quad.deploy.simulators import make_simulator
-from torchrl_quad.deploy.tasks import PROGRESS
+from torchrl_quad.deploy.tasks import PROGRESS, progress_of
 
 Array = NDArray[np.float64]
 # Fields of the rate loop, which does not know the true drone.
@@ -82,6 +82,9 @@ def fly(
         by name: the states (n, time + 1, ...), the first of which is the start, the last one repeated after the end of
         an episode; ``action`` (n, time, 4); what :func:`~torchrl_quad.deploy.judging.judge` finds (n); ``simulator``,
         name and version; ``faults``, the bundle's refusals by name.
+
+    Raises:
+        ValueError: the policy sees, or flies through obstacles, which no simulator here has; or an argument is unknown.
     """
     bundle = folder if isinstance(folder, Bundle) else load_bundle(folder, on_fault="hover")
     contract, mutant = other_drone(bundle.contract, scale or {}), mutant or Mutant("none")
@@ -117,8 +120,7 @@ def fly(
             world.keep(on)
         if not len(alive):
             break
-    progress = PROGRESS[contract["task"]["rule"]]
-    flight[progress] = starts[progress]
+    flight |= {name: starts[name] for name in PROGRESS[contract["task"]["rule"]]}
     faults = sum((pilot.faults for pilot in pilots), Counter())
     return {**flight, **judge(contract, flight), "simulator": world.version, "faults": dict(faults)}
 
@@ -149,9 +151,7 @@ def _pilot(bundle: Bundle, start: dict[str, Any]) -> Bundle:
     """Another bundle of the same policy, with a flight and a memory of its own."""
     pilot = copy.copy(bundle)
     pilot.rule, pilot.faults = copy.copy(bundle.rule), Counter()
-    entry = PROGRESS[bundle.contract["task"]["rule"]]
-    value = start[entry]
-    pilot.reset(**{entry: value if value.size > 1 else value.item()})
+    pilot.reset(**progress_of(bundle.contract["task"]["rule"], start))
     return pilot
 
 

@@ -80,7 +80,7 @@ class ForestEnv(QuadrotorEnv):
     """
 
     length, half_width, ceiling = 30.0, 8.0, 4.0  # [m]
-    run_up = (1.0, 2.0)  # [m], from the start to the forest
+    run_up, run_out = (1.0, 2.0), 2.0  # [m], from the start to the forest, and from the forest to the target
     before = 4.0  # [m], before the forest
     start_half_width = 4.0  # [m]
     cruise_height, start_height = 1.5, 0.3  # [m], of the target, and how far from it drones start
@@ -152,7 +152,9 @@ class ForestEnv(QuadrotorEnv):
         across, along, up = self.uniform(3, n, 1)
         x = -0.5 * (self.run_up[0] + self.run_up[1]) + 0.5 * (self.run_up[1] - self.run_up[0]) * along
         y, z = self.start_half_width * across, self.cruise_height + self.start_height * up
-        target = torch.cat((torch.full_like(x, self.length + 2.0), y, torch.full_like(z, self.cruise_height)), -1)
+        target = torch.cat(
+            (torch.full_like(x, self.length + self.run_out), y, torch.full_like(z, self.cruise_height)), -1
+        )
         low, high = self.speeds
         speed = low + (high - low) * 0.5 * (self.uniform(n, 1) + 1.0)
         return {**self.hover_state(torch.cat((x, y, z), -1)), "target": target, "speed": speed}

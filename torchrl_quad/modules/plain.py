@@ -95,12 +95,12 @@ class Critic(ValueOperator):
         """
         network = self.module
         is_known = type(self) is Critic and type(network) is Network and type(network.mlp) is MLP
-        if not is_known or type(network.head) is not nn.Identity or _is_hooked(self):
+        if not is_known or type(network.head) is not nn.Identity or is_hooked(self):
             return None
         layers = {f"module.mlp.{name}": layer for name, layer in network.mlp.named_children()}
         known = (nn.Linear, nn.LayerNorm)
         if len(layers) < len(network.mlp) or not all(
-            type(layer) in known or _is_pointwise(layer) for layer in layers.values()
+            type(layer) in known or is_pointwise(layer) for layer in layers.values()
         ):
             return None
 
@@ -130,7 +130,7 @@ class TanhGaussianActor(ProbabilisticActor):
         is_random = samples(self)
         network = getattr(self[0], "module", None)
         is_known = is_random is not None and type(self) in (TanhGaussianActor, CorrelatedActor)
-        if not is_known or type(network) is not Network or _is_hooked(self) or len(self.module) != 2:
+        if not is_known or type(network) is not Network or is_hooked(self) or len(self.module) != 2:
             return None
         if len(set(map(str, self[0].in_keys))) < len(self[0].in_keys):
             return None
@@ -143,7 +143,7 @@ class TanhGaussianActor(ProbabilisticActor):
         layers, activations = list(network.mlp)[::2], list(network.mlp)[1::2]
         if any(type(layer) is not nn.Linear or layer.bias is None for layer in layers):
             return None
-        if len(activations) != len(layers) - 1 or not all(map(_is_pointwise, activations)):
+        if len(activations) != len(layers) - 1 or not all(map(is_pointwise, activations)):
             return None
         return PlainTanhGaussian(self, layers, activations, is_random)
 
@@ -335,12 +335,13 @@ def _concatenated(inputs: Sequence[Tensor], scales: Sequence[float]) -> Tensor:
     return torch.cat([x if scale == 1.0 else x * scale for x, scale in zip(inputs, scales, strict=True)], -1)
 
 
-def _is_hooked(module: nn.Module) -> bool:
+def is_hooked(module: nn.Module) -> bool:
+    """Whether somebody watches or changes what a module or one of its parts reads or returns."""
     hooks = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
     return any(getattr(part, name) for part in module.modules() for name in hooks)
 
 
-def _is_pointwise(activation: nn.Module) -> bool:
+def is_pointwise(activation: nn.Module) -> bool:
     """Whether an activation is a function of its input alone: one of torch's without parameters or random numbers."""
     known = type(activation).__module__ == "torch.nn.modules.activation" and not isinstance(activation, nn.RReLU)
     return known and not getattr(activation, "inplace", False) and not list(activation.parameters())

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numbers
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
@@ -12,10 +12,20 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase, TensorDictPrimer
-from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, set_recurrent_mode
+from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, TanhNormal, set_recurrent_mode
+from torchrl.modules.models.utils import SquashDims
+from torchrl.modules.tensordict_module.rnn import GRU
 
 from torchrl_quad.modules.networks import OBSERVATION, first_action, network_of, sampling, start_near
-from torchrl_quad.modules.plain import GaussianHead, Network, PlainTanhGaussian, bounds_of, samples
+from torchrl_quad.modules.plain import (
+    GaussianHead,
+    Network,
+    PlainTanhGaussian,
+    bounds_of,
+    is_hooked,
+    is_pointwise,
+    samples,
+)
 
 MEMORY = "recurrent_state"
 NEAREST = 0.3  # [m], of what a policy tells apart
@@ -142,6 +152,19 @@ class Sight(nn.Module):
         return self.activation(self.trunk(self.eyes(depth.clamp_min(NEAREST).reciprocal()), *vectors))
 
 
+class Parts(NamedTuple):
+    """What a policy that sees is made of, in the order in which it computes."""
+
+    eyes: list[nn.Module]  #: convolutions, each followed by its activation
+    nearest: float  #: [m]; they read 1 / max(depth, nearest)
+    trunk: list[nn.Module]  #: linear layers, each followed by its activation; the first reads the eyes, then vectors
+    widths: tuple[int, ...]  #: of what the eyes give, and of the vectors
+    scales: tuple[float, ...]  #: by which these are multiplied
+    memory: GRU | None  #: reads what the trunk returns
+    head: nn.Linear  #: reads what trunk and memory return; its first outputs are the mean action before the tanh
+    size: int  #: of the action
+
+
 class VisualActor(ProbabilisticActor):
     """What :func:`~torchrl_quad.make_visual_actor` builds."""
 
@@ -164,6 +187,33 @@ class VisualActor(ProbabilisticActor):
     def replayed(self) -> Replay | None:
         """The policy as losses let it act again in a whole rollout, or None where it explores in another way."""
         return None if samples(self) is None else Replay(self)
+
+    def parts(self) -> Parts | None:
+        """The parts as :func:`~torchrl_quad.make_visual_actor` builds them; None if somebody changed or hooks them."""
+        if type(self) is not VisualActor or len(self.module) != 2 or is_hooked(self) or samples(self) is None:
+            return None
+        if self[1].distribution_class is not TanhNormal or type(self[0]) is not TensorDictSequential:
+            return None
+        if len(self[0].module) not in (2, 3):
+            return None
+        seen, *memory, last = self[0].module
+        sight, head = (getattr(part, "module", None) for part in (seen, last))
+        if type(sight) is not Sight or not _is_network(head, GaussianHead) or not _is_network(sight.trunk, nn.Identity):
+            return None
+        eyes, trunk = list(sight.eyes), [*sight.trunk.mlp, sight.activation]
+        if type(sight.eyes) is not ConvNet or type(eyes.pop()) is not SquashDims or sight.eyes[-1].ndims_in != 3:
+            return None
+        if not _alternates(eyes, _halves) or not _alternates(trunk, _is_linear):
+            return None
+        if len(head.mlp) != 1 or not _is_linear(head.mlp[0]) or any(scale != 1.0 for scale in head.scales):
+            return None
+        if memory and not _is_memory(memory[0]):
+            return None
+        reads, keys = ["seen", "recalled"][: len(memory) + 1], [list(part.in_keys) for part in (last, *memory)]
+        if keys != [reads, *([["seen", MEMORY, "is_init"]] if memory else [])] or len(head.scales) != len(reads):
+            return None
+        gru = memory[0].gru if memory else None
+        return Parts(eyes, NEAREST, trunk, sight.trunk.widths, sight.trunk.scales, gru, head.mlp[0], head.head.size)
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """TorchRL's transform that gives an environment the memory of this policy, in its precision.
@@ -198,3 +248,32 @@ class Replay(PlainTanhGaussian):
             read = self.actor.get_dist_params(tensordict.select(*self.actor.in_keys).detach())
         noise = self.drawn_again(tensordict).view_as(tensordict["action"])
         return self._squash(read["loc"], read["scale"], noise, self.log_prob_key)
+
+
+def _is_network(module: nn.Module | None, head: type[nn.Module]) -> bool:
+    return type(module) is Network and type(module.mlp) is MLP and type(module.head) is head
+
+
+def _alternates(layers: list[nn.Module], is_known: Callable[[nn.Module], bool]) -> bool:
+    """Whether these are layers of a known kind, each followed by its activation."""
+    return len(layers) % 2 == 0 and all(map(is_known, layers[::2])) and all(map(is_pointwise, layers[1::2]))
+
+
+def _is_linear(layer: nn.Module) -> bool:
+    return type(layer) is nn.Linear and layer.bias is not None
+
+
+def _halves(layer: nn.Module) -> bool:
+    """Whether it is a convolution, 3 x 3, that halves height and width."""
+    if type(layer) is not nn.Conv2d or layer.bias is None or (layer.groups, layer.padding_mode) != (1, "zeros"):
+        return False
+    found = layer.kernel_size, layer.stride, layer.padding, layer.dilation
+    return found == ((3, 3), (2, 2), (1, 1), (1, 1))
+
+
+def _is_memory(module: nn.Module) -> bool:
+    """Whether it is a GRU of one layer that goes forwards."""
+    gru = getattr(module, "gru", None)
+    if type(module) is not GRUModule or type(gru) not in (GRU, nn.GRU):
+        return False
+    return (gru.num_layers, gru.bias, gru.bidirectional) == (1, True, False)

@@ -11,6 +11,8 @@ extern "C" {
 
 #define POLICY_CONTRACT_VERSION $version
 #define POLICY_OBSERVATION $observation /* floats that the network reads */
+@depth #define POLICY_DEPTH $depth /* floats of an image: $rows rows of $columns */
+@memory #define POLICY_MEMORY $memory /* floats that the network keeps */
 #define POLICY_ACTION 4 /* floats that it writes: thrust, roll rate, pitch rate, yaw rate, each in -1..1 */
 #define POLICY_CONTROL_DT $control_dt /* s, between two calls */
 #define POLICY_ACTION_DELAY $action_delay /* control steps between a call and its effect, as trained */
@@ -18,8 +20,14 @@ extern "C" {
 extern const float policy_hover_action[POLICY_ACTION];
 
 /* The action for an observation. Returns 0; or 1, and writes the action that hovers, where an entry of the observation
- * or the result is not finite. Do not compile with -ffast-math: it removes this check. */
-int policy_action(const float observation[POLICY_OBSERVATION], float action[POLICY_ACTION]);
+ * or the result is not finite. Do not compile with -ffast-math: it removes this check.
+@depth  *
+@depth  * depth [m]: rows from the top, each from the left. 0 where the camera measures nothing, its range where nothing is nearer.
+@memory  *
+@memory  * memory: yours to keep. Zeros when a flight begins, then what the call before left in it; a call that returns 1 leaves
+@memory  * it as it was.
+ */
+int policy_action(const float observation[POLICY_OBSERVATION],$parameters float action[POLICY_ACTION]);
 
 /* What an action commands: collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up. */
 void policy_command(const float action[POLICY_ACTION], float *thrust, float body_rate[3]);

@@ -1,0 +1,133 @@
+"""Take a policy apart: its weights as plain numbers, with the normaliser and the scales of the input in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_quad.data import ObservationNormalizer
+from torchrl_quad.data.normalizer import NormalizedPolicy
+from torchrl_quad.deploy.network import ACTIVATIONS, Layer, Memory, Network
+
+GRU = ("weight_ih_l0", "bias_ih_l0", "weight_hh_l0", "bias_hh_l0")  # torch's names, in the order of Memory
+
+
+def fold(
+    actor: TensorDictModuleBase, normalizer: ObservationNormalizer | None = None, image: Sequence[int] | None = None
+) -> Network:
+    """The network of a policy's mean action, in float32, with the normaliser and the input's scale in its weights.
+
+    Args:
+        actor: the policy.
+        normalizer: of the observation that it reads.
+        image: height and width of the camera's image; None where there is no camera.
+
+    Raises:
+        ValueError: the policy is not one that :func:`~torchrl_quad.make_actor` or
+            :func:`~torchrl_quad.make_visual_actor` builds, or reads what a drone cannot give it.
+    """
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        plain, parts = (
+            getattr(actor, name)() if hasattr(actor, name) and not isinstance(actor, NormalizedPolicy) else None
+            for name in ("plain", "parts")
+        )
+    if plain is not None:
+        _require_readable(plain.in_keys, ["observation"])
+        _require_unit_actions(plain.low, plain.high)
+        linear = zip(plain.weights[::2], plain.weights[1::2], [*plain.activations, nn.Tanh()], strict=True)
+        network = Network(_layers(linear, plain.size, np.repeat(plain.scales, plain.widths), normalizer))
+    elif parts is not None:
+        network = _seeing(actor, parts, normalizer, image)
+    else:
+        raise ValueError(
+            "export_policy exports what make_actor and make_visual_actor build, with its parts as they are and without "
+            f"hooks: tanh-Gaussian policies. This {type(actor).__name__} is something else; build the policy with "
+            "make_actor(env, ...) or make_visual_actor(env, ...), and load your weights into it."
+        )
+    if not all(np.isfinite(x).all() for x in network.weights()):
+        raise ValueError("export_policy: the weights of the policy, or its normaliser, are not finite.")
+    return network
+
+
+def _seeing(
+    actor: TensorDictModuleBase, parts: Any, normalizer: ObservationNormalizer | None, image: Sequence[int] | None
+) -> Network:
+    """The network of a policy with eyes, from what it says that it is made of."""
+    _require_readable(list(actor[0][0].in_keys), ["depth", "observation"])
+    bounds = actor[1].distribution_kwargs
+    _require_unit_actions(bounds.get("low"), bounds.get("high"))
+    eyes, trunk = (
+        [(layer.weight, layer.bias, activation) for layer, activation in zip(x[::2], x[1::2], strict=True)]
+        for x in (parts.eyes, parts.trunk)
+    )
+    memory = parts.memory and Memory(*(_float32(_numbers(getattr(parts.memory, name))) for name in GRU))
+    sight = Network([], _layers(eyes), tuple(image or (0, 0)), parts.nearest, memory)
+    if image is None or sight.found != parts.widths[0] or sight.eyes[0].weight.shape[1] != 1:
+        camera = "has no camera" if image is None else f"shows it {image[1]} x {image[0]} pixels"
+        raise ValueError(f"export_policy: the policy was built for images of another size; the environment {camera}.")
+    last = parts.head.weight, parts.head.bias, nn.Tanh()
+    return sight._replace(layers=_layers([*trunk, last], parts.size, np.repeat(parts.scales, parts.widths), normalizer))
+
+
+def _layers(
+    parts: Any,
+    size: int | None = None,
+    columns: NDArray[np.float64] | None = None,
+    normalizer: ObservationNormalizer | None = None,
+) -> list[Layer]:
+    """Layers from weights, biases and activations.
+
+    Args:
+        parts: these, for each layer.
+        size: how many outputs of the last one to keep; by default all.
+        columns: what multiplies each input of the first one.
+        normalizer: of its last inputs, the observation.
+
+    Raises:
+        ValueError: an activation is one that this package cannot write.
+    """
+    weights, biases, activations = zip(*parts, strict=True)
+    for activation in activations:
+        if type(activation).__name__ not in ACTIVATIONS or repr(activation) != repr(type(activation)()):
+            raise ValueError(
+                f"export_policy cannot write {activation} as ONNX and C. Choose from: {', '.join(ACTIVATIONS)}, with "
+                "their default arguments."
+            )
+    weights, biases = ([_numbers(x) for x in values] for values in (weights, biases))
+    if columns is not None:
+        weights[0] = weights[0] * columns
+    if normalizer is not None:
+        loc, scale = _numbers(normalizer.loc), _numbers(normalizer.scale)
+        others, own = np.split(weights[0], [-len(loc)], 1)
+        own = own / scale
+        weights[0], biases[0] = np.concatenate((others, own), 1), biases[0] - own @ loc
+    weights[-1], biases[-1] = weights[-1][:size], biases[-1][:size]  # the rest is the noise's
+    names = [type(activation).__name__ for activation in activations]
+    return [Layer(_float32(w), _float32(b), name) for w, b, name in zip(weights, biases, names, strict=True)]
+
+
+def _require_readable(found: Sequence[Any], known: list[str]) -> None:
+    if found != known:
+        raise ValueError(
+            f'export_policy: the policy reads {found}. A drone can give it the "observation" alone: train it with '
+            'in_keys=[\'observation\']. A policy that sees may also read "depth", with image_key="depth".'
+        )
+
+
+def _require_unit_actions(low: Any, high: Any) -> None:
+    if low is not None:
+        raise ValueError(f"export_policy: actions must lie from -1 to 1, got {low} to {high}.")
+
+
+def _numbers(x: Tensor) -> NDArray[np.float64]:
+    return x.detach().double().cpu().numpy()
+
+
+def _float32(x: NDArray[np.float64]) -> NDArray[np.float32]:
+    return x.astype(np.float32)

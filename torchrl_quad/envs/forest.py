@@ -54,7 +54,7 @@ class ForestEnv(QuadrotorEnv):
     ``target`` (3) [m], straight ahead, 2 m behind the forest and 1.5 m high; ``speed`` (1) [m/s], the commanded one.
 
     End: success on the other side of the forest; crash when the drone touches a tree or the ground, when it is 8 m from
-    the middle, 4 m before the forest, or 4 m high; truncated after ``max_episode_steps``, 900. Success of an episode:
+    the middle, 5 m before the forest, or 4 m high; truncated after ``max_episode_steps``, 900. Success of an episode:
     that it ended in success.
 
     Metrics: ``distance``, how far the drone has come in the forest [m]; ``flown_speed``, towards the target [m/s], its

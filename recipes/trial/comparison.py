@@ -21,6 +21,7 @@ Shown = tuple[str, float, int, str]  # of a task: column, factor, digits, unit
 RELIABLE = 0.99  # of the episodes, solved by the worst seed
 ENOUGH = 3  # seeds, for an interval
 COLORS = {"bptt": "#3b9c5a", "shac": "#2f6db5", "abpt": "#c8452f", "hybrid": "#8a4fb0", "ppo": "#7d7d7d"}
+COLORS |= {"sapo": "#c99a2e", "ahac": "#35a7a7"}
 
 
 def interquartile_mean(values: Sequence[float], axis: int = 0) -> float:
@@ -99,9 +100,10 @@ def choice_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping
 def improvement_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping[str, Shown]) -> str:
     """Show how probable it is that the method of a row has a higher return than that of a column, over the tasks."""
     groups, lines = grouped(rows), []
-    for ours, label in methods.items():
+    enough = [x for x in methods if any(len(groups.get((task, x), ())) >= ENOUGH for task in shown)]
+    for ours in enough:
         cells = []
-        for theirs in methods:
+        for theirs in enough:
             both = [
                 [column(groups[task, method], "return") for method in (ours, theirs)]
                 for task in shown
@@ -109,8 +111,8 @@ def improvement_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Ma
             ]
             values = [improvement(*pair) for pair in both]
             cells.append(f"{np.mean(values):.2f}, {len(values)}" if values and ours != theirs else "")
-        lines.append([label, *cells])
-    return table(["", *methods.values()], lines)
+        lines.append([methods[ours], *cells])
+    return table(["", *(methods[x] for x in enough)], lines)
 
 
 def draw(curves: Sequence[Row], methods: Mapping[str, str], tasks: Sequence[str], path: Path) -> None:

@@ -33,7 +33,8 @@ from torchrl_quad.files import machine
 from torchrl_quad.files import read_rows as read
 
 SEEDS = tuple(range(10))
-METHODS = {"bptt": "BPTT", "shac": "SHAC", "abpt": "ABPT", "hybrid": "Hybrid", "ppo": "PPO"}
+SHOWN = {"bptt": "BPTT", "shac": "SHAC", "abpt": "ABPT", "hybrid": "Hybrid", "ppo": "PPO"}  # in the README
+METHODS = SHOWN | {"sapo": "SAPO", "ahac": "AHAC"}
 TASKS = {  # what is shown of each beside the solved episodes: column, factor, digits, unit
     "hovering": ("position_error", 100, 1, "cm"),
     "tracking": ("tracking_rmse", 100, 1, "cm"),
@@ -101,12 +102,12 @@ def blocks(data: Path) -> dict[str, str]:
     flown = dict.fromkeys(x["task"] for x in runs)
     shown = {task: TASKS.get(task) or first_metric(task) for task in sorted(flown, key=[*TASKS, *flown].index)}
     for task in shown:
-        groups = ([x for x in runs if (x["task"], x["algorithm"]) == (task, method)] for method in METHODS)
+        groups = ([x for x in runs if (x["task"], x["algorithm"]) == (task, method)] for method in SHOWN)
         label = task.replace("_", ", ") if task in VARIANTS else task
         lines.append([label, *(cell(group, *shown[task]) for group in groups)])
     compared = {"choice": choice_table, "reached": reached_table, "improvement": improvement_table}
     made = {name: make(runs, METHODS, shown) for name, make in compared.items()}
-    return {"summary": table(["", *METHODS.values()], lines)} | made
+    return {"summary": table(["", *SHOWN.values()], lines)} | made
 
 
 def main() -> None:

@@ -34,6 +34,7 @@ from torchrl_quad.files import read_rows as read
 
 POLICIES = {  # recipe, and what differs from what it ships with
     "bptt": ("bptt", []),
+    "bptt, twice as long": ("bptt", ["total_steps=4_096_000"]),
     "shac": ("shac", []),
     "hybrid": ("hybrid", []),
     "ppo": ("ppo", ["total_steps=720_000"]),  # about the seconds of BPTT

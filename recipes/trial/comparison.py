@@ -82,7 +82,7 @@ def choice_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping
     """Show for each task the quickest method that works with every seed, and the one of the highest return."""
     groups, lines = grouped(rows), []
     for task in shown:
-        flown = {method: groups[task, method] for method in methods if len(groups.get((task, method), ())) >= ENOUGH}
+        flown = {method: groups[task, method] for method in methods if (task, method) in groups}
         if not flown:
             continue
         worst = {method: min(column(own, "solved")) for method, own in flown.items()}
@@ -91,7 +91,8 @@ def choice_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping
         reliable = [method for method in flown if worst[method] >= RELIABLE]
         quick = min(reliable, key=seconds.get, default=None)
         most = max(returns, key=returns.get)
-        said = {x: f"{methods[x]}: {returns[x]:.4g}, {worst[x]:.1%}, {seconds[x]:.0f} s" for x in flown}
+        few = {x: f", {len(own)} seed{'s' * (len(own) > 1)}" if len(own) < ENOUGH else "" for x, own in flown.items()}
+        said = {x: f"{methods[x]}: {returns[x]:.4g}, {worst[x]:.1%}, {seconds[x]:.0f} s{few[x]}" for x in flown}
         cells = [said.get(x, "none") for x in (quick, most)]
         lines.append([task.replace("_", ", "), *cells, ", ".join(methods[x] for x in flown)])
     return table(["task", "quickest that works with every seed", "highest return", "compared"], lines)
@@ -128,7 +129,7 @@ def draw(curves: Sequence[Row], methods: Mapping[str, str], tasks: Sequence[str]
     figure = Figure((3.2 * len(tasks) + 0.6, 5.2), layout="constrained")
     panels = figure.subplots(2, len(tasks), squeeze=False)
     lines = {}
-    for row, time in enumerate(("steps", "seconds")):
+    for row, (time, unit) in enumerate((("steps", 1e6), ("seconds", 1.0))):
         for panel, task in zip(panels[row], tasks, strict=True):
             for method in methods:
                 if (task, method) not in runs:
@@ -137,12 +138,12 @@ def draw(curves: Sequence[Row], methods: Mapping[str, str], tasks: Sequence[str]
                 grid = np.linspace(0.0, np.median([t[-1] for t, _ in seeds]), 100)
                 values = np.array([np.interp(grid, t, y, left=np.nan) for t, y in seeds])
                 grid, values = (x[..., np.isfinite(values).all(0)] for x in (grid, values))
-                (lines[method],) = panel.plot(grid, interquartile_mean(values), color=COLORS[method])
+                (lines[method],) = panel.plot(grid / unit, interquartile_mean(values), color=COLORS[method])
                 if len(seeds) >= ENOUGH:
                     low, high = np.transpose([interval(x) for x in values.T])
-                    panel.fill_between(grid, low, high, color=COLORS[method], alpha=0.2, linewidth=0)
+                    panel.fill_between(grid / unit, low, high, color=COLORS[method], alpha=0.2, linewidth=0)
             panel.grid(alpha=0.3)
-            panel.set(xlabel={"steps": "control steps", "seconds": "processor seconds"}[time])
+            panel.set(xlabel={"steps": "million control steps", "seconds": "processor seconds"}[time])
             panel.set_title("" if row else task.replace("_", ", "))
         panels[row, 0].set_ylabel("return")
     names = [methods[method] for method in lines]

@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "recipes/trial"))
 import ascent
 import claims
 import comparison
+import forest
 import matrix
 import reproduce
 import shipped
@@ -266,6 +267,21 @@ def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(run
     for refused in (["--quick"], ["--tasks", "own_task.CornerEnv"], ["--tasks", "window"]):
         with pytest.raises(SystemExit):
             run_main(monkeypatch, shipped, *refused)
+
+
+def test_policies_of_the_forest_are_flown_at_the_speeds_and_densities_and_not_twice(run_here, monkeypatch, tmp_path):
+    monkeypatch.setattr(forest, "run", run_here)
+    wanted = ["--policies", "blind", "--seeds", "0", "--speeds", "6", "--difficulties", "middle"]
+    arguments = [*wanted, "--forests", "2", "--data", tmp_path, "--output", tmp_path / "runs", "--quick"]
+    run_main(monkeypatch, forest, *arguments)
+    (row,) = rows = reproduce.read(tmp_path / "forest.csv")
+    assert (row["difficulty"], row["speed"], row["steps"]) == ("middle", "6.0", "64")
+    assert float(row["solved"]) + float(row["crash"]) <= 1.0
+    assert (tmp_path / "images/forest_success.png").exists()
+    monkeypatch.setattr(forest, "fly", lambda *_: pytest.fail("It has been flown."))
+    run_main(monkeypatch, forest, *arguments)
+    flown = [{**row, "policy": "bptt", "seed": str(seed), "solved": x} for seed, x in enumerate(("0.5", "0.75"))]
+    assert "| bptt | 0.0 | " in forest.summary([*rows, *flown]) and "62% (50%, 2 seeds) |" in forest.summary(flown)
 
 
 def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom():

@@ -123,20 +123,24 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
     from matplotlib.figure import Figure
 
     present = [name for name in DIFFICULTIES if any(row["difficulty"] == name for row in rows)]
-    figure = Figure((3.2 * max(len(present), 1) + 1.0, 3.0), layout="constrained")
+    figure = Figure((3.2 * max(len(present), 1) + 2.0, 3.0), layout="constrained")
+    flown = [name for name in POLICIES if any(row["policy"] == name for row in rows)]
     panels = figure.subplots(1, max(len(present), 1), sharey=True, squeeze=False)[0]
+    lines = {}
     for name, panel in zip(present, panels, strict=False):
-        for policy in dict.fromkeys(row["policy"] for row in rows):
+        for i, policy in enumerate(flown):
             of_speed: dict[float, list[float]] = {}
             for row in rows:
                 if (row["policy"], row["difficulty"]) == (policy, name):
                     of_speed.setdefault(float(row["speed"]), []).append(100 * float(row["solved"]))
-            speeds = sorted(of_speed)
-            panel.plot(speeds, [np.mean(of_speed[speed]) for speed in speeds], marker="o", label=policy)
+            if speeds := sorted(of_speed):
+                means = [np.mean(of_speed[speed]) for speed in speeds]
+                (lines[policy],) = panel.plot(speeds, means, marker="o", markersize=4, color=f"C{i}")
         panel.set(title=name, xlabel="commanded speed [m/s]", ylim=(0, 100))
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("success [%]")
-    panels[-1].legend(fontsize=8)
+    flown = [policy for policy in flown if policy in lines]
+    figure.legend([lines[policy] for policy in flown], flown, loc="outside right center", fontsize=8, frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=120)

@@ -11,6 +11,7 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from scipy.stats import mannwhitneyu
@@ -288,7 +289,7 @@ def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom():
     assert comparison.interquartile_mean([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 100.0]) == 3.5
     ours, theirs = [3.0, 1.0, 2.0], [2.0, 0.0, 2.0, 1.0]
     expected = mannwhitneyu(ours, theirs).statistic / 12
-    assert comparison.improvement(ours, theirs) == pytest.approx(expected)
+    assert comparison.probability(np.array(ours), np.array(theirs)) == pytest.approx(expected)
     assert comparison.interval([2.0, 2.0, 2.0]) == (2.0, 2.0)
     low, high = comparison.interval([1.0, 2.0, 3.0, 4.0])
     assert 1.0 <= low < 2.5 < high <= 4.0

@@ -11,7 +11,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import bootstrap, trim_mean
+from evidence import bootstrap, probability
+from numpy.typing import ArrayLike, NDArray
+from results import COLORS
+from scipy.stats import trim_mean
 from tables import table
 
 from torchrl_quad.files import replacing
@@ -20,29 +23,17 @@ Row = Mapping[str, str]
 Shown = tuple[str, float, int, str]  # of a task: column, factor, digits, unit
 RELIABLE = 0.99  # of the episodes, solved by the worst seed
 ENOUGH = 3  # seeds, for an interval
-COLORS = {"bptt": "#3b9c5a", "shac": "#2f6db5", "abpt": "#c8452f", "hybrid": "#8a4fb0", "ppo": "#7d7d7d"}
-COLORS |= {"sapo": "#c99a2e", "ahac": "#35a7a7"}
+LABELS = {"racing_position": "racing, position"}  # of variants of a task
 
 
-def interquartile_mean(values: Sequence[float], axis: int = 0) -> float:
-    """The mean of the middle half, without the quarter below and the quarter above it."""
-    return trim_mean(values, 0.25, axis=axis)
+def interquartile_mean(values: ArrayLike) -> NDArray[np.float64]:
+    """The mean (*) of the middle half of values (*, seeds), without the quarter below and the quarter above it."""
+    return trim_mean(values, 0.25, axis=-1)
 
 
 def interval(values: Sequence[float]) -> tuple[float, float]:
-    """The 95 % interval of the interquartile mean, by percentiles of 2000 bootstrap samples."""
-    if len(set(values)) == 1:
-        return values[0], values[0]
-    found = bootstrap(
-        (values,), interquartile_mean, n_resamples=2000, method="percentile", rng=np.random.default_rng(0)
-    ).confidence_interval
-    return found.low, found.high
-
-
-def improvement(ours: Sequence[float], theirs: Sequence[float]) -> float:
-    """The probability that a seed of ours has more than a seed of theirs; half of it where they are equal."""
-    gap = np.subtract.outer(ours, theirs)
-    return float(np.mean((gap > 0) + 0.5 * (gap == 0)))
+    """The 95 % interval of the interquartile mean, by the bootstrap over seeds."""
+    return bootstrap("", interquartile_mean, np.asarray(values)).interval()
 
 
 def column(rows: Sequence[Row], name: str) -> list[float]:
@@ -73,7 +64,7 @@ def reached_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mappin
             precise = f"{factor * interquartile_mean(metric):.{digits}f} {unit}" if metric else ""
             cost = f"{np.median(column(own, 'steps')) / 1e6:.1f}", f"{np.median(column(own, 'seconds')):.0f}"
             share = f"{np.mean(solved):.1%} ({min(solved):.1%})"
-            lines.append([task.replace("_", ", "), label, str(len(own)), mean, share, precise, *cost])
+            lines.append([LABELS.get(task, task), label, str(len(own)), mean, share, precise, *cost])
     head = ["task", "", "seeds", "return (95 % interval)", "solved (worst seed)", "", "million steps", "seconds"]
     return table(head, lines)
 
@@ -94,7 +85,7 @@ def choice_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping
         few = {x: f", {len(own)} seed{'s' * (len(own) > 1)}" if len(own) < ENOUGH else "" for x, own in flown.items()}
         said = {x: f"{methods[x]}: {returns[x]:.4g}, {worst[x]:.1%}, {seconds[x]:.0f} s{few[x]}" for x in flown}
         cells = [said.get(x, "none") for x in (quick, most)]
-        lines.append([task.replace("_", ", "), *cells, ", ".join(methods[x] for x in flown)])
+        lines.append([LABELS.get(task, task), *cells, ", ".join(methods[x] for x in flown)])
     return table(["task", "quickest that works with every seed", "highest return", "compared"], lines)
 
 
@@ -110,7 +101,7 @@ def improvement_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Ma
                 for task in shown
                 if all(len(groups.get((task, method), ())) >= ENOUGH for method in (ours, theirs))
             ]
-            values = [improvement(*pair) for pair in both]
+            values = [probability(*map(np.array, pair)) for pair in both]
             cells.append(f"{np.mean(values):.2f}, {len(values)}" if values and ours != theirs else "")
         lines.append([methods[ours], *cells])
     return table(["", *(methods[x] for x in enough)], lines)
@@ -138,13 +129,13 @@ def draw(curves: Sequence[Row], methods: Mapping[str, str], tasks: Sequence[str]
                 grid = np.linspace(0.0, np.median([t[-1] for t, _ in seeds]), 100)
                 values = np.array([np.interp(grid, t, y, left=np.nan) for t, y in seeds])
                 grid, values = (x[..., np.isfinite(values).all(0)] for x in (grid, values))
-                (lines[method],) = panel.plot(grid / unit, interquartile_mean(values), color=COLORS[method])
+                (lines[method],) = panel.plot(grid / unit, interquartile_mean(values.T), color=COLORS[method])
                 if len(seeds) >= ENOUGH:
                     low, high = np.transpose([interval(x) for x in values.T])
                     panel.fill_between(grid / unit, low, high, color=COLORS[method], alpha=0.2, linewidth=0)
             panel.grid(alpha=0.3)
             panel.set(xlabel={"steps": "million control steps", "seconds": "processor seconds"}[time])
-            panel.set_title("" if row else task.replace("_", ", "))
+            panel.set_title("" if row else LABELS.get(task, task))
         panels[row, 0].set_ylabel("return")
     names = [methods[method] for method in lines]
     figure.legend(lines.values(), names, loc="outside lower center", ncols=len(names), frameon=False)

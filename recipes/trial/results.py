@@ -26,7 +26,8 @@ from torchrl_quad.files import replacing
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-COLORS = {"abpt": "#c8452f", "shac": "#2f6db5", "bptt": "#3b9c5a", "ppo": "#7d7d7d"}
+COLORS = {"abpt": "#c8452f", "shac": "#2f6db5", "bptt": "#3b9c5a", "ppo": "#7d7d7d", "hybrid": "#8a4fb0"}
+COLORS |= {"sapo": "#c99a2e", "ahac": "#35a7a7"}
 FIGURES = {  # name of the experiment: variants, tasks and column of its curves
     "main": (METHODS, TASKS, "return"),
     "published": (("bptt", "shac", *EXPERIMENTS["published"]), TASKS, "return"),

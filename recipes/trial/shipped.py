@@ -21,7 +21,7 @@ from pathlib import Path
 from threading import Lock
 
 import numpy as np
-from comparison import choice_table, draw, improvement_table, reached_table
+from comparison import LABELS, choice_table, draw, improvement_table, reached_table
 from matrix import EVALUATIONS
 from reproduce import CURVE, DATA, OWN, QUICK, RECIPES, known_task, run, stop, write
 from results import fill
@@ -103,8 +103,7 @@ def blocks(data: Path) -> dict[str, str]:
     shown = {task: TASKS.get(task) or first_metric(task) for task in sorted(flown, key=[*TASKS, *flown].index)}
     for task in shown:
         groups = ([x for x in runs if (x["task"], x["algorithm"]) == (task, method)] for method in SHOWN)
-        label = task.replace("_", ", ") if task in VARIANTS else task
-        lines.append([label, *(cell(group, *shown[task]) for group in groups)])
+        lines.append([LABELS.get(task, task), *(cell(group, *shown[task]) for group in groups)])
     compared = {"choice": choice_table, "reached": reached_table, "improvement": improvement_table}
     made = {name: make(runs, METHODS, shown) for name, make in compared.items()}
     return {"summary": table(["", *SHOWN.values()], lines)} | made
@@ -134,8 +133,9 @@ def main() -> None:
     pages = (DATA.parents[2] / "README.md", DATA.parents[1] / "choosing.md") if shipped else (args.data / "summary.md",)
     curves = read(args.data / "shipped_curves.csv")
     draw(curves, METHODS, list(TASKS if shipped else args.tasks), pages[-1].parent / "results/shipped.png")
+    made = blocks(args.data)
     for page in pages:
-        fill(page, blocks(args.data))
+        fill(page, made)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,14 @@
 """Policies that see and remember: gradients through their memory, where it begins anew, and which losses take them."""
 
+import math
+
 import pytest
 import torch
 from torch.func import functional_call
 from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import set_recurrent_mode
+from torchrl.objectives import ClipPPOLoss
 
 from torchrl_quad import (
     ABPTLoss,
@@ -67,9 +71,10 @@ def test_the_gradient_goes_through_the_memory():
     torch.testing.assert_close(slope, measured, rtol=1e-6, atol=0)
 
 
-def test_a_flight_is_that_of_torchrls_loop_with_its_transforms_and_forgets_where_episodes_begin():
+@pytest.mark.parametrize("noise_correlation", [0.0, 0.9])
+def test_a_flight_is_that_of_torchrls_loop_with_its_transforms_and_forgets_where_episodes_begin(noise_correlation):
     env = forest(max_episode_steps=7)
-    actor = actor_for(env)
+    actor = actor_for(env, noise_correlation=noise_correlation)
     wrapped = TransformedEnv(env, Compose(InitTracker(), actor.make_tensordict_primer()))
     flights = []
     for flown in (env, wrapped):
@@ -80,6 +85,9 @@ def test_a_flight_is_that_of_torchrls_loop_with_its_transforms_and_forgets_where
         flights.append((flight, carry, torch.autograd.grad(loss, list(actor.parameters()))))
     (quick, quick_carry, quick_grad), (slow, slow_carry, slow_grad) = flights
     assert quick["is_init"][:, [7, 14]].all() and quick["is_init"].sum() == 6
+    if noise_correlation:  # it goes on where an episode begins
+        torch.testing.assert_close(quick["noise"][:, :-1], quick["noise_before"][:, 1:])
+        torch.testing.assert_close(quick["noise"], slow["noise"])
     for key in (MEMORY, "depth", "action", "loc", ("next", MEMORY), ("next", "reward"), ("next", "is_init")):
         own = torch.where(slow["is_init"].unsqueeze(-1), 0.0, slow[key]) if key == MEMORY else slow[key]
         torch.testing.assert_close(quick[key], own)
@@ -165,10 +173,10 @@ def test_an_empty_memory_is_none():
     assert (flights[0][MEMORY] == 0).all()
 
 
-@pytest.mark.parametrize("recurrent", [True, False])
-def test_losses_take_a_policy_that_sees(recurrent):
+@pytest.mark.parametrize(("recurrent", "noise_correlation"), [(True, 0.0), (True, 0.9), (False, 0.9)])
+def test_losses_take_a_policy_that_sees(recurrent, noise_correlation):
     env = forest(max_episode_steps=4)
-    actor = actor_for(env, recurrent=recurrent, return_log_prob=True)
+    actor = actor_for(env, recurrent=recurrent, noise_correlation=noise_correlation, return_log_prob=True)
     value, qvalue = (make(env, in_keys=["observation", ("state", "position")]) for make in (make_value, make_qvalue))
     rollout, _ = differentiable_rollout(env, actor, None, 6)
     losses = [BPTTLoss(actor, alpha=0.1), SHACLoss(actor, value), ABPTLoss(actor, qvalue), SAPOLoss(actor, value)]
@@ -190,6 +198,34 @@ def test_losses_take_a_policy_that_sees(recurrent):
         for x in actor.parameters():
             x.add_(0.1)
     assert bound.divergence(rollout) <= 1e-3
+
+
+@pytest.mark.parametrize("recurrent", [True, False])
+def test_correlated_noise_of_a_policy_that_sees_is_that_of_its_head(recurrent):
+    env = forest(max_episode_steps=4)
+    actor = actor_for(env, recurrent=recurrent, scale_init=0.3, noise_correlation=0.9, return_log_prob=True)
+    white = actor_for(env, recurrent=recurrent, scale_init=0.3)
+    white.load_state_dict(actor.state_dict())
+    rollout, _ = differentiable_rollout(env, actor, None, 6)
+    rollout, rest = rollout.detach(), math.sqrt(1 - 0.9**2)
+    with torch.no_grad(), set_recurrent_mode(True):
+        free, given = (x.get_dist_params(rollout.select(*x.in_keys)) for x in (white, actor))
+    torch.testing.assert_close(rollout["scale"], free["scale"] * rest)
+    torch.testing.assert_close(rollout["loc"], free["loc"] + 0.9 * free["scale"] * rollout["noise_before"])
+    torch.testing.assert_close(rollout["action"], torch.tanh(free["loc"] + free["scale"] * rollout["noise"]))
+    loss = ClipPPOLoss(actor, make_value(env), entropy_bonus=False)
+    assert "noise_before" in loss.in_keys
+    rollout["advantage"] = rollout["value_target"] = torch.ones(3, 6, 1)
+    with set_recurrent_mode(True):  # nothing has changed yet: the ratio is one
+        assert loss(rollout)["kl_approx"].abs().max() < 1e-9
+    torch.testing.assert_close(given["loc"], rollout["loc"])
+    start = rollout[:, 0].select(*white.in_keys)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):  # also after a random flight
+        modes = [policy(start.copy().set("noise", torch.ones(3, 4))) for policy in (actor, white)]
+    torch.testing.assert_close(modes[0]["action"], modes[1]["action"])
+    assert actor.parts().size == 4
+    with pytest.raises(ValueError, match="noise_correlation must lie from 0 to below 1"):
+        actor_for(env, noise_correlation=1.0)
 
 
 def test_what_cannot_be_seen_is_refused():

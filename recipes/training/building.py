@@ -56,8 +56,6 @@ def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModuleBase:
     noise["learn_scale"] = cfg.actor.get("learn_scale", True)  # checkpoints from before do not say
     if not sees(cfg, env):
         return make_actor(env, **network(cfg, "actor"), **noise, return_log_prob=log_prob)
-    if noise.pop("noise_correlation"):
-        raise ValueError("actor.noise_correlation must be 0 for a policy that sees; actor.vision=false flies it blind.")
     sight = {name: cfg.actor[name] for name in ("recurrent", "hidden_size")} | {"channels": list(cfg.actor.channels)}
     return make_visual_actor(env, **network(cfg, "actor"), **noise, **sight, return_log_prob=log_prob)
 

@@ -17,14 +17,8 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_quad.data.unwrap import base_env
-from torchrl_quad.modules.plain import (
-    CorrelatedActor,
-    CorrelatedHead,
-    Critic,
-    GaussianHead,
-    Network,
-    TanhGaussianActor,
-)
+from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead
+from torchrl_quad.modules.plain import CorrelatedActor, Critic, Network, TanhGaussianActor
 
 OBSERVATION = ("observation",)
 
@@ -72,24 +66,14 @@ def make_actor(
             the bounds.
     """
     spec, first = first_action(env, action_init, scale_init, "make_actor")
-    if not 0 <= noise_correlation < 1:
-        raise ValueError(f"noise_correlation must lie from 0 to below 1, got {noise_correlation}.")
     size = spec.shape[-1]
     net = network_of(env, in_keys, 2 * size if learn_scale else size, num_cells, activation, input_scale)
     start_near(net.mlp[-1], first)
-    mapping, read = f"biased_softplus_{scale_init}", list(in_keys)
-    if noise_correlation:
-        net.head = CorrelatedHead(noise_correlation, size, mapping)
-        read.append("noise_before")
-    else:
-        net.head = GaussianHead(size, mapping)
-    params = TensorDictModule(net, in_keys=read, out_keys=["loc", "scale"])
+    params = with_head(net, size, scale_init, noise_correlation, in_keys)
     actor = (CorrelatedActor if noise_correlation else TanhGaussianActor)(
         params, **sampling(spec), return_log_prob=return_log_prob
     )
-    if noise_correlation:
-        actor.out_keys = [*actor.out_keys, "noise_before", "noise"]
-    return actor
+    return writes_noise(actor) if noise_correlation else actor
 
 
 def make_value(
@@ -165,6 +149,31 @@ def start_near(layer: nn.Linear, first: Tensor) -> None:
         layer.weight.mul_(0.01)
         layer.bias.zero_()
         layer.bias[: len(first)] = first
+
+
+def with_head(
+    network: Network, size: int, scale_init: float, noise_correlation: float, in_keys: Sequence[NestedKey]
+) -> TensorDictModule:
+    """Give the last network of a policy, which reads ``in_keys``, a normal distribution of an action of ``size``.
+
+    Raises:
+        ValueError: the correlation is below 0, or not below 1.
+    """
+    if not 0 <= noise_correlation < 1:
+        raise ValueError(f"noise_correlation must lie from 0 to below 1, got {noise_correlation}.")
+    mapping, read = f"biased_softplus_{scale_init}", list(in_keys)
+    if noise_correlation:
+        network.head = CorrelatedHead(noise_correlation, size, mapping)
+        read.append("noise_before")
+    else:
+        network.head = GaussianHead(size, mapping)
+    return TensorDictModule(network, in_keys=read, out_keys=["loc", "scale"])
+
+
+def writes_noise(actor: ProbabilisticActor) -> ProbabilisticActor:
+    """Let a policy whose noise is correlated in time say that it writes the noise."""
+    actor.out_keys = [*actor.out_keys, "noise_before", "noise"]
+    return actor
 
 
 def sampling(spec: Bounded) -> dict[str, Any]:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import NormalParamExtractor, dispatch
+from tensordict.nn import dispatch
 from tensordict.nn.utils import biased_softplus
 from torch import Tensor, nn
 from torch.func import vjp
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+
+from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead, tanh_gaussian
 
 
 class Network(nn.Module):
@@ -33,53 +34,6 @@ class Network(nn.Module):
         """The head's output for inputs (*, k_i); the head receives (*, out_features), and the further inputs."""
         own = len(self.scales)
         return self.head(self.mlp(_concatenated(inputs[:own], self.scales)), *inputs[own:])
-
-
-class GaussianHead(NormalParamExtractor):
-    """The normal distribution of an action of ``size`` entries, from what a network returns.
-
-    Args:
-        size: of the action, k.
-        scale_mapping: as for NormalParamExtractor.
-    """
-
-    def __init__(self, size: int, scale_mapping: str) -> None:
-        super().__init__(scale_mapping=scale_mapping)
-        self.size = size
-
-    def forward(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """loc and scale (*, k), from both (*, 2k), or from loc alone (*, k): the scale stays what it starts as."""
-        return super().forward(raw if raw.shape[-1] > self.size else torch.cat((raw, torch.zeros_like(raw)), -1))
-
-
-class CorrelatedHead(GaussianHead):
-    """The normal distribution of an action whose noise e is correlated in time, given the noise of the step before.
-
-    With e_t = rho e_(t-1) + sqrt(1 - rho^2) xi_t the action mu + sigma e_t has mean mu + rho sigma e_(t-1) and standard
-    deviation sigma sqrt(1 - rho^2). Every e_t for itself is standard normal, so the noise is as large as without
-    correlation.
-
-    Args:
-        rho: the correlation of the noise of two steps that follow each other.
-        size, scale_mapping: as for GaussianHead.
-    """
-
-    def __init__(self, rho: float, size: int, scale_mapping: str) -> None:
-        super().__init__(size, scale_mapping)
-        self.rho, self.rest = rho, math.sqrt(1.0 - rho**2)
-
-    def forward(self, raw: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
-        """loc and scale (*, k) from what the network returns, and the noise of the step before (*, k)."""
-        loc, scale = super().forward(raw)
-        return loc + self.rho * scale * before, self.rest * scale
-
-    def next(self, before: Tensor, xi: Tensor) -> Tensor:
-        """The noise of this step, from that of the step before and what is new in it."""
-        return self.rho * before + self.rest * xi
-
-    def innovation(self, before: Tensor, noise: Tensor) -> Tensor:
-        """What is new in the noise of this step."""
-        return (noise - self.rho * before) / self.rest
 
 
 class Critic(ValueOperator):
@@ -158,18 +112,33 @@ class CorrelatedActor(TanhGaussianActor):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write loc, scale, action, noise and noise_before, and the log-probability if wanted."""
-        is_random, network = samples(self), self[0].module
-        shape, before = (*tensordict.batch_size, network.head.size), tensordict.get("noise", None)
-        if before is None or not is_random:
-            before = _first_noise(network.mlp[-1].weight.new_zeros(shape), is_random)
-        tensordict.set("noise_before", before)
-        if is_random is None:
-            return super().forward(tensordict, **kwargs).set("noise", before)
-        loc, scale = (self[0](tensordict).get(key) for key in ("loc", "scale"))
-        xi = _first_noise(torch.zeros_like(loc.detach()), is_random)
-        log_prob_key = self[1].log_prob_key if self[1].return_log_prob else None
-        written = _tanh_gaussian(loc, scale, xi, *bounds_of(self), log_prob_key)
-        return tensordict.update(written).set("noise", network.head.next(before, xi))
+        return explore(self, self[0].module, super().forward, tensordict, **kwargs)
+
+
+def explore(
+    actor: ProbabilisticActor, network: Network, act: Callable[..., Any], tensordict: TensorDictBase, **kwargs: Any
+) -> TensorDictBase:
+    """Let a policy act with noise that is correlated in time; see :class:`CorrelatedActor`.
+
+    Args:
+        actor: the policy.
+        network: its last one, whose head is a :class:`CorrelatedHead`.
+        act: what it does where it does not sample.
+        tensordict: the states (*), which it writes into.
+        kwargs: of ``act``.
+    """
+    is_random, head = samples(actor), network.head
+    shape, before = (*tensordict.batch_size, head.size), tensordict.get("noise", None)
+    if before is None or not is_random:
+        before = _first_noise(network.mlp[-1].weight.new_zeros(shape), is_random)
+    tensordict.set("noise_before", before)
+    if is_random is None:
+        return act(tensordict, **kwargs).set("noise", before)
+    loc, scale = (actor[0](tensordict).get(key) for key in ("loc", "scale"))
+    xi = _first_noise(torch.zeros_like(loc.detach()), is_random)
+    log_prob_key = actor[1].log_prob_key if actor[1].return_log_prob else None
+    written = tanh_gaussian(loc, scale, xi, *bounds_of(actor), log_prob_key)
+    return tensordict.update(written).set("noise", head.next(before, xi))
 
 
 class PlainTanhGaussian:
@@ -282,7 +251,7 @@ class PlainTanhGaussian:
 
     def _squash(self, loc: Tensor, scale: Tensor, xi: Tensor, log_prob_key: Any) -> dict[Any, Tensor]:
         low, high = (None if bound is None else loc.new_tensor(bound) for bound in (self.low, self.high))
-        return _tanh_gaussian(loc, scale, xi, low, high, log_prob_key)
+        return tanh_gaussian(loc, scale, xi, low, high, log_prob_key)
 
     def _sample(self, raw: Tensor, drawn: Tensor) -> dict[Any, Tensor]:
         xi, *before = drawn.split(self.size, -1)
@@ -291,27 +260,6 @@ class PlainTanhGaussian:
         if before:
             written |= {"noise_before": before[0], "noise": self.head.next(before[0], xi)}
         return {key: written[key] for key in self.out_keys}
-
-
-def _tanh_gaussian(
-    loc: Tensor, scale: Tensor, noise: Tensor, low: Tensor | None, high: Tensor | None, log_prob_key: Any
-) -> dict[Any, Tensor]:
-    """loc, scale, the action (*, k) that standard normal noise makes of them, and its log-probability (*) if wanted."""
-    x = loc + scale * noise
-    limit = 1.0 - torch.finfo(x.dtype).resolution
-    squashed = torch.tanh(x)
-    # Clipped as in TorchRL's TanhNormal, which keeps the derivative where it clips.
-    squashed = squashed + (squashed.clamp(-limit, limit) - squashed).detach()
-    action = squashed if low is None else (high + low) / 2 + (high - low) / 2 * squashed
-    written = {"loc": loc, "scale": scale, "action": action}
-    if log_prob_key is not None:
-        x = x + (torch.atanh(squashed) - x).detach()
-        density = -((x - loc) ** 2) / (2 * scale**2) - scale.log() - 0.5 * math.log(2 * math.pi)
-        slope = 2.0 * (math.log(2.0) - x - nn.functional.softplus(-2.0 * x))
-        if low is not None:
-            slope = slope + ((high - low) / 2).log()
-        written[log_prob_key] = (density - slope).sum(-1)
-    return written
 
 
 def samples(actor: ProbabilisticActor) -> bool | None:

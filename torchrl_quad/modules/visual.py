@@ -16,12 +16,21 @@ from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, TanhNor
 from torchrl.modules.models.utils import SquashDims
 from torchrl.modules.tensordict_module.rnn import GRU
 
-from torchrl_quad.modules.networks import OBSERVATION, first_action, network_of, sampling, start_near
+from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead
+from torchrl_quad.modules.networks import (
+    OBSERVATION,
+    first_action,
+    network_of,
+    sampling,
+    start_near,
+    with_head,
+    writes_noise,
+)
 from torchrl_quad.modules.plain import (
-    GaussianHead,
     Network,
     PlainTanhGaussian,
     bounds_of,
+    explore,
     is_hooked,
     is_pointwise,
     samples,
@@ -45,6 +54,7 @@ def make_visual_actor(
     action_init: Tensor | None = None,
     scale_init: float = 0.1,
     learn_scale: bool = True,
+    noise_correlation: float = 0.0,
     return_log_prob: bool = False,
 ) -> ProbabilisticActor:
     """A tanh-Gaussian policy of a depth image and vectors, with memory or without.
@@ -74,6 +84,7 @@ def make_visual_actor(
         action_init: as for :func:`~torchrl_quad.make_actor`.
         scale_init: as there.
         learn_scale: as there.
+        noise_correlation: as there.
         return_log_prob: as there.
 
     Raises:
@@ -129,9 +140,9 @@ def make_visual_actor(
     last = MLP(sum(widths), outputs, num_cells=[], device=env.device).to(image.dtype)
     start_near(last[-1], first)
     head = Network(last, [1.0] * len(widths), widths)
-    head.head = GaussianHead(size, f"biased_softplus_{scale_init}")
-    parts.append(TensorDictModule(head, in_keys=["seen", "recalled"][: len(widths)], out_keys=["loc", "scale"]))
-    return VisualActor(TensorDictSequential(*parts), **sampling(spec), return_log_prob=return_log_prob)
+    parts.append(with_head(head, size, scale_init, noise_correlation, ["seen", "recalled"][: len(widths)]))
+    actor = VisualActor(TensorDictSequential(*parts), **sampling(spec), return_log_prob=return_log_prob)
+    return writes_noise(actor) if noise_correlation else actor
 
 
 class Sight(nn.Module):
@@ -170,7 +181,7 @@ class VisualActor(ProbabilisticActor):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
-        """Write loc, scale and action, the memory, and the log-probability if wanted.
+        """Write loc, scale and action, the memory, correlated noise, and the log-probability if wanted.
 
         Raises:
             ValueError: nobody says where episodes begin.
@@ -182,6 +193,9 @@ class VisualActor(ProbabilisticActor):
                 "transforms; or give the environment TorchRL's: TransformedEnv(env, Compose(InitTracker(), "
                 "actor.make_tensordict_primer()))."
             )
+        network = getattr(self[0][-1], "module", None)
+        if type(getattr(network, "head", None)) is CorrelatedHead:
+            return explore(self, network, super().forward, tensordict, **kwargs)
         return super().forward(tensordict, **kwargs)
 
     def replayed(self) -> Replay | None:
@@ -198,7 +212,10 @@ class VisualActor(ProbabilisticActor):
             return None
         seen, *memory, last = self[0].module
         sight, head = (getattr(part, "module", None) for part in (seen, last))
-        if type(sight) is not Sight or not _is_network(head, GaussianHead) or not _is_network(sight.trunk, nn.Identity):
+        if type(sight) is not Sight or not _is_network(sight.trunk, nn.Identity):
+            return None
+        is_correlated = _is_network(head, CorrelatedHead)
+        if not is_correlated and not _is_network(head, GaussianHead):
             return None
         eyes, trunk = list(sight.eyes), [*sight.trunk.mlp, sight.activation]
         if type(sight.eyes) is not ConvNet or type(eyes.pop()) is not SquashDims or sight.eyes[-1].ndims_in != 3:
@@ -210,7 +227,8 @@ class VisualActor(ProbabilisticActor):
         if memory and not _is_memory(memory[0]):
             return None
         reads, keys = ["seen", "recalled"][: len(memory) + 1], [list(part.in_keys) for part in (last, *memory)]
-        if keys != [reads, *([["seen", MEMORY, "is_init"]] if memory else [])] or len(head.scales) != len(reads):
+        wanted = [reads + ["noise_before"] * is_correlated, *([["seen", MEMORY, "is_init"]] if memory else [])]
+        if keys != wanted or len(head.scales) != len(reads):
             return None
         gru = memory[0].gru if memory else None
         return Parts(eyes, NEAREST, trunk, sight.trunk.widths, sight.trunk.scales, gru, head.mlp[0], head.head.size)
@@ -234,7 +252,7 @@ class Replay(PlainTanhGaussian):
 
     def __init__(self, actor: VisualActor) -> None:
         head, sample = actor[0][-1].module.head, actor[1]
-        self.actor, self.head, self.size, self.rho = actor, head, head.size, None
+        self.actor, self.head, self.size, self.rho = actor, head, head.size, getattr(head, "rho", None)
         self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
         self.low, self.high = (x if x is None else x.tolist() for x in bounds_of(actor))
 
@@ -246,7 +264,7 @@ class Replay(PlainTanhGaussian):
         has_time = tensordict.ndim > 1 or tensordict.names[-1] == "time"
         with set_recurrent_mode(has_time):
             read = self.actor.get_dist_params(tensordict.select(*self.actor.in_keys).detach())
-        noise = self.drawn_again(tensordict).view_as(tensordict["action"])
+        noise = self.drawn_again(tensordict)[:, : self.size].view_as(tensordict["action"])
         return self._squash(read["loc"], read["scale"], noise, self.log_prob_key)
 
 

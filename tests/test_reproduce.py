@@ -14,12 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 from scipy.stats import mannwhitneyu
 
 from torchrl_quad import BPTTLoss, differentiable_rollout, make_actor, make_env
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes/trial"))
 
+import ablations
 import ascent
 import claims
 import comparison
@@ -268,6 +270,29 @@ def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(run
     for refused in (["--quick"], ["--tasks", "own_task.CornerEnv"], ["--tasks", "window"]):
         with pytest.raises(SystemExit):
             run_main(monkeypatch, shipped, *refused)
+
+
+def test_options_are_changed_one_at_a_time_and_shown_beside_what_ships(run_here, monkeypatch, tmp_path):
+    monkeypatch.setattr(shipped, "run", run_here)
+    assert [x for x in ablations.CHANGES if not ablations.is_change("landing", "shac", x)] == ["event times"]
+    assert [x for x in ablations.CHANGES if not ablations.is_change("landing", "abpt", x)] == ["no event times"]
+    wanted = ["--tasks", "landing", "--methods", "bptt", "--changes", "event times", "clip", "--seeds", "0"]
+    arguments = [*wanted, "--data", tmp_path, "--output", tmp_path / "runs", "--quick"]
+    run_main(monkeypatch, ablations, *arguments)
+    (row,) = reproduce.read(tmp_path / "ablations.csv")
+    assert (row["change"], row["algorithm"], row["steps"]) == ("clip", "bptt", "64")
+    monkeypatch.setattr(ablations, "train", lambda *_: pytest.fail("It has been flown."))
+    run_main(monkeypatch, ablations, *arguments)
+    ships = [row | {"seed": seed, "return": "9.0", "solved": "0.5"} for seed in "012"]
+    reproduce.write(tmp_path / "shipped.csv", ships)  # of which one seed has flown with a change
+    assert "| landing | BPTT | as it ships | 1 | 9 (9) | 50.0% (50.0%) |" in ablations.summary(tmp_path)
+    with pytest.raises(SystemExit):
+        run_main(monkeypatch, ablations, "--quick")
+    with initialize_config_dir(str(reproduce.RECIPES / "config"), version_base=None):
+        for task in ablations.TASKS:
+            for method in ablations.OF_METHODS:
+                times = compose(method, shipped.VARIANTS.get(task, [f"task={task}"])).env.event_discount
+                assert ablations.is_change(task, method, "event times") is (times is None)
 
 
 def test_policies_of_the_forest_are_flown_at_the_speeds_and_densities_and_not_twice(run_here, monkeypatch, tmp_path):

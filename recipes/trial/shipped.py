@@ -16,6 +16,7 @@ import json
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Lock
@@ -46,10 +47,9 @@ VARIANTS = {"racing_position": ["task=racing", "env.reward=position"]}  # of a t
 ADDING = Lock()
 
 
-def fly(task: str, method: str, seed: int, output: Path, data: Path, quick: bool) -> None:
-    """Train once, and add the final evaluation to the results."""
-    folder = output / task / method / f"seed{seed}"
-    own = [f"seed={seed}", *(QUICK if quick else ()), "resume=auto", f"hydra.run.dir={folder}"]
+def train(task: str, method: str, seed: int, folder: Path, quick: bool, changes: Sequence[str] = ()) -> dict[str, str]:
+    """Train once, or resume it, with changes of what ships; return the final evaluation, and what it is of."""
+    own = [f"seed={seed}", *changes, *(QUICK if quick else ()), "resume=auto", f"hydra.run.dir={folder}"]
     run([sys.executable, str(RECIPES / f"{method}.py"), *VARIANTS.get(task, [f"task={task}"]), *own], folder)
     end = folder / "summary.json"
     summary = json.loads(end.read_text()) if end.exists() else {"solved": 0.0, "crash": 1.0}  # it diverged
@@ -57,12 +57,18 @@ def fly(task: str, method: str, seed: int, output: Path, data: Path, quick: bool
     flown = datetime.date.today().isoformat()
     about = {"task": task, "algorithm": method, "seed": seed, "machine": machine(), "flown": flown, "seconds": seconds}
     summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}
+    return about | {k: v for k, v in summary.items() if k not in about}
+
+
+def fly(task: str, method: str, seed: int, output: Path, data: Path, quick: bool) -> None:
+    """Train once, and add the final evaluation to the results."""
+    folder = output / task / method / f"seed{seed}"
+    row = train(task, method, seed, folder, quick)
     with ADDING:
         key = {"task": task, "algorithm": method, "seed": str(seed)}
         curves = [point for point in read(data / "shipped_curves.csv") if key.items() - point.items()]
         write(data / "shipped_curves.csv", [*curves, *(key | point for point in curve(folder))])
-        others = read(data / "shipped.csv")
-        write(data / "shipped.csv", [*others, about | {k: v for k, v in summary.items() if k not in about}])
+        write(data / "shipped.csv", [*read(data / "shipped.csv"), row])
 
 
 def curve(folder: Path) -> list[dict[str, str]]:

@@ -41,7 +41,6 @@ POLICIES = {  # recipe, and what differs from what it ships with
     "blind": ("bptt", [HALF, "actor.vision=false", "env.camera=null"]),
     "shac": ("shac", []),
     "hybrid": ("hybrid", []),
-    "ppo, a quarter": ("ppo", ["total_steps=720_000"]),
     "ppo": ("ppo", ["total_steps=2_880_000"]),  # about the seconds of BPTT
     "ppo, four times as long": ("ppo", ["total_steps=11_520_000"]),
 }

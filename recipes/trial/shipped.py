@@ -44,11 +44,13 @@ TASKS = {  # what is shown of each beside the solved episodes: column, factor, d
     "racing_position": ("gates_passed", 1, 1, "gates"),
 }
 VARIANTS = {"racing_position": ["task=racing", "env.reward=position"]}  # of a task: its overrides
+RATES = {("racing_position", "ppo"): ["actor.lr=3e-3"]}  # PPO's best rate depends on the reward
 ADDING = Lock()
 
 
 def train(task: str, method: str, seed: int, folder: Path, quick: bool, changes: Sequence[str] = ()) -> dict[str, str]:
     """Train once, or resume it, with changes of what ships; return the final evaluation, and what it is of."""
+    changes = [*RATES.get((task, method), ()), *changes]
     own = [f"seed={seed}", *changes, *(QUICK if quick else ()), "resume=auto", f"hydra.run.dir={folder}"]
     run([sys.executable, str(RECIPES / f"{method}.py"), *VARIANTS.get(task, [f"task={task}"]), *own], folder)
     end = folder / "summary.json"

@@ -316,6 +316,7 @@ def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom():
     expected = mannwhitneyu(ours, theirs).statistic / 12
     assert comparison.probability(np.array(ours), np.array(theirs)) == pytest.approx(expected)
     assert comparison.interval([2.0, 2.0, 2.0]) == (2.0, 2.0)
+    assert comparison.interval([-math.inf, 1.0, 2.0]) == (-math.inf, 2.0)  # one seed diverged
     low, high = comparison.interval([1.0, 2.0, 3.0, 4.0])
     assert 1.0 <= low < 2.5 < high <= 4.0
     flown = {  # by method: return, solved and seconds of each seed

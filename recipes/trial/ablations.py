@@ -64,7 +64,7 @@ def summary(data: Path) -> str:
         for change in ("", *CHANGES):
             if rows := of_change.get(change):
                 returns, solved = (column(rows, name) for name in ("return", "solved"))
-                reached = f"{np.mean(returns):.4g} ({min(returns):.4g})" if returns else "diverged"
+                reached = f"{np.mean(returns):.4g} ({min(returns):.4g})"
                 names = (LABELS.get(task, task), METHODS[method], change or "as it ships", str(len(rows)))
                 lines.append([*names, reached, f"{np.mean(solved):.1%} ({min(solved):.1%})"])
     return table(["task", "", "", "seeds", "return (worst)", "solved (worst)"], lines)

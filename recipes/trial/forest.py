@@ -75,7 +75,7 @@ def fly(policy: str, seed: int, todo: list[tuple[str, float]], args: argparse.Na
     """Train once, then fly through the forests that are wanted, and add each result as it comes."""
     recipe, overrides = POLICIES[policy]
     folder = args.output / policy.replace(",", "").replace(" ", "_") / f"seed{seed}"
-    own = [f"seed={seed}", *overrides, *args.overrides, *(QUICK if args.quick else ())]
+    own = [f"seed={seed}", *overrides, *(QUICK if args.quick else ())]
     own += ["resume=auto", f"hydra.run.dir={folder}"]
     if not (folder / "summary.json").exists():
         run([sys.executable, str(RECIPES / f"{recipe}.py"), "task=forest", *own], folder)
@@ -153,14 +153,13 @@ def main() -> None:
     parser.add_argument("--speeds", nargs="+", type=float, default=list(SPEEDS), help="commanded [m/s]")
     parser.add_argument("--difficulties", nargs="+", default=list(DIFFICULTIES), choices=DIFFICULTIES)
     parser.add_argument("--forests", type=int, default=FORESTS, help="for each speed and density")
-    parser.add_argument("--overrides", nargs="+", default=[], help="of all recipes, such as total_steps=1_000_000")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
     parser.add_argument("--output", type=Path, default=Path("outputs/forest"), help="folder of the runs")
     parser.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
     args = parser.parse_args()
     shipped = args.data.resolve() == DATA.resolve()
-    if args.quick and shipped:
-        parser.error("--quick gives no results to keep: name another folder with --data.")
+    if shipped and (args.quick or args.forests != FORESTS):
+        parser.error("--quick and --forests give no results to keep: name another folder with --data.")
     torch.set_num_threads(1)
     names = ("policy", "seed", "difficulty", "speed")
     kept = {tuple(row[name] for name in names) for row in read(args.data / "forest.csv")}

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
+import math
 import os
 import signal
 import sys
@@ -54,8 +55,9 @@ def train(task: str, method: str, seed: int, folder: Path, quick: bool, changes:
     own = [f"seed={seed}", *changes, *(QUICK if quick else ()), "resume=auto", f"hydra.run.dir={folder}"]
     run([sys.executable, str(RECIPES / f"{method}.py"), *VARIANTS.get(task, [f"task={task}"]), *own], folder)
     end = folder / "summary.json"
-    summary = json.loads(end.read_text()) if end.exists() else {"solved": 0.0, "crash": 1.0}  # it diverged
-    seconds = read(folder / "metrics.csv")[-1]["time/processor_seconds"]
+    diverged = {"return": -math.inf, "solved": 0.0, "crash": 1.0}
+    summary = json.loads(end.read_text()) if end.exists() else diverged
+    seconds = next((row["time/processor_seconds"] for row in read(folder / "metrics.csv")[::-1]), "")
     flown = datetime.date.today().isoformat()
     about = {"task": task, "algorithm": method, "seed": seed, "machine": machine(), "flown": flown, "seconds": seconds}
     summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}

@@ -46,8 +46,8 @@ def make_actor(
         num_cells: widths of the hidden layers.
         in_keys: the entries that are concatenated into the network's input, each (*, k).
         activation: of the hidden layers; smooth ones give smooth policy gradients.
-        input_scale: multiplies the input; a number, or one for each of ``in_keys``. What the tasks observe is of about
-            one; entries of the state may not be.
+        input_scale: multiplies the input; a number, or one for each of ``in_keys``. What the tasks observe is of one to
+            ten [m, m/s, rad/s, ten times the quaternion]; entries of the state may be far larger.
         action_init: the mean action at the start, (k), strictly between the bounds. By default
             ``env.neutral_action``, averaged over environments, where the environment has one (see
             :mod:`torchrl_quad.data`; a drone's is to hover), and the middle of the range elsewhere.
@@ -61,9 +61,10 @@ def make_actor(
         return_log_prob: also write the log-probability of the action, which an entropy bonus and PPO need.
 
     Raises:
-        ValueError: an entry is unknown or has more than one dimension, or the action has; a width is not a whole number
-            of at least 1, the number of scales is not that of the entries, or the first action is not strictly inside
-            the bounds.
+        ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one;
+            ``in_keys`` is empty; a width is not a whole number of at least 1; the number of scales is not that of the
+            entries; the first action is not strictly inside the bounds; ``scale_init`` is not positive and finite, or
+            ``noise_correlation`` not from 0 to below 1.
     """
     spec, first = first_action(env, action_init, scale_init, "make_actor")
     size = spec.shape[-1]

@@ -123,7 +123,7 @@ def explore(
     Args:
         actor: the policy.
         network: its last one, whose head is a :class:`CorrelatedHead`.
-        act: what it does where it does not sample.
+        act: what it does under an exploration type that is neither RANDOM nor DETERMINISTIC.
         tensordict: the states (*), which it writes into.
         kwargs: of ``act``.
     """
@@ -196,7 +196,7 @@ class PlainTanhGaussian:
         return torch.cat((noise, torch.stack(earlier)), -1)
 
     def drawn_again(self, tensordict: TensorDictBase) -> Tensor:
-        """What was drawn for the actions of a rollout (*), as rows (n, k)."""
+        """What was drawn for the actions of a rollout (*), as rows (n, k); see :meth:`drawn` for correlated noise."""
         if self.rho is not None:
             noise, before = (tensordict[key].detach() for key in ("noise", "noise_before"))
             return torch.cat((self.head.innovation(before, noise), before), -1).flatten(0, -2)

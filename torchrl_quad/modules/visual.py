@@ -88,7 +88,8 @@ def make_visual_actor(
         return_log_prob: as there.
 
     Raises:
-        ValueError: the environment has no such image, or a width is not a whole number of at least 1; or as for
+        ValueError: the environment has no such image, ``num_cells`` or ``channels`` is empty, or a width is not a whole
+            number of at least 1; or as for
             :func:`~torchrl_quad.make_actor`.
     """
     known = dict(env.observation_spec.items(True, True))
@@ -159,7 +160,7 @@ class Sight(nn.Module):
         self.eyes, self.trunk, self.activation = eyes, trunk, activation
 
     def forward(self, depth: Tensor, *vectors: Tensor) -> Tensor:
-        """The features (*, k) of a depth image (*, 1, height, width) [m] and of vectors (*, k_i)."""
+        """The features (*, k) of a depth image (*, channels, height, width) [m] and of vectors (*, k_i)."""
         return self.activation(self.trunk(self.eyes(depth.clamp_min(NEAREST).reciprocal()), *vectors))
 
 

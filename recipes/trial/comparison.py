@@ -61,7 +61,7 @@ def reached_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mappin
             mean = f"{interquartile_mean(returns):.4g}"
             if len(returns) >= ENOUGH:
                 mean += " ({:.4g} to {:.4g})".format(*interval(returns))
-            precise = f"{factor * interquartile_mean(metric):.{digits}f} {unit}" if metric else ""
+            precise = f"{factor * np.median(metric):.{digits}f} {unit}" if metric else ""
             cost = f"{np.median(column(own, 'steps')) / 1e6:.1f}", f"{np.median(column(own, 'seconds')):.0f}"
             share = f"{np.mean(solved):.1%} ({min(solved):.1%})"
             lines.append([LABELS.get(task, task), label, str(len(own)), mean, share, precise, *cost])

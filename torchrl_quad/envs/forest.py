@@ -44,8 +44,8 @@ class ForestEnv(QuadrotorEnv):
     ground [m], the direction N away from that, and h(x) = (|x|^2 + 0.25)^(1/2) - 0.5:
 
     - speed: 0.1 (1 - h(v - c) / h(c)): nothing for a drone that stands still, the most for one that flies as commanded;
-    - clearance: -0.1 log(1 + exp((0.3 - d) / 0.1)) 0.1 / 0.3;
-    - closing: -0.05 max(-N v, 0) exp(-d / 0.5), the speed towards the nearest surface, where it is near;
+    - clearance: -0.1 log(1 + exp((0.3 - d) / 0.1));
+    - closing: -0.15 max(-N v, 0) exp(-d / 0.5), the speed towards the nearest surface, where it is near;
     - smoothness: -0.005 |w|^2, with the angular velocity w;
     - heading: -0.05 (1 - cos), with the horizontal angle from the body's x axis to the command;
     - collision: -10 for a crash, and finish: 10 on the other side. These two carry no gradient.
@@ -87,8 +87,8 @@ class ForestEnv(QuadrotorEnv):
     margin, softness, nearness = 0.3, 0.1, 0.5  # [m], of the rewards for clearance and for the closing speed
     weights = {
         "speed": 0.1,
-        "clearance": 0.1,
-        "closing": 0.05,
+        "clearance": 0.3,
+        "closing": 0.15,
         "smoothness": 0.005,
         "heading": 0.05,
         "collision": 10.0,

@@ -27,7 +27,7 @@ def main(cfg: DictConfig) -> None:
         # Both gradients of one horizon, and what they are worth.
         rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         data = loss.write_targets(rollout)
-        read = data.exclude("state", "next")  # which minibatches do not read
+        read = data.exclude("state", "next", "metrics", "reward_terms")  # which minibatches do not read
 
         # Several passes over it, until the policy has moved far enough.
         moved = 0.0

@@ -207,6 +207,15 @@ class PlainTanhGaussian:
         limit = 1.0 - torch.finfo(action.dtype).resolution
         return ((torch.atanh(action.clamp(-limit, limit)) - loc) / scale).flatten(0, -2)
 
+    def distribution(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """loc and scale (*, k) in the states of a rollout (*), with gradients in the weights alone."""
+        x = _concatenated([tensordict[key].detach() for key in self.in_keys], self.scales)
+        layers = zip(self.weights[::2], self.weights[1::2], [*self.activations, None], strict=True)
+        for weight, bias, activation in layers:
+            x = nn.functional.linear(x, weight, bias)
+            x = x if activation is None else activation(x)
+        return self.head(x, *([] if self.rho is None else [tensordict["noise_before"].detach()]))
+
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
     ) -> tuple[list[Tensor], dict[Any, Tensor]]:

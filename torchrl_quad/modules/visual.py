@@ -257,16 +257,20 @@ class Replay(PlainTanhGaussian):
         self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
         self.low, self.high = (x if x is None else x.tolist() for x in bounds_of(actor))
 
-    def replay(self, tensordict: TensorDictBase) -> dict[Any, Tensor]:
-        """What it writes in the states of a rollout (*, horizon), with the noise of the rollout.
+    def distribution(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """loc and scale in the states of a rollout (*, horizon), with gradients in the weights alone.
 
         Single steps (n) that are no rollout are each remembered as they were flown.
         """
         has_time = tensordict.ndim > 1 or tensordict.names[-1] == "time"
         with set_recurrent_mode(has_time):
             read = self.actor.get_dist_params(tensordict.select(*self.actor.in_keys).detach())
+        return read["loc"], read["scale"]
+
+    def replay(self, tensordict: TensorDictBase) -> dict[Any, Tensor]:
+        """What it writes in the states of a rollout (*, horizon), with the noise of the rollout."""
         noise = self.drawn_again(tensordict)[:, : self.size].view_as(tensordict["action"])
-        return self._squash(read["loc"], read["scale"], noise, self.log_prob_key)
+        return self._squash(*self.distribution(tensordict), noise, self.log_prob_key)
 
 
 def _is_network(module: nn.Module | None, head: type[nn.Module]) -> bool:

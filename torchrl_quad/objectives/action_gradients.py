@@ -65,6 +65,17 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
         return act(plain, tensordict.select(*plain.in_keys).detach(), plain.drawn_again(tensordict))
 
 
+def distribution_again(
+    actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase
+) -> tuple[Tensor, Tensor]:
+    """The mean and standard deviation of the normal distribution, before the tanh, in a rollout's states: (*, k).
+
+    The arguments, the gradients and the errors are those of :func:`act_again`.
+    """
+    with params.to_module(actor):
+        return _plain(actor).distribution(tensordict)
+
+
 def location_gradient(
     actor: TensorDictModule,
     params: TensorDictParams,

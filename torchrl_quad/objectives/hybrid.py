@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 
-from torchrl_quad.objectives.action_gradients import act_again, action_gradient, location_gradient
+from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again, location_gradient
 from torchrl_quad.objectives.pathwise import discounts, segments
 from torchrl_quad.objectives.shac import SHACLoss
 
@@ -204,8 +204,9 @@ class HybridLoss(SHACLoss):
 
     def _distributions(self, tensordict: TensorDictBase) -> tuple[Normal, Normal]:
         """The normal distribution of the policy as it is, and as it flew."""
-        new = act_again(self.actor_network, self.actor_network_params, tensordict)
-        return Normal(new["loc"], new["scale"]), Normal(tensordict.get("loc"), tensordict.get("scale"))
+        new = distribution_again(self.actor_network, self.actor_network_params, tensordict)
+        old = tensordict.get("loc"), tensordict.get("scale")
+        return Normal(*new, validate_args=False), Normal(*old, validate_args=False)
 
     def _ratio(self, new: Normal, old: Normal, tensordict: TensorDictBase) -> Tensor:
         """The ratio of the probabilities of the action that was flown: (*, 1)."""

@@ -248,18 +248,18 @@ def test_without_visited_states_every_horizon_goes_on_where_the_last_one_ended()
 
 def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(run_here, monkeypatch, tmp_path):
     monkeypatch.setattr(shipped, "run", run_here)
-    wanted = ["--tasks", "racing", "own_task.CornerEnv", "--methods", "ppo", "--seeds", "0", "--cores", "2"]
+    wanted = ["--tasks", "six_gates_back", "own_task.CornerEnv", "--methods", "ppo", "--seeds", "0", "--cores", "2"]
     arguments = [*wanted, "--data", tmp_path, "--output", tmp_path / "runs", "--quick"]
     run_main(monkeypatch, shipped, *arguments[:-1], "--quick")
     rows = reproduce.read(tmp_path / "shipped.csv")
-    assert len(rows) == 2 and {row["task"] for row in rows} == {"own_task.CornerEnv", "racing"}
+    assert len(rows) == 2 and {row["task"] for row in rows} == {"own_task.CornerEnv", "six_gates_back"}
     assert all(row["steps"] == "64" and row["machine"] and float(row["seconds"]) > 0 for row in rows)
     page = (tmp_path / "summary.md").read_text()
-    assert "| racing |  |  |  |  | 0.0% (0.0%), 0.0 gates, " in page
+    assert "| six gates, backwards |  |  |  |  | 0.0% (0.0%), 0.00 gates passed, " in page
     assert re.search(r"\| own_task.CornerEnv \|  \|  \|  \|  \| 0.0% \(0.0%\), \d\.\d\d m, ", page)
-    assert "| racing | PPO | 1 | " in page
+    assert "| six gates, backwards | PPO | 1 | " in page
     curves = reproduce.read(tmp_path / "shipped_curves.csv")
-    assert {row["task"] for row in curves} == {"own_task.CornerEnv", "racing"} and curves[-1]["steps"] == "64"
+    assert {row["task"] for row in curves} == {"own_task.CornerEnv", "six_gates_back"} and curves[-1]["steps"] == "64"
     assert (tmp_path / "results/shipped.png").stat().st_size > 10_000
     monkeypatch.setattr(shipped, "run", lambda *_: pytest.fail("It has been flown."))
     run_main(monkeypatch, shipped, *arguments)

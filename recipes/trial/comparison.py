@@ -23,7 +23,11 @@ Row = Mapping[str, str]
 Shown = tuple[str, float, int, str]  # of a task: column, factor, digits, unit
 RELIABLE = 0.99  # of the episodes, solved by the worst seed
 ENOUGH = 3  # seeds, for an interval
-LABELS = {"racing_position": "racing, position"}  # of variants of a task
+LABELS = {  # of variants of a task
+    "racing_position": "racing, position",
+    "six_gates": "six gates",
+    "six_gates_back": "six gates, backwards",
+}
 
 
 def interquartile_mean(values: ArrayLike) -> NDArray[np.float64]:

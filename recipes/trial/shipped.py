@@ -2,6 +2,7 @@
 
 python recipes/trial/shipped.py --cores 2
 python recipes/trial/shipped.py --tasks mypackage.WindowEnv --data FOLDER   # a task of your own; the table in FOLDER
+python recipes/trial/shipped.py --tasks six_gates six_gates_back --data FOLDER   # a track it was not tuned on
 
 It may be stopped at any moment. Started again, it skips what is in docs/results/data/shipped.csv, and resumes what was
 cut off. The README shows each method on each task: the episodes solved over all seeds, and by the worst of them.
@@ -30,6 +31,7 @@ from results import fill
 from tables import table
 
 from torchrl_quad.envs import task_class
+from torchrl_quad.envs.racing import load_track
 from torchrl_quad.envs.scenery import EPISODE_METRICS
 from torchrl_quad.files import machine
 from torchrl_quad.files import read_rows as read
@@ -44,7 +46,11 @@ TASKS = {  # what is shown of each beside the solved episodes: column, factor, d
     "racing": ("gates_passed", 1, 1, "gates"),
     "racing_position": ("gates_passed", 1, 1, "gates"),
 }
-VARIANTS = {"racing_position": ["task=racing", "env.reward=position"]}  # of a task: its overrides
+VARIANTS = {  # of a task: its overrides
+    "racing_position": ["task=racing", "env.reward=position"],
+    "six_gates": ["task=racing", "env.track=six_gates"],
+    "six_gates_back": ["task=racing", f"env.track={{gates: {load_track('six_gates')['gates'][::-1]}}}"],
+}
 RATES = {("racing_position", "ppo"): ["actor.lr=3e-3"]}  # PPO's best rate depends on the reward
 ADDING = Lock()
 
@@ -100,8 +106,9 @@ def known(name: str) -> str:
 
 
 def first_metric(task: str) -> tuple[str, float, int, str]:
-    """Show of a task of your own the metric that its class names first; where it has none, the return."""
-    own = [x for x in task_class(task).metric_info.items() if x[0] not in EPISODE_METRICS]
+    """Show of any other task the metric that its class names first; where it has none, the return."""
+    (_, name), *_ = (override.split("=") for override in VARIANTS.get(task, [f"task={task}"]))
+    own = [x for x in task_class(name).metric_info.items() if x[0] not in EPISODE_METRICS]
     name, metric = own[0] if own else ("return", EPISODE_METRICS["return"])
     return name, metric.scale, 2, metric.unit or metric.label
 

@@ -24,26 +24,34 @@ from tables import table
 
 from torchrl_quad.files import read_rows as read
 
-CHANGES = {
-    "event times": ["env.event_discount=${gamma}"],
-    "no event times": ["env.event_discount=null"],
-    "clip": ["loss.clip_action_gradient=2"],
-    "KL bound": ["actor.max_kl=0.05"],
-    "correlated noise": ["actor.noise_correlation=0.9"],
+OPTIONS = {  # with it, and without it
+    "event times": ("env.event_discount", "${gamma}", "null"),
+    "clip": ("loss.clip_action_gradient", "2", "null"),
+    "KL bound": ("actor.max_kl", "0.05", "null"),
+    "correlated noise": ("actor.noise_correlation", "0.9", "0"),
+    "fixed noise": ("actor.learn_scale", "false", "true"),  # noise that stays as large as it starts
 }
-TASKS, OF_METHODS, SEEDS = ("landing", "racing_position"), ("bptt", "shac", "abpt"), tuple(range(5))
-SHIPS_WITH = {("landing", method): "event times" for method in ("bptt", "shac")}  # elsewhere: without
+CHANGES = {
+    f"{no}{x}": f"{key}={value}" for x, (key, *v) in OPTIONS.items() for no, value in zip(("", "no "), v, strict=True)
+}
+TASKS, OF_METHODS, SEEDS = ("landing", "racing", "racing_position"), ("bptt", "shac", "abpt"), tuple(range(5))
+IN_RACING = {"event times", "clip", "correlated noise", "fixed noise"}
+SHIPS_WITH = {  # task and method: which of the options they have; the others have none
+    **{("landing", method): {"event times"} for method in ("bptt", "shac")},
+    **{(task, method): IN_RACING for task in ("racing", "racing_position") for method in ("bptt", "shac")},
+}
 
 
 def is_change(task: str, method: str, change: str) -> bool:
     """Whether it differs from what ships."""
-    return change != SHIPS_WITH.get((task, method), "no event times")
+    has = change.removeprefix("no ") in SHIPS_WITH.get((task, method), ())
+    return change.startswith("no ") == has
 
 
 def fly(task: str, method: str, change: str, seed: int, output: Path, data: Path, quick: bool) -> None:
     """Train once with a change, and add the final evaluation to the results."""
     folder = output / task / method / change.replace(" ", "_") / f"seed{seed}"
-    row = train(task, method, seed, folder, quick, CHANGES[change])
+    row = train(task, method, seed, folder, quick, [CHANGES[change]])
     with ADDING:
         write(data / "ablations.csv", [*read(data / "ablations.csv"), {"change": change} | row])
 

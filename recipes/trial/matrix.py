@@ -22,6 +22,10 @@ TASKS = tuple(STEPS)
 EPISODE = {"hovering": 256, "tracking": 512, "landing": 256, "racing": 512}
 # What the recipes have taken on since the trial, and the trial goes without.
 AS_THEN = ("env.event_discount=null",)
+RACING_AS_THEN = (  # of BPTT and SHAC
+    "loss.clip_action_gradient=null",
+    *("actor.scale_init=0.3", "actor.learn_scale=true", "actor.noise_correlation=0"),
+)
 PPO_AS_THEN = (
     *("num_envs=256", "horizon=64", "actor.max_kl=null", "actor.noise_correlation=0"),
     *("actor.betas=[0.9,0.999]", "critic.betas=[0.9,0.999]", "critic.lr=1e-3", "critic.final_lr=1e-5"),
@@ -147,6 +151,7 @@ class Job:
             steps, lr = int(SEARCH_FRACTION.get(self.task, 1.0) * steps), self.lr
         lr *= variant.rate
         racing = [x for x in RACING if variant.algorithm != "bptt" or "critic" not in x]
+        racing += RACING_AS_THEN if variant.algorithm in ("bptt", "shac") else ()
         horizon = EPISODE.get(self.task, 256) if variant.horizon == "episode" else variant.horizon
         batch = 128 * 128 if self.task == "racing" else 64 * 64  # steps in an iteration of the first-order methods
         return [

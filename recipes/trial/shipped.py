@@ -107,7 +107,7 @@ def known(name: str) -> str:
 
 def first_metric(task: str) -> tuple[str, float, int, str]:
     """Show of any other task the metric that its class names first; where it has none, the return."""
-    (_, name), *_ = (override.split("=") for override in VARIANTS.get(task, [f"task={task}"]))
+    name = VARIANTS.get(task, [f"task={task}"])[0].removeprefix("task=")
     own = [x for x in task_class(name).metric_info.items() if x[0] not in EPISODE_METRICS]
     name, metric = own[0] if own else ("return", EPISODE_METRICS["return"])
     return name, metric.scale, 2, metric.unit or metric.label

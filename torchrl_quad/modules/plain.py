@@ -209,21 +209,17 @@ class PlainTanhGaussian:
 
     def distribution(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """loc and scale (*, k) in the states of a rollout (*), with gradients in the weights alone."""
-        x = _concatenated([tensordict[key].detach() for key in self.in_keys], self.scales)
-        layers = zip(self.weights[::2], self.weights[1::2], [*self.activations, None], strict=True)
-        for weight, bias, activation in layers:
-            x = nn.functional.linear(x, weight, bias)
-            x = x if activation is None else activation(x)
-        return self.head(x, *([] if self.rho is None else [tensordict["noise_before"].detach()]))
+        keys = [*self.in_keys, *([] if self.rho is None else ["noise_before"])]
+        read = [tensordict[key].detach().flatten(0, -2) for key in keys]
+        own = len(self.in_keys)
+        loc, scale = self.head(self._layers(self.weights, read[:own])[-1], *read[own:])
+        return loc.view(*tensordict.shape, -1), scale.view(*tensordict.shape, -1)
 
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
     ) -> tuple[list[Tensor], dict[Any, Tensor]]:
         """What each layer returns before its activation, and loc, scale, action, and log-probability if wanted."""
-        x, kept = _concatenated(inputs, self.scales), []
-        for weight, bias, activation in zip(weights[::2], weights[1::2], [*self.activations, None], strict=True):
-            kept.append(torch.addmm(bias, x, weight.t()))
-            x = kept[-1] if activation is None else activation(kept[-1])
+        kept = self._layers(weights, inputs)
         return kept, self._sample(kept[-1], drawn)
 
     def adjoint(
@@ -257,6 +253,14 @@ class PlainTanhGaussian:
     def action(self, loc: Tensor, scale: Tensor, xi: Tensor) -> Tensor:
         """The action (*, k) of a normal distribution and the noise in it, each (*, k)."""
         return self._squash(loc, scale, xi, None)["action"]
+
+    def _layers(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
+        """What each layer returns before its activation, for inputs (n, k_i)."""
+        x, kept = _concatenated(inputs, self.scales), []
+        for weight, bias, activation in zip(weights[::2], weights[1::2], [*self.activations, None], strict=True):
+            kept.append(torch.addmm(bias, x, weight.t()))
+            x = kept[-1] if activation is None else activation(kept[-1])
+        return kept
 
     def _squash(self, loc: Tensor, scale: Tensor, xi: Tensor, log_prob_key: Any) -> dict[Any, Tensor]:
         low, high = (None if bound is None else loc.new_tensor(bound) for bound in (self.low, self.high))

@@ -206,7 +206,7 @@ class HybridLoss(SHACLoss):
         """The normal distribution of the policy as it is, and as it flew."""
         new = distribution_again(self.actor_network, self.actor_network_params, tensordict)
         old = tensordict.get("loc"), tensordict.get("scale")
-        return Normal(*new, validate_args=False), Normal(*old, validate_args=False)
+        return Normal(*new), Normal(*old)
 
     def _ratio(self, new: Normal, old: Normal, tensordict: TensorDictBase) -> Tensor:
         """The ratio of the probabilities of the action that was flown: (*, 1)."""

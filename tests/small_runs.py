@@ -15,6 +15,7 @@ EVERYTHING = [  # that draws random numbers or keeps a memory
     "env.randomize={mass: {scale: [0.8, 1.2]}}",
     "actor.noise_correlation=0.9",
     "actor.max_kl=0.05",
+    "actor.average=0.5",
 ]
 
 

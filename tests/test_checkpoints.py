@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_runs import SMALL, poison, stop_at_save
+from omegaconf import OmegaConf
+from small_runs import SMALL, poison, rows, stop_at_save
 from training import checkpoints, evaluation
+from training.building import average_policy
 from training.checkpoints import previous, read_checkpoint, write_checkpoint
 
 
@@ -116,3 +118,26 @@ def test_a_checkpoint_without_an_evaluated_policy_is_no_policy(refused, no_pictu
     refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "max_skipped=0")
     with pytest.raises(ValueError, match="failure.pt holds no policy: the run stopped before its first evaluation"):
         evaluation.load_policy(tmp_path / "failure.pt")
+
+
+def test_the_average_of_the_policy_spans_a_share_of_the_iterations_and_is_what_a_run_keeps(train, tmp_path):
+    policy = torch.nn.Linear(1, 1, bias=False)
+    average = average_policy(OmegaConf.create({"actor": {"average": 0.5}}), policy)
+    seen = []
+    for weight in (1.0, 2.0, 3.0):
+        torch.nn.init.constant_(policy.weight, weight)
+        average.update_parameters(policy)
+        seen.append(average.module.weight.item())
+    assert seen == pytest.approx([1.0, 7 / 4, 22 / 9])  # what was before counts (1 - 1/t)^2: 0, 1/4, 4/9
+
+    saved = train("bptt", tmp_path / "averaged", "actor.average=1", "eval.interval=8")  # a plain mean of the weights
+    plain = train("bptt", tmp_path / "plain", "eval.interval=8")
+    assert saved["stateful"][0].keys() == plain["stateful"][0].keys()
+    for name, weight in saved["stateful"][0].items():  # which the training does not see
+        torch.testing.assert_close(weight, plain["stateful"][0][name], rtol=0, atol=0)
+    best, last = (x["best"]["actor"] for x in (saved, plain))
+    mean = {k.removeprefix("module."): v for k, v in saved["stateful"][-1].items()}
+    assert mean.pop("n_averaged") == 8
+    torch.testing.assert_close(best, mean, rtol=0, atol=0)
+    assert any((best[name] - last[name]).abs().max() > 1e-3 for name in best)
+    assert rows(tmp_path / "averaged")[-1]["eval/return"] != rows(tmp_path / "plain")[-1]["eval/return"]

@@ -10,9 +10,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 from torch.optim import lr_scheduler
-from torch.optim.swa_utils import get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import SoftUpdate
 
@@ -150,6 +150,22 @@ class TargetUpdate(SoftUpdate):
         name = f"{self.loss_module.critic_name}_params"
         target, critic = (getattr(self.loss_module, f"{prefix}{name}").values(True, True) for prefix in ("target_", ""))
         get_ema_multi_avg_fn(self.eps)(list(target), list(critic), None)
+
+
+def average_policy(cfg: DictConfig, actor: TensorDictModuleBase) -> AveragedModel | None:
+    """The running average of a policy's weights over the last iterations, where the configuration wants one.
+
+    The average is about ``actor.average`` of the iterations so far long, so that it grows with the run and forgets
+    the start (the power function average of Karras et al. 2024, arXiv:2312.02696).
+    """
+    share = cfg.actor.get("average")  # checkpoints from before have none
+    if share is None:
+        return None
+
+    def update(average: list[Tensor], now: list[Tensor], updates: Tensor) -> None:
+        get_ema_multi_avg_fn((1 - 1 / (updates.item() + 1)) ** (1 / share))(average, now, updates)
+
+    return AveragedModel(actor, multi_avg_fn=update)
 
 
 def trust_region(cfg: DictConfig, actor: TensorDictModuleBase) -> TrustRegion:

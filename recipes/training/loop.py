@@ -31,7 +31,7 @@ from torchrl_quad import (
 from torchrl_quad.files import replacing
 from torchrl_quad.objectives import PathwiseLoss
 from training import drawing
-from training.building import iterations, own_seed
+from training.building import average_policy, iterations, own_seed
 from training.checkpoints import read_checkpoint, revision, write_checkpoint
 from training.evaluation import (
     best_policy,
@@ -92,7 +92,10 @@ class Run:
         buffer: VisitedStateBuffer | None = None,
     ) -> None:
         self.cfg, self.env, self.actor, self.loss, self.buffer = cfg, env, actor, loss, buffer
-        self.stateful = [loss, *stateful, *([env.transform] if cfg.normalize else [])]
+        self.average = average_policy(cfg, actor)
+        self.flown = actor if self.average is None else self.average.module  # what evaluations fly
+        averages = [] if self.average is None else [self.average]
+        self.stateful = [loss, *stateful, *averages, *([env.transform] if cfg.normalize else [])]
         self.horizon, self.steps, self.drones = cfg.horizon, 0, cfg.num_envs * world_size()
         self.total_steps = iterations(cfg) * cfg.horizon * self.drones
         self.recorded: dict[str, list[float]] = defaultdict(list)
@@ -141,6 +144,8 @@ class Run:
                 self.starts.append(self.carry["state", "position"].clone())
                 start, processor_start = time.perf_counter(), time.process_time()
                 yield self.done
+                if self.average is not None:
+                    self.average.update_parameters(self.actor)
                 self.seconds += time.perf_counter() - start
                 self.processor_seconds += time.process_time() - processor_start
                 self.done += 1
@@ -215,7 +220,7 @@ class Run:
     def _evaluate(self) -> dict[str, float]:
         """Fly the policy as it is, and log the result with everything recorded since the last time."""
         with drawing_from(self.env, self.cfg.eval.seed):
-            metrics, flight = evaluate(self.env, self.actor)
+            metrics, flight = evaluate(self.env, self.flown)
         row = {
             "iteration": self.done,
             "steps": self.steps,
@@ -239,7 +244,7 @@ class Run:
         # A checkpoint from before knows the return alone.
         record = self.best.get("solved", -math.inf), self.best["return"]
         if math.isfinite(score["return"]) and tuple(score.values()) >= record:
-            policy = {"actor": self.actor, **({"normalizer": self.env.transform} if self.cfg.normalize else {})}
+            policy = {"actor": self.flown, **({"normalizer": self.env.transform} if self.cfg.normalize else {})}
             weights = {name: copy.deepcopy(module.state_dict()) for name, module in policy.items()}
             self.best = {**score, "steps": self.steps, **weights}
         return metrics

@@ -120,6 +120,10 @@ class Actor(Optimised):
     max_kl: Positive | None = Field(
         description="How far an update, or PPO's iteration, may move the policy; null for none."
     )
+    average: Annotated[Real, Field(gt=0, le=1)] | None = Field(
+        description="The share of the iterations so far over which the weights that are evaluated are averaged, such "
+        "as 0.1; null for none."
+    )
 
 
 class Critic(Optimised):

@@ -30,7 +30,6 @@ OPTIONS = {  # with it, and without it
     "KL bound": ("actor.max_kl", "0.05", "null"),
     "correlated noise": ("actor.noise_correlation", "0.9", "0"),
     "fixed noise": ("actor.learn_scale", "false", "true"),  # noise that stays as large as it starts
-    "average": ("actor.average", "0.1", "null"),
 }
 CHANGES = {
     f"{no}{x}": f"{key}={value}" for x, (key, *v) in OPTIONS.items() for no, value in zip(("", "no "), v, strict=True)
@@ -39,8 +38,7 @@ TASKS, OF_METHODS, SEEDS = ("landing", "racing", "racing_position"), ("bptt", "s
 IN_RACING = {"event times", "clip", "correlated noise", "fixed noise"}
 SHIPS_WITH = {  # task and method: which of the options they have; the others have none
     **{("landing", method): {"event times"} for method in ("bptt", "shac")},
-    **{(task, "bptt"): IN_RACING for task in ("racing", "racing_position")},
-    **{(task, "shac"): IN_RACING | {"average"} for task in ("racing", "racing_position")},
+    **{(task, method): IN_RACING for task in ("racing", "racing_position") for method in ("bptt", "shac")},
 }
 
 

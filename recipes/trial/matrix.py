@@ -24,7 +24,7 @@ EPISODE = {"hovering": 256, "tracking": 512, "landing": 256, "racing": 512}
 AS_THEN = ("env.event_discount=null",)
 RACING_AS_THEN = (  # of BPTT and SHAC
     "loss.clip_action_gradient=null",
-    *("actor.scale_init=0.3", "actor.learn_scale=true", "actor.noise_correlation=0", "actor.average=null"),
+    *("actor.scale_init=0.3", "actor.learn_scale=true", "actor.noise_correlation=0"),
 )
 PPO_AS_THEN = (
     *("num_envs=256", "horizon=64", "actor.max_kl=null", "actor.noise_correlation=0"),

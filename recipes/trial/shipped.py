@@ -51,16 +51,13 @@ VARIANTS = {  # of a task: its overrides
     "six_gates": ["task=racing", "env.track=six_gates"],
     "six_gates_back": ["task=racing", f"env.track={{gates: {load_track('six_gates')['gates'][::-1]}}}"],
 }
-BY_REWARD = {  # what a method needs with the position reward
-    ("racing_position", "ppo"): ["actor.lr=3e-3"],
-    ("racing_position", "shac"): ["total_steps=12_288_000"],
-}
+RATES = {("racing_position", "ppo"): ["actor.lr=3e-3"]}  # PPO's best rate depends on the reward
 ADDING = Lock()
 
 
 def train(task: str, method: str, seed: int, folder: Path, quick: bool, changes: Sequence[str] = ()) -> dict[str, str]:
     """Train once, or resume it, with changes of what ships; return the final evaluation, and what it is of."""
-    changes = [*BY_REWARD.get((task, method), ()), *changes]
+    changes = [*RATES.get((task, method), ()), *changes]
     own = [f"seed={seed}", *changes, *(QUICK if quick else ()), "resume=auto", f"hydra.run.dir={folder}"]
     run([sys.executable, str(RECIPES / f"{method}.py"), *VARIANTS.get(task, [f"task={task}"]), *own], folder)
     end = folder / "summary.json"

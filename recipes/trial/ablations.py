@@ -30,6 +30,7 @@ OPTIONS = {  # with it, and without it
     "KL bound": ("actor.max_kl", "0.05", "null"),
     "correlated noise": ("actor.noise_correlation", "0.9", "0"),
     "fixed noise": ("actor.learn_scale", "false", "true"),  # noise that stays as large as it starts
+    "average": ("actor.average", "0.1", "null"),
 }
 CHANGES = {
     f"{no}{x}": f"{key}={value}" for x, (key, *v) in OPTIONS.items() for no, value in zip(("", "no "), v, strict=True)

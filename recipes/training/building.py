@@ -153,10 +153,10 @@ class TargetUpdate(SoftUpdate):
 
 
 def average_policy(cfg: DictConfig, actor: TensorDictModuleBase) -> AveragedModel | None:
-    """The running average of a policy's weights over the last iterations, where the configuration wants one.
+    """The running average of a policy's weights, where the configuration wants one.
 
-    The average is about ``actor.average`` of the iterations so far long, so that it grows with the run and forgets
-    the start (the power function average of Karras et al. 2024, arXiv:2312.02696).
+    It spans about the share ``actor.average`` of the iterations so far, so it lengthens with the run and forgets the
+    start (the power function average of Karras et al. 2024, arXiv:2312.02696).
     """
     share = cfg.actor.get("average")  # checkpoints from before have none
     if share is None:

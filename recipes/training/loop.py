@@ -54,7 +54,8 @@ class Run:
     Evaluates every ``eval.interval`` iterations, and each time writes a row of metrics and a checkpoint. The checkpoint
     holds all that the run needs to go on exactly as if it had not stopped (``resume=PATH``), and the best policy so
     far, which is flown at the end from other starts: the one that solved most episodes in these evaluations, and of
-    those the one with the greatest return.
+    those the one with the greatest return. With ``actor.average`` evaluations fly the average of the policy's weights,
+    and the best policy is one of these averages.
 
     Leaves in the run's folder: ``config.yaml``, ``metrics.csv``, ``checkpoint.pt`` and the one before it,
     ``summary.json``, ``learning_curve.png``, and the flight as ``flight.png``, ``flight.mp4`` or .gif,
@@ -218,7 +219,7 @@ class Run:
         self.loss.load_state_dict(before)  # such as running means
 
     def _evaluate(self) -> dict[str, float]:
-        """Fly the policy as it is, and log the result with everything recorded since the last time."""
+        """Fly the policy or its average, and log the result with everything recorded since the last time."""
         with drawing_from(self.env, self.cfg.eval.seed):
             metrics, flight = evaluate(self.env, self.flown)
         row = {

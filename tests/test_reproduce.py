@@ -291,7 +291,7 @@ def test_options_are_changed_one_at_a_time_and_shown_beside_what_ships(run_here,
     with initialize_config_dir(str(reproduce.RECIPES / "config"), version_base=None):
         for task in ablations.TASKS:
             for method in ablations.OF_METHODS:
-                cfg = compose(method, shipped.VARIANTS.get(task, [f"task={task}"]))
+                cfg = compose(method, shipped.overrides(task, method))
                 for change, override in ablations.CHANGES.items():
                     key, value = override.split("=")
                     value = cfg.gamma if value == "${gamma}" else yaml.safe_load(value)

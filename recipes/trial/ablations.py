@@ -40,6 +40,7 @@ IN_RACING = {"event times", "clip", "correlated noise", "fixed noise"}
 SHIPS_WITH = {  # task and method: which of the options they have; the others have none
     **{("landing", method): {"event times"} for method in ("bptt", "shac")},
     **{(task, method): IN_RACING for task in ("racing", "racing_position") for method in ("bptt", "shac")},
+    ("racing_position", "shac"): IN_RACING | {"average"},
 }
 
 

@@ -51,15 +51,13 @@ VARIANTS = {  # of a task: its overrides
     "six_gates": ["task=racing", "env.track=six_gates"],
     "six_gates_back": ["task=racing", f"env.track={{gates: {load_track('six_gates')['gates'][::-1]}}}"],
 }
-RATES = {("racing_position", "ppo"): ["actor.lr=3e-3"]}  # PPO's best rate depends on the reward
 ADDING = Lock()
 
 
 def train(task: str, method: str, seed: int, folder: Path, quick: bool, changes: Sequence[str] = ()) -> dict[str, str]:
     """Train once, or resume it, with changes of what ships; return the final evaluation, and what it is of."""
-    changes = [*RATES.get((task, method), ()), *changes]
     own = [f"seed={seed}", *changes, *(QUICK if quick else ()), "resume=auto", f"hydra.run.dir={folder}"]
-    run([sys.executable, str(RECIPES / f"{method}.py"), *VARIANTS.get(task, [f"task={task}"]), *own], folder)
+    run([sys.executable, str(RECIPES / f"{method}.py"), *overrides(task, method), *own], folder)
     end = folder / "summary.json"
     diverged = {"return": -math.inf, "solved": 0.0, "crash": 1.0}
     summary = json.loads(end.read_text()) if end.exists() else diverged
@@ -68,6 +66,13 @@ def train(task: str, method: str, seed: int, folder: Path, quick: bool, changes:
     about = {"task": task, "algorithm": method, "seed": seed, "machine": machine(), "flown": flown, "seconds": seconds}
     summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}
     return about | {k: v for k, v in summary.items() if k not in about}
+
+
+def overrides(task: str, method: str) -> list[str]:
+    """Name the task to a recipe; a variant of a task may have tuned values of its own."""
+    tuned = f"{method}_{task}"
+    own = [f"tuned={tuned}"] if task in VARIANTS and (RECIPES / f"config/tuned/{tuned}.yaml").exists() else []
+    return [*VARIANTS.get(task, [f"task={task}"]), *own]
 
 
 def fly(task: str, method: str, seed: int, output: Path, data: Path, quick: bool) -> None:

@@ -38,7 +38,7 @@ CHANGES = {
 TASKS, OF_METHODS, SEEDS = ("landing", "racing", "racing_position"), ("bptt", "shac", "abpt"), tuple(range(5))
 IN_RACING = {"event times", "clip", "correlated noise", "fixed noise"}
 SHIPS_WITH = {  # task and method: which of the options they have; the others have none
-    **{("landing", method): {"event times"} for method in ("bptt", "shac")},
+    **{("landing", method): {"event times", "average"} for method in ("bptt", "shac")},
     **{(task, method): IN_RACING for task in ("racing", "racing_position") for method in ("bptt", "shac")},
     ("racing_position", "shac"): IN_RACING | {"average"},
 }

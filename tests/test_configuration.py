@@ -102,11 +102,12 @@ def test_an_exponential_schedule_does_not_end_at_zero_while_a_linear_one_may():
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_every_configuration_that_ships_passes_the_schema_with_its_tuned_values(recipe):
-    own = sorted(path.stem for path in (CONFIG / "tuned").glob(f"{recipe}_racing_*.yaml"))
-    for task, more in [*((x, []) for x in TASKS), *(("racing", [f"tuned={x}"]) for x in own)]:
-        cfg = composed(recipe, f"task={task}", *more)
+    ships = {f"{recipe}_{task}": [f"task={task}"] for task in TASKS}
+    for path in (CONFIG / "tuned").glob(f"{recipe}_racing_*.yaml"):
+        ships[path.stem] = ["task=racing", f"tuned={path.stem}"]
+    for name, overrides in ships.items():
+        cfg = composed(recipe, *overrides)
         check(cfg)
-        name = more[0].removeprefix("tuned=") if more else f"{recipe}_{task}"
         tuned = yaml.safe_load((CONFIG / f"tuned/{name}.yaml").read_text())
         tuned.pop("defaults", None)
         assert contains(OmegaConf.to_container(cfg), tuned)

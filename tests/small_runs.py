@@ -6,7 +6,10 @@ import torch
 
 from torchrl_quad import BPTTLoss
 
-SMALL = ["num_envs=4", "horizon=6", "total_steps=192", "eval.interval=2", "env.max_episode_steps=30", "compile=false"]
+SMALL = [
+    *("num_envs=4", "horizon=6", "total_steps=192", "env.max_episode_steps=30", "compile=false"),
+    *("eval.interval=2", "eval.episodes=null"),
+]
 EVERYTHING = [  # that draws random numbers or keeps a memory
     "normalize=true",
     "env.wind={mean: [1, 0, 0], gust: 0.5}",

@@ -10,14 +10,17 @@ from pathlib import Path
 import pytest
 import torch
 from omegaconf import OmegaConf
+from small_runs import SMALL as SMALL_RUN
 from training.building import make_optimizer
 from training.checkpoints import read_checkpoint
+from training.evaluation import drawing_from, evaluate
 
+from torchrl_quad import LandingEnv, make_actor
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.scenery import EPISODE_METRICS
 
 ROOT = Path(__file__).parent.parent
-SMALL = ["num_envs=4", "horizon=6", "total_steps=96", "eval.interval=2", "env.max_episode_steps=30", "compile=false"]
+SMALL = [*SMALL_RUN, "total_steps=96"]
 RECIPES = ["abpt", "bptt", "shac", "ppo", "sapo", "ahac", "hybrid"]
 FIRST_ORDER = ["abpt", "bptt", "shac"]
 
@@ -145,3 +148,18 @@ def test_make_train_trains_and_leaves_its_results(tmp_path):
     assert "abpt on hovering, seed 0, 256 fresh episodes" in printed
     pictures = {"learning_curve.png", "flight.png", "flight.mp4", "flight.html", "episode.pdf"}
     assert {"checkpoint.pt", "metrics.csv", *pictures} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_an_evaluation_of_more_episodes_than_drones_flies_rounds_from_starts_of_their_own():
+    env = LandingEnv(num_envs=4, max_episode_steps=10, seed=0)
+    actor = make_actor(env)
+    with drawing_from(env, 7):
+        rounds = [evaluate(env, actor) for _ in range(3)]
+    with drawing_from(env, 7):
+        metrics, flight = evaluate(env, actor, episodes=9)  # 9 take 3 rounds of 4
+    means = [single["eval/return"] for single, _ in rounds]
+    assert len(set(means)) == 3
+    assert metrics["eval/return"] == pytest.approx(sum(means) / 3, rel=1e-6)
+    terms = [value for name, value in metrics.items() if name.startswith("reward/")]
+    assert sum(terms) == pytest.approx(sum(means) / 3, rel=1e-5)
+    torch.testing.assert_close(flight["state"].to_dict(), rounds[-1][1]["state"].to_dict(), rtol=0, atol=0)

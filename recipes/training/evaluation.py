@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -25,25 +25,31 @@ from training.building import build_env, make_policy
 from training.checkpoints import read_checkpoint
 
 
-def evaluate(env: EnvBase, actor: TensorDictModuleBase) -> tuple[dict[str, float], TensorDictBase]:
-    """Fly one episode in every environment.
+def evaluate(
+    env: EnvBase, actor: TensorDictModuleBase, episodes: int | None = None
+) -> tuple[dict[str, float], TensorDictBase]:
+    """Fly one episode in every environment, again and again until there are as many episodes as asked for.
 
     Returns:
         the metrics by name, each the mean over the episodes that have one (the median if the task asks for it), and the
-        flight.
+        last flight of all environments.
     """
+    of_episodes = []
     with torch.no_grad():
-        flight, _ = differentiable_rollout(
-            env, actor, None, env.max_episode_steps, exploration_type=ExplorationType.DETERMINISTIC
-        )
+        for _ in range(-(-(episodes or 1) // env.batch_size[0])):
+            flight, _ = differentiable_rollout(
+                env, actor, None, env.max_episode_steps, exploration_type=ExplorationType.DETERMINISTIC
+            )
+            first = first_episode(flight)
+            rewards = {name: (term * first).sum(1) for name, term in flight["next", "reward_terms"].items()}
+            measured = {"eval": env.episode_metrics(flight), "reward": rewards}
+            of_episodes.append(TensorDict(measured, env.batch_size))
+    measured = torch.cat(of_episodes)
     metrics = {
         f"eval/{name}": describe_metric(name, env.metric_info).summarise(values)
-        for name, values in env.episode_metrics(flight).items()
+        for name, values in measured["eval"].items()
     }
-    first = first_episode(flight)
-    for name, term in flight["next", "reward_terms"].items():
-        metrics[f"reward/{name}"] = (term * first).sum(1).mean().item()
-    return metrics, flight
+    return metrics | {f"reward/{name}": term.mean().item() for name, term in measured["reward"].items()}, flight
 
 
 @contextlib.contextmanager

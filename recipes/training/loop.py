@@ -221,7 +221,7 @@ class Run:
     def _evaluate(self) -> dict[str, float]:
         """Fly the policy or its average, and log the result with everything recorded since the last time."""
         with drawing_from(self.env, self.cfg.eval.seed):
-            metrics, flight = evaluate(self.env, self.flown)
+            metrics, flight = evaluate(self.env, self.flown, self.cfg.eval.episodes)
         row = {
             "iteration": self.done,
             "steps": self.steps,

@@ -188,6 +188,7 @@ class Evaluation(Section):
     """The evaluations during training."""
 
     interval: Size = Field(description="Iterations between evaluations; for the last one alone, write 10000000.")
+    episodes: Size | None = Field(description="Episodes of each evaluation, at least; null for one of each drone.")
     seed: Seed
 
 

@@ -36,11 +36,11 @@ CHANGES = {
     f"{no}{x}": f"{key}={value}" for x, (key, *v) in OPTIONS.items() for no, value in zip(("", "no "), v, strict=True)
 }
 TASKS, OF_METHODS, SEEDS = ("landing", "racing", "racing_position"), ("bptt", "shac", "abpt"), tuple(range(5))
-IN_RACING = {"event times", "clip", "correlated noise", "fixed noise"}
+IN_RACING = {"event times", "clip", "correlated noise", "fixed noise", "average"}
 SHIPS_WITH = {  # task and method: which of the options they have; the others have none
     **{("landing", method): {"event times", "average"} for method in ("bptt", "shac")},
     **{(task, method): IN_RACING for task in ("racing", "racing_position") for method in ("bptt", "shac")},
-    ("racing_position", "shac"): IN_RACING | {"average"},
+    ("racing", "shac"): IN_RACING - {"average"},
 }
 
 

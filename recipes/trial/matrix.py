@@ -21,7 +21,7 @@ STEPS = {  # of a run, for the first-order methods and for PPO, which has more o
 TASKS = tuple(STEPS)
 EPISODE = {"hovering": 256, "tracking": 512, "landing": 256, "racing": 512}
 # What the recipes have taken on since the trial, and the trial goes without.
-AS_THEN = ("env.event_discount=null", "actor.average=null")
+AS_THEN = ("env.event_discount=null", "actor.average=null", "eval.episodes=null")
 RACING_AS_THEN = (  # of BPTT and SHAC
     "loss.clip_action_gradient=null",
     *("actor.scale_init=0.3", "actor.learn_scale=true", "actor.noise_correlation=0"),

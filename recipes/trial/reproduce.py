@@ -35,7 +35,10 @@ from torchrl_quad.files import read_rows as read
 RECIPES = Path(__file__).parents[1]
 sys.path += [str(RECIPES), os.getcwd()]  # the recipes' code, and tasks of your own
 DATA = RECIPES.parent / "docs/results/data"
-QUICK = ["num_envs=4", "horizon=4", "total_steps=64", "env.max_episode_steps=20", "compile=false", "eval.interval=1"]
+QUICK = [
+    *("num_envs=4", "horizon=4", "total_steps=64", "env.max_episode_steps=20", "compile=false"),
+    *("eval.interval=1", "eval.episodes=null"),
+]
 CURVE = {  # columns of a curve, and their names in metrics.csv
     "steps": "steps",
     "seconds": "time/processor_seconds",  # of one thread: other processes do not count

@@ -109,7 +109,9 @@ def test_a_long_gradient_is_shortened_to_so_many_medians():
     shorter, fraction = clip(grad)
     assert shorter.flatten().tolist() == [1.0, -1.0, 1.0, 1.0, 2.0, 0.0]
     assert fraction == pytest.approx(1 / 5)  # of those that are not zero
-    assert clip(torch.tensor([[torch.inf], [1.0]]))[0].tolist() == [[0.0], [1.0]]
+    broken, fraction = clip(torch.tensor([[torch.inf, 1.0], [torch.nan, 1.0], [0.0, 1.0]]))
+    assert broken.tolist() == [[0.0, 0.0], [0.0, 0.0], [0.0, 1.0]]
+    assert fraction == pytest.approx(2 / 3)
     clip.median.fill_(1.0)
     clip(3.0 * grad)
     assert clip.median == 2.0  # half way from 1 to 3

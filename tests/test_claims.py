@@ -10,6 +10,7 @@ from test_reproduce import curve, run_main, write
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes/trial"))
 
+import ablations
 import claims
 import matrix
 import reproduce
@@ -205,6 +206,8 @@ def test_the_page_of_the_project_shows_what_its_data_hold():
         assert f"{results.MARKER.format(name)}\n\n{block}\n\n{results.END}" in shown, (
             "run: python recipes/trial/shipped.py"
         )
+    options = (PROJECT / "docs/ablations.md").read_text()
+    assert ablations.summary(reproduce.DATA) in options, "run: python recipes/trial/ablations.py --tasks landing"
     assert page.count("<!-- generated") == page.count(results.END)
 
 

@@ -4,7 +4,7 @@ python recipes/trial/ablations.py --cores 2
 python recipes/trial/ablations.py --tasks landing --methods shac --changes "KL bound" --seeds 0
 
 It may be stopped at any moment. Started again, it skips what is in docs/results/data/ablations.csv, and resumes what
-was cut off. What the recipes reach as they ship is in shipped.csv beside it. docs/using_losses.md shows the table.
+was cut off. What the recipes reach as they ship is in shipped.csv beside it. docs/ablations.md shows the table.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def main() -> None:
     with ThreadPoolExecutor(args.cores) as pool:
         for future in [pool.submit(fly, *job, args.output, args.data, args.quick) for job in todo]:
             future.result()
-    fill((DATA.parents[1] if ships else args.data) / "using_losses.md", {"ablations": summary(args.data)})
+    fill((DATA.parents[1] if ships else args.data) / "ablations.md", {"ablations": summary(args.data)})
 
 
 if __name__ == "__main__":

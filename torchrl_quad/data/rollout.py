@@ -80,7 +80,8 @@ def differentiable_rollout(
             buffer.detach_()
     end = env.step_mdp(rollout[..., -1]).detach().clone()
     written = end.select(*(key for key in actor.out_keys if key != "action"), strict=False).clone()
-    carry = env.maybe_reset(end).update(written)  # a reset keeps nothing that it does not know, such as noise
+    # A reset keeps nothing that it does not know, such as noise, and an environment with a state of its own its graph.
+    carry = env.maybe_reset(end).detach().update(written)
     done = rollout["next", "done"][..., -1, :]
     for key in memory_keys(actor):
         memory = rollout[..., -1].get(unravel_key(("next", key))).detach()

@@ -139,7 +139,8 @@ def median_length(length: Tensor) -> Tensor:
 class MedianClip(nn.Module):
     """Shortens gradients (*, k) that are longer than ``factor`` times the running median of their lengths.
 
-    One drone that tumbles has gradients many times as long as those of all others, and would be all of their mean.
+    One drone that tumbles has gradients many times as long as those of all others, and would be all of their mean. A
+    gradient that is not finite would be all of it, too: it becomes zero, and counts as shortened.
 
     Args:
         factor: of the median; 1 to 5 are usual.
@@ -154,15 +155,15 @@ class MedianClip(nn.Module):
 
     @torch.no_grad()
     def forward(self, grad: Tensor) -> tuple[Tensor, Tensor]:
-        """The gradients, and the fraction that was shortened of those that are not zero; infinite ones become zero."""
+        """The gradients, and the fraction that was shortened of those that are not zero."""
         length = grad.norm(dim=-1, keepdim=True)
-        counts = length > 0
-        median = median_length(length)
+        finite, counts = length.isfinite(), length != 0
+        median = median_length(torch.where(finite, length, 0.0))
         running = torch.where(self.median > 0, torch.lerp(median, self.median.to(median), self.decay), median)
         self.median = torch.where(median.isnan(), self.median.to(median), running)
-        factor = (self.factor * self.median / length.clamp_min(1e-30)).clamp_max(1.0)
+        factor = torch.where(finite, self.factor * self.median / length.clamp_min(1e-30), 0.0).clamp_max(1.0)
         clipped = (counts & (factor < 1)).sum() / counts.sum().clamp_min(1)
-        return torch.where(length.isinf(), 0.0, grad) * factor, clipped
+        return torch.where(finite, grad, 0.0) * factor, clipped
 
 
 def _is_stack_of_steps(action: Tensor) -> bool:

@@ -1,0 +1,272 @@
+"""Train the losses on two environments that are not ours: are they what they say?
+
+python recipes/trial/elsewhere.py --environment pendulum --losses shac sapo ahac abpt abpt-simulated --seeds 0 1 2
+python recipes/trial/elsewhere.py --environment balance --losses bptt shac hybrid --seeds 0 1 2 3 4
+
+The pendulum is TorchRL's, with the task of gymnasium's Pendulum-v1: 200 steps from a random angle, under a torque too
+weak to lift the pendulum at once. Random actions reach about -1200, and a policy that swings it up about -150.
+
+Balance is a task of VMAS (Bettini et al. 2022, arXiv:2207.03530; ``pip install vmas``), in TorchRL's wrapper: three
+agents carry a bar with a ball on it against gravity, and have to bring the ball to a goal. The reward is a hundred
+times the way that the ball comes closer, and -10 if it falls, which ends the episode, as the goal does. An episode
+lasts 200 steps at most. All forces between bar, ball and agents act by contact.
+
+The return is the mean over 256 episodes without exploration noise. All losses have the same networks, rates and number
+of steps. The hybrid has the settings of its recipe instead, and as many steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+import torch
+from tables import table  # whose import makes the recipes' code known
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import Compose, PendulumEnv, RewardScaling, Transform, TransformedEnv, VmasEnv
+from torchrl.envs.utils import ExplorationType
+from torchrl.objectives import SoftUpdate
+from training.building import AdaptiveRate, shuffled
+
+from torchrl_quad import (
+    ABPTLoss,
+    AHACLoss,
+    BPTTLoss,
+    HybridLoss,
+    SAPOLoss,
+    SHACLoss,
+    differentiable_rollout,
+    make_actor,
+    make_qvalue,
+    make_value,
+)
+
+ENVS, HORIZON, EPISODE, EPISODES = 256, 16, 200, 256
+LEARNING_RATE = 1e-2  # of actor and critics; it falls to a fiftieth
+LOSSES = {
+    "bptt": lambda env, actor, **clip: BPTTLoss(actor, **clip),
+    "shac": lambda env, actor, **clip: SHACLoss(actor, make_value(env), **clip),
+    "sapo": lambda env, actor, **clip: SAPOLoss(actor, make_value(env), alpha_init=1e-2, **clip),
+    "ahac": lambda env, actor, **clip: AHACLoss(actor, make_value(env), horizon=HORIZON, **clip),
+    "abpt": lambda env, actor, **clip: ABPTLoss(actor, make_qvalue(env), **clip),
+    "abpt-simulated": lambda env, actor, **clip: ABPTLoss(actor, make_qvalue(env), simulated_steps=1, **clip),
+    "hybrid": lambda env, actor: HybridLoss(actor, make_value(env, num_cells=(128, 128))),
+}
+
+
+class CosSin(Transform):
+    """The angle as cosine and sine, which do not jump at half a turn, and the speed: ``observation`` (*, 3)."""
+
+    def _call(self, td: TensorDictBase) -> TensorDictBase:
+        th, thdot = td["th"], td["thdot"]
+        return td.set("observation", torch.stack((th.cos(), th.sin(), thdot / 8), -1))
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, spec: Composite) -> Composite:
+        """Add the observation."""
+        return spec.set("observation", Unbounded((*spec.shape, 3)))
+
+
+class Pendulum:
+    """TorchRL's pendulum, with an observation."""
+
+    reward = 0.1  # times the cost: returns near ten are quicker to learn than those near 100
+    clip: dict[str, float] = {}
+
+    def __init__(self, seed: int, count: int):
+        self.count = count
+        self.env = TransformedEnv(PendulumEnv(seed=seed), Compose(CosSin(), RewardScaling(0.0, self.reward)))
+
+    def starts(self, count: int | None = None) -> TensorDictBase:
+        """Random angles and speeds, as the environment draws them."""
+        return self.env.reset(PendulumEnv.gen_params(batch_size=[count or self.count]), set_state=False)
+
+    def go_on(self, carry: TensorDictBase) -> TensorDictBase:
+        """Let half of the pendulums start afresh: an episode has no end of its own."""
+        fresh = self.starts(len(carry) // 2)
+        going_on = carry.select(*fresh.keys())[torch.randperm(len(carry))[: len(carry) - len(fresh)]]
+        return torch.cat((fresh, going_on))
+
+
+class OneBody(Transform):
+    """The agents of a team as one body: ``observation`` and ``action`` of all, and the ``reward`` that they share."""
+
+    def __init__(self, agents: int):
+        super().__init__(in_keys_inv=[("agents", "action")], out_keys_inv=["action"])
+        self.agents = agents
+
+    def _step(self, td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
+        return self._reset(td, next_td).set("reward", next_td["agents", "reward"].mean(-2))
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return tensordict_reset.set("observation", tensordict_reset["agents", "observation"].flatten(-2))
+
+    def _inv_apply_transform(self, action: Tensor) -> Tensor:
+        return action.unflatten(-1, (self.agents, -1))
+
+    def transform_observation_spec(self, spec: Composite) -> Composite:
+        """Add the observation of all agents."""
+        each = spec["agents", "observation"]
+        return spec.set("observation", Unbounded((*each.shape[:-2], each.shape[-2:].numel())))
+
+    def transform_input_spec(self, spec: Composite) -> Composite:
+        """Put the action of all agents in the place of theirs."""
+        actions = spec["full_action_spec"]
+        each = actions["agents", "action"].shape
+        del actions["agents"]
+        actions["action"] = Bounded(-1.0, 1.0, (*each[:-2], each[-2:].numel()))
+        return spec
+
+    def transform_reward_spec(self, spec: Composite) -> Composite:
+        """Put one reward in the place of theirs."""
+        each = spec["agents", "reward"].shape
+        del spec["agents"]
+        spec["reward"] = Unbounded((*each[:-2], 1))
+        return spec
+
+
+class Balance:
+    """VMAS's balance, whose three agents one policy moves. It keeps its state, with the graph, to itself."""
+
+    reward = 0.1
+    clip = {"clip_action_gradient": 2.0}  # the derivative of a contact is NaN now and then
+
+    def __init__(self, seed: int, count: int):
+        env = VmasEnv("balance", num_envs=count, continuous_actions=True, grad_enabled=True, seed=seed)
+        self.env = TransformedEnv(env, Compose(OneBody(env.n_agents), RewardScaling(0.0, self.reward)))
+
+    def starts(self) -> TensorDictBase:
+        """The bar with the ball on the agents, at rest, and the goal at a random point above."""
+        return self.env.reset()
+
+    def go_on(self, carry: TensorDictBase) -> TensorDictBase:
+        """Cut the graph, and let half of the environments start afresh."""
+        env = self.env.base_env
+        env.world.zero_grad()
+        for name, value in vars(env.scenario).items():
+            if isinstance(value, Tensor):
+                setattr(env.scenario, name, value.detach())
+        return self.env.reset(carry.set("_reset", torch.rand(len(carry), 1) < 0.5))
+
+
+ENVIRONMENTS = {"pendulum": Pendulum, "balance": Balance}
+
+
+def mean_return(environment: str, actor: torch.nn.Module) -> float:
+    """Fly fresh episodes without exploration noise."""
+    place = ENVIRONMENTS[environment](10_000, EPISODES)
+    with torch.no_grad():
+        mode = ExplorationType.DETERMINISTIC
+        flight, _ = differentiable_rollout(place.env, actor, place.starts(), EPISODE, exploration_type=mode)
+    done = flight["next", "done"].int()
+    first = done.cumsum(1) - done == 0  # an episode that ends early is followed by another
+    return (flight["next", "reward"] * first).sum(1).mean().item() / place.reward
+
+
+def train(name: str, environment: str, seed: int, total_steps: int) -> tuple[float, float, float]:
+    """Train with a loss; return the mean returns before and after, and the seconds."""
+    torch.manual_seed(seed)
+    place = ENVIRONMENTS[environment](seed, ENVS)
+    env = place.env
+    actor = make_actor(env, scale_init=0.3, return_log_prob=name == "sapo")
+    loss = LOSSES[name](env, actor, **place.clip)
+    loss.make_value_estimator(gamma=0.98)
+    target = SoftUpdate(loss, tau=0.05) if name in ("shac", "abpt", "abpt-simulated") else None
+    extra = [loss.log_alpha] if loss.automatic_alpha else []
+    actor_optimizer = torch.optim.Adam([*loss.actor_network_params.parameters(), *extra], betas=(0.7, 0.95))
+    critic = [] if name == "bptt" else list(getattr(loss, f"{loss.critic_name}_params").parameters())
+    critic_optimizer = torch.optim.Adam(critic, betas=(0.7, 0.95)) if critic else None
+    learn = getattr(loss, loss.critic_loss_key) if critic else None
+
+    before, start, steps = mean_return(environment, actor), time.process_time(), 0
+    carry = place.starts()
+    while steps < total_steps:
+        for optimizer in (actor_optimizer, critic_optimizer):
+            if optimizer:
+                optimizer.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - 0.98 * steps / total_steps)
+        rollout, carry = differentiable_rollout(env, actor, carry, getattr(loss, "horizon", HORIZON))
+        loss_actor, metadata = loss.loss_actor(rollout)
+        actor_optimizer.zero_grad()
+        (loss_actor + metadata.get("loss_alpha", 0.0)).backward()
+        torch.nn.utils.clip_grad_norm_(loss.actor_network_params.parameters(), 0.5)
+        actor_optimizer.step()
+        if critic:
+            data = loss.write_value_target(rollout.detach()).reshape(-1)
+            for _ in range(8):
+                optimise(critic_optimizer, learn(data[torch.randint(len(data), (512,))])[0], 1.0)
+                if target:
+                    target.step()
+        if name == "ahac":
+            loss.adapt_horizon(metadata["stiffness"])
+        steps += rollout.numel()
+        carry = place.go_on(carry)
+    return before, mean_return(environment, actor), time.process_time() - start
+
+
+def optimise(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
+    """Take a step down the gradient of a loss, of bounded norm."""
+    optimizer.zero_grad()
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_([x for group in optimizer.param_groups for x in group["params"]], max_grad_norm)
+    optimizer.step()
+
+
+def train_hybrid(environment: str, seed: int, total_steps: int) -> tuple[float, float, float]:
+    """As :func:`train`, with the loop and the settings of recipes/hybrid.py."""
+    torch.manual_seed(seed)
+    envs, horizon, batch_size = min(128, ENVS), 2 * HORIZON, 1024
+    place = ENVIRONMENTS[environment](seed, envs)
+    env = place.env
+    actor = make_actor(env, scale_init=0.2, learn_scale=False, noise_correlation=0.9)
+    loss = LOSSES["hybrid"](env, actor)
+    loss.make_value_estimator(gamma=0.99, lmbda=0.95)
+    actor_optimizer = torch.optim.Adam(loss.actor_network_params.parameters(), 1e-3, betas=(0.9, 0.99))
+    critic_optimizer = torch.optim.Adam(loss.value_network_params.parameters(), 3e-3, betas=(0.9, 0.99))
+    iterations = -(-total_steps // (envs * horizon))
+    rate = AdaptiveRate(actor_optimizer, 0.25, iterations)
+
+    before, start = mean_return(environment, actor), time.process_time()
+    carry = place.starts()
+    for iteration in range(iterations):
+        critic_optimizer.param_groups[0]["lr"] = 3e-3 * (1.0 - 0.99 * iteration / iterations)
+        rollout, carry = differentiable_rollout(env, actor, carry, horizon)
+        moved = 0.0
+        for batch in shuffled(loss.write_targets(rollout).exclude("next"), batch_size, 5):
+            losses = loss(batch)
+            if moved < rate.limit(iteration):
+                moved = max(moved, losses["kl"].item())
+                optimise(actor_optimizer, losses["loss_actor"], 0.5)
+            optimise(critic_optimizer, losses["loss_value"], 1.0)
+        rate.step(iteration, moved)
+        carry = place.go_on(carry)
+    return before, mean_return(environment, actor), time.process_time() - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--environment", default="pendulum", choices=list(ENVIRONMENTS))
+    parser.add_argument("--losses", nargs="+", default=list(LOSSES), choices=list(LOSSES))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--steps", type=int, default=1_024_000, help="of all 256 environments together")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    lines = []
+    for name in args.losses:
+        runs = []
+        for seed in args.seeds:
+            what = (args.environment, seed, args.steps)
+            runs.append(train_hybrid(*what) if name == "hybrid" else train(name, *what))
+            print(f"{name}, seed {seed}: {runs[-1][1]:.4g}", file=sys.stderr)
+        before, after, seconds = zip(*runs, strict=True)
+        returns = ", ".join(f"{x:.4g}" for x in after)
+        lines.append([name, f"{sum(before) / len(runs):.4g}", returns, f"{sum(seconds) / len(runs):.0f} s"])
+    print(table(["loss", "before", "after, by seed", "seconds"], lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,59 @@
+"""The check of the losses on environments that are not ours, on a reduced budget."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchrl_quad import differentiable_rollout, make_actor
+
+SCRIPT = Path(__file__).parent.parent / "recipes/trial/elsewhere.py"
+RANGE = {"pendulum": (-4 * 16.3, 0.0), "balance": (-20.0, 20.0)}  # returns that four steps can have
+
+
+@pytest.fixture
+def program(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+    program = runpy.run_path(str(SCRIPT))
+    program["main"].__globals__.update(ENVS=2, HORIZON=4, EPISODE=4, EPISODES=2)
+    return program
+
+
+@pytest.mark.parametrize(("environment", "losses"), [("pendulum", None), ("balance", ["shac", "hybrid"])])
+def test_a_loss_trains_on_an_environment_that_is_not_ours_and_has_a_row_in_the_table(
+    environment, losses, program, monkeypatch, capsys
+):
+    losses = losses or list(program["LOSSES"])
+    arguments = ["--environment", environment, "--losses", *losses, "--seeds", "0", "--steps", "1"]
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
+    program["main"]()
+    head, _, *rows = capsys.readouterr().out.splitlines()
+    assert head == "| loss | before | after, by seed | seconds |"
+    assert [row.split(" | ")[0] for row in rows] == [f"| {name}" for name in losses]
+    low, high = RANGE[environment]
+    assert low < float(rows[0].split(" | ")[1]) < high
+
+
+def test_balance_cuts_the_graph_between_horizons_and_lets_some_go_on(program):
+    torch.manual_seed(0)
+    place = program["Balance"](0, 16)
+    actions = torch.zeros(16, 6, requires_grad=True)
+    end = place.env.step(place.starts().set("action", actions))["next"]
+    gradient = torch.autograd.grad(end["observation"].sum(), actions, retain_graph=True)[0]
+    assert (gradient != 0).any(0).all(), "each agent is moved by its own action"
+    start = place.go_on(end.detach())
+    assert not any(entry.requires_grad for entry in start.values(True, True))
+    kept = (start["observation"] == end["observation"]).all(-1)
+    assert 0 < kept.sum() < 16
+
+
+def test_a_reset_at_the_end_of_a_horizon_leaves_no_graph_in_the_carry(program):
+    place = program["Balance"](0, 4)
+    carry, scenario = place.starts(), place.env.base_env.scenario
+    scenario.package.set_pos(torch.tensor([0.0, -2.0]), batch_index=0)  # one ball lies on the floor
+    rollout, carry = differentiable_rollout(place.env, make_actor(place.env), carry, 1)
+    assert rollout["next", "done"].flatten().tolist() == [True, False, False, False]
+    assert rollout["next", "observation"].requires_grad
+    assert not any(entry.requires_grad for entry in carry.values(True, True))

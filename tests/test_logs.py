@@ -17,8 +17,8 @@ def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(lau
     small = [*SMALL, f"hydra.run.dir={tmp_path}"]
     (tmp_path / "policy").mkdir()  # what has been exported lies beside the checkpoint
     (tmp_path / "policy/policy.txt").write_text("exported")
-    launch("bptt", *small, "seed=3", "actor.lr=0.01", "logger.backend=wandb", "logger.flight_every=3")
-    launch("bptt", *small, "seed=3", "actor.lr=0.01", "resume=auto", "total_steps=240")
+    launch("bptt", "seed=3", "actor.lr=0.01", *small, "logger.backend=wandb", "logger.flight_every=3")
+    launch("bptt", "seed=3", "actor.lr=0.01", *small, "resume=auto", "total_steps=240")
     resumed = read_checkpoint(tmp_path / "checkpoint.pt")
     logs = sorted(tmp_path.glob("wandb/offline-run-*/*.wandb"))
     assert len(logs) == 2 and len({log.stem for log in logs}) == 1  # one run, of two parts
@@ -26,8 +26,8 @@ def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(lau
 
     run = first["run"][0].run
     assert run.display_name == second["run"][0].run.display_name
-    assert run.display_name.startswith("hovering_bptt_seed3 num_envs=4 horizon=6 ")
-    assert run.display_name.endswith(" compile=false actor.lr=0.01")
+    assert run.display_name.startswith("hovering_bptt_seed3 actor.lr=0.01 num_envs=4 horizon=6 ")
+    assert run.display_name.endswith(" compile=false eval.interval=2 e…") and len(run.display_name) == 128
     assert list(run.tags) == ["hovering", "bptt", "visfly"] and run.job_type == "train"
     changes = [*run.config.update, *(item for record in first.get("config", []) for item in record.config.update)]
     config = {item.key: json.loads(item.value_json) for item in changes if item.key}  # the last of each counts

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from torchrl_quad import differentiable_rollout, make_actor
+from torchrl_quad.files import read_rows
 
 SCRIPT = Path(__file__).parent.parent / "recipes/trial/elsewhere.py"
 RANGE = {"pendulum": (-4 * 16.3, 0.0), "balance": (-20.0, 20.0)}  # returns that four steps can have
@@ -17,23 +18,29 @@ RANGE = {"pendulum": (-4 * 16.3, 0.0), "balance": (-20.0, 20.0)}  # returns that
 def program(monkeypatch):
     monkeypatch.syspath_prepend(SCRIPT.parent)
     program = runpy.run_path(str(SCRIPT))
-    program["main"].__globals__.update(ENVS=2, HORIZON=4, EPISODE=4, EPISODES=2)
+    program["main"].__globals__.update(ENVS=2, HORIZON=4, EPISODE=4, EPISODES=2, STEPS=1)
     return program
 
 
 @pytest.mark.parametrize(("environment", "losses"), [("pendulum", None), ("balance", ["shac", "hybrid"])])
-def test_a_loss_trains_on_an_environment_that_is_not_ours_and_has_a_row_in_the_table(
-    environment, losses, program, monkeypatch, capsys
+def test_a_loss_trains_on_an_environment_that_is_not_ours_once_and_has_a_row_in_the_table(
+    environment, losses, program, monkeypatch, tmp_path
 ):
     losses = losses or list(program["LOSSES"])
-    arguments = ["--environment", environment, "--losses", *losses, "--seeds", "0", "--steps", "1"]
+    arguments = ["--environments", environment, "--losses", *losses, "--seeds", "0", "--data", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
     program["main"]()
-    head, _, *rows = capsys.readouterr().out.splitlines()
-    assert head == "| loss | before | after, by seed | seconds |"
-    assert [row.split(" | ")[0] for row in rows] == [f"| {name}" for name in losses]
+    rows = read_rows(tmp_path / "elsewhere.csv")
+    assert [(row["environment"], row["loss"], row["seed"]) for row in rows] == [(environment, x, "0") for x in losses]
     low, high = RANGE[environment]
-    assert low < float(rows[0].split(" | ")[1]) < high
+    assert low < float(rows[0]["before"]) < high
+    head, _, *lines = program["blocks"](tmp_path)[environment].splitlines()
+    assert head == "| loss | before | after | each seed | seconds |"
+    assert {line.split(" | ")[0] for line in lines} == {f"| {name}" for name in losses}
+    assert all(line in (tmp_path / "elsewhere.md").read_text() for line in lines)
+    for name in ("train", "train_hybrid"):
+        program["main"].__globals__[name] = lambda *_: pytest.fail("It has been trained.")
+    program["main"]()
 
 
 def test_balance_cuts_the_graph_between_horizons_and_lets_some_go_on(program):

@@ -1,7 +1,11 @@
 """Train the losses on two environments that are not ours: are they what they say?
 
-python recipes/trial/elsewhere.py --environment pendulum --losses shac sapo ahac abpt abpt-simulated --seeds 0 1 2
-python recipes/trial/elsewhere.py --environment balance --losses bptt shac hybrid --seeds 0 1 2 3 4
+python recipes/trial/elsewhere.py --environments pendulum
+python recipes/trial/elsewhere.py --environments balance --losses bptt shac hybrid
+
+It may be stopped at any moment. Started again, it skips what is in docs/results/data/elsewhere.csv, and it fills in the
+tables of docs/elsewhere.md: those of the two environments, and that of a track which no setting was chosen on, from
+tracks.csv beside it. That track is flown by shipped.py.
 
 The pendulum is TorchRL's, with the task of gymnasium's Pendulum-v1: 200 steps from a random angle, under a torque too
 weak to lift the pendulum at once. Random actions reach about -1200, and a policy that swings it up about -150.
@@ -18,11 +22,16 @@ of steps. The hybrid has the settings of its recipe instead, and as many steps.
 from __future__ import annotations
 
 import argparse
-import sys
+import datetime
 import time
+from pathlib import Path
 
+import numpy as np
 import torch
-from tables import table  # whose import makes the recipes' code known
+from comparison import LABELS, reached_table
+from reproduce import DATA, write  # whose import makes the recipes' code known
+from results import fill
+from tables import table
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
@@ -43,8 +52,11 @@ from torchrl_quad import (
     make_qvalue,
     make_value,
 )
+from torchrl_quad.files import machine
+from torchrl_quad.files import read_rows as read
 
 ENVS, HORIZON, EPISODE, EPISODES = 256, 16, 200, 256
+STEPS = 1_024_000  # of all environments together
 LEARNING_RATE = 1e-2  # of actor and critics; it falls to a fiftieth
 LOSSES = {
     "bptt": lambda env, actor: BPTTLoss(actor),
@@ -166,7 +178,7 @@ def mean_return(environment: str, actor: torch.nn.Module) -> float:
     return (flight["next", "reward"] * first).sum(1).mean().item() / place.reward
 
 
-def train(name: str, environment: str, seed: int, total_steps: int) -> tuple[float, float, float]:
+def train(name: str, environment: str, seed: int) -> tuple[float, float, float]:
     """Train with a loss; return the mean returns before and after, and the seconds."""
     torch.manual_seed(seed)
     place = ENVIRONMENTS[environment](seed, ENVS)
@@ -183,10 +195,10 @@ def train(name: str, environment: str, seed: int, total_steps: int) -> tuple[flo
 
     before, start, steps = mean_return(environment, actor), time.process_time(), 0
     carry = place.starts()
-    while steps < total_steps:
+    while steps < STEPS:
         for optimizer in (actor_optimizer, critic_optimizer):
             if optimizer:
-                optimizer.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - 0.98 * steps / total_steps)
+                optimizer.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - 0.98 * steps / STEPS)
         rollout, carry = differentiable_rollout(env, actor, carry, getattr(loss, "horizon", HORIZON))
         loss_actor, metadata = loss.loss_actor(rollout)
         actor_optimizer.zero_grad()
@@ -215,7 +227,7 @@ def optimise(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: floa
     optimizer.step()
 
 
-def train_hybrid(environment: str, seed: int, total_steps: int) -> tuple[float, float, float]:
+def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
     """As :func:`train`, with the loop and the settings of recipes/hybrid.py."""
     torch.manual_seed(seed)
     envs, horizon, batch_size = min(128, ENVS), 2 * HORIZON, 1024
@@ -226,7 +238,7 @@ def train_hybrid(environment: str, seed: int, total_steps: int) -> tuple[float, 
     loss.make_value_estimator(gamma=0.99, lmbda=0.95)
     actor_optimizer = torch.optim.Adam(loss.actor_network_params.parameters(), 1e-3, betas=(0.9, 0.99))
     critic_optimizer = torch.optim.Adam(loss.value_network_params.parameters(), 3e-3, betas=(0.9, 0.99))
-    iterations = -(-total_steps // (envs * horizon))
+    iterations = -(-STEPS // (envs * horizon))
     rate = AdaptiveRate(actor_optimizer, 0.25, iterations)
 
     before, start = mean_return(environment, actor), time.process_time()
@@ -246,25 +258,44 @@ def train_hybrid(environment: str, seed: int, total_steps: int) -> tuple[float, 
     return before, mean_return(environment, actor), time.process_time() - start
 
 
+def blocks(data: Path) -> dict[str, str]:
+    """Make the tables of docs/elsewhere.md."""
+    made, rows, tracks = {}, read(data / "elsewhere.csv"), read(data / "tracks.csv")
+    for environment in ENVIRONMENTS:
+        lines = []
+        for name in LOSSES:
+            if own := [row for row in rows if (row["environment"], row["loss"]) == (environment, name)]:
+                before, after, seconds = ([float(row[x]) for row in own] for x in ("before", "after", "seconds"))
+                each = ", ".join(f"{x:.4g}" for x in sorted(after))
+                lines.append(
+                    [name, f"{np.mean(before):.4g}", f"{np.mean(after):.4g}", each, f"{np.median(seconds):.0f}"]
+                )
+        made[environment] = table(["loss", "before", "after", "each seed", "seconds"], lines)
+    shown = {row["task"]: ("gates_passed", 1, 1, "gates") for row in tracks}
+    return made | {"tracks": reached_table(tracks, {"shac": "SHAC"}, {x: shown[x] for x in LABELS if x in shown})}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--environment", default="pendulum", choices=list(ENVIRONMENTS))
+    parser.add_argument("--environments", nargs="+", default=list(ENVIRONMENTS), choices=list(ENVIRONMENTS))
     parser.add_argument("--losses", nargs="+", default=list(LOSSES), choices=list(LOSSES))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--steps", type=int, default=1_024_000, help="of all 256 environments together")
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(range(5)))
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    lines = []
-    for name in args.losses:
-        runs = []
-        for seed in args.seeds:
-            what = (args.environment, seed, args.steps)
-            runs.append(train_hybrid(*what) if name == "hybrid" else train(name, *what))
-            print(f"{name}, seed {seed}: {runs[-1][1]:.4g}", file=sys.stderr)
-        before, after, seconds = zip(*runs, strict=True)
-        returns = ", ".join(f"{x:.4g}" for x in after)
-        lines.append([name, f"{sum(before) / len(runs):.4g}", returns, f"{sum(seconds) / len(runs):.0f} s"])
-    print(table(["loss", "before", "after, by seed", "seconds"], lines))
+    jobs = [
+        (environment, name, seed) for seed in args.seeds for environment in args.environments for name in args.losses
+    ]
+    for environment, name, seed in jobs:
+        key = {"environment": environment, "loss": name, "seed": str(seed)}
+        if any(key.items() <= row.items() for row in read(args.data / "elsewhere.csv")):
+            continue
+        flown = train_hybrid(environment, seed) if name == "hybrid" else train(name, environment, seed)
+        numbers = {x: f"{y:.6g}" for x, y in zip(("before", "after", "seconds"), flown, strict=True)}
+        row = key | numbers | {"steps": STEPS, "machine": machine(), "flown": datetime.date.today().isoformat()}
+        write(args.data / "elsewhere.csv", [*read(args.data / "elsewhere.csv"), row])
+    ships = args.data.resolve() == DATA.resolve()
+    fill((DATA.parents[1] if ships else args.data) / "elsewhere.md", blocks(args.data))
 
 
 if __name__ == "__main__":

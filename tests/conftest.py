@@ -1,5 +1,6 @@
 import runpy
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -113,3 +114,15 @@ def train(launch, no_pictures):
         return read_checkpoint(folder / "checkpoint.pt")
 
     return train
+
+
+@pytest.fixture
+def run_here(launch, no_pictures):
+    """As ``reproduce.run``, but in this process, one after the other, and without pictures."""
+    alone = threading.Lock()
+
+    def run(command, folder):
+        with alone:
+            launch(Path(command[1]).stem, *command[2:])
+
+    return run

@@ -7,24 +7,19 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from scipy.stats import mannwhitneyu
 
-from torchrl_quad import BPTTLoss, differentiable_rollout, make_actor, make_env
-
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes/trial"))
 
 import ablations
-import ascent
 import claims
 import comparison
 import forest
@@ -51,18 +46,6 @@ def curve(variant, seed, *returns, **more):
 def run_main(monkeypatch, module, *arguments):
     monkeypatch.setattr(sys, "argv", [module.__name__, *map(str, arguments)])
     module.main()
-
-
-@pytest.fixture
-def run_here(launch, no_pictures):
-    """As ``reproduce.run``, but in this process, one after the other, and without pictures."""
-    alone = threading.Lock()
-
-    def run(command, folder):
-        with alone:
-            launch(Path(command[1]).stem, *command[2:])
-
-    return run
 
 
 @pytest.mark.slow
@@ -114,46 +97,6 @@ def test_runs_that_were_flown_elsewhere_are_collected_when_they_are_finished(mon
     assert (row["variant"], row["seed"], row["solved"], row["seconds"]) == ("shac-xu", "3", "0.1", "1.5")
     assert (row["revision"], row["dynamics"]) == ("abc", matrix.DYNAMICS) and row["flown"].count("-") == 2
     assert [row["solved"] for row in reproduce.read(tmp_path / "data/curves/racing.csv")] == ["0.1"]
-
-
-def test_the_gradients_of_every_method_are_compared_with_the_simulator(
-    launch, no_pictures, monkeypatch, capsys, tmp_path
-):
-    folders = [tmp_path / f"hovering/{variant}/seed42" for variant in ("abpt", "shac", "bptt")]
-    other = tmp_path / "elsewhere"  # whose name tells no variant
-    for folder, algorithm in zip([*folders, other], ("abpt", "shac", "bptt", "bptt"), strict=True):
-        launch(algorithm, *reproduce.QUICK, f"seed={7 if folder == other else 42}", f"hydra.run.dir={folder}")
-    checkpoints, output = [folder / "checkpoint.pt" for folder in (*folders, other)], tmp_path / "ascent.csv"
-    sizes = ("--output", output, "--states", 4, "--repeats", 2, "--steps", 8)
-    for some in (checkpoints[:1], checkpoints):
-        run_main(monkeypatch, ascent, *some, *sizes)
-    rows = reproduce.read(output)
-    assert [(row["variant"], row["seed"]) for row in rows] == [
-        *((algorithm, "42") for algorithm in ("abpt", "shac", "bptt")),
-        ("bptt", "7"),
-    ]
-    assert all(-1.0 <= float(row["objective"]) <= 1.0 for row in rows)
-    assert [bool(row["zero_step_return"]) for row in rows] == [True, False, False, False]
-
-    with pytest.raises(SystemExit):
-        run_main(monkeypatch, ascent, *(2 * [other / "checkpoint.pt"]), *sizes)
-    assert "is a second hovering bptt 7: give runs that differ in more an --output each" in capsys.readouterr().err
-    launch("ppo", *reproduce.QUICK, "batch_size=8", f"hydra.run.dir={tmp_path}/ppo")
-    with pytest.raises(SystemExit):
-        run_main(monkeypatch, ascent, tmp_path / "ppo/checkpoint.pt", *sizes)
-    assert "was trained with PPO, which follows no gradient of the simulator" in capsys.readouterr().err
-
-
-def test_backpropagation_through_all_steps_knows_the_true_slopes():
-    smooth = {"velocity": 0.0, "angular_velocity": 0.0}  # norms, which have a kink where the drone rests
-    env = make_env("hovering", num_envs=16, seed=0, dtype=torch.float64, weights=smooth)
-    loss = BPTTLoss(make_actor(env, scale_init=1e-4)).make_value_estimator(gamma=0.9)
-    start = env.reset()
-    rollout, _ = differentiable_rollout(env, loss.actor_network, start, 20)
-    estimated = ascent.estimates(loss, rollout)["objective"]
-    true = ascent.slopes(env, loss, start, rollout["action"][:, 0].detach(), steps=20, size=1e-3)
-    assert torch.nn.functional.cosine_similarity(estimated, true, dim=-1).min() > 0.99
-    torch.testing.assert_close(estimated.norm(), true.norm(), rtol=0.02, atol=0.0)
 
 
 def test_quick_results_never_get_among_the_real_ones(monkeypatch, capsys):

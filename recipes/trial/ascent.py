@@ -82,29 +82,39 @@ def slopes(env: EnvBase, loss: PathwiseLoss, start: TensorDictBase, action: Tens
         steps: control steps whose rewards count, up to the end of the episode.
         size: the change of each component up and down.
     """
-    gamma = loss.value_estimator.gamma
 
     def flown(action: Tensor) -> Tensor:
-        torch.manual_seed(SEED)
-        first = env.step(start.clone().set("action", action))
-        rest, _ = differentiable_rollout(env, loss.actor_network, env.step_mdp(first), steps - 1)
-        flight = torch.cat([x.select(("next", "reward"), ("next", "done")) for x in (first.unsqueeze(1), rest)], 1)
-        discount = discounts(flight["next", "done"], gamma) * first_episode(flight)
-        return (discount * flight["next", "reward"]).sum((1, 2))
+        return return_of(env, loss, start.clone().set("action", action), steps)
 
     changes = size * torch.eye(action.shape[-1])
     return torch.stack([flown(action + x) - flown(action - x) for x in changes], -1) / (2.0 * size)
 
 
+def return_of(env: EnvBase, loss: PathwiseLoss, start: TensorDictBase, steps: int) -> Tensor:
+    """Fly a first action, and then the policy with the same noise in each call: the discounted return (envs)."""
+    torch.manual_seed(SEED)
+    first = env.step(start)
+    rest, _ = differentiable_rollout(env, loss.actor_network, env.step_mdp(first), steps - 1)
+    flight = torch.cat([x.select(("next", "reward"), ("next", "done")) for x in (first.unsqueeze(1), rest)], 1)
+    discount = discounts(flight["next", "done"], loss.value_estimator.gamma) * first_episode(flight)
+    return (discount * flight["next", "reward"]).sum((1, 2))
+
+
+def visited(cfg: DictConfig, loss: PathwiseLoss, env: EnvBase, states: int) -> TensorDictBase:
+    """States that a policy visits, each in as many environments as there are for it: the tensordict of a reset."""
+    scout = build_env(cfg, states, SEED)
+    with torch.no_grad():
+        flight, _ = differentiable_rollout(scout, loss.actor_network, None, env.max_episode_steps // 2)
+    drawn = flight[torch.arange(states), torch.randint(flight.shape[1], (states,))].select("state")
+    return env.reset(drawn.repeat_interleave(env.num_envs // states), set_state=True)
+
+
 def examine(saved: dict, cfg: DictConfig, states: int, repeats: int, steps: int, size: float) -> dict[str, str]:
     """Compare the gradients of a checkpoint with the measured one."""
     torch.manual_seed(SEED)
-    scout, env = (build_env(cfg, number, SEED) for number in (states, states * repeats))
+    env = build_env(cfg, states * repeats, SEED)
     loss = load_loss(saved, cfg, env)
-    with torch.no_grad():
-        flight, _ = differentiable_rollout(scout, loss.actor_network, None, env.max_episode_steps // 2)
-    visited = flight[torch.arange(states), torch.randint(flight.shape[1], (states,))].select("state")
-    start = env.reset(visited.repeat_interleave(repeats), set_state=True)
+    start = visited(cfg, loss, env, states)
     rollout, _ = differentiable_rollout(env, loss.actor_network, start, cfg.horizon)
     estimated = estimates(loss, rollout)
     action = rollout["action"][:, 0].detach()

@@ -1,0 +1,195 @@
+"""Train the hybrid on racing, and measure in each phase of it which of its two gradients points uphill.
+
+python recipes/trial/phases.py --tasks racing racing_position --seeds 100
+
+In states that the policy of a phase visits, the gradient of the return in the mean of the next action is measured: the
+action is changed a little up and down, with what follows of it in noise that is correlated in time, and the policy
+flies on, gates and crashes included. That gradient, the pathwise one, that of the score function, and what the loss
+makes of both become gradients in the policy's weights over all these states. The result is the cosine of each with the
+measured one. Two halves of the measurement are compared in the same way: their cosine shows its noise.
+
+It may be stopped at any moment. Started again, it skips what is in docs/results/data/phases.csv, and resumes what was
+cut off. It fills in the table of docs/more_losses.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import torch
+from ascent import SEED, return_of, visited
+from comparison import LABELS
+from omegaconf import OmegaConf
+from reproduce import DATA, QUICK, RECIPES, run, stop, write
+from results import fill
+from shipped import overrides
+from tables import table
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import cosine_similarity
+from torchrl.envs import EnvBase
+from training.building import build_env, make_policy, network
+from training.checkpoints import read_checkpoint
+
+from torchrl_quad import HybridLoss, differentiable_rollout, make_value
+from torchrl_quad.files import read_rows as read
+from torchrl_quad.files import replacing
+from torchrl_quad.objectives.action_gradients import distribution_again
+
+SHARES = (0.05, 0.125, 0.25, 0.5, 0.75, 1.0)  # of the steps of a run
+GRADIENTS = {"pathwise": "pathwise", "score": "score function", "hybrid": "hybrid", "halves": "measurement"}
+
+
+def train(task: str, seed: int, folder: Path, quick: bool) -> None:
+    """Train once, or resume it, and keep a copy of the checkpoint in each phase."""
+    own = [f"seed={seed}", *(QUICK if quick else ["eval.interval=10"]), "resume=auto", f"hydra.run.dir={folder}"]
+    command = [sys.executable, str(RECIPES / "hybrid.py"), *overrides(task, "hybrid"), *own]
+    with ThreadPoolExecutor(1) as pool:
+        training = pool.submit(run, command, folder)
+        while not training.done():
+            keep(folder)
+            time.sleep(1.0)
+        training.result()
+    keep(folder)
+
+
+def keep(folder: Path) -> None:
+    """Copy the checkpoint of a run if a phase has begun of which there is no copy yet."""
+    path = folder / "checkpoint.pt"
+    if not path.exists():
+        return
+    saved = read_checkpoint(path)
+    share = saved["rows"][-1]["steps"] / OmegaConf.create(saved["config"]).total_steps if saved["rows"] else 0.0
+    for phase in SHARES:
+        copy = folder / f"phase_{phase}.pt"
+        if share >= 0.99 * phase and not copy.exists():
+            with replacing(copy) as temporary:
+                shutil.copyfile(path, temporary)
+
+
+def examine(saved: dict, states: int, repeats: int, steps: int, size: float) -> dict[str, str]:
+    """Compare the gradients of a checkpoint with the measured one."""
+    torch.manual_seed(SEED)
+    cfg = OmegaConf.create(saved["config"])
+    env = build_env(cfg, states * repeats, SEED)
+    loss = HybridLoss(make_policy(cfg, env), make_value(env, **network(cfg, "critic", env)), **cfg.loss)
+    loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
+    loss.load_state_dict(saved["stateful"][0])
+    start = visited(cfg, loss, env, states)
+    rollout, _ = differentiable_rollout(env, loss.actor_network, start, cfg.horizon)
+    weight = loss.pathwise_weight.clamp(0.0, 1.0).item()
+    loss.pathwise_weight.fill_(1.0)  # so that the whole pathwise gradient is written
+    loss.decay = 1.0
+    first = loss.write_targets(rollout)[:, 0]
+    pathwise, noise = first["location_gradient"], first["latent"] - first["loc"]
+    predicted = (pathwise * noise).sum(-1, keepdim=True)
+    advantage = first["advantage"] + predicted
+    score = noise / first["scale"] ** 2  # the gradient of the logarithm of the density
+    true = slopes(env, loss, cfg.actor.noise_correlation, start, first, steps, size)
+    half = torch.arange(len(true)) % 2 == 0
+    directions = {
+        "true": true,
+        "pathwise": pathwise,
+        "score": advantage * score,
+        "hybrid": weight * pathwise + (advantage - weight * predicted) * score,
+        "one half": true * half.unsqueeze(-1),
+        "other half": true * ~half.unsqueeze(-1),
+    }
+    in_weights = {name: weight_gradient(loss, first, x) for name, x in directions.items()}
+    pairs = {name: (name, "true") for name in GRADIENTS} | {"halves": ("one half", "other half")}
+    row = {name: cosine_similarity(*(in_weights[x] for x in pair), dim=0).item() for name, pair in pairs.items()}
+    row |= {"weight": weight, "explained_variance": saved["rows"][-1]["train/explained_variance"]}
+    return {name: f"{x:.4g}" for name, x in row.items()}
+
+
+def weight_gradient(loss: HybridLoss, data: TensorDictBase, direction: Tensor) -> Tensor:
+    """The gradient in the policy's weights from that in the means of its actions, (envs, 4)."""
+    loc, _ = distribution_again(loss.actor_network, loss.actor_network_params, data)
+    weights = list(loss.actor_network_params.parameters())
+    grads = torch.autograd.grad((loc * direction).sum(), weights)
+    return torch.cat([x.flatten() for x in grads])
+
+
+@torch.no_grad()
+def slopes(
+    env: EnvBase, loss: HybridLoss, rho: float, start: TensorDictBase, first: TensorDictBase, steps: int, size: float
+) -> Tensor:
+    """Measure the gradient of the discounted return in the mean of an action by central differences: (envs, 4).
+
+    Args:
+        env: as many environments as there are starts.
+        loss: whose policy flies.
+        rho: the correlation of its noise from step to step.
+        start: the tensordict of a reset (envs).
+        first: the first step of a flight from there, with ``latent``, ``noise`` and ``scale``.
+        steps: control steps whose rewards count, up to the end of the episode.
+        size: the change of each component up and down, before the tanh.
+    """
+    deviation = first["scale"] / (1.0 - rho**2) ** 0.5
+
+    def flown(change: Tensor) -> Tensor:
+        changed = {"action": (first["latent"] + change).tanh(), "noise": first["noise"] + change / deviation}
+        return return_of(env, loss, start.clone().update(changed), steps)
+
+    changes = size * torch.eye(first["latent"].shape[-1], dtype=deviation.dtype)
+    return torch.stack([flown(x) - flown(-x) for x in changes], -1) / (2.0 * size)
+
+
+def block(data: Path) -> str:
+    """Make the table of docs/more_losses.md."""
+    lines, rows = [], read(data / "phases.csv")
+    for task, share in dict.fromkeys((row["task"], row["share"]) for row in rows):
+        own = [row for row in rows if (row["task"], row["share"]) == (task, share)]
+        mean = {
+            name: np.mean([float(row[name]) for row in own]) for name in (*GRADIENTS, "weight", "explained_variance")
+        }
+        steps = f"{np.mean([float(row['steps']) for row in own]) / 1e6:.1f}"
+        lines.append([LABELS.get(task, task), steps, *(f"{x:.2f}" for x in mean.values())])
+    return table(["racing", "million steps", *GRADIENTS.values(), "weight b", "explained variance of V"], lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    tasks = ["racing", "racing_position"]
+    parser.add_argument("--cores", type=int, default=os.cpu_count(), help="runs at the same time")
+    parser.add_argument("--tasks", nargs="+", default=tasks, choices=tasks)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[100])
+    parser.add_argument("--states", type=int, default=256)
+    parser.add_argument("--repeats", type=int, default=4, help="flights from each of them, each with its own noise")
+    parser.add_argument("--steps", type=int, default=256, help="control steps whose rewards count")
+    parser.add_argument("--size", type=float, default=0.1, help="change of an action before the tanh")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
+    parser.add_argument("--output", type=Path, default=Path("outputs/phases"), help="folder of the runs")
+    parser.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
+    args = parser.parse_args()
+    ships = args.data.resolve() == DATA.resolve()
+    if args.quick and ships:
+        parser.error("--quick gives no results to keep: name another folder with --data.")
+    torch.set_num_threads(1)
+    jobs = [(task, seed, args.output / task / f"seed{seed}") for seed in args.seeds for task in args.tasks]
+    with ThreadPoolExecutor(args.cores) as pool:
+        for future in [pool.submit(train, *job, args.quick) for job in jobs]:
+            future.result()
+    for task, seed, folder in jobs:
+        for share in SHARES:
+            key = {"task": task, "seed": str(seed), "share": str(share)}
+            rows = read(args.data / "phases.csv")
+            if not any(key.items() <= row.items() for row in rows):
+                saved = read_checkpoint(folder / f"phase_{share}.pt")
+                measured = examine(saved, args.states, args.repeats, args.steps, args.size)
+                rows.append(key | {"steps": str(saved["rows"][-1]["steps"])} | measured)
+                write(args.data / "phases.csv", rows)
+    fill((DATA.parents[1] if ships else args.data) / "more_losses.md", {"phases": block(args.data)})
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, stop)
+    main()

@@ -39,7 +39,7 @@ TASKS, OF_METHODS, SEEDS = ("landing", "racing", "racing_position"), ("bptt", "s
 IN_RACING = {"event times", "clip", "correlated noise", "fixed noise", "average"}
 SHIPS_WITH = {  # task and method: which of the options they have; the others have none
     **{("landing", method): {"event times", "average"} for method in ("bptt", "shac")},
-    **{(task, method): IN_RACING for task in ("racing", "racing_position") for method in ("bptt", "shac")},
+    **{(task, method): IN_RACING for task in ("racing", "racing_position") for method in OF_METHODS},
     ("racing", "shac"): IN_RACING - {"average"},
 }
 

@@ -22,7 +22,7 @@ TASKS = tuple(STEPS)
 EPISODE = {"hovering": 256, "tracking": 512, "landing": 256, "racing": 512}
 # What the recipes have taken on since the trial, and the trial goes without.
 AS_THEN = ("env.event_discount=null", "actor.average=null", "eval.episodes=null")
-RACING_AS_THEN = (  # of BPTT and SHAC
+RACING_AS_THEN = (  # of the first-order methods
     "loss.clip_action_gradient=null",
     *("actor.scale_init=0.3", "actor.learn_scale=true", "actor.noise_correlation=0"),
 )
@@ -151,7 +151,7 @@ class Job:
             steps, lr = int(SEARCH_FRACTION.get(self.task, 1.0) * steps), self.lr
         lr *= variant.rate
         racing = [x for x in RACING if variant.algorithm != "bptt" or "critic" not in x]
-        racing += RACING_AS_THEN if variant.algorithm in ("bptt", "shac") else ()
+        racing += RACING_AS_THEN if variant.algorithm != "ppo" else ()
         horizon = EPISODE.get(self.task, 256) if variant.horizon == "episode" else variant.horizon
         batch = 128 * 128 if self.task == "racing" else 64 * 64  # steps in an iteration of the first-order methods
         return [

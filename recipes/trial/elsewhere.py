@@ -31,6 +31,7 @@ import torch
 from comparison import LABELS, reached_table
 from reproduce import DATA, write  # whose import makes the recipes' code known
 from results import fill
+from shipped import METHODS
 from tables import table
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -272,7 +273,7 @@ def blocks(data: Path) -> dict[str, str]:
                 )
         made[environment] = table(["loss", "before", "after", "each seed", "seconds"], lines)
     shown = {row["task"]: ("gates_passed", 1, 1, "gates") for row in tracks}
-    return made | {"tracks": reached_table(tracks, {"shac": "SHAC"}, {x: shown[x] for x in LABELS if x in shown})}
+    return made | {"tracks": reached_table(tracks, METHODS, {x: shown[x] for x in LABELS if x in shown})}
 
 
 def main() -> None:

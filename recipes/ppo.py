@@ -38,7 +38,7 @@ def main(cfg: DictConfig) -> None:
             if cfg.actor.max_kl is None or moved < cfg.actor.max_kl:
                 with set_recurrent_mode(True):  # a memory, if there is one, goes through whole horizons
                     losses = loss(batch)
-                moved = mean_of_all(losses["kl_approx"])
+                moved = mean_of_all(losses["kl_approx"]).abs()  # a mean of samples, which can be negative
                 loss_actor = losses["loss_objective"] + losses.get("loss_entropy", 0.0)
                 run.optimise("actor", actor_optimizer, loss_actor, cfg.actor.max_grad_norm)
             else:

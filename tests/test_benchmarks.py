@@ -2,10 +2,13 @@
 
 import csv
 import importlib
+import platform
 import sys
 from pathlib import Path
 
 import pytest
+
+from torchrl_quad.files import machine
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SMALL = "num_envs=4 horizon=4 env.max_episode_steps=20 compile=false"
@@ -77,3 +80,11 @@ def test_the_results_that_are_published_name_their_machine():
     for path in published:
         with open(path, newline="") as file:
             assert all(row["machine"] for row in csv.DictReader(file))
+
+
+def test_a_processor_is_named_with_its_generation_and_without_linux_by_what_python_knows(monkeypatch):
+    said = "processor\t: 0\ncpu family\t: 25\nmodel\t\t: 17\nmodel name\t: AMD EPYC\npower management:\n"
+    monkeypatch.setattr(Path, "read_text", lambda path: said)
+    assert machine() == "AMD EPYC (25-17)"
+    monkeypatch.setattr(Path, "read_text", lambda path: "Processor\t: ARMv7\n")
+    assert machine() == (platform.processor() or platform.machine())

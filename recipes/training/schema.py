@@ -173,9 +173,7 @@ class Loss(Section):
     clip_epsilon: Annotated[Real, Field(gt=0, lt=1)] | None = Field(
         None, description="How far the ratio of probabilities may move from 1; 0.2 is usual."
     )
-    max_importance_ratio: Annotated[Real, Field(gt=1)] | None = Field(
-        None, description="A bound on the ratio of probabilities in PPO; null for none."
-    )
+    max_importance_ratio: Positive | None = Field(None, description="The largest ratio of probabilities; null for any.")
     critic_coeff: Positive | None = Field(None, description="The weight of the critic's loss.")
     entropy_coeff: Annotated[Real, Field(ge=0)] | None = Field(None, description="The weight of the entropy bonus.")
 

@@ -1,4 +1,4 @@
-"""The runs that put the paper on trial, and the measurement of their gradients."""
+"""The runs that put the paper on trial."""
 
 import csv
 import math
@@ -175,6 +175,7 @@ def test_the_jobs_of_the_matrix_are_valid_runs_of_their_recipes_and_each_is_ther
         if job.task == "racing":
             assert cfg.env.reward == ("velocity" if "velocity" in job.variant else "position")
             assert "critic" not in cfg or cfg.critic.num_cells == [128, 128]
+        assert cfg.actor.schedule == "linear" and cfg.loss.get("max_importance_ratio") is None
         if cfg.algorithm != "ppo":
             assert cfg.num_envs * cfg.horizon == pytest.approx(16384 if job.task == "racing" else 4096, rel=0.02)
         if cfg.algorithm == "shac":

@@ -91,7 +91,13 @@ def slopes(env: EnvBase, loss: PathwiseLoss, start: TensorDictBase, action: Tens
 
 
 def return_of(env: EnvBase, loss: PathwiseLoss, start: TensorDictBase, steps: int) -> Tensor:
-    """Fly a first action, and then the policy with the same noise in each call: the discounted return (envs)."""
+    """Fly the action in ``start`` (envs), and then the policy, with the same noise in each call: the discounted return.
+
+    Noise that is correlated in time goes on from ``start["noise"]``, if it is there.
+
+    Returns:
+        (envs), up to the end of the episode, or of the steps.
+    """
     torch.manual_seed(SEED)
     first = env.step(start)
     rest, _ = differentiable_rollout(env, loss.actor_network, env.step_mdp(first), steps - 1)

@@ -1,12 +1,12 @@
-"""Train the hybrid on racing, and measure in each phase of it which of its two gradients points uphill.
+"""Train the hybrid on racing, and measure in phases of its training which of its two gradients points uphill.
 
 python recipes/trial/phases.py --tasks racing racing_position --seeds 100
 
 In states that the policy of a phase visits, the gradient of the return in the mean of the next action is measured: the
-action is changed a little up and down, with what follows of it in noise that is correlated in time, and the policy
-flies on, gates and crashes included. That gradient, the pathwise one, that of the score function, and what the loss
-makes of both become gradients in the policy's weights over all these states. The result is the cosine of each with the
-measured one. Two halves of the measurement are compared in the same way: their cosine shows its noise.
+action is changed a little up and down, together with what it carries into later noise, and the policy flies on, gates
+and crashes included. That gradient, the pathwise one, that of the score function, and what the loss makes of both
+become gradients in the policy's weights over all these states. The result is the cosine of each with the measured one.
+Two halves of the measurement are compared in the same way: their cosine shows its noise.
 
 It may be stopped at any moment. Started again, it skips what is in docs/results/data/phases.csv, and resumes what was
 cut off. It fills in the table of docs/more_losses.md.
@@ -45,12 +45,12 @@ from torchrl_quad.files import replacing
 from torchrl_quad.objectives.action_gradients import distribution_again
 
 SHARES = (0.05, 0.125, 0.25, 0.5, 0.75, 1.0)  # of the steps of a run
-GRADIENTS = {"pathwise": "pathwise", "score": "score function", "hybrid": "hybrid", "halves": "measurement"}
+GRADIENTS = {"pathwise": "pathwise", "score": "score function", "hybrid": "hybrid", "halves": "two halves"}
 
 
 def train(task: str, seed: int, folder: Path, quick: bool) -> None:
     """Train once, or resume it, and keep a copy of the checkpoint in each phase."""
-    own = [f"seed={seed}", *(QUICK if quick else ["eval.interval=10"]), "resume=auto", f"hydra.run.dir={folder}"]
+    own = [f"seed={seed}", *(QUICK if quick else ()), "resume=auto", f"hydra.run.dir={folder}"]
     command = [sys.executable, str(RECIPES / "hybrid.py"), *overrides(task, "hybrid"), *own]
     with ThreadPoolExecutor(1) as pool:
         training = pool.submit(run, command, folder)
@@ -88,10 +88,11 @@ def examine(saved: dict, states: int, repeats: int, steps: int, size: float) -> 
     weight = loss.pathwise_weight.clamp(0.0, 1.0).item()
     loss.pathwise_weight.fill_(1.0)  # so that the whole pathwise gradient is written
     loss.decay = 1.0
-    first = loss.write_targets(rollout)[:, 0]
+    data = loss.write_targets(rollout)
+    predicted = (data["location_gradient"] * (data["latent"] - data["loc"])).sum(-1, keepdim=True)
+    predicted = predicted - predicted.mean()
+    first, advantage, predicted = data[:, 0], (data["advantage"] + predicted)[:, 0], predicted[:, 0]
     pathwise, noise = first["location_gradient"], first["latent"] - first["loc"]
-    predicted = (pathwise * noise).sum(-1, keepdim=True)
-    advantage = first["advantage"] + predicted
     score = noise / first["scale"] ** 2  # the gradient of the logarithm of the density
     true = slopes(env, loss, cfg.actor.noise_correlation, start, first, steps, size)
     half = torch.arange(len(true)) % 2 == 0
@@ -111,7 +112,7 @@ def examine(saved: dict, states: int, repeats: int, steps: int, size: float) -> 
 
 
 def weight_gradient(loss: HybridLoss, data: TensorDictBase, direction: Tensor) -> Tensor:
-    """The gradient in the policy's weights from that in the means of its actions, (envs, 4)."""
+    """The gradient in the policy's weights (parameters) from that in the means of its actions, (envs, 4)."""
     loc, _ = distribution_again(loss.actor_network, loss.actor_network_params, data)
     weights = list(loss.actor_network_params.parameters())
     grads = torch.autograd.grad((loc * direction).sum(), weights)
@@ -153,7 +154,7 @@ def block(data: Path) -> str:
         }
         steps = f"{np.mean([float(row['steps']) for row in own]) / 1e6:.1f}"
         lines.append([LABELS.get(task, task), steps, *(f"{x:.2f}" for x in mean.values())])
-    return table(["racing", "million steps", *GRADIENTS.values(), "weight b", "explained variance of V"], lines)
+    return table(["task", "million steps", *GRADIENTS.values(), "weight b", "explained variance of V"], lines)
 
 
 def main() -> None:
@@ -173,8 +174,16 @@ def main() -> None:
     ships = args.data.resolve() == DATA.resolve()
     if args.quick and ships:
         parser.error("--quick gives no results to keep: name another folder with --data.")
+    if args.repeats % 2:
+        parser.error("--repeats must be even: two halves of them are compared.")
     torch.set_num_threads(1)
-    jobs = [(task, seed, args.output / task / f"seed{seed}") for seed in args.seeds for task in args.tasks]
+    kept = {(row["task"], row["seed"], row["share"]) for row in read(args.data / "phases.csv")}
+    jobs = [
+        (task, seed, args.output / task / f"seed{seed}")
+        for seed in args.seeds
+        for task in args.tasks
+        if any((task, str(seed), str(share)) not in kept for share in SHARES)
+    ]
     with ThreadPoolExecutor(args.cores) as pool:
         for future in [pool.submit(train, *job, args.quick) for job in jobs]:
             future.result()

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from ascent import SEED, return_of, visited
-from comparison import LABELS
+from comparison import LABELS, column
 from omegaconf import OmegaConf
 from reproduce import DATA, QUICK, RECIPES, run, stop, write
 from results import fill
@@ -149,11 +149,9 @@ def block(data: Path) -> str:
     lines, rows = [], read(data / "phases.csv")
     for task, share in dict.fromkeys((row["task"], row["share"]) for row in rows):
         own = [row for row in rows if (row["task"], row["share"]) == (task, share)]
-        mean = {
-            name: np.mean([float(row[name]) for row in own]) for name in (*GRADIENTS, "weight", "explained_variance")
-        }
-        steps = f"{np.mean([float(row['steps']) for row in own]) / 1e6:.1f}"
-        lines.append([LABELS.get(task, task), steps, *(f"{x:.2f}" for x in mean.values())])
+        shown = (*GRADIENTS, "weight", "explained_variance")
+        steps, *means = (np.mean(column(own, name)) for name in ("steps", *shown))
+        lines.append([LABELS.get(task, task), f"{steps / 1e6:.1f}", *(f"{x:.2f}" for x in means)])
     return table(["task", "million steps", *GRADIENTS.values(), "weight b", "explained variance of V"], lines)
 
 

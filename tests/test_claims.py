@@ -12,7 +12,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "recipes/trial"))
 
 import ablations
 import claims
+import elsewhere
 import matrix
+import phases
 import reproduce
 import results
 import shipped
@@ -208,6 +210,13 @@ def test_the_page_of_the_project_shows_what_its_data_hold():
         )
     options = (PROJECT / "docs/ablations.md").read_text()
     assert ablations.summary(reproduce.DATA) in options, "run: python recipes/trial/ablations.py --tasks landing"
+    far = (PROJECT / "docs/elsewhere.md").read_text()
+    assert all(block in far for block in elsewhere.blocks(reproduce.DATA).values()), (
+        "recipes/trial/elsewhere.py fills it"
+    )
+    assert phases.block(reproduce.DATA) in (PROJECT / "docs/more_losses.md").read_text(), (
+        "recipes/trial/phases.py fills it"
+    )
     assert page.count("<!-- generated") == page.count(results.END)
 
 

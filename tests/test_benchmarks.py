@@ -86,5 +86,7 @@ def test_a_processor_is_named_with_its_generation_and_without_linux_by_what_pyth
     said = "processor\t: 0\ncpu family\t: 25\nmodel\t\t: 17\nmodel name\t: AMD EPYC\npower management:\n"
     monkeypatch.setattr(Path, "read_text", lambda path: said)
     assert machine() == "AMD EPYC (25-17)"
+    monkeypatch.setattr(Path, "read_text", lambda path: "processor\t: 0\nmodel name\t: ARMv7 rev 4\n")
+    assert machine() == "ARMv7 rev 4"
     monkeypatch.setattr(Path, "read_text", lambda path: "Processor\t: ARMv7\n")
     assert machine() == (platform.processor() or platform.machine())

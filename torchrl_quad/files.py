@@ -54,7 +54,8 @@ def machine() -> str:
     try:
         lines = [line.split(":", 1) for line in Path("/proc/cpuinfo").read_text().splitlines() if ":" in line]
         said = {key.strip(): value.strip() for key, value in reversed(lines)}
-        return f"{said['model name']} ({said['cpu family']}-{said['model']})"
+        generation = "-".join(said[key] for key in ("cpu family", "model") if key in said)
+        return f"{said['model name']} ({generation})" if generation else said["model name"]
     except (OSError, KeyError):
         return platform.processor() or platform.machine()
 

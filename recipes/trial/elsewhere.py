@@ -1,7 +1,7 @@
 """Train the losses on two environments that are not ours: are they what they say?
 
 python recipes/trial/elsewhere.py --environments pendulum
-python recipes/trial/elsewhere.py --environments balance --losses bptt shac hybrid
+python recipes/trial/elsewhere.py --environments balance --losses abpt shac hybrid bptt
 
 It may be stopped at any moment. Started again, it skips what is in docs/results/data/elsewhere.csv, and it fills in the
 tables of docs/elsewhere.md: those of the two environments, and that of a track which no setting was chosen on, from

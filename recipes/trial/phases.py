@@ -188,12 +188,11 @@ def main() -> None:
     for task, seed, folder in jobs:
         for share in SHARES:
             key = {"task": task, "seed": str(seed), "share": str(share)}
-            rows = read(args.data / "phases.csv")
-            if not any(key.items() <= row.items() for row in rows):
+            if tuple(key.values()) not in kept:
                 saved = read_checkpoint(folder / f"phase_{share}.pt")
                 measured = examine(saved, args.states, args.repeats, args.steps, args.size)
-                rows.append(key | {"steps": str(saved["rows"][-1]["steps"])} | measured)
-                write(args.data / "phases.csv", rows)
+                row = key | {"steps": str(saved["rows"][-1]["steps"])} | measured
+                write(args.data / "phases.csv", [*read(args.data / "phases.csv"), row])
     fill((DATA.parents[1] if ships else args.data) / "more_losses.md", {"phases": block(args.data)})
 
 

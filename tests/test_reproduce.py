@@ -24,6 +24,7 @@ import claims
 import comparison
 import forest
 import matrix
+import rates
 import reproduce
 import shipped
 import tables
@@ -240,6 +241,25 @@ def test_options_are_changed_one_at_a_time_and_shown_beside_what_ships(run_here,
                     key, value = override.split("=")
                     value = cfg.gamma if value == "${gamma}" else yaml.safe_load(value)
                     assert ablations.is_change(task, method, change) is (OmegaConf.select(cfg, key) != value)
+
+
+def test_half_and_twice_a_rate_fly_once_and_are_judged_by_their_worst_seed(run_here, monkeypatch, tmp_path):
+    monkeypatch.setattr(shipped, "run", run_here)
+    wanted = ["--tasks", "hovering", "--methods", "bptt", "--factors", "0.5", "--seeds", "101"]
+    arguments = [*wanted, "--data", tmp_path, "--output", tmp_path / "runs", "--quick"]
+    run_main(monkeypatch, rates, *arguments)
+    (row,) = reproduce.read(tmp_path / "rates.csv")
+    assert (row["factor"], row["algorithm"], row["steps"]) == ("0.5", "bptt", "64")
+    monkeypatch.setattr(rates, "train", lambda *_: pytest.fail("It has been flown."))
+    run_main(monkeypatch, rates, *arguments)
+    ends = {("0.5", "102"): "1.5", ("2", "101"): "9.0", ("2", "102"): "8.0", ("2", "103"): "7.0"}
+    rows = [row | {"factor": factor, "seed": seed, "return": x, "solved": "0.5"} for (factor, seed), x in ends.items()]
+    reproduce.write(tmp_path / "rates.csv", rows)
+    assert "| hovering | BPTT | 1.5, 50.0%, 1 of 3 seeds |  | 7, 50.0% |" in rates.summary(tmp_path)
+    assert rates.scaled("racing", "ppo", "2") == ["actor.lr=0.02", "actor.final_lr=0.0002"]
+    assert rates.scaled("hovering", "hybrid", "0.5") == ["actor.max_kl=0.125"]
+    with pytest.raises(SystemExit):
+        run_main(monkeypatch, rates, "--quick")
 
 
 def test_policies_of_the_forest_are_flown_at_the_speeds_and_densities_and_not_twice(run_here, monkeypatch, tmp_path):

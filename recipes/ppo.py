@@ -13,7 +13,7 @@ from training.launch import recipe
 from training.loop import Run
 from training.processes import mean_of_all
 
-from torchrl_quad import differentiable_rollout, make_value
+from torchrl_quad import differentiable_rollout, make_value, restart
 
 
 @recipe("ppo")
@@ -46,6 +46,8 @@ def main(cfg: DictConfig) -> None:
             run.optimise("critic", critic_optimizer, losses["loss_critic"], cfg.critic.max_grad_norm)
 
         update_normalizer(env, data)
+        if cfg.normalize:  # observe anew
+            run.carry = restart(env, run.carry, 0.0)
         actor_schedule.step()
         critic_schedule.step()
         run.record(**losses.apply(torch.mean))  # some are per step of the horizon where a policy remembers

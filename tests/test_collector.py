@@ -97,10 +97,14 @@ def test_weights_are_copied_from_whatever_form_torchrl_hands_over():
     with torch.no_grad():
         for parameter in other.policy.parameters():
             parameter.uniform_()
-    for given in ((other.policy,), ({"policy": other.policy},)):
+    for given in ((other.policy,), ({"policy": other.policy},), (other.policy.state_dict(),)):
         collector = make()
         collector.update_policy_weights_()
-        options = {"weights_dict": given[0]} if isinstance(given[0], dict) else {"policy_or_weights": given[0]}
+        options = (
+            {"weights_dict": given[0]}
+            if given[0] is not other.policy and "policy" in given[0]
+            else {"policy_or_weights": given[0]}
+        )
         collector.update_policy_weights_(**options)
         for ours, theirs in zip(collector.policy.parameters(), other.policy.parameters(), strict=True):
             assert torch.equal(ours, theirs) and ours is not theirs

@@ -172,7 +172,17 @@ def test_a_gate_needs_a_finite_radius():
         (
             "initial_state",
             lambda self, n: {**HoveringEnv.initial_state(self, n), "legs": torch.zeros(n)},
-            r"initial_state: entry 'legs' must be a tensor \(4, ...\) of at least two dimensions; got \(4,\)",
+            r"initial_state: entry 'legs' must be a tensor \(4, ...\) of at least two dimensions, .* got \(\(4,\)",
+        ),
+        (
+            "initial_state",
+            lambda self, n: {**HoveringEnv.initial_state(self, n), "step": torch.zeros(n, 1)},
+            "initial_state: entry 'step' is the environment's own; give yours another name",
+        ),
+        (
+            "initial_state",
+            lambda self, n: {**HoveringEnv.initial_state(self, n), "legs": torch.zeros(n, 1, dtype=torch.int32)},
+            r"initial_state: entry 'legs' must be .* torch.float32, int64 or bool; got \(\(4, 1\), torch.int32\)",
         ),
     ],
 )

@@ -147,6 +147,8 @@ def test_the_stiffness_is_the_root_mean_square_of_the_action_gradients_in_median
     _, measured = loss._measure(grad)  # lengths 5, 5, 25, and one that counts nothing
     assert measured["stiffness"].item() == pytest.approx(math.sqrt((25 + 25 + 625) / 3) / 5)
     assert loss._measure(0.0 * grad)[1]["stiffness"].isnan()
+    grad[0, 0, 0] = torch.nan  # nothing is stiffer than this
+    assert make_ahac(clip_action_gradient=2.0)._measure(grad)[1]["stiffness"] == torch.inf
 
 
 def test_ahac_learns_what_shac_does_from_the_least_of_its_critics(env64):
@@ -220,7 +222,7 @@ def test_the_simulated_start_has_the_gradient_of_the_simulator_once_an_action_ha
 
 def test_a_clip_that_never_clips_leaves_the_gradient_of_the_simulated_start():
     env = HoveringEnv(num_envs=4, dtype=torch.float64)
-    actor = make_actor(env, scale_init=1e-6)  # actions that are sampled anew are the same
+    actor = make_actor(env, scale_init=1e-4)  # actions that are sampled anew are the same
     rollout, _ = differentiable_rollout(env, actor, None, 6)
     found = []
     for clip in (None, 1e9):

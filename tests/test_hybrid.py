@@ -4,6 +4,7 @@ import pytest
 import torch
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import ValueEstimators
 
 from torchrl_quad import HoveringEnv, HybridLoss, differentiable_rollout, make_actor, make_value
 
@@ -113,6 +114,13 @@ def test_the_weight_tells_a_true_derivative_from_none(env):
     assert jumps.pathwise_weight < 0 and not data["location_gradient"].any()
 
 
+def test_a_single_flight_is_regressed_over_its_steps():
+    env = HoveringEnv(num_envs=1, dtype=torch.float64)
+    loss = make_loss(env)
+    data = loss.write_targets(flight(env, loss, 16))
+    assert loss.pathwise_weight != 0 and data["location_gradient"].isfinite().all()
+
+
 def test_weights_are_running_means_that_a_checkpoint_keeps(env):
     loss = make_loss(env, decay=0.5)
     rollout = flight(env, loss)
@@ -146,5 +154,11 @@ def test_errors(env):
     broken["next", "observation"] = torch.where(broken["next", "terminated"], torch.nan, broken["next", "observation"])
     data = loss.write_targets(rollout.copy().update({"next": broken["next"]}))
     assert data["location_gradient"].isfinite().all() and loss.pathwise_weight.isfinite()
+    short = make_loss(env, gradient_lmbda=1e-30).make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
+    with pytest.raises(ValueError, match="too small for a horizon of 12 steps.* Fly at most 11 steps, or raise"):
+        short.write_targets(flight(env, short, 12))
+    short.write_targets(flight(env, short, 11))
+    with pytest.raises(NotImplementedError, match="TD0"):
+        short.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
     read = loss.write_targets(rollout.select(*loss.in_keys))
     assert loss(read)["loss_actor"].isfinite()

@@ -6,7 +6,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from test_objectives import GAMMA, make_networks, make_rollout
 from torch import nn
 from torchrl.envs import PendulumEnv
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import SoftUpdate, ValueEstimators
 
 from torchrl_quad import (
     ABPTLoss,
@@ -104,6 +104,20 @@ def test_a_loss_goes_on_from_a_checkpoint_with_its_discounts():
         key: x.tolist() for key, x in saved.state_dict().items()
     }
     assert [loss.value_estimator.gamma.item() for loss in loaded.values()] == [0.5] * 3
+    actor, value, _ = make_networks()
+    one_step = SHACLoss(actor, value).make_value_estimator(ValueEstimators.TD0, gamma=0.5)
+    other = SHACLoss(actor, value)
+    other.load_state_dict(one_step.state_dict())
+    assert other.value_type is ValueEstimators.TD0 and other.value_estimator.gamma == 0.5
+
+
+def test_the_running_median_of_the_clip_has_the_precision_of_the_actor():
+    env = HoveringEnv(num_envs=2, dtype=torch.float64)
+    loss = BPTTLoss(make_actor(env), clip_action_gradient=2.0)
+    loss(differentiable_rollout(env, loss.actor_network, None, 3)[0])
+    other = BPTTLoss(make_actor(env), clip_action_gradient=2.0)
+    other.load_state_dict(loss.state_dict())
+    assert other.clip.median == loss.clip.median and other.clip.median.dtype == torch.float64
 
 
 # -- what they refuse -------------------------------------------------------------------------------------------------
@@ -193,6 +207,20 @@ def test_a_rollout_that_lacks_an_entry_is_refused(env, flight, key):
             named = "reads .*'next'" if key == "next" else f"reads {key!r}".replace("(", r"\(").replace(")", r"\)")
             with pytest.raises(ValueError, match=f"{type(loss).__name__} {named}.*not in the rollout.*set_keys"):
                 loss(flight[0].exclude(key))
+
+
+def test_an_entry_of_another_shape_is_refused(env, flight):
+    for loss in losses(env):
+        for key in ("reward", "done", "terminated"):
+            wrong = flight[0].copy()
+            wrong["next"] = wrong["next"].copy().set(key, wrong["next", key].squeeze(-1))
+            with pytest.raises(ValueError, match=rf"'{key}'\) of shape \(4, 3, 1\) in this rollout; got \(4, 3\)"):
+                loss(wrong)
+    shac = losses(env)[1]
+    with pytest.raises(
+        ValueError, match=r"'value_target' has shape \(4, 3\), and the critic's predictions \(4, 3, 1\)"
+    ):
+        shac(flight[0].copy().set("value_target", torch.zeros(4, 3)))
 
 
 def test_a_wrong_tensor_key_is_refused(env, flight):

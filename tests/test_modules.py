@@ -105,7 +105,7 @@ def test_a_network_of_wrong_sizes_or_entries_is_refused(env, make, kwargs, messa
         ({"action_init": [0.0, 0.0, 0.0]}, "action_init must be 4 numbers strictly between"),
         ({"action_init": [1.0, 0.0, 0.0, 0.0]}, r"strictly between .* got \[1.0, 0.0, 0.0, 0.0\]"),
         ({"action_init": [float("nan"), 0.0, 0.0, 0.0]}, "strictly between"),
-        ({"scale_init": 0.0}, "scale_init must be positive and finite, got 0.0"),
+        ({"scale_init": 0.0}, "scale_init must be finite and at least 1e-4, got 0.0"),
     ],
 )
 def test_a_first_action_out_of_bounds_and_a_wrong_list_of_entries_are_refused(env, kwargs, message):

@@ -149,3 +149,12 @@ def test_a_recipe_outside_the_repository_is_short_and_takes_any_task(tmp_path, m
     saved = read_checkpoint(tmp_path / "run/smooth/checkpoint.pt")
     assert "smoothness: 0.3" in saved["config"] and "algorithm: smooth" in saved["config"]
     assert math.isfinite(saved["best"]["return"])
+
+
+def test_a_metric_that_is_described_and_not_given_is_named():
+    class SilentEnv(CornerEnv):
+        def metrics(self, state):
+            return {}
+
+    with pytest.raises(ValueError, match=r"SilentEnv.metrics\(state\) lacks corner_error, which metric_info describes"):
+        SilentEnv()

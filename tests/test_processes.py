@@ -59,7 +59,14 @@ def train_together(rank, ports, launches):
 
 
 def test_two_processes_train_one_policy_and_resume(in_two_processes, tmp_path):
-    options = [*SMALL, *EVERYTHING, "buffer.capacity=24", "actor.schedule=constant", "critic.schedule=constant"]
+    options = [
+        *SMALL,
+        *EVERYTHING,
+        "loss.clip_action_gradient=2",
+        "buffer.capacity=24",
+        "actor.schedule=constant",
+        "critic.schedule=constant",
+    ]
     launches = [
         [*options, "total_steps=384", f"hydra.run.dir={tmp_path}/straight"],
         [*options, "total_steps=192", f"hydra.run.dir={tmp_path}/resumed"],
@@ -71,7 +78,7 @@ def test_two_processes_train_one_policy_and_resume(in_two_processes, tmp_path):
     assert [row["steps"] for row in straight["rows"]] == [96, 192, 288, 384]
     first, second = straight["processes"]
     assert first["parameters"] == second["parameters"]
-    for name in ("torch", "env"):
+    for name in ("torch", "env", "clip"):
         with pytest.raises(AssertionError):
             assert_equal(first[name], second[name])
     assert not torch.equal(first["carry"]["state"]["position"], second["carry"]["state"]["position"])

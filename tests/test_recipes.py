@@ -11,11 +11,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from small_runs import SMALL as SMALL_RUN
-from training.building import make_optimizer
+from tensordict import TensorDict
+from training.building import build_env, make_optimizer
 from training.checkpoints import read_checkpoint
 from training.evaluation import drawing_from, evaluate
 
-from torchrl_quad import LandingEnv, make_actor
+from torchrl_quad import LandingEnv, make_actor, restart
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.scenery import EPISODE_METRICS
 
@@ -95,6 +96,11 @@ def test_evaluation_repeats_the_summary_of_the_run_also_with_a_normalizer(train,
     train(recipe, tmp_path, "normalize=true", "env.wind={gust: 0.5}", "actor.schedule=exponential")
     checkpoint = read_checkpoint(tmp_path / "checkpoint.pt")
     assert checkpoint["stateful"][-1]["count"] == 96
+    if recipe == "ppo":  # the next horizon starts from what the normalizer of now makes of its states
+        cfg = OmegaConf.create(checkpoint["config"])
+        env, carry = build_env(cfg, cfg.num_envs, 0), TensorDict(checkpoint["processes"][0]["carry"], [cfg.num_envs])
+        env.transform.load_state_dict(checkpoint["stateful"][-1])
+        torch.testing.assert_close(carry["observation"], restart(env, carry, 0.0)["observation"])
     launch("evaluate", f"checkpoint={tmp_path}/checkpoint.pt")
     summary = json.loads((tmp_path / "summary.json").read_text())
     evaluation = json.loads((tmp_path / "evaluation.json").read_text())

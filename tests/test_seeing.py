@@ -192,6 +192,9 @@ def test_losses_take_a_policy_that_sees(recurrent, noise_correlation):
         for loss in (BPTTLoss(actor), BPTTLoss(actor, clip_action_gradient=1e12))
     ]
     torch.testing.assert_close(*grads)
+    over = rollout[:, :2].clone(recurse=False)  # all have crashed: there is no value after the end
+    over["next"].update({name: torch.ones_like(over["next", name]) for name in ("done", "terminated")})
+    assert ABPTLoss(actor, qvalue)(over)["loss_actor"].isfinite()
     bound = TrustRegion(actor, max_kl=1e-3)
     assert bound.divergence(rollout) < 1e-12
     with bound.around(rollout), torch.no_grad():
@@ -232,10 +235,12 @@ def test_what_cannot_be_seen_is_refused():
     with pytest.raises(ValueError, match="Give it a camera"):
         make_visual_actor(HoveringEnv(num_envs=1))
     env = forest(num_envs=1)
-    with pytest.raises(ValueError, match="at least one whole number"):
-        make_visual_actor(env, channels=())
-    with pytest.raises(ValueError, match="at least one layer"):
-        make_visual_actor(env, num_cells=())
+    for channels in ((), 8, (2.5,)):
+        with pytest.raises(ValueError, match="at least one whole number"):
+            make_visual_actor(env, channels=channels)
+    for cells in ((), 64, (2.5,), (0,)):
+        with pytest.raises(ValueError, match="num_cells must name the widths"):
+            make_visual_actor(env, num_cells=cells)
     with pytest.raises(ValueError, match="recurrent=False"):
         make_visual_actor(env, recurrent=False).make_tensordict_primer()
     with pytest.raises(ValueError, match="InitTracker"):

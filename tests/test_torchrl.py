@@ -324,6 +324,10 @@ def test_environments_in_one_process_keep_their_gradients():
         loss = make_loss(name, env, actor)
         (grad, *_) = torch.autograd.grad(loss(rollout)["loss_actor"], list(actor.parameters()), retain_graph=True)
         assert grad.isfinite().all() and grad.norm() > 0
+    carry = None
+    for _ in range(2):  # each horizon has a graph of its own
+        rollout, carry = differentiable_rollout(env, actor, carry, 3)
+        BPTTLoss(actor)(rollout)["loss_actor"].backward()
 
 
 def test_environments_in_several_processes_fly_and_the_loss_says_that_they_cut_the_gradient(deadline):

@@ -15,7 +15,8 @@ from torch.autograd.graph import GradientEdge
 from torchrl.envs import EnvBase
 
 from torchrl_quad.data import differentiable_rollout
-from torchrl_quad.objectives.pathwise import PathwiseLoss, discounts
+from torchrl_quad.objectives.pathwise import PathwiseLoss
+from torchrl_quad.objectives.segments import discounts
 
 Inputs = nn.Module | Tensor | Iterable[Tensor]
 

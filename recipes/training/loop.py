@@ -280,6 +280,7 @@ class Run:
 
     def _save(self, path: Path) -> None:
         """Write all that the run needs to go on, of all processes."""
+        clip = getattr(self.loss, "clip", None)
         processes = gather(
             {
                 "torch": torch.get_rng_state(),
@@ -287,6 +288,7 @@ class Run:
                 "env": self.env.random_state(),
                 "carry": self.carry.cpu().to_dict(),
                 "buffer": None if self.buffer is None else self.buffer.state_dict(),
+                "clip": None if clip is None else clip.state_dict(),  # each clips by the median of its own drones
                 "parameters": sum(p.detach().double().sum().item() for p in self.loss.parameters()),
             }
         )
@@ -329,6 +331,8 @@ class Run:
             x.load_state_dict(state)
         if self.buffer is not None:
             self.buffer.load_state_dict(own["buffer"])
+        if own.get("clip") is not None:
+            self.loss.clip.load_state_dict(own["clip"])
         self.carry = TensorDict(own["carry"], self.env.batch_size).to(self.env.device)
         self.env.set_random_state(own["env"])
         torch.set_rng_state(own["torch"])

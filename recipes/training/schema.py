@@ -42,6 +42,7 @@ def existing_checkpoint(path: str) -> str:
 Real = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[Real, Field(gt=0)]
 Fraction = Annotated[Real, Field(ge=0, le=1)]
+Share = Annotated[Real, Field(gt=0, le=1)]
 Count = Annotated[int, Field(ge=0, le=10**9)]
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 Size = Annotated[int, Field(ge=1, le=10_000_000)]
@@ -73,7 +74,7 @@ class Env(Section):
     observation_delay: int = Field(ge=0, le=1000, description="Control steps by which observations lag behind.")
     max_episode_steps: Size = Field(description="Control steps after which an episode is truncated.")
     observe_last_action: bool
-    event_discount: Annotated[Real, Field(gt=0, le=1)] | None = Field(
+    event_discount: Share | None = Field(
         None, description="The discount per control step by which the time of an event counts; null: no gradient in it."
     )
 
@@ -106,7 +107,9 @@ class Optimised(Section):
 class Actor(Optimised):
     """The policy."""
 
-    scale_init: Positive = Field(description="The standard deviation of the policy's noise at the start.")
+    scale_init: Annotated[Real, Field(ge=1e-4)] = Field(
+        description="The standard deviation of the policy's noise at the start."
+    )
     learn_scale: bool = Field(description="Whether this noise changes with the state and in training.")
     vision: bool = Field(description="Whether the policy reads the images of a camera, where there is one.")
     recurrent: bool = Field(description="Whether a policy that sees has a memory.")
@@ -120,7 +123,7 @@ class Actor(Optimised):
     max_kl: Positive | None = Field(
         description="How far an update, or PPO's iteration, may move the policy; null for none."
     )
-    average: Annotated[Real, Field(gt=0, le=1)] | None = Field(
+    average: Share | None = Field(
         description="The share of the iterations so far over which the weights that are evaluated are averaged, such "
         "as 0.1; null for none."
     )
@@ -130,52 +133,50 @@ class Critic(Optimised):
     """The critic; that of PPO has no target network."""
 
     lmbda: Fraction = Field(description="The lambda of the TD(lambda) targets; 0.95 is usual.")
-    updates: int | None = Field(None, ge=1, le=100_000, description="Gradient steps of the critic per iteration.")
-    batch_size: Size | None = Field(None, description="Control steps in a minibatch of the critic.")
-    tau: Annotated[Real, Field(gt=0, le=1)] | None = Field(
-        None, description="The share of the critic that its target network takes over in each update."
-    )
+    updates: int = Field(None, ge=1, le=100_000, description="Gradient steps of the critic per iteration.")
+    batch_size: Size = Field(None, description="Control steps in a minibatch of the critic.")
+    tau: Share = Field(None, description="The share of the critic that its target network takes over in each update.")
 
 
 class Loss(Section):
     """The options of the loss; it checks itself what is not listed here."""
 
     model_config = ConfigDict(strict=True, extra="allow")
-    alpha: Annotated[Real, Field(ge=0)] | Literal["auto"] | None = Field(
+    alpha: Annotated[Real, Field(ge=0)] | Literal["auto"] = Field(
         None, description="The coefficient of the entropy bonus: a number, 0 for none, or auto to learn it."
     )
     clip_action_gradient: Positive | None = Field(
         None, description="The longest gradient in one action, in running medians; null for no bound."
     )
-    terminal_gradient: bool | None = None
-    target_bootstrap: bool | None = None
-    average_over_horizon: bool | None = None
-    alpha_init: Positive | None = Field(None, description="What alpha=auto starts from.")
-    target_entropy: Annotated[Real, Field(lt=0)] | Literal["auto"] | None = Field(
+    terminal_gradient: bool = Field(None)
+    target_bootstrap: bool = Field(None)
+    average_over_horizon: bool = Field(None)
+    alpha_init: Positive = Field(None, description="What alpha=auto starts from.")
+    target_entropy: Annotated[Real, Field(lt=0)] | Literal["auto"] = Field(
         None, description="The entropy at which alpha=auto holds the policy; auto for the size of the action."
     )
-    simulated_steps: int | None = Field(
+    simulated_steps: int = Field(
         None, ge=0, le=100_000, description="Control steps that ABPT's return of the start flies before its critic."
     )
     min_horizon: Size | None = Field(None, description="The shortest horizon; null for a quarter of horizon.")
     max_horizon: Size | None = Field(None, description="The longest horizon; null for twice horizon.")
-    max_stiffness: Annotated[Real, Field(gt=1)] | None = Field(
+    max_stiffness: Annotated[Real, Field(gt=1)] = Field(
         None, description="Where the action gradients grow beyond it along a horizon, the horizon gets shorter."
     )
-    horizon_lr: Annotated[Real, Field(ge=0, lt=1)] | None = Field(
+    horizon_lr: Annotated[Real, Field(ge=0, lt=1)] = Field(
         None, description="The share by which the horizon may change in an iteration."
     )
-    num_value_nets: int | None = Field(None, ge=1, le=64, description="Critics of states.")
-    num_qvalue_nets: int | None = Field(None, ge=1, le=64, description="Critics whose smallest value counts.")
-    gradient_lmbda: Annotated[Real, Field(gt=0, le=1)] | None = Field(
+    num_value_nets: int = Field(None, ge=1, le=64, description="Critics of states.")
+    num_qvalue_nets: int = Field(None, ge=1, le=64, description="Critics whose smallest value counts.")
+    gradient_lmbda: Share = Field(
         None, description="The lambda of the return that the pathwise gradient differentiates; 0.9 is usual."
     )
-    clip_epsilon: Annotated[Real, Field(gt=0, lt=1)] | None = Field(
+    clip_epsilon: Annotated[Real, Field(gt=0, lt=1)] = Field(
         None, description="How far the ratio of probabilities may move from 1; 0.2 is usual."
     )
     max_importance_ratio: Positive | None = Field(None, description="The largest ratio of probabilities; null for any.")
-    critic_coeff: Positive | None = Field(None, description="The weight of the critic's loss.")
-    entropy_coeff: Annotated[Real, Field(ge=0)] | None = Field(None, description="The weight of the entropy bonus.")
+    critic_coeff: Positive = Field(None, description="The weight of the critic's loss.")
+    entropy_coeff: Annotated[Real, Field(ge=0)] = Field(None, description="The weight of the entropy bonus.")
 
 
 class Buffer(Section):
@@ -222,9 +223,9 @@ class Training(Section):
     critic: Critic | None = None
     loss: Loss
     buffer: Buffer | None = None
-    restart_fraction: Fraction | None = Field(None, description="The share of flights that each iteration gives up.")
-    epochs: int | None = Field(None, ge=1, le=10_000, description="Passes over each rollout.")
-    batch_size: Size | None = Field(None, description="Control steps in a minibatch.")
+    restart_fraction: Fraction = Field(None, description="The share of flights that each iteration gives up.")
+    epochs: int = Field(None, ge=1, le=10_000, description="Passes over each rollout.")
+    batch_size: Size = Field(None, description="Control steps in a minibatch.")
     gamma: Fraction = Field(description="The discount of future rewards per control step; 0.99 is usual.")
     diagnostics: Count = Field(description="Evaluations between audits of reward and gradient; 0 for none.")
     max_skipped: Count = Field(description="Updates that may be left out for not being finite; 0 stops at the first.")

@@ -32,7 +32,7 @@ from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss, differentiable_rollout, m
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.files import read_rows as read
 from torchrl_quad.objectives import PathwiseLoss
-from torchrl_quad.objectives.pathwise import discounts
+from torchrl_quad.objectives.segments import discounts
 
 sys.path.insert(0, str(RECIPES))  # which holds training/
 from training.building import build_env, make_policy, network

@@ -101,7 +101,8 @@ class DifferentiableCollector(BaseCollector):
         several = (policy_or_weights, weights, policy, (weights_dict or {}).get("policy"))
         given = next((x for x in several if x is not None), None)
         if given is not None and given is not self.policy:
-            given = TensorDict.from_module(given) if isinstance(given, nn.Module) else TensorDict(given)
+            is_module = isinstance(given, nn.Module)
+            given = TensorDict.from_module(given) if is_module else TensorDict(given).unflatten_keys(".")
             TensorDict.from_module(self.policy).data.update_(given.data)
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:

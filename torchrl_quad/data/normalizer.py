@@ -11,6 +11,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, ObservationNorm
 
+from torchrl_quad.data.unwrap import base_env
+
 
 class ObservationNormalizer(ObservationNorm):
     """Subtracts the mean and divides by the standard deviation of all observations seen, fixed within a horizon.
@@ -34,7 +36,7 @@ class ObservationNormalizer(ObservationNorm):
         min_scale: the least standard deviation to divide by, in the observation's unit.
 
     Raises:
-        ValueError: the environment does not observe the key, or min_scale is not positive.
+        ValueError: the environment does not observe the key, its state holds the key, or min_scale is not positive.
     """
 
     def __init__(self, env: EnvBase, key: NestedKey = "observation", *, min_scale: float = 0.01) -> None:
@@ -42,6 +44,11 @@ class ObservationNormalizer(ObservationNorm):
             raise ValueError(
                 f"The environment does not observe {key!r}. Choose from: "
                 f"{', '.join(map(str, env.observation_spec.keys(True, True)))}."
+            )
+        if key in base_env(env).state_keys:
+            raise ValueError(
+                f"{key!r} is part of the state from which the next step starts, and cannot be overwritten. Copy it: "
+                f'CatTensors([{key!r}], "features", del_keys=False), and normalise "features".'
             )
         if not min_scale > 0:
             raise ValueError(f"min_scale must be positive, since the normalizer divides by it; got {min_scale}.")

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.normalizer import NormalizedPolicy, ObservationNormalizer
-from torchrl_quad.data.unwrap import memory_keys
+from torchrl_quad.data.unwrap import base_env, memory_keys, require_whole_state
 
 
 def differentiable_rollout(
@@ -43,11 +43,17 @@ def differentiable_rollout(
         environments whose last step was done.
 
     Raises:
-        ValueError: the horizon is less than 1, or the actor reads an entry that nobody writes.
+        ValueError: the horizon is less than 1, the actor reads an entry that nobody writes, or a transform overwrites
+            or leaves out a part of the state.
         TypeError: the actor is not a TensorDictModule, or the carry is not a tensordict.
     """
     if not (isinstance(horizon, numbers.Integral) and horizon >= 1):
         raise ValueError(f"horizon must be at least 1 control step, got {horizon}.")
+    if hasattr(actor, "_orig_mod"):
+        raise TypeError(
+            "torch.compile(actor) is no TensorDictModule. Write actor.compile() instead, which compiles it in place, "
+            "or give the environment compile=True, which compiles the whole horizon."
+        )
     if not isinstance(actor, TensorDictModuleBase):
         raise TypeError(
             f"actor must be a TensorDictModule that writes the action, got {type(actor).__name__}. "
@@ -58,6 +64,7 @@ def differentiable_rollout(
             f"carry must be the tensordict to start from, or None to reset the environment; got {type(carry).__name__}."
         )
     try:
+        require_whole_state(env)
         carry = env.reset() if carry is None else carry.copy()
         with set_exploration_type(exploration_type):
             rollout = _rollout(env, actor, carry, horizon)
@@ -70,16 +77,26 @@ def differentiable_rollout(
         missing = [key for key in actor.in_keys if carry is not None and key not in carry]
         if not missing:
             raise
+        if set(missing) & {*memory_keys(actor), "is_init"}:
+            raise ValueError(
+                f"The actor remembers, and the tensordict it starts from has no {missing[0]!r}. Give the environment "
+                "TorchRL's transforms: Compose(InitTracker(), module.make_tensordict_primer())."
+            ) from error
         raise ValueError(
             f"The actor reads {missing[0]!r}, which is not in the tensordict it starts from. Choose its in_keys from "
             f"what env.reset() writes: {', '.join(map(str, env.observation_spec.keys(True, True)))}."
         ) from error
+    base = base_env(env)
     # Transforms such as CatFrames keep past observations in buffers, with their graph.
     for buffer in env.buffers():
         if not buffer.is_leaf:
             buffer.detach_()
+    if (shared := getattr(base, "shared_tensordict_parent", None)) is not None:  # of SerialEnv
+        shared.detach_()
     end = env.step_mdp(rollout[..., -1]).detach().clone()
-    written = end.select(*(key for key in actor.out_keys if key != "action"), strict=False).clone()
+    specs = (*env.observation_spec.keys(True, True), *env.state_spec.keys(True, True), *env.action_keys)
+    known = set(map(unravel_key, specs))
+    written = end.select(*(key for key in actor.out_keys if unravel_key(key) not in known), strict=False).clone()
     # A reset keeps nothing that it does not know, such as noise, and an environment with a state of its own its graph.
     carry = env.maybe_reset(end).detach().update(written)
     done = rollout["next", "done"][..., -1, :]

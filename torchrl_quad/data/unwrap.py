@@ -2,7 +2,7 @@
 
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 
 def base_env(env: EnvBase) -> EnvBase:
@@ -10,6 +10,32 @@ def base_env(env: EnvBase) -> EnvBase:
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env
+
+
+def require_whole_state(env: EnvBase) -> None:
+    """Refuse transforms that change the state from which the next step starts.
+
+    Raises:
+        ValueError: a transform leaves out a part of it, or overwrites one and does not undo that before the step.
+    """
+    base = base_env(env)
+    state = set(map(unravel_key, base.state_keys))
+    lost = state & {*base.observation_spec.keys(True, True)} - {*env.observation_spec.keys(True, True)}
+    if lost:
+        raise ValueError(
+            f"A transform leaves out {min(lost, key=str)!r}, and every step would start where the first one did. No "
+            "transform may drop a part of the state, from which the next step starts: let SelectTransform keep it, too."
+        )
+    while isinstance(env, TransformedEnv):
+        for transform in env.transform if isinstance(env.transform, Compose) else [env.transform]:
+            kept = set(map(unravel_key, transform.in_keys_inv))
+            for key in sorted(state & set(map(unravel_key, transform.out_keys)) - kept, key=str):
+                raise ValueError(
+                    f"{type(transform).__name__} overwrites {key!r}, from which the next step starts, and so changes "
+                    f"the flight. Write into another entry: out_keys=[...], or CatTensors([{key!r}], 'features', "
+                    "del_keys=False) before it."
+                )
+        env = env.base_env
 
 
 def memory_keys(policy: TensorDictModuleBase) -> tuple[NestedKey, ...]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import numbers
 from collections.abc import Callable, Sequence
 
@@ -155,13 +157,17 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         return states.reshape(fresh.shape).where(pick, fresh), visited.reshape(fresh.shape), pick
 
 
+# The metaclass of TorchRL's buffers hides it.
+VisitedStateBuffer.__signature__ = inspect.signature(functools.partial(VisitedStateBuffer.__init__, None))
+
+
 def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictBase:
     """Start a random fraction of the environments afresh, and let the others go on from where they are.
 
     Beside visited states this is the other way to choose where the next horizon starts: most flights go on through many
     horizons, and some begin anew. The choice draws from torch's global generator, the fresh starts from the
-    environment's own. Those that go on keep the memory of a recurrent policy. Transforms that remember, such as
-    StepCounter or a primer, begin anew in all environments.
+    environment's own. Those that go on keep the memory of a recurrent policy. In all environments transforms that
+    remember, such as StepCounter or a primer, begin anew, and so does the correlated noise of a policy without memory.
 
     Args:
         env: an environment that can be set to a state, also under transforms.
@@ -172,13 +178,18 @@ def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictB
         the tensordict of the reset, the carry of the next rollout.
 
     Raises:
-        ValueError: the fraction is not in [0, 1], or the carry lacks an entry of the state.
+        ValueError: the fraction is not in [0, 1], or the carry lacks an entry of the state or has another batch size.
     """
     _require_fraction(fraction)
     keys = _state_keys(env)
     missing = [key for key in base_env(env).state_keys if key not in carry]
     if missing:
         raise ValueError(f"restart needs the whole state, {keys}, and the carry lacks {missing[0]!r}.")
+    if carry.shape != env.batch_size:
+        raise ValueError(
+            f"The carry has batch size {tuple(carry.shape)}, and the environment {tuple(env.batch_size)}. Build one of "
+            "that batch size, such as num_envs=..., to start flights of it afresh."
+        )
     fresh = _fresh(env, keys)
     chosen = torch.rand(carry.shape, device=carry.device) < fraction
     start = env.reset(fresh.where(chosen, carry.select(*keys)), set_state=True)

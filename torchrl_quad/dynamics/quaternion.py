@@ -65,7 +65,7 @@ def distance(p: Tensor, q: Tensor) -> Tensor:
 
     p and -p are one attitude, so the error does not depend on either sign.
     """
-    flip = torch.where((p * q).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    flip = torch.where((p * q).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(p)
     return torch.linalg.vector_norm(p - flip * q, dim=-1, keepdim=True)
 
 

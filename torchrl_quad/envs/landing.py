@@ -100,7 +100,7 @@ class LandingEnv(QuadrotorEnv):
     def events(self, previous: State, state: State) -> dict[str, Event]:
         """``touchdown``: the last condition of success becomes true."""
         start, end = ((x["position"] - x["target"])[..., :2] for x in (previous, state))
-        side = torch.where(start.detach() < 0.0, -1.0, 1.0)  # from which it comes nearer
+        side = torch.where(start.detach() < 0.0, -1.0, 1.0).to(start)  # from which it comes nearer
         conditions = (
             level_crossing(previous["position"][..., 2:], state["position"][..., 2:], self.success_height),
             level_crossing(side * start, side * end, self.success_radius),

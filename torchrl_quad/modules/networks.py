@@ -51,7 +51,7 @@ def make_actor(
         action_init: the mean action at the start, (k), strictly between the bounds. By default
             ``env.neutral_action``, averaged over environments, where the environment has one (see
             :mod:`torchrl_quad.data`; a drone's is to hover), and the middle of the range elsewhere.
-        scale_init: standard deviation at the start.
+        scale_init: standard deviation at the start; training brings it down to 0.01 at least, or to a tenth of this.
         learn_scale: whether the network returns the standard deviation, too. Otherwise it stays what it is, and
             neither a gradient through the simulator nor a KL bound takes the exploration away.
         noise_correlation: of the noise of two steps that follow each other, from 0 to below 1. Correlated noise moves a
@@ -63,8 +63,8 @@ def make_actor(
     Raises:
         ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one;
             ``in_keys`` is empty; a width is not a whole number of at least 1; the number of scales is not that of the
-            entries; the first action is not strictly inside the bounds; ``scale_init`` is not positive and finite, or
-            ``noise_correlation`` not from 0 to below 1.
+            entries; the first action is not strictly inside the bounds; ``scale_init`` is below 1e-4 or not finite,
+            or ``noise_correlation`` not from 0 to below 1.
     """
     spec, first = first_action(env, action_init, scale_init, "make_actor")
     size = spec.shape[-1]
@@ -139,8 +139,8 @@ def first_action(env: EnvBase, action_init: Tensor | None, scale_init: float, na
             f"action_init must be {spec.shape[-1]} numbers strictly between {low.tolist()} and {high.tolist()}, got "
             f"{action_init.tolist()}."
         )
-    if not 0 < scale_init < math.inf:
-        raise ValueError(f"scale_init must be positive and finite, got {scale_init}.")
+    if not 1e-4 <= scale_init < math.inf:  # TorchRL's mapping to a scale ends there
+        raise ValueError(f"scale_init must be finite and at least 1e-4, got {scale_init}.")
     return spec, torch.atanh((action_init - middle) / (0.5 * (high - low)))
 
 
@@ -162,7 +162,8 @@ def with_head(
     """
     if not 0 <= noise_correlation < 1:
         raise ValueError(f"noise_correlation must lie from 0 to below 1, got {noise_correlation}.")
-    mapping, read = f"biased_softplus_{scale_init}", list(in_keys)
+    least = min(0.01, 0.1 * scale_init)  # to which training can bring the scale down
+    mapping, read = f"biased_softplus_{scale_init}_{least}", list(in_keys)
     if noise_correlation:
         network.head = CorrelatedHead(noise_correlation, size, mapping)
         read.append("noise_before")

@@ -99,7 +99,8 @@ def make_visual_actor(
             f'none there. Give it a camera, camera={{"width": 16, "height": 12}}, or choose image_key from: '
             f"{', '.join(map(str, known))}."
         )
-    if not channels or not all(isinstance(n, numbers.Integral) and n >= 1 for n in (*channels, hidden_size)):
+    widths = (*channels, hidden_size) if isinstance(channels, Sequence) and channels else (0,)
+    if not all(isinstance(n, numbers.Integral) and n >= 1 for n in widths):
         raise ValueError(
             "channels must be a list of at least one whole number, such as (8, 16), and hidden_size a whole number of "
             f"at least 1; got {channels!r} and {hidden_size!r}."
@@ -119,8 +120,15 @@ def make_visual_actor(
         activation_class=activation,
         device=env.device,
     ).to(image.dtype)
-    if not num_cells:
-        raise ValueError("num_cells must name at least one layer between the convolutions and the head; got none.")
+    if (
+        not isinstance(num_cells, Sequence)
+        or not num_cells
+        or not all(isinstance(n, numbers.Integral) and n >= 1 for n in num_cells)
+    ):
+        raise ValueError(
+            "num_cells must name the widths of the layers between the convolutions and the head, at least one, such as "
+            f"(64,); got {num_cells!r}."
+        )
     trunk = network_of(
         env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale, more=channels[-1] * height * width
     )

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchrl_quad.objectives.calls import sample_action
 from torchrl_quad.objectives.critic import PathwiseCriticLoss
-from torchrl_quad.objectives.pathwise import segments, step_in_segment
+from torchrl_quad.objectives.segments import segments, step_in_segment
 
 
 class ABPTLoss(PathwiseCriticLoss):

@@ -109,7 +109,8 @@ class AHACLoss(SHACLoss):
 
         Args:
             stiffness: as ``loss_actor`` measured it, a scalar. The mean of several processes keeps their horizons
-                alike. NaN, where no action had a gradient, changes nothing.
+                alike. Infinity, where a gradient is not finite, shortens the
+                horizon; NaN, where no action had a gradient, changes nothing.
         """
         if stiffness.isnan():
             return
@@ -121,5 +122,6 @@ class AHACLoss(SHACLoss):
         length = grad.norm(dim=-1)
         counts = length > 0  # the last actions move nothing within the horizon
         stiffness = (length.square().sum() / counts.sum()).sqrt() / median_length(length)
+        stiffness = torch.where(length.isfinite().all(), stiffness, math.inf)
         grad, measured = super()._measure(grad)
         return grad, {"stiffness": stiffness, **measured}

@@ -12,7 +12,8 @@ from torch import Tensor
 from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_quad.objectives.calls import predict
-from torchrl_quad.objectives.pathwise import PathwiseLoss, segments
+from torchrl_quad.objectives.pathwise import PathwiseLoss
+from torchrl_quad.objectives.segments import segments
 
 
 class PathwiseCriticLoss(PathwiseLoss):
@@ -87,7 +88,14 @@ class PathwiseCriticLoss(PathwiseLoss):
         """
         network = getattr(self, self.critic_name)
         params = getattr(self, f"{'target_' if target else ''}{self.critic_name}_params")
-        return predict(network, params, tensordict, getattr(self.tensor_keys, self.prediction_key), learning=learning)
+        key = getattr(self.tensor_keys, self.prediction_key)
+        predictions = predict(network, params, tensordict, key, learning=learning)
+        if predictions.shape[1:] != (*tensordict.shape, 1):
+            raise ValueError(
+                f"{self.critic_name} must write one number for each state, {key!r} of shape "
+                f"{(*tensordict.shape, 1)}; got {tuple(predictions.shape[1:])}."
+            )
+        return predictions
 
     def _value(self, tensordict: TensorDictBase, *, target: bool) -> Tensor:
         """The value (*, 1) of states: the least of the predictions of the critics or of their targets."""
@@ -99,6 +107,11 @@ class PathwiseCriticLoss(PathwiseLoss):
         if target is None:
             target = self.write_value_target(tensordict.copy()).get(key)
         target, prediction = target.detach(), self._critics(tensordict, learning=True)
+        if target.shape != prediction.shape[1:]:
+            raise ValueError(
+                f"{key!r} has shape {tuple(target.shape)}, and the critic's predictions {tuple(prediction.shape[1:])}: "
+                "give targets as write_value_target writes them."
+            )
         error = (prediction - target).square().sum(0)
         with torch.no_grad():
             residual = (target - prediction).var(correction=0) / target.var(correction=0).clamp_min(1e-12)
@@ -117,8 +130,10 @@ class PathwiseCriticLoss(PathwiseLoss):
         """gamma^(t+1) V(s_(t+1)) after steps (*, horizon, 1), but for those that terminated, summed over steps: (*)."""
         where = after & ~tensordict.get(("next", self.tensor_keys.terminated))
         next_state = tensordict.get("next").select(*self._critic_inputs(), strict=False)[where.squeeze(-1)]
-        value = self._value(next_state, target=self.target_bootstrap)
         discount = self.value_estimator.gamma * self._discounts(tensordict)
+        if next_state.shape[0] == 0:  # a recurrent policy refuses an empty batch
+            return torch.zeros_like(discount).sum((-2, -1))
+        value = self._value(next_state, target=self.target_bootstrap)
         return (discount * torch.zeros_like(discount).masked_scatter(where, value.to(discount.dtype))).sum((-2, -1))
 
     def _critic_inputs(self) -> set[NestedKey]:

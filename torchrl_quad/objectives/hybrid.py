@@ -12,9 +12,10 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
+from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again, location_gradient
-from torchrl_quad.objectives.pathwise import discounts, segments
+from torchrl_quad.objectives.segments import discounts, segments
 from torchrl_quad.objectives.shac import SHACLoss
 
 
@@ -84,6 +85,7 @@ class HybridLoss(SHACLoss):
         *("pred_value", "target_value", "explained_variance"),
     ]
 
+    supported_value_estimators = (ValueEstimators.TDLambda,)
     pathwise_weight: Tensor
 
     def __init__(
@@ -168,7 +170,8 @@ class HybridLoss(SHACLoss):
         return self._reduce_loss(-(score + pathwise)), {"pathwise_weight": weight, "kl": kl}
 
     def _with_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict if self.tensor_keys.advantage in tensordict else self.write_targets(tensordict)
+        written = {self.tensor_keys.advantage, self.tensor_keys.location_gradient, self.tensor_keys.latent}
+        return tensordict if all(key in tensordict for key in written) else self.write_targets(tensordict)
 
     def _own_gradient(self, tensordict: TensorDictBase) -> Tensor:
         """The gradient of each action's own lambda-return in that action: (*, horizon, k)."""
@@ -177,6 +180,7 @@ class HybridLoss(SHACLoss):
         reward = tensordict.get(("next", keys.reward))
         self._require_graph(reward, ("next", keys.reward))
         gamma = estimator.gamma.to(reward.dtype)
+        self._require_precision(gamma.item() * self.gradient_lmbda, reward)
         goes_on = tensordict.get("next").select(*self._critic_inputs())[~terminated.squeeze(-1)]
         value = self._value(goes_on, target=False).to(reward.dtype)
         _, end = segments(done)
@@ -187,13 +191,23 @@ class HybridLoss(SHACLoss):
         grad = action_gradient(objective, tensordict.get(keys.action)) / discount
         return grad if self.clip is None else self.clip(grad)[0]
 
+    def _require_precision(self, discount: float, reward: Tensor) -> None:
+        """Refuse a horizon at whose end the discount is too small to divide by."""
+        least = 1e6 * torch.finfo(reward.dtype).tiny
+        longest = 1 + int(math.log(least) / math.log(discount)) if 0 < discount < 1 else 1
+        if discount < 1 and reward.shape[-2] > longest:
+            raise ValueError(
+                f"gamma * gradient_lmbda = {discount:.3g} is too small for a horizon of {reward.shape[-2]} steps: "
+                f"{reward.dtype} cannot divide by its power. Fly at most {longest} steps, or raise gradient_lmbda."
+            )
+
     def _regress(self, advantage: Tensor, predicted: Tensor) -> Tensor:
         """Update the weight with the slope of the advantages over what was predicted, each (*, horizon, 1).
 
-        Both are centred in each step of the horizon: before the critic knows anything, an advantage says first of all
-        how many steps are left.
+        Both are centred in each step of the horizon, and over the steps of a single flight: before the critic knows
+        anything, an advantage says first of all how many steps are left.
         """
-        batch = tuple(range(advantage.ndim - 2))
+        batch = tuple(i for i, size in enumerate(advantage.shape[:-2]) if size > 1) or (-2,)
         advantage, predicted = (x - x.mean(batch, keepdim=True) for x in (advantage, predicted))
         covariance, variance = (predicted * advantage).mean(), predicted.square().mean()
         slope = (self.average(covariance) / self.average(variance).clamp_min(1e-12)).clamp(-1.0, 2.0)

@@ -1,4 +1,4 @@
-"""What all first-order losses share: the segments of a horizon, their discounted rewards, the entropy bonus."""
+"""What all first-order losses share: the discounted rewards of a horizon's segments, and the entropy bonus."""
 
 from __future__ import annotations
 
@@ -16,28 +16,7 @@ from torchrl.objectives.utils import ValueEstimators, default_value_kwargs, disp
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_quad.objectives.action_gradients import MedianClip, act_again, action_gradient
-
-
-def segments(done: Tensor) -> tuple[Tensor, Tensor]:
-    """Mark the first and the last step of each segment, both bool (*, horizon, 1), as ``done`` is.
-
-    The last step of the horizon is the last one of a segment, too.
-    """
-    end = done.clone()
-    end[..., -1, :] = True
-    return end.roll(1, -2), end
-
-
-def step_in_segment(done: Tensor) -> Tensor:
-    """The steps of each segment, counted from 0: (*, horizon, 1), as ``done``."""
-    start, _ = segments(done)
-    index = torch.arange(done.shape[-2], device=done.device).unsqueeze(-1).expand(done.shape)
-    return index - torch.where(start, index, 0).cummax(-2).values
-
-
-def discounts(done: Tensor, gamma: Tensor) -> Tensor:
-    """gamma^t, where t counts the steps of each segment from 0: (*, horizon, 1), as ``done``; gamma is a scalar."""
-    return gamma ** step_in_segment(done)
+from torchrl_quad.objectives.segments import discounts
 
 
 class PathwiseLoss(LossModule):
@@ -128,11 +107,11 @@ class PathwiseLoss(LossModule):
             )
         self._in_keys = None
         self.reduction = reduction
-        self.clip = None if clip_action_gradient is None else MedianClip(clip_action_gradient)
         self.convert_to_functional(actor_network, "actor_network")
+        number = {"device": self._default_device, "dtype": self._precision}
+        self.clip = None if clip_action_gradient is None else MedianClip(clip_action_gradient).to(**number)
         self.target_entropy = target_entropy
         self.automatic_alpha = alpha == "auto"
-        number = {"device": self._default_device, "dtype": self._precision}
         if self.automatic_alpha:
             self.log_alpha = torch.nn.Parameter(torch.tensor(float(alpha_init), **number).log())
         else:
@@ -198,7 +177,7 @@ class PathwiseLoss(LossModule):
         value_type = self.default_value_estimator if value_type is None else value_type
         if isinstance(value_type, ValueEstimatorBase | type):
             return super().make_value_estimator(value_type, **hyperparams)
-        if value_type is ValueEstimators.TDLambda:
+        if value_type in (ValueEstimators.TDLambda, "tdlambda"):
             hyperparams.setdefault("vectorized", False)
         estimator = dispatch_value_estimator(
             self, value_type, supported=self.supported_value_estimators, value_network=None, **hyperparams
@@ -214,8 +193,10 @@ class PathwiseLoss(LossModule):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         # The estimator is made when it is first needed, and a checkpoint may hold one already.
-        if self._value_estimator is None and any(key.startswith(f"{prefix}_value_estimator.") for key in state_dict):
-            self.make_value_estimator()
+        kept = f"{prefix}_value_estimator."
+        if self._value_estimator is None and f"{kept}gamma" in state_dict:
+            has_default = f"{kept}lmbda" in state_dict or self.default_value_estimator is ValueEstimators.TD1
+            self.make_value_estimator(None if has_default else ValueEstimators.TD0)
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _forward_value_estimator_keys(self, **_: Any) -> None:
@@ -330,11 +311,19 @@ class PathwiseLoss(LossModule):
                 'it what differentiable_rollout returns, unflattened; name a single flight: rollout.names = ["time"].'
             )
         missing = [key for key in self.in_keys if key not in tensordict and key != self.tensor_keys.sample_log_prob]
+        if missing and missing[0] in ("loc", "scale"):
+            raise ValueError(
+                f"{name} needs a policy as make_actor builds it, which writes loc and scale: the rollout has no "
+                f"{missing[0]!r}."
+            )
         if missing:
             raise ValueError(
                 f"{name} reads {missing[0]!r}, which is not in the rollout. If it has another name there, write "
                 f"loss.set_keys(...), which takes {', '.join(vars(self.tensor_keys))}."
             )
+        for key in (("next", getattr(self.tensor_keys, x)) for x in ("reward", "done", "terminated")):
+            if (got := tuple(tensordict.get(key).shape)) != (*shape, 1):
+                raise ValueError(f"{name} needs {key!r} of shape {(*shape, 1)} in this rollout; got {got}.")
         device, own = tensordict.get(("next", self.tensor_keys.reward)).device, self._default_device
         if own not in (None, device):
             raise ValueError(f"{name} is on {own}, and the rollout on {device}: loss.to({str(device)!r}) moves it.")
@@ -345,5 +334,6 @@ class PathwiseLoss(LossModule):
                 f"{type(self).__name__} differentiates through the rollout, but {key!r} carries no gradient. "
                 "Collectors, ParallelEnv, replay buffers, .detach() and torch.no_grad() cut it. Use "
                 "differentiable_rollout(env, actor, carry, horizon), or env.rollout(horizon, actor, "
-                "break_when_any_done=False) with gradients enabled, on an environment that is differentiable."
+                "break_when_any_done=False) with gradients enabled, on an environment that is differentiable. "
+                "The horizon must be longer than the delay between an action and its effect."
             )

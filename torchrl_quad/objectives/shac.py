@@ -75,6 +75,9 @@ class SHACLoss(PathwiseCriticLoss):
         self.average_over_horizon = average_over_horizon
         copies = None if num_value_nets == 1 else num_value_nets
         self.convert_to_functional(value_network, "value_network", expand_dim=copies, create_target_params=delay_value)
+        critic = self.value_network
+        if self.tensor_keys.action in critic.in_keys and self.tensor_keys.value in critic.out_keys:
+            raise ValueError(f"{type(self).__name__} needs a V(s), which reads no action: make_value builds one.")
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The critic's loss (paper, equation 16).

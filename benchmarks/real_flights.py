@@ -1,6 +1,6 @@
 """Fit a drone to real flights, and judge it on flights of other shapes, beside what others would predict.
 
-    python benchmarks/real_flights.py --flights ../shared/flights    # minutes; writes results/real_flights.csv
+    python benchmarks/real_flights.py --flights FOLDER    # minutes; writes results/real_flights.csv
 
 The rows: constant velocity, the preset before and after, the parameters that others published, the fit, and a small
 network that learns on the same flights what the fitted physics leaves out.
@@ -154,7 +154,7 @@ def read_all(folder: Path) -> dict[str, FlightLog]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--flights", type=Path, default=Path("../shared/flights"))
+    parser.add_argument("--flights", type=Path, required=True, help="folder of the logs")
     parser.add_argument("--network-steps", type=int, default=300)
     parser.add_argument("--output", type=Path, default=RESULTS / "real_flights.csv")
     parser.add_argument("--folder", type=Path, default=Path("outputs/real_flights"), help="where the fits are saved")

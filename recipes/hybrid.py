@@ -1,4 +1,4 @@
-"""Hybrid of pathwise and score-function gradient, each weighted by what the flights say of it.
+"""Hybrid of pathwise and score-function gradient, joined by a regression of the advantage on the derivative.
 
 python recipes/hybrid.py task=racing seed=0
 """

@@ -149,5 +149,5 @@ def test_a_missing_package_is_named_with_what_installs_it(package, monkeypatch):
     monkeypatch.delitem(sys.modules, f"torchrl_quad.adapters.{package}")
     for name in [name for name in sys.modules if name.split(".")[0] == package]:
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(ImportError, match=r'needs .*: pip install "torchrl_quad\[adapters\]"'):
+    with pytest.raises(ImportError, match=r'needs .*: pip install ".\[adapters\]"'):
         importlib.import_module(f"torchrl_quad.adapters.{package}")

@@ -15,6 +15,7 @@ import claims
 import elsewhere
 import matrix
 import phases
+import rates
 import reproduce
 import results
 import shipped
@@ -210,6 +211,7 @@ def test_the_page_of_the_project_shows_what_its_data_hold():
         )
     options = (PROJECT / "docs/ablations.md").read_text()
     assert ablations.summary(reproduce.DATA) in options, "run: python recipes/trial/ablations.py --tasks landing"
+    assert rates.summary(reproduce.DATA) in options, "recipes/trial/rates.py fills it"
     far = (PROJECT / "docs/elsewhere.md").read_text()
     assert all(block in far for block in elsewhere.blocks(reproduce.DATA).values()), (
         "recipes/trial/elsewhere.py fills it"

@@ -1,7 +1,5 @@
 """What newcomers stumble over: each gets told what to write instead."""
 
-import inspect
-
 import pytest
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -13,7 +11,6 @@ from torchrl_quad import (
     HybridLoss,
     LandingEnv,
     SHACLoss,
-    VisitedStateBuffer,
     differentiable_rollout,
     make_actor,
     make_value,
@@ -97,7 +94,6 @@ def test_losses_say_what_a_policy_or_a_critic_must_write():
     loss = HybridLoss(actor, make_value(env))  # somebody else's advantage is not what its own targets are
     assert loss(rollout.copy().set("advantage", torch.zeros(4, 3, 1)))["loss_actor"].isfinite()
     assert loss.make_value_estimator("tdlambda").value_estimator.vectorized is False
-    assert next(iter(inspect.signature(VisitedStateBuffer).parameters)) == "capacity"
 
 
 def test_a_default_precision_of_float64_changes_no_environment():

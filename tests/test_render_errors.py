@@ -57,11 +57,11 @@ def test_without_matplotlib_it_says_what_to_install(draw, monkeypatch, tmp_path)
     flight = env.rollout(5)
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(ImportError, match=r"pip install 'torchrl_quad\[render\]'"):
+    with pytest.raises(ImportError, match=r"pip install '.\[render\]'"):
         env.render() if draw == "render" else draw(flight, tmp_path / FILES.get(draw, "flight.png"))
 
 
 def test_a_film_in_mp4_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(ImportError, match=r"MP4 need imageio-ffmpeg: pip install 'torchrl_quad\[render\]'"):
+    with pytest.raises(ImportError, match=r"MP4 need imageio-ffmpeg: pip install '.\[render\]'"):
         animate_flight(HoveringEnv(num_envs=1).rollout(3), tmp_path / "flight.mp4")

@@ -128,5 +128,5 @@ def test_a_rollout_without_attitudes_is_refused(tmp_path):
 
 def test_without_plotly_it_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
-    with pytest.raises(ImportError, match=r"pip install 'torchrl_quad\[render\]'"):
+    with pytest.raises(ImportError, match=r"pip install '.\[render\]'"):
         write_replay(HoveringEnv(num_envs=1).rollout(2), tmp_path / "replay.html")

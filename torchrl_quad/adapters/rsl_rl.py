@@ -14,7 +14,7 @@ from torchrl_quad.adapters.torch_vector import TorchVectorEnv
 try:
     from rsl_rl.env import VecEnv
 except ImportError as error:
-    raise ImportError('RslRlVecEnv needs rsl-rl: pip install "torchrl_quad[adapters]"') from error
+    raise ImportError('RslRlVecEnv needs rsl-rl: pip install ".[adapters]" in a clone') from error
 
 
 class RslRlVecEnv(VecEnv):

@@ -13,7 +13,7 @@ from torchrl_quad.adapters.torch_vector import TorchVectorEnv
 try:
     from skrl.envs.wrappers.torch import Wrapper
 except ImportError as error:
-    raise ImportError('SkrlEnv needs skrl: pip install "torchrl_quad[adapters]"') from error
+    raise ImportError('SkrlEnv needs skrl: pip install ".[adapters]" in a clone') from error
 
 
 class SkrlEnv(Wrapper):

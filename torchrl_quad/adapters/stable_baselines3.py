@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 try:
     from stable_baselines3.common.vec_env import VecEnv
 except ImportError as error:
-    raise ImportError('DronesVecEnv needs stable-baselines3: pip install "torchrl_quad[adapters]"') from error
+    raise ImportError('DronesVecEnv needs stable-baselines3: pip install ".[adapters]" in a clone') from error
 
 
 class DronesVecEnv(VecEnv):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
 import numbers
 from collections.abc import Callable, Sequence
 
@@ -155,10 +153,6 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         pick = torch.rand(fresh.shape, generator=self._rng, device=self._rng.device) < fraction
         pick = pick.to(fresh.device)
         return states.reshape(fresh.shape).where(pick, fresh), visited.reshape(fresh.shape), pick
-
-
-# The metaclass of TorchRL's buffers hides it.
-VisitedStateBuffer.__signature__ = inspect.signature(functools.partial(VisitedStateBuffer.__init__, None))
 
 
 def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictBase:

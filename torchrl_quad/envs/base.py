@@ -48,7 +48,7 @@ class QuadrotorEnv(Task, EnvBase):
         drone: name of a preset, path of a YAML file, mapping, or :class:`~torchrl_quad.QuadrotorParams`.
         dynamics: "quadrotor", or "point_mass", whose thrust and body rates follow the action at once.
         control: what an action (4) in [-1, 1] commands: "rates" (thrust, body rates), "attitude" (thrust, roll, pitch,
-            yaw rate), "rotor_thrusts", "velocity" (and yaw rate), or a mapping with limits; see ``docs/dynamics.md``.
+            yaw rate), "rotor_thrusts", "velocity" (and yaw rate), or a mapping with limits; see ``docs/actions.md``.
         dt: physics step [s].
         control_dt: control step [s], a whole multiple of dt.
         action_delay: control steps between an action and its effect.

@@ -66,7 +66,7 @@ class RacingEnv(QuadrotorEnv):
     ``max_episode_steps``, 512. Success of a state: 8 gates passed. Success of an episode: 8 gates, without a crash.
 
     Metrics: ``gates_passed``; ``lap_time`` [s], from a gate to the same gate again, NaN for an episode without a full
-    lap.
+    lap; ``time_near_gate`` [s], within 1 m of the next gate.
 
     Args:
         num_envs: number of drones that fly in parallel.

@@ -56,7 +56,7 @@ def read_bag(path: Path, columns: str | Layout | Mapping[str, object] | None) ->
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError as error:
-        raise UnreadableLog("A ROS bag needs rosbags. Write: pip install 'torchrl_quad[logs]'.") from error
+        raise UnreadableLog("A ROS bag needs rosbags. Write: pip install '.[logs]' in a clone.") from error
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
             topics = {topic: info.msgtype or "" for topic, info in reader.topics.items() if info.msgcount}

@@ -77,7 +77,7 @@ def read_log(
                        "acceleration": Columns(("ax", "ay", "az"), scale=9.80665)})
         print(log)
 
-    ULog needs pyulog and bags need rosbags: ``pip install 'torchrl_quad[logs]'``.
+    ULog needs pyulog and bags need rosbags: ``pip install '.[logs]'`` in a clone.
 
     Args:
         path: a file, or the folder of a ROS 2 bag. Its first bytes say of what kind it is.

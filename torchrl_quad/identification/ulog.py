@@ -24,7 +24,7 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     try:
         from pyulog import ULog
     except ModuleNotFoundError as error:
-        raise UnreadableLog("A ULog needs pyulog. Write: pip install 'torchrl_quad[logs]'.") from error
+        raise UnreadableLog("A ULog needs pyulog. Write: pip install '.[logs]' in a clone.") from error
     try:
         log = ULog(io.BytesIO(data))
     except Exception as error:  # pyulog raises whatever its parser meets in a broken file

@@ -25,8 +25,9 @@ class HybridLoss(SHACLoss):
     The simulator's derivative gives p_t, the gradient of an action's own lambda-return in the mean of that action.
     The flight itself gives A_t, the advantage of the same action. If p_t is right, then A_t is p_t . (u_t - loc_t) plus
     what does not depend on this action, where u_t is the action before the tanh. The loss therefore regresses A on
-    p . (u - loc). The slope is the ``pathwise_weight`` b: near 1 where the derivative tells the truth, and far from it
-    where it does not. It is a running mean over rollouts, clamped to [0, 1]. The pathwise term of the loss is
+    p . (u - loc). The slope is the ``pathwise_weight`` b: near 1 where the critic's advantage and the derivative agree.
+    Both read the same critic, so b does not show where that critic is wrong. It is a running mean over rollouts,
+    clamped to [0, 1]. The pathwise term of the loss is
 
         - b mean_t p_t . loc(s_t)
 

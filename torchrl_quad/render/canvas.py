@@ -19,7 +19,7 @@ def make_figure(**options: Any) -> Any:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError("Pictures need matplotlib: pip install 'torchrl_quad[render]'.") from error
+        raise ImportError("Pictures need matplotlib: pip install '.[render]' in a clone.") from error
     figure = Figure(**options)
     FigureCanvasAgg(figure)
     return figure

@@ -201,7 +201,7 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> N
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise ImportError("Films in MP4 need imageio-ffmpeg: pip install 'torchrl_quad[render]'.") from error
+        raise ImportError("Films in MP4 need imageio-ffmpeg: pip install '.[render]' in a clone.") from error
     first, rate = next(frames), 1.0 / (times[-1] - times[-2])
     writer = imageio_ffmpeg.write_frames(
         str(path),

@@ -255,5 +255,5 @@ def _plotlyjs() -> str:
     try:
         from plotly.offline import get_plotlyjs
     except ImportError as error:
-        raise ImportError("Replays need plotly: pip install 'torchrl_quad[render]'.") from error
+        raise ImportError("Replays need plotly: pip install '.[render]' in a clone.") from error
     return get_plotlyjs()

@@ -15,8 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams, load_drone
 from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compiler, nested
 from torchrl_quad.engine.simulation import State
-from torchrl_quad.envs import checks
-from torchrl_quad.envs.checked_task import check_task
+from torchrl_quad.envs import checked_task, checks
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.options import choose_disturbances
 from torchrl_quad.envs.randomness import Randomness
@@ -131,7 +130,7 @@ class QuadrotorEnv(Task, EnvBase):
         self.set_up()
         self.task_entries = [key for key in self.initial_state(num_envs) if key not in self.dynamics.sizes]
         state = sample_state(self, num_envs)
-        check_task(self, state)
+        checked_task.check_task(self, state)
         self._connect(state)
         set_specs(self)
         self.set_seed(seed)

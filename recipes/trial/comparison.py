@@ -22,7 +22,7 @@ from torchrl_quad.files import replacing
 Row = Mapping[str, str]
 Shown = tuple[str, float, int, str]  # of a task: column, factor, digits, unit
 RELIABLE = 0.99  # of the episodes, solved by the worst seed
-ENOUGH = 3  # seeds, for an interval
+ENOUGH, WANTED = 3, 10  # seeds: for an interval, and of each method
 LABELS = {  # of variants of a task
     "racing_position": "racing, position",
     "six_gates": "six gates",
@@ -86,7 +86,7 @@ def choice_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping
         reliable = [method for method in flown if worst[method] >= RELIABLE]
         quick = min(reliable, key=seconds.get, default=None)
         most = max(returns, key=returns.get)
-        few = {x: f", {len(own)} seed{'s' * (len(own) > 1)}" if len(own) < ENOUGH else "" for x, own in flown.items()}
+        few = {x: f", {len(own)} seed{'s' * (len(own) > 1)}" if len(own) < WANTED else "" for x, own in flown.items()}
         said = {x: f"{methods[x]}: {returns[x]:.4g}, {worst[x]:.1%}, {seconds[x]:.0f} s{few[x]}" for x in flown}
         cells = [said.get(x, "none") for x in (quick, most)]
         lines.append([LABELS.get(task, task), *cells, ", ".join(methods[x] for x in flown)])

@@ -24,7 +24,7 @@ from pathlib import Path
 from threading import Lock
 
 import numpy as np
-from comparison import LABELS, choice_table, draw, improvement_table, reached_table
+from comparison import LABELS, WANTED, choice_table, draw, improvement_table, reached_table
 from matrix import EVALUATIONS
 from reproduce import CURVE, DATA, OWN, QUICK, RECIPES, known_task, run, stop, write
 from results import fill
@@ -36,7 +36,7 @@ from torchrl_quad.envs.scenery import EPISODE_METRICS
 from torchrl_quad.files import machine
 from torchrl_quad.files import read_rows as read
 
-SEEDS = tuple(range(10))
+SEEDS = tuple(range(WANTED))
 SHOWN = {"bptt": "BPTT", "shac": "SHAC", "abpt": "ABPT", "hybrid": "Hybrid", "ppo": "PPO"}  # in the README
 METHODS = SHOWN | {"sapo": "SAPO", "ahac": "AHAC"}
 TASKS = {  # what is shown of each beside the solved episodes: column, factor, digits, unit

@@ -250,7 +250,7 @@ def test_half_and_twice_a_rate_fly_once_and_are_judged_by_their_worst_seed(run_h
     run_main(monkeypatch, rates, *arguments)
     (row,) = reproduce.read(tmp_path / "rates.csv")
     assert (row["factor"], row["algorithm"], row["steps"]) == ("0.5", "bptt", "64")
-    monkeypatch.setattr(rates, "train", lambda *_: pytest.fail("It has been flown."))
+    monkeypatch.setattr(ablations, "train", lambda *_: pytest.fail("It has been flown."))
     run_main(monkeypatch, rates, *arguments)
     ends = {("0.5", "102"): "1.5", ("2", "101"): "9.0", ("2", "102"): "8.0", ("2", "103"): "7.0"}
     rows = [row | {"factor": factor, "seed": seed, "return": x, "solved": "0.5"} for (factor, seed), x in ends.items()]

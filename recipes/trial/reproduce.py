@@ -87,8 +87,13 @@ def configuration(job: Job, lr: float) -> DictConfig:
     from training.own import offer_tasks  # from the folder above
 
     offer_tasks([f"task={job.task}"])
+    return composed(VARIANTS[job.variant].algorithm, job.overrides(lr))
+
+
+def composed(algorithm: str, overrides: list[str]) -> DictConfig:
+    """Compose the configuration of a recipe. Not for several threads: hydra holds one folder at a time."""
     with initialize_config_dir(str(RECIPES / "config"), version_base=None):
-        return compose(VARIANTS[job.variant].algorithm, job.overrides(lr))
+        return compose(algorithm, overrides)
 
 
 def command(job: Job, lr: float, folder: Path, quick: bool) -> list[str]:

@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 from claims import METHODS, PUBLISHED, Verdict
 from evidence import NotRunError, Part, Results
-from hydra import compose, initialize_config_dir
 from matrix import EXPERIMENTS, LEARNING_RATES, TASKS, VARIANTS
 from omegaconf import DictConfig, OmegaConf
-from reproduce import RECIPES, best_learning_rate
+from reproduce import best_learning_rate, composed
 
 from torchrl_quad.files import read_rows as read
 
@@ -46,8 +45,7 @@ def spread(values: np.ndarray, factor: float = 1.0, digits: int = 2) -> str:
 @cache
 def recipe(algorithm: str, task: str) -> DictConfig:
     """Compose the configuration of a recipe on a task."""
-    with initialize_config_dir(str(RECIPES / "config"), version_base=None):
-        return compose(algorithm, [f"task={task}"])
+    return composed(algorithm, [f"task={task}"])
 
 
 def starts(task: str, variant: str) -> str:

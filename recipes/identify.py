@@ -35,8 +35,8 @@ def main(cfg: DictConfig) -> None:
         progress=True,
         checkpoint=folder / "checkpoint.json",
     )
-    result.save(folder)
     print(result)
+    result.save(folder)
     print(f"{folder}: python recipes/abpt.py env.drone={folder}/drone.yaml env.randomize={folder}/randomization.yaml")
 
 

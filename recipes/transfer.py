@@ -16,7 +16,6 @@ flown again. Settings:
     pictures=true        film the first drones beside our own simulator, and write a replay; needs torch and an extra
 """
 
-import csv
 import json
 import sys
 import time
@@ -30,7 +29,7 @@ from torchrl_quad.deploy import Bundle, load_bundle
 from torchrl_quad.deploy.judging import PRECISION
 from torchrl_quad.deploy.simulators import make_simulator, simulator_class
 from torchrl_quad.deploy.transfer import MUTANTS, fly
-from torchrl_quad.files import machine, read_rows, replacing
+from torchrl_quad.files import machine, read_rows, write_rows
 
 SETTINGS = {
     "bundle": (str, None),
@@ -98,13 +97,7 @@ def measure(bundle: Bundle, cfg: dict, loop: str, mutant: str | None, path: Path
         "faults": sum(flight["faults"].values()),
         "machine": machine(),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    row = {"task": task, **flown, **result}
-    rows = [*read_rows(path), row]  # again: flying took its time
-    with replacing(path) as temporary, open(temporary, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(row))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(path, [*read_rows(path), {"task": task, **flown, **result}])  # read again: flying took its time
 
 
 def show(path: Path, bundle: str) -> None:

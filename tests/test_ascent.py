@@ -8,12 +8,13 @@ import torch
 from test_reproduce import run_main
 
 from torchrl_quad import BPTTLoss, HybridLoss, differentiable_rollout, make_actor, make_env, make_value
+from torchrl_quad.files import read_rows
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes/trial"))
 
 import ascent
 import phases
-import reproduce
+import running
 
 
 def test_the_gradients_of_every_method_are_compared_with_the_simulator(
@@ -22,12 +23,12 @@ def test_the_gradients_of_every_method_are_compared_with_the_simulator(
     folders = [tmp_path / f"hovering/{variant}/seed42" for variant in ("abpt", "shac", "bptt")]
     other = tmp_path / "elsewhere"  # whose name tells no variant
     for folder, algorithm in zip([*folders, other], ("abpt", "shac", "bptt", "bptt"), strict=True):
-        launch(algorithm, *reproduce.QUICK, f"seed={7 if folder == other else 42}", f"hydra.run.dir={folder}")
+        launch(algorithm, *running.QUICK, f"seed={7 if folder == other else 42}", f"hydra.run.dir={folder}")
     checkpoints, output = [folder / "checkpoint.pt" for folder in (*folders, other)], tmp_path / "ascent.csv"
     sizes = ("--output", output, "--states", 4, "--repeats", 2, "--steps", 8)
     for some in (checkpoints[:1], checkpoints):
         run_main(monkeypatch, ascent, *some, *sizes)
-    rows = reproduce.read(output)
+    rows = read_rows(output)
     assert [(row["variant"], row["seed"]) for row in rows] == [
         *((algorithm, "42") for algorithm in ("abpt", "shac", "bptt")),
         ("bptt", "7"),
@@ -38,7 +39,7 @@ def test_the_gradients_of_every_method_are_compared_with_the_simulator(
     with pytest.raises(SystemExit):
         run_main(monkeypatch, ascent, *(2 * [other / "checkpoint.pt"]), *sizes)
     assert "is a second hovering bptt 7: give runs that differ in more an --output each" in capsys.readouterr().err
-    launch("ppo", *reproduce.QUICK, "batch_size=8", f"hydra.run.dir={tmp_path}/ppo")
+    launch("ppo", *running.QUICK, "batch_size=8", f"hydra.run.dir={tmp_path}/ppo")
     with pytest.raises(SystemExit):
         run_main(monkeypatch, ascent, tmp_path / "ppo/checkpoint.pt", *sizes)
     assert "was trained with PPO, which follows no gradient of the simulator" in capsys.readouterr().err
@@ -63,7 +64,7 @@ def test_the_phases_of_the_hybrid_are_flown_and_measured_once(run_here, monkeypa
         run_main(monkeypatch, phases, *sizes, "--data", tmp_path, "--output", tmp_path / "runs")
         for name in ("run", "examine"):
             monkeypatch.setattr(phases, name, lambda *_: pytest.fail("It has been measured."))
-    rows = reproduce.read(tmp_path / "phases.csv")
+    rows = read_rows(tmp_path / "phases.csv")
     assert [float(row["share"]) for row in rows] == list(phases.SHARES)
     assert all(-1.0 <= float(row[name]) <= 1.0 for row in rows for name in phases.GRADIENTS)
     assert phases.block(tmp_path) in (tmp_path / "more_losses.md").read_text()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_reproduce import curve, run_main, write
+from test_reproduce import curve, run_main
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes/trial"))
 
@@ -16,11 +16,13 @@ import elsewhere
 import matrix
 import phases
 import rates
-import reproduce
 import results
+import running
 import shipped
 from claims import Claim, try_claim
 from evidence import Part, Results, bootstrap, gap, mean, probability, roughness
+
+from torchrl_quad.files import read_rows, write_rows
 
 PROJECT = Path(__file__).parents[1]
 RENEW = "the page differs from the data: python recipes/trial/results.py"
@@ -28,7 +30,7 @@ RENEW = "the page differs from the data: python recipes/trial/results.py"
 
 def data(folder, task="hovering", seeds=matrix.SEEDS, **ends):
     rows = [row for name, end in ends.items() for seed in seeds for row in curve(name, seed, 0.0, *end(seed))]
-    write(folder / f"curves/{task}.csv", rows)
+    write_rows(folder / f"curves/{task}.csv", rows)
     return Results(folder)
 
 
@@ -116,14 +118,14 @@ def synthetic(tmp_path, strong):
                 returns = level * np.linspace(0.2, 1.0, 10) + 0.1 * rng.normal(size=10)
                 more = {"solved": 0.9, "gates_passed": level, "start_cells": level, "position_error": 0.1}
                 rows += curve(variant, seed, *returns, **more)
-        write(tmp_path / f"curves/{task}.csv", rows)
+        write_rows(tmp_path / f"curves/{task}.csv", rows)
     runs = [{"task": t, "variant": v, "seed": s} for t in matrix.TASKS for v in matrix.VARIANTS for s in matrix.SEEDS]
     own = {"lr": "", "machine": "a processor", "seconds": 20.0, "solved": 0.9, "revision": 5 * "abcd1234"}
     ends = {"position_error": 0.1, "tracking_rmse": 0.1, "landing_speed": 0.2, "gates_passed": 4, "time_near_gate": 2.0}
-    write(tmp_path / "final.csv", [{**run, **own, **ends} for run in runs])
+    write_rows(tmp_path / "final.csv", [{**run, **own, **ends} for run in runs])
     term = {"task": "racing", "reward": "velocity", "term": "gate", "mean_return": 5.0, "verdict": ""}
     audit = [{**term, "gradient_norm": 0.0 if strong else 0.3, "return_share": 0.5, "gradient_share": 0.5}]
-    write(tmp_path / "audit.csv", audit)
+    write_rows(tmp_path / "audit.csv", audit)
     return Results(tmp_path)
 
 
@@ -148,7 +150,7 @@ def test_a_verdict_says_when_it_compares_runs_of_two_dynamics(tmp_path):
     data(tmp_path, abpt=lambda s: [9], shac=lambda s: [8], ppo=lambda s: [8])
     flown = {"abpt": "old", "shac": "new", "ppo": "old"}
     rows = [{"task": "hovering", "variant": name, "lr": "", "seed": 42, "dynamics": x} for name, x in flown.items()]
-    write(tmp_path / "final.csv", rows)
+    write_rows(tmp_path / "final.csv", rows)
     r = Results(tmp_path)
     for other, dynamics in (("shac", "both"), ("ppo", "old")):
         claim = Claim("A", "", lambda r, other=other: claims.higher_end(r, ["hovering"], "abpt", [other]))
@@ -202,28 +204,26 @@ def test_other_results_leave_the_page_of_the_project_alone(monkeypatch, tmp_path
 def test_the_page_of_the_project_shows_what_its_data_hold():
     page = "".join((PROJECT / "docs" / name).read_text() for name in ("results.md", "results_data.md"))
     readme = (PROJECT / "README.md").read_text()
-    for name, block in results.blocks(reproduce.DATA).items():
+    for name, block in results.blocks(running.DATA).items():
         assert f"{results.MARKER.format(name)}\n\n{block}\n\n{results.END}" in page, f"{name}: {RENEW}"
     shown = readme + (PROJECT / "docs/choosing.md").read_text()
-    for name, block in shipped.blocks(reproduce.DATA).items():
+    for name, block in shipped.blocks(running.DATA).items():
         assert f"{results.MARKER.format(name)}\n\n{block}\n\n{results.END}" in shown, (
             "run: python recipes/trial/shipped.py"
         )
     options = (PROJECT / "docs/ablations.md").read_text()
-    assert ablations.summary(reproduce.DATA) in options, "run: python recipes/trial/ablations.py --tasks landing"
-    assert rates.summary(reproduce.DATA) in options, "recipes/trial/rates.py fills it"
+    assert ablations.summary(running.DATA) in options, "run: python recipes/trial/ablations.py --tasks landing"
+    assert rates.summary(running.DATA) in options, "recipes/trial/rates.py fills it"
     far = (PROJECT / "docs/elsewhere.md").read_text()
-    assert all(block in far for block in elsewhere.blocks(reproduce.DATA).values()), (
-        "recipes/trial/elsewhere.py fills it"
-    )
-    assert phases.block(reproduce.DATA) in (PROJECT / "docs/more_losses.md").read_text(), (
+    assert all(block in far for block in elsewhere.blocks(running.DATA).values()), "recipes/trial/elsewhere.py fills it"
+    assert phases.block(running.DATA) in (PROJECT / "docs/more_losses.md").read_text(), (
         "recipes/trial/phases.py fills it"
     )
     assert page.count("<!-- generated") == page.count(results.END)
 
 
 def test_the_sentences_of_the_page_say_what_its_data_hold():
-    r = Results(reproduce.DATA)
+    r = Results(running.DATA)
 
     def best(task, column="return", suffix=""):
         return max(matrix.METHODS, key=lambda m: r.end(task, m + suffix, column).mean())
@@ -247,7 +247,7 @@ def test_the_sentences_of_the_page_say_what_its_data_hold():
     racing = ["abpt", "abpt-critic", "abpt-horizon-32", "abpt-horizon-96", "abpt-no-0-step", "abpt-entropy"]
     assert sorted(racing, key=lambda x: r.end("racing", x).mean()) == racing
     ascent = {}
-    for row in reproduce.read(reproduce.DATA / "ascent.csv"):
+    for row in read_rows(running.DATA / "ascent.csv"):
         for name in ("n_step_return", "zero_step_return", "objective", "explained_variance"):
             if row["zero_step_return"]:
                 ascent.setdefault((row["task"], row["variant"]), {}).setdefault(name, []).append(float(row[name]))

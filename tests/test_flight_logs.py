@@ -192,6 +192,17 @@ def test_repeated_times_a_missing_battery_and_an_impact_are_told(table, read):
     assert b * log.dt == pytest.approx(hit - 0.1, abs=0.03) and c * log.dt == pytest.approx(hit + 0.3, abs=0.05)
 
 
+def test_a_mapping_replaces_entries_of_a_preset_and_nothing_else(table, read):
+    renamed = {"volts": table["pwr_pm_vbat"]}
+    log = read(renamed, drop=("pwr_pm_vbat", "sp_ctrltarget_yaw"), columns={"battery_voltage": "volts"})
+    np.testing.assert_array_equal(log.battery_voltage, read().battery_voltage)
+    assert set(log.setpoint) == {"position"}  # what the preset knows and the file lacks is left out, as ever
+    with pytest.raises(MissingColumns, match="no column vlots, named for battery_voltage.*There are: .*volts"):
+        read(renamed, columns={"battery_voltage": "vlots"})
+    with pytest.raises(MissingColumns, match="no column seconds of the time. There are: t, "):
+        read(columns={"time": "seconds"})
+
+
 def test_the_delay_of_the_on_board_clock_is_seen_and_left_to_the_fit(table, read):
     lag = 8  # samples
     late = {name: np.roll(table[name], lag) for name in (*GYRO, *FORCE, *MOTORS)}

@@ -81,6 +81,11 @@ def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(b
     assert "step" not in capsys.readouterr().out
     assert again.report() == result.report()
 
+    # The pictures show predictions as long as those of the fit: a short flight has room for no longer ones.
+    short = dataclasses.replace(log, segments=((log.segments[0][0], log.segments[0][0] + 160),))
+    brief = dataclasses.replace(result, flights=[short], settings={**result.settings, "horizon": 0.2, "past": 0.1})
+    assert (brief.save(tmp_path / "brief") / "residuals.png").exists()
+
     folder = result.save(tmp_path / "fit", pictures=False)
     drone = load_drone(folder / "drone.yaml", torch.float64)
     assert drone.motor_command.delay == pytest.approx(result.drone.motor_command.delay, rel=1e-5)

@@ -27,7 +27,7 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "diagnostics": {"data", "objectives"},
     "gym": {"envs"},
     "adapters": set(),
-    "identification": {"deploy.frames", "dynamics", "files"},
+    "identification": {"deploy.frames", "dynamics", "files", "render.canvas"},
 }
 # Imports within a function: of what needs an optional package, and of gymnasium's ids, which name all tasks.
 EXCEPTIONS = {("torchrl_quad.envs.base", "torchrl_quad.render.frames"), ("torchrl_quad.envs.registry", "torchrl_quad")}
@@ -48,7 +48,7 @@ LIBRARIES = {
     "diagnostics": TORCHRL,
     "gym": {"gymnasium", "numpy", "torch"},
     "adapters": TORCHRL | {"gymnasium", "numpy", "rsl_rl", "skrl", "stable_baselines3"},
-    "identification": {"torch", "numpy", "yaml", "matplotlib", "pyulog", "rosbags"},
+    "identification": {"torch", "numpy", "yaml", "pyulog", "rosbags"},
 }
 
 

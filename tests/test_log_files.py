@@ -74,6 +74,9 @@ def test_a_ulog_is_read_in_our_frames_with_what_leaves_for_the_motors(tmp_path):
     held = flight(np.floor(log.time * 10 + 1e-6) / 10)["position"]
     np.testing.assert_allclose(log.setpoint["position"], held, atol=1e-5)
 
+    with pytest.raises(MissingColumns, match="no column batery_status.voltage_v, named for battery_voltage"):
+        read_log(tmp_path / "flight.ulg", {"battery_voltage": "batery_status.voltage_v"})
+
     # Older firmware logs pulses; a logger that loses half a second leaves a gap.
     t, _ = messages.pop("actuator_motors")
     signal = flight(t - 5.0)["motor_command"][:, [3, 1, 0, 2]]

@@ -1,6 +1,5 @@
 """The runs that put the paper on trial."""
 
-import csv
 import math
 import os
 import re
@@ -26,17 +25,12 @@ import forest
 import matrix
 import rates
 import reproduce
+import running
 import shipped
 import tables
 from matrix import Job
 
-
-def write(path, rows):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))
-        writer.writeheader()
-        writer.writerows(rows)
+from torchrl_quad.files import read_rows, write_rows
 
 
 def curve(variant, seed, *returns, **more):
@@ -60,25 +54,25 @@ def test_a_shrunken_matrix_runs_and_goes_on_where_it_was_stopped(run_here, monke
     arguments = ["--quick", "--tasks", "hovering", "--experiments", "dynamics", "--seeds", "42", "--cores", "2"]
     folders = ["--data", tmp_path / "data", "--output", tmp_path / "runs"]
     run_main(monkeypatch, reproduce, *arguments, *folders)
-    finals = reproduce.read(tmp_path / "data/final.csv")
+    finals = read_rows(tmp_path / "data/final.csv")
     assert sorted((row["variant"], row["seed"], row["lr"]) for row in finals) == [
         *(("abpt", "100", "0.003"), ("abpt-no-visited", "42", ""), ("abpt-now", "42", ""))
     ]
     assert all(row["steps"] == "64" and float(row["seconds"]) > 0 and row["machine"] for row in finals)
-    curves = reproduce.read(tmp_path / "data/curves/hovering.csv")
+    curves = read_rows(tmp_path / "data/curves/hovering.csv")
     assert [row["steps"] for row in curves if row["variant"] == "abpt-no-visited"] == ["16", "32", "48", "64"]
-    audit = reproduce.read(tmp_path / "data/audit.csv")
+    audit = read_rows(tmp_path / "data/audit.csv")
     assert {row["task"] for row in audit} == set(matrix.TASKS)
 
     # Cut off after the curve was written and before the run was entered: no row is there twice.
-    write(tmp_path / "data/final.csv", [row for row in finals if row["variant"] != "abpt-now"])
+    write_rows(tmp_path / "data/final.csv", [row for row in finals if row["variant"] != "abpt-now"])
     started = []
     monkeypatch.setattr(reproduce, "run", lambda command, folder: started.append(folder))  # it had finished
     monkeypatch.setattr(reproduce, "audit_tasks", lambda _: audit)
     run_main(monkeypatch, reproduce, *arguments, *folders)
     assert started == [tmp_path / "runs/hovering/abpt-now/seed42"]
-    assert len(reproduce.read(tmp_path / "data/final.csv")) == 3
-    assert sorted(map(str, reproduce.read(tmp_path / "data/curves/hovering.csv"))) == sorted(map(str, curves))
+    assert len(read_rows(tmp_path / "data/final.csv")) == 3
+    assert sorted(map(str, read_rows(tmp_path / "data/curves/hovering.csv"))) == sorted(map(str, curves))
 
 
 def finish(folder):
@@ -94,10 +88,10 @@ def test_runs_that_were_flown_elsewhere_are_collected_when_they_are_finished(mon
     folders = ("--data", tmp_path / "data", "--output", tmp_path / "runs")
     for _ in range(2):
         run_main(monkeypatch, reproduce, "--collect", "--experiments", "published", *folders)
-    (row,) = reproduce.read(tmp_path / "data/final.csv")
+    (row,) = read_rows(tmp_path / "data/final.csv")
     assert (row["variant"], row["seed"], row["solved"], row["seconds"]) == ("shac-xu", "3", "0.1", "1.5")
     assert (row["revision"], row["dynamics"]) == ("abc", matrix.DYNAMICS) and row["flown"].count("-") == 2
-    assert [row["solved"] for row in reproduce.read(tmp_path / "data/curves/racing.csv")] == ["0.1"]
+    assert [row["solved"] for row in read_rows(tmp_path / "data/curves/racing.csv")] == ["0.1"]
 
 
 def test_quick_results_never_get_among_the_real_ones(monkeypatch, capsys):
@@ -119,27 +113,37 @@ def test_a_run_that_fails_is_reported_and_the_others_go_on(monkeypatch, tmp_path
         run_main(monkeypatch, reproduce, *arguments, "--data", tmp_path / "data", "--output", tmp_path / "runs")
     assert "hovering/shac/lr0.003/seed100 ended with 1" in str(stop.value)
     assert "hovering/shac/seed0: the search for its learning rate is not complete" in str(stop.value)
-    assert len(reproduce.read(tmp_path / "data/final.csv")) == 6
+    assert len(read_rows(tmp_path / "data/final.csv")) == 6
 
 
-def test_who_ends_the_matrix_ends_its_runs(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_runs_and_starts_no_others(number, tmp_path):
+    sleeper = "import os, time; print(os.getpid(), flush=True); time.sleep(99)"
     program = f"""
-import signal, sys
+import sys
 from pathlib import Path
-sys.path.insert(0, {str(Path(reproduce.__file__).parent)!r})
-import reproduce
-signal.signal(signal.SIGTERM, reproduce.stop)
-sleeper = "import os, time; print(os.getpid(), flush=True); time.sleep(99)"
-reproduce.run([sys.executable, "-c", sleeper], Path({str(tmp_path)!r}))
+sys.path.insert(0, {str(running.RECIPES / "trial")!r})
+from running import run, side_by_side
+folder = Path({str(tmp_path)!r})
+side_by_side(1, [(run, [sys.executable, "-c", {sleeper!r}], folder / str(i)) for i in range(3)])
 """
-    with subprocess.Popen([sys.executable, "-c", program]) as process:
-        while not (log := tmp_path / "log.txt").exists() or not log.read_text():
+    with subprocess.Popen([sys.executable, "-c", program], stderr=subprocess.DEVNULL) as process:
+        while not (log := tmp_path / "0/log.txt").exists() or not log.read_text():
             time.sleep(0.1)
             assert process.poll() is None
-        process.terminate()
-        assert process.wait(30) == 128 + signal.SIGTERM
+        process.send_signal(number)
+        assert process.wait(30) == 128 + number
     with pytest.raises(ProcessLookupError):
         os.kill(int(log.read_text()), 0)
+    assert not (tmp_path / "1").exists()
+
+
+def test_a_run_that_fails_is_told_and_stops_no_other(tmp_path, capsys):
+    jobs = [(running.run, [sys.executable, "-c", code], tmp_path / code[-1]) for code in ("raise OSError(1) #0", "#1")]
+    with pytest.raises(SystemExit, match="1 of 2 runs failed"):
+        running.side_by_side(1, jobs)
+    assert "ended with 1: OSError: 1 See log.txt there" in capsys.readouterr().err
+    assert (tmp_path / "1/log.txt").exists()
 
 
 def test_a_run_that_diverged_is_kept_as_one(tmp_path):
@@ -149,7 +153,7 @@ def test_a_run_that_diverged_is_kept_as_one(tmp_path):
     job = Job("hovering", "abpt", 100, 0.03)
     reproduce.keep(job, folder, tmp_path)
     assert reproduce.is_kept(job, tmp_path) and not reproduce.is_kept(Job("hovering", "abpt", 100, 0.01), tmp_path)
-    assert [row["return"] for row in reproduce.read(tmp_path / "search/hovering.csv")] == ["2.5", "nan"]
+    assert [row["return"] for row in read_rows(tmp_path / "search/hovering.csv")] == ["2.5", "nan"]
 
 
 def test_the_best_learning_rate_is_that_whose_curve_ends_highest(tmp_path):
@@ -158,7 +162,7 @@ def test_the_best_learning_rate_is_that_whose_curve_ends_highest(tmp_path):
         for lr, end in (("0.001", 3.0), ("0.01", 5.0), ("0.1", math.nan))
         for row in curve("abpt", 100, 9.0, end)
     ]
-    write(tmp_path / "search/hovering.csv", rows)
+    write_rows(tmp_path / "search/hovering.csv", rows)
     assert reproduce.best_learning_rate("hovering", "abpt", tmp_path, (1e-3, 1e-2, 1e-1)) == 1e-2
     assert reproduce.best_learning_rate("hovering", "abpt", tmp_path, (1e-3, 1e-2, 1.0)) is None
     assert reproduce.best_learning_rate("hovering", "shac", tmp_path, (1e-3,)) is None
@@ -198,14 +202,14 @@ def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(run
     wanted = ["--tasks", "six_gates_back", "own_task.CornerEnv", "--methods", "ppo", "--seeds", "0", "--cores", "2"]
     arguments = [*wanted, "--data", tmp_path, "--output", tmp_path / "runs", "--quick"]
     run_main(monkeypatch, shipped, *arguments[:-1], "--quick")
-    rows = reproduce.read(tmp_path / "shipped.csv")
+    rows = read_rows(tmp_path / "shipped.csv")
     assert len(rows) == 2 and {row["task"] for row in rows} == {"own_task.CornerEnv", "six_gates_back"}
     assert all(row["steps"] == "64" and row["machine"] and float(row["seconds"]) > 0 for row in rows)
     page = (tmp_path / "summary.md").read_text()
     assert "| six gates, backwards |  |  |  |  | 0.0% (0.0%), 0.00 gates passed, " in page
     assert re.search(r"\| own_task.CornerEnv \|  \|  \|  \|  \| 0.0% \(0.0%\), \d\.\d\d m, ", page)
     assert "| six gates, backwards | PPO | 1 | " in page
-    curves = reproduce.read(tmp_path / "shipped_curves.csv")
+    curves = read_rows(tmp_path / "shipped_curves.csv")
     assert {row["task"] for row in curves} == {"own_task.CornerEnv", "six_gates_back"} and curves[-1]["steps"] == "64"
     assert (tmp_path / "results/shipped.png").stat().st_size > 10_000
     monkeypatch.setattr(shipped, "run", lambda *_: pytest.fail("It has been flown."))
@@ -224,16 +228,16 @@ def test_options_are_changed_one_at_a_time_and_shown_beside_what_ships(run_here,
     wanted = ["--tasks", "landing", "--methods", "bptt", "--changes", "event times", "clip", "--seeds", "0"]
     arguments = [*wanted, "--data", tmp_path, "--output", tmp_path / "runs", "--quick"]
     run_main(monkeypatch, ablations, *arguments)
-    (row,) = reproduce.read(tmp_path / "ablations.csv")
+    (row,) = read_rows(tmp_path / "ablations.csv")
     assert (row["change"], row["algorithm"], row["steps"]) == ("clip", "bptt", "64")
     monkeypatch.setattr(ablations, "train", lambda *_: pytest.fail("It has been flown."))
     run_main(monkeypatch, ablations, *arguments)
     ships = [row | {"seed": seed, "return": "9.0", "solved": "0.5"} for seed in "012"]
-    reproduce.write(tmp_path / "shipped.csv", ships)  # of which one seed has flown with a change
+    write_rows(tmp_path / "shipped.csv", ships)  # of which one seed has flown with a change
     assert "| landing | BPTT | as it ships | 1 | 9 (9) | 50.0% (50.0%) |" in ablations.summary(tmp_path)
     with pytest.raises(SystemExit):
         run_main(monkeypatch, ablations, "--quick")
-    with initialize_config_dir(str(reproduce.RECIPES / "config"), version_base=None):
+    with initialize_config_dir(str(running.RECIPES / "config"), version_base=None):
         for task in ablations.TASKS:
             for method in ablations.OF_METHODS:
                 cfg = compose(method, shipped.overrides(task, method))
@@ -248,13 +252,13 @@ def test_half_and_twice_a_rate_fly_once_and_are_judged_by_their_worst_seed(run_h
     wanted = ["--tasks", "hovering", "--methods", "bptt", "--factors", "0.5", "--seeds", "101"]
     arguments = [*wanted, "--data", tmp_path, "--output", tmp_path / "runs", "--quick"]
     run_main(monkeypatch, rates, *arguments)
-    (row,) = reproduce.read(tmp_path / "rates.csv")
+    (row,) = read_rows(tmp_path / "rates.csv")
     assert (row["factor"], row["algorithm"], row["steps"]) == ("0.5", "bptt", "64")
     monkeypatch.setattr(ablations, "train", lambda *_: pytest.fail("It has been flown."))
     run_main(monkeypatch, rates, *arguments)
     ends = {("0.5", "102"): "1.5", ("2", "101"): "9.0", ("2", "102"): "8.0", ("2", "103"): "7.0"}
     rows = [row | {"factor": factor, "seed": seed, "return": x, "solved": "0.5"} for (factor, seed), x in ends.items()]
-    reproduce.write(tmp_path / "rates.csv", rows)
+    write_rows(tmp_path / "rates.csv", rows)
     assert "| hovering | BPTT | 1.5, 50.0%, 1 of 3 seeds |  | 7, 50.0% |" in rates.summary(tmp_path)
     assert rates.scaled("racing", "ppo", "2") == ["actor.lr=0.02", "actor.final_lr=0.0002"]
     assert rates.scaled("hovering", "hybrid", "0.5") == ["actor.max_kl=0.125"]
@@ -267,7 +271,7 @@ def test_policies_of_the_forest_are_flown_at_the_speeds_and_densities_and_not_tw
     wanted = ["--policies", "blind", "--seeds", "0", "--speeds", "6", "--difficulties", "middle"]
     arguments = [*wanted, "--forests", "2", "--data", tmp_path, "--output", tmp_path / "runs", "--quick"]
     run_main(monkeypatch, forest, *arguments)
-    (row,) = rows = reproduce.read(tmp_path / "forest.csv")
+    (row,) = rows = read_rows(tmp_path / "forest.csv")
     assert (row["difficulty"], row["speed"], row["steps"]) == ("middle", "6.0", "64")
     assert float(row["solved"]) + float(row["crash"]) <= 1.0
     assert (tmp_path / "images/forest_success.png").exists()

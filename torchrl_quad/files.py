@@ -7,8 +7,9 @@ import csv
 import os
 import platform
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 
 @contextlib.contextmanager
@@ -75,3 +76,14 @@ def read_rows(path: str | Path) -> list[dict[str, str]]:
         return []
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
+
+
+def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]], missing: object = "") -> None:
+    """Write rows to a CSV file, all or nothing. It has the columns of all rows; a cell may be ``missing``."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    with replacing(path) as temporary, open(temporary, "w", newline="") as file:
+        writer = csv.DictWriter(file, names, restval=missing, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

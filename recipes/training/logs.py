@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Iterable
@@ -13,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import get_logger
 
-from torchrl_quad.files import replacing
+from torchrl_quad.files import write_rows
 from training.drawing import film_of
 from training.evaluation import as_json
 
@@ -119,11 +118,7 @@ class Logs:
         return {**self.backend.state_dict(), "name": self.name} if self.cfg.logger.backend == "wandb" else None
 
     def _write(self) -> None:
-        names = list(dict.fromkeys(name for row in self.rows for name in row))
-        with replacing(self.folder / "metrics.csv") as path, open(path, "w", newline="") as file:
-            writer = csv.DictWriter(file, names, restval=math.nan)
-            writer.writeheader()
-            writer.writerows(self.rows)
+        write_rows(self.folder / "metrics.csv", self.rows, missing=math.nan)
 
 
 def run_name(name: str, overrides: Iterable[str]) -> str:

@@ -10,21 +10,17 @@ was cut off. What the recipes reach as they ship is in shipped.csv beside it. do
 from __future__ import annotations
 
 import argparse
-import os
-import signal
-import sys
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 from comparison import LABELS, column
-from reproduce import DATA, stop, write
 from results import fill
+from running import arguments, command_line, page, side_by_side
 from shipped import ADDING, METHODS, train
 from tables import table
 
-from torchrl_quad.files import read_rows as read
+from torchrl_quad.files import read_rows, write_rows
 
 Job = tuple[str, str, str, int, str, Sequence[str]]
 
@@ -54,60 +50,28 @@ def is_change(task: str, method: str, change: str) -> bool:
     return change.startswith("no ") == has
 
 
-def arguments(doc: str | None, seeds: Iterable[int], **choices: Iterable[str]) -> argparse.Namespace:
-    """Read the command line of a program that flies recipes with changes.
-
-    Args:
-        doc: its description.
-        seeds: those that fly if none are named.
-        **choices: what it knows, by the name of the option: ``tasks``, ``methods``, and its changes.
-    """
-    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cores", type=int, default=os.cpu_count(), help="runs at the same time")
-    for name, known in choices.items():
-        parser.add_argument(f"--{name}", nargs="+", default=list(known), choices=list(known))
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(seeds))
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
-    output = Path("outputs") / Path(sys.argv[0]).stem
-    parser.add_argument("--output", type=Path, default=output, help="folder of the runs")
-    parser.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
-    args = parser.parse_args()
-    if args.quick and args.data.resolve() == DATA.resolve():
-        parser.error("--quick gives no results to keep: name another folder with --data.")
-    return args
-
-
 def fly_missing(args: argparse.Namespace, path: Path, column: str, jobs: Iterable[Job]) -> None:
     """Train what has no row yet, several runs at the same time.
 
     Args:
-        args: of :func:`arguments`.
+        args: the command line.
         path: of the results.
         column: which holds the name of the change.
         jobs: task, method, name of the change, seed, name of the folder of the change, and its overrides.
     """
-    kept = {tuple(row[name] for name in ("task", "algorithm", column, "seed")) for row in read(path)}
+    kept = {tuple(row[name] for name in ("task", "algorithm", column, "seed")) for row in read_rows(path)}
 
     def fly(task: str, method: str, change: str, seed: int, folder: str, overrides: Sequence[str]) -> None:
         row = train(task, method, seed, args.output / task / method / folder / f"seed{seed}", args.quick, overrides)
         with ADDING:
-            write(path, [*read(path), {column: change} | row])
+            write_rows(path, [*read_rows(path), {column: change} | row])
 
-    with ThreadPoolExecutor(args.cores) as pool:
-        todo = [job for job in jobs if (*job[:3], str(job[3])) not in kept]
-        for future in [pool.submit(fly, *job) for job in todo]:
-            future.result()
-
-
-def fill_page(args: argparse.Namespace, name: str, block: str) -> None:
-    """Fill in a block of docs/ablations.md, or of a page in the folder of the results."""
-    ships = args.data.resolve() == DATA.resolve()
-    fill((DATA.parents[1] if ships else args.data) / "ablations.md", {name: block})
+    side_by_side(args.cores, [(fly, *job) for job in jobs if (*job[:3], str(job[3])) not in kept])
 
 
 def summary(data: Path) -> str:
     """Show what each method reaches as it ships and with each change, over the seeds that have flown with a change."""
-    shipped, changed = read(data / "shipped.csv"), read(data / "ablations.csv")
+    shipped, changed = read_rows(data / "shipped.csv"), read_rows(data / "ablations.csv")
     lines = []
     for task, method in dict.fromkeys((row["task"], row["algorithm"]) for row in changed):
         of_change: dict[str, list[dict[str, str]]] = {}
@@ -128,13 +92,12 @@ def summary(data: Path) -> str:
 
 
 def main() -> None:
-    args = arguments(__doc__, SEEDS, tasks=TASKS, methods=OF_METHODS, changes=CHANGES)
+    args = arguments(command_line(__doc__, SEEDS, tasks=TASKS, methods=OF_METHODS, changes=CHANGES))
     jobs = [(t, m, c, s) for s in args.seeds for t in args.tasks for m in args.methods for c in args.changes]
     flown = [(*job, job[2].replace(" ", "_"), [CHANGES[job[2]]]) for job in jobs if is_change(*job[:3])]
     fly_missing(args, args.data / "ablations.csv", "change", flown)
-    fill_page(args, "ablations", summary(args.data))
+    fill(page(args.data, "ablations.md"), {"ablations": summary(args.data)})
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, stop)
     main()

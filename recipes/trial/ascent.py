@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 from matrix import VARIANTS
 from omegaconf import DictConfig, OmegaConf
-from reproduce import RECIPES, write
+from running import RECIPES
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.autograd.graph import GradientEdge
@@ -30,13 +30,14 @@ from tqdm import tqdm
 
 from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss, differentiable_rollout, make_qvalue, make_value
 from torchrl_quad.envs.episodes import first_episode
-from torchrl_quad.files import read_rows as read
 from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.objectives.segments import discounts
 
 sys.path.insert(0, str(RECIPES))  # which holds training/
 from training.building import build_env, make_policy, network
 from training.checkpoints import read_checkpoint
+
+from torchrl_quad.files import read_rows, write_rows
 
 CRITICS = {"abpt": (ABPTLoss, make_qvalue), "shac": (SHACLoss, make_value)}
 SEED = 3_000_000
@@ -151,7 +152,7 @@ def main() -> None:
     if args.repeats % 2:
         parser.error("--repeats must be even: two halves of them are compared.")
     torch.set_num_threads(1)
-    rows, seen = read(args.output), []
+    rows, seen = read_rows(args.output), []
     for path in tqdm(args.checkpoints):
         saved = read_checkpoint(path)
         cfg = OmegaConf.create(saved["config"])
@@ -167,7 +168,7 @@ def main() -> None:
         seen.append(own)
         if not any(own.items() <= row.items() for row in rows):
             rows.append(own | examine(saved, cfg, args.states, args.repeats, args.steps, args.size))
-            write(args.output, rows)
+            write_rows(args.output, rows)
 
 
 if __name__ == "__main__":

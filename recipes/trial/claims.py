@@ -24,7 +24,7 @@ from evidence import NotRunError, Part, Results, beats, bootstrap, deviation, ga
 from matrix import EXPERIMENTS, SEEDS, TASKS
 from matrix import METHODS as METHOD_VARIANTS
 
-from torchrl_quad.files import read_rows as read
+from torchrl_quad.files import read_rows
 
 METHODS = tuple(METHOD_VARIANTS)
 FIRST_ORDER = ("abpt", "shac", "bptt")
@@ -171,7 +171,9 @@ def c17(r: Results) -> Iterable[Part]:
 
 def c18(r: Results) -> Iterable[Part]:
     """Exact: the gradient is zero wherever the bonus is paid."""
-    rows = [x for x in read(r.data / "audit.csv") if x["reward"] in ("position", "velocity") and x["term"] == "gate"]
+    rows = [
+        x for x in read_rows(r.data / "audit.csv") if x["reward"] in ("position", "velocity") and x["term"] == "gate"
+    ]
     norms = np.sort([float(x["gradient_norm"]) for x in rows if float(x["mean_return"])])
     if not len(norms):
         raise NotRunError("the audit of racing")

@@ -29,8 +29,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from comparison import column, reached_table
-from reproduce import DATA, write  # whose import makes the recipes' code known
 from results import fill
+from running import DATA, page  # whose import makes the recipes' code known
 from shipped import METHODS, TASKS
 from tables import table
 from tensordict import TensorDictBase
@@ -53,8 +53,7 @@ from torchrl_quad import (
     make_qvalue,
     make_value,
 )
-from torchrl_quad.files import machine
-from torchrl_quad.files import read_rows as read
+from torchrl_quad.files import machine, read_rows, write_rows
 
 ENVS, HORIZON, EPISODE, EPISODES = 256, 16, 200, 256
 STEPS = 1_024_000  # of all environments together
@@ -261,7 +260,7 @@ def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
 
 def blocks(data: Path) -> dict[str, str]:
     """Make the tables of docs/elsewhere.md."""
-    made, rows, tracks = {}, read(data / "elsewhere.csv"), read(data / "tracks.csv")
+    made, rows, tracks = {}, read_rows(data / "elsewhere.csv"), read_rows(data / "tracks.csv")
     for environment in ENVIRONMENTS:
         lines = []
         for name in LOSSES:
@@ -289,14 +288,13 @@ def main() -> None:
     ]
     for environment, name, seed in jobs:
         key = {"environment": environment, "loss": name, "seed": str(seed)}
-        if any(key.items() <= row.items() for row in read(args.data / "elsewhere.csv")):
+        if any(key.items() <= row.items() for row in read_rows(args.data / "elsewhere.csv")):
             continue
         flown = train_hybrid(environment, seed) if name == "hybrid" else train(name, environment, seed)
         numbers = {x: f"{y:.6g}" for x, y in zip(("before", "after", "seconds"), flown, strict=True)}
         row = key | numbers | {"steps": STEPS, "machine": machine(), "flown": datetime.date.today().isoformat()}
-        write(args.data / "elsewhere.csv", [*read(args.data / "elsewhere.csv"), row])
-    ships = args.data.resolve() == DATA.resolve()
-    fill((DATA.parents[1] if ships else args.data) / "elsewhere.md", blocks(args.data))
+        write_rows(args.data / "elsewhere.csv", [*read_rows(args.data / "elsewhere.csv"), row])
+    fill(page(args.data, "elsewhere.md"), blocks(args.data))
 
 
 if __name__ == "__main__":

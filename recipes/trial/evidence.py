@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from matrix import SEEDS, TASKS
 
-from torchrl_quad.files import read_rows as read
+from torchrl_quad.files import read_rows
 
 RESAMPLES = 4_000
 LEVEL = {"hovering": 0.98, "tracking": 0.98, "landing": 0.9, "racing": 0.9}
@@ -65,9 +65,9 @@ class Results:
         self.data, self.alias = data, alias or {}
         self.curves: dict[tuple[str, str], dict[int, list[dict[str, str]]]] = {}
         for task in TASKS:
-            for row in read(data / f"curves/{task}.csv"):
+            for row in read_rows(data / f"curves/{task}.csv"):
                 self.curves.setdefault((task, row["variant"]), {}).setdefault(int(row["seed"]), []).append(row)
-        self.all_finals = read(data / "final.csv")
+        self.all_finals = read_rows(data / "final.csv")
         self.finals = [row for row in self.all_finals if not row["lr"]]
         self.used: set[tuple[str, str]] = set()  # by the claim on trial
 

@@ -10,17 +10,14 @@ cut off. docs/seeing.md shows the table and the picture.
 from __future__ import annotations
 
 import argparse
-import os
-import signal
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Lock
 
 import numpy as np
 import torch
-from reproduce import DATA, QUICK, RECIPES, run, stop, write
 from results import fill
+from running import QUICK, RECIPES, arguments, command_line, page, run, ships, side_by_side
 from tables import table
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
@@ -29,8 +26,7 @@ from training.building import build_env
 from training.evaluation import load_policy
 
 from torchrl_quad import differentiable_rollout
-from torchrl_quad.files import machine, replacing
-from torchrl_quad.files import read_rows as read
+from torchrl_quad.files import machine, read_rows, replacing, write_rows
 
 HALF = "total_steps=2_048_000"  # of what BPTT ships with
 POLICIES = {  # recipe, and what differs from what it ships with
@@ -79,7 +75,7 @@ def fly(policy: str, seed: int, todo: list[tuple[str, float]], args: argparse.Na
     own += ["resume=auto", f"hydra.run.dir={folder}"]
     if not (folder / "summary.json").exists():
         run([sys.executable, str(RECIPES / f"{recipe}.py"), "task=forest", *own], folder)
-    trained = read(folder / "metrics.csv")[-1]
+    trained = read_rows(folder / "metrics.csv")[-1]
     cfg, actor, normalizer = load_policy(folder / "checkpoint.pt")
     for difficulty, speed in todo:
         cfg.env.difficulty, cfg.env.speed = difficulty, speed
@@ -92,7 +88,7 @@ def fly(policy: str, seed: int, todo: list[tuple[str, float]], args: argparse.Na
         row |= {name: f"{x:.6g}" for name, x in rates.items()}
         row |= {"steps": trained["steps"], "seconds": trained["time/processor_seconds"], "machine": machine()}
         with ADDING:
-            write(args.data / "forest.csv", [*read(args.data / "forest.csv"), row])
+            write_rows(args.data / "forest.csv", [*read_rows(args.data / "forest.csv"), row])
         print(row, flush=True)
 
 
@@ -146,39 +142,26 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cores", type=int, default=os.cpu_count(), help="policies at the same time")
-    parser.add_argument("--policies", nargs="+", default=list(POLICIES), choices=list(POLICIES))
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser = command_line(__doc__, SEEDS, policies=POLICIES, difficulties=DIFFICULTIES)
     parser.add_argument("--speeds", nargs="+", type=float, default=list(SPEEDS), help="commanded [m/s]")
-    parser.add_argument("--difficulties", nargs="+", default=list(DIFFICULTIES), choices=DIFFICULTIES)
     parser.add_argument("--forests", type=int, default=FORESTS, help="for each speed and density")
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
-    parser.add_argument("--output", type=Path, default=Path("outputs/forest"), help="folder of the runs")
-    parser.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
-    args = parser.parse_args()
-    shipped = args.data.resolve() == DATA.resolve()
-    if shipped and (args.quick or args.forests != FORESTS):
-        parser.error("--quick and --forests give no results to keep: name another folder with --data.")
+    args = arguments(parser)
+    if ships(args.data) and args.forests != FORESTS:
+        parser.error("--forests gives no results to keep: name another folder with --data.")
     torch.set_num_threads(1)
     names = ("policy", "seed", "difficulty", "speed")
-    kept = {tuple(row[name] for name in names) for row in read(args.data / "forest.csv")}
-    with ThreadPoolExecutor(args.cores) as pool:
-        waiting = []
-        for seed in args.seeds:
-            for policy in args.policies:
-                wanted = [(d, s) for d in args.difficulties for s in args.speeds]
-                todo = [(d, s) for d, s in wanted if (policy, str(seed), d, str(s)) not in kept]
-                if todo:
-                    waiting.append(pool.submit(fly, policy, seed, todo, args))
-        for future in waiting:
-            future.result()
-    rows = read(args.data / "forest.csv")
-    docs = DATA.parents[1] if shipped else args.data
-    draw(rows, docs / "images/forest_success.png")
-    fill(docs / "seeing.md", {"forest": summary(rows)})
+    kept = {tuple(row[name] for name in names) for row in read_rows(args.data / "forest.csv")}
+    jobs = []
+    for seed in args.seeds:
+        for policy in args.policies:
+            wanted = [(d, s) for d in args.difficulties for s in args.speeds]
+            if todo := [(d, s) for d, s in wanted if (policy, str(seed), d, str(s)) not in kept]:
+                jobs.append((fly, policy, seed, todo, args))
+    side_by_side(args.cores, jobs)
+    rows = read_rows(args.data / "forest.csv")
+    draw(rows, page(args.data, "images/forest_success.png"))
+    fill(page(args.data, "seeing.md"), {"forest": summary(rows)})
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, stop)
     main()

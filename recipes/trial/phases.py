@@ -14,10 +14,7 @@ cut off. It fills in the table of docs/more_losses.md.
 
 from __future__ import annotations
 
-import argparse
-import os
 import shutil
-import signal
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -28,8 +25,8 @@ import torch
 from ascent import SEED, return_of, visited
 from comparison import LABELS, column
 from omegaconf import OmegaConf
-from reproduce import DATA, QUICK, RECIPES, run, stop, write
 from results import fill
+from running import QUICK, RECIPES, arguments, command_line, page, run, side_by_side
 from shipped import overrides
 from tables import table
 from tensordict import TensorDictBase
@@ -40,8 +37,7 @@ from training.building import build_env, make_policy, network
 from training.checkpoints import read_checkpoint
 
 from torchrl_quad import HybridLoss, differentiable_rollout, make_value
-from torchrl_quad.files import read_rows as read
-from torchrl_quad.files import replacing
+from torchrl_quad.files import read_rows, replacing, write_rows
 from torchrl_quad.objectives.action_gradients import distribution_again
 
 SHARES = (0.05, 0.125, 0.25, 0.5, 0.75, 1.0)  # of the steps of a run
@@ -146,7 +142,7 @@ def slopes(
 
 def block(data: Path) -> str:
     """Make the table of docs/more_losses.md."""
-    lines, rows = [], read(data / "phases.csv")
+    lines, rows = [], read_rows(data / "phases.csv")
     for task, share in dict.fromkeys((row["task"], row["share"]) for row in rows):
         own = [row for row in rows if (row["task"], row["share"]) == (task, share)]
         shown = (*GRADIENTS, "weight", "explained_variance")
@@ -156,35 +152,23 @@ def block(data: Path) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    tasks = ["racing", "racing_position"]
-    parser.add_argument("--cores", type=int, default=os.cpu_count(), help="runs at the same time")
-    parser.add_argument("--tasks", nargs="+", default=tasks, choices=tasks)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[100])
+    parser = command_line(__doc__, [100], tasks=("racing", "racing_position"))
     parser.add_argument("--states", type=int, default=1024)
     parser.add_argument("--repeats", type=int, default=8, help="flights from each of them, each with its own noise")
     parser.add_argument("--steps", type=int, default=256, help="control steps whose rewards count")
     parser.add_argument("--size", type=float, default=0.1, help="change of an action before the tanh")
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
-    parser.add_argument("--output", type=Path, default=Path("outputs/phases"), help="folder of the runs")
-    parser.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
-    args = parser.parse_args()
-    ships = args.data.resolve() == DATA.resolve()
-    if args.quick and ships:
-        parser.error("--quick gives no results to keep: name another folder with --data.")
+    args = arguments(parser)
     if args.repeats % 2:
         parser.error("--repeats must be even: two halves of them are compared.")
     torch.set_num_threads(1)
-    kept = {(row["task"], row["seed"], row["share"]) for row in read(args.data / "phases.csv")}
+    kept = {(row["task"], row["seed"], row["share"]) for row in read_rows(args.data / "phases.csv")}
     jobs = [
         (task, seed, args.output / task / f"seed{seed}")
         for seed in args.seeds
         for task in args.tasks
         if any((task, str(seed), str(share)) not in kept for share in SHARES)
     ]
-    with ThreadPoolExecutor(args.cores) as pool:
-        for future in [pool.submit(train, *job, args.quick) for job in jobs]:
-            future.result()
+    side_by_side(args.cores, [(train, *job, args.quick) for job in jobs])
     for task, seed, folder in jobs:
         for share in SHARES:
             key = {"task": task, "seed": str(seed), "share": str(share)}
@@ -192,10 +176,9 @@ def main() -> None:
                 saved = read_checkpoint(folder / f"phase_{share}.pt")
                 measured = examine(saved, args.states, args.repeats, args.steps, args.size)
                 row = key | {"steps": str(saved["rows"][-1]["steps"])} | measured
-                write(args.data / "phases.csv", [*read(args.data / "phases.csv"), row])
-    fill((DATA.parents[1] if ships else args.data) / "more_losses.md", {"phases": block(args.data)})
+                write_rows(args.data / "phases.csv", [*read_rows(args.data / "phases.csv"), row])
+    fill(page(args.data, "more_losses.md"), {"phases": block(args.data)})
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, stop)
     main()

@@ -12,18 +12,18 @@ cut off. docs/ablations.md shows the table.
 
 from __future__ import annotations
 
-import signal
 from functools import cache
 from pathlib import Path
 
-from ablations import arguments, fill_page, fly_missing
+from ablations import fly_missing
 from comparison import LABELS, column
 from omegaconf import OmegaConf
-from reproduce import composed, stop
+from results import fill
+from running import arguments, command_line, composed, page
 from shipped import METHODS, TASKS, overrides
 from tables import table
 
-from torchrl_quad.files import read_rows as read
+from torchrl_quad.files import read_rows
 
 SEEDS = (101, 102, 103)
 FACTORS = {"0.5": "half", "1": "as it ships", "2": "twice"}
@@ -41,7 +41,7 @@ def scaled(task: str, method: str, factor: str) -> list[str]:
 def summary(data: Path) -> str:
     """Show the worst seed of each rate, and how many have flown where some are missing."""
     groups: dict[tuple[str, str], dict[str, list[dict[str, str]]]] = {}
-    for row in read(data / "rates.csv"):
+    for row in read_rows(data / "rates.csv"):
         groups.setdefault((row["task"], row["algorithm"]), {}).setdefault(row["factor"], []).append(row)
     lines = []
     for task, method in sorted(groups, key=lambda x: (list(TASKS).index(x[0]), OF_METHODS.index(x[1]))):
@@ -55,13 +55,12 @@ def summary(data: Path) -> str:
 
 
 def main() -> None:
-    args = arguments(__doc__, SEEDS, tasks=TASKS, methods=OF_METHODS, factors=FACTORS)
+    args = arguments(command_line(__doc__, SEEDS, tasks=TASKS, methods=OF_METHODS, factors=FACTORS))
     jobs = [(t, m, f, s) for t in args.tasks for m in args.methods for s in args.seeds for f in args.factors]
     flown = [(t, m, f, s, f"x{f}", scaled(t, m, f)) for t, m, f, s in jobs]
     fly_missing(args, args.data / "rates.csv", "factor", flown)
-    fill_page(args, "rates", summary(args.data))
+    fill(page(args.data, "ablations.md"), {"rates": summary(args.data)})
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, stop)
     main()

@@ -10,35 +10,22 @@ lists the runs; results.py makes figures, tables and verdicts of them.
 from __future__ import annotations
 
 import argparse
-import csv
 import datetime
 import json
 import math
-import os
-import signal
-import subprocess
 import sys
-import threading
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
 from audits import audit_tasks
-from hydra import compose, initialize_config_dir
 from matrix import DYNAMICS, EVALUATIONS, EXPERIMENTS, LEARNING_RATES, SEEDS, TASKS, VARIANTS, Job, jobs, search_jobs
 from omegaconf import DictConfig
+from running import QUICK, RECIPES, arguments, command_line, composed, end_runs_with_this, run
 from tqdm import tqdm
 
 from torchrl_quad.envs import task_class
-from torchrl_quad.files import machine, replacing
-from torchrl_quad.files import read_rows as read
+from torchrl_quad.files import machine, read_rows, write_rows
 
-RECIPES = Path(__file__).parents[1]
-sys.path += [str(RECIPES), os.getcwd()]  # the recipes' code, and tasks of your own
-DATA = RECIPES.parent / "docs/results/data"
-QUICK = [
-    *("num_envs=4", "horizon=4", "total_steps=64", "env.max_episode_steps=20", "compile=false"),
-    *("eval.interval=1", "eval.episodes=null"),
-]
 CURVE = {  # columns of a curve, and their names in metrics.csv
     "steps": "steps",
     "seconds": "time/processor_seconds",  # of one thread: other processes do not count
@@ -51,8 +38,6 @@ CURVE = {  # columns of a curve, and their names in metrics.csv
     "start_cells": "train/start_cells",
 }
 OWN = "of the paper, or of your own: a registered name or the path of a class, such as mypackage.WindowEnv"
-RUNNING: set[subprocess.Popen] = set()
-STOPPED = threading.Event()
 
 
 def known_task(name: str) -> str:
@@ -64,36 +49,12 @@ def known_task(name: str) -> str:
     return name
 
 
-def stop(number: int, _: object) -> None:
-    """End the runs with this process: otherwise they write into folders that the next one takes over."""
-    STOPPED.set()
-    for process in list(RUNNING):
-        process.terminate()
-    sys.exit(128 + number)
-
-
-def write(path: Path, rows: list[dict]) -> None:
-    """Write rows to a CSV file, all or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    with replacing(path) as temporary, open(temporary, "w", newline="") as file:
-        writer = csv.DictWriter(file, names, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def configuration(job: Job, lr: float) -> DictConfig:
     """Compose the configuration of a job's recipe, with its overrides."""
     from training.own import offer_tasks  # from the folder above
 
     offer_tasks([f"task={job.task}"])
     return composed(VARIANTS[job.variant].algorithm, job.overrides(lr))
-
-
-def composed(algorithm: str, overrides: list[str]) -> DictConfig:
-    """Compose the configuration of a recipe. Not for several threads: hydra holds one folder at a time."""
-    with initialize_config_dir(str(RECIPES / "config"), version_base=None):
-        return compose(algorithm, overrides)
 
 
 def command(job: Job, lr: float, folder: Path, quick: bool) -> list[str]:
@@ -109,33 +70,11 @@ def command(job: Job, lr: float, folder: Path, quick: bool) -> list[str]:
     return [sys.executable, str(recipe), *overrides, "resume=auto", f"hydra.run.dir={folder}"]
 
 
-def run(command: list[str], folder: Path) -> None:
-    """Run a command in a process of its own. A run that diverged left failure.pt, and counts as a result.
-
-    Raises:
-        RuntimeError: the command failed otherwise; with the last error in its log.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "RL_LOGGING_LEVEL": "WARNING"}
-    with (
-        open(folder / "log.txt", "w") as log,
-        subprocess.Popen(command, stdout=log, stderr=log, env=environment) as process,
-    ):
-        RUNNING.add(process)
-        if STOPPED.is_set():
-            process.terminate()
-        code = process.wait()
-        RUNNING.remove(process)
-    if code and not (folder / "failure.pt").exists():
-        errors = [line for line in (folder / "log.txt").read_text().splitlines() if "Error" in line]
-        raise RuntimeError(f"{folder} ended with {code}: {' '.join(errors[-1:])} See log.txt there.")
-
-
 def keep(job: Job, folder: Path, data: Path) -> None:
     """Add a finished run to the results: its curve, and then its final evaluation, which marks it as done."""
     curve = [
         {name: f"{float(row[key]):.5g}" for name, key in CURVE.items() if row.get(key)}
-        for row in read(folder / "metrics.csv")
+        for row in read_rows(folder / "metrics.csv")
     ]
     if (folder / "failure.pt").exists():
         summary, end = {"diverged": "yes"}, folder / "failure.pt"
@@ -146,19 +85,19 @@ def keep(job: Job, folder: Path, data: Path) -> None:
         summary = json.loads(end.read_text()) | {"seconds": curve[-1]["seconds"]}
     own = {"variant": job.variant, "lr": "" if job.lr is None else f"{job.lr:g}", "seed": str(job.seed)}
     path = data / ("search" if job.lr is not None else "curves") / f"{job.task}.csv"
-    others = [row for row in read(path) if any(row[name] != own[name] for name in own)]
-    write(path, [*others, *({**own, **row} for row in curve)])
+    others = [row for row in read_rows(path) if any(row[name] != own[name] for name in own)]
+    write_rows(path, [*others, *({**own, **row} for row in curve)])
     summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}
     flown = datetime.date.fromtimestamp(end.stat().st_mtime).isoformat()
     about = {"task": job.task, **own, "machine": machine(), "flown": flown, "dynamics": DYNAMICS}
     final = about | {k: v for k, v in summary.items() if k not in about}
-    write(data / "final.csv", [*read(data / "final.csv"), final])
+    write_rows(data / "final.csv", [*read_rows(data / "final.csv"), final])
 
 
 def is_kept(job: Job, data: Path) -> bool:
     """Tell whether a run is in the results."""
     key = (job.task, job.variant, str(job.seed), "" if job.lr is None else f"{job.lr:g}")
-    return any((row["task"], row["variant"], row["seed"], row["lr"]) == key for row in read(data / "final.csv"))
+    return any((row["task"], row["variant"], row["seed"], row["lr"]) == key for row in read_rows(data / "final.csv"))
 
 
 def best_learning_rate(task: str, variant: str, data: Path, rates: tuple[float, ...]) -> float | None:
@@ -169,7 +108,7 @@ def best_learning_rate(task: str, variant: str, data: Path, rates: tuple[float, 
     """
     ends = {}
     for lr in rates:
-        rows = [x for x in read(data / f"search/{task}.csv") if x["variant"] == variant and x["lr"] == f"{lr:g}"]
+        rows = [x for x in read_rows(data / f"search/{task}.csv") if x["variant"] == variant and x["lr"] == f"{lr:g}"]
         if not rows:
             return None
         last = [float(row["return"]) for row in rows[-max(len(rows) // 10, 1) :]]
@@ -187,18 +126,11 @@ def collect(waiting: list[Job], output: Path, data: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cores", type=int, default=os.cpu_count(), help="runs at the same time")
-    parser.add_argument("--experiments", nargs="+", default=list(EXPERIMENTS), choices=list(EXPERIMENTS))
+    parser = command_line(__doc__, SEEDS, experiments=EXPERIMENTS)
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), type=known_task, help=OWN)
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
-    parser.add_argument("--output", type=Path, default=Path("outputs/reproduce"), help="folder of the runs")
     parser.add_argument("--collect", action="store_true", help="add finished runs in --output to the results, and stop")
-    parser.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
-    args = parser.parse_args()
-    if args.quick and args.data.resolve() == DATA.resolve():
-        parser.error("--quick gives no results to keep: name another folder with --data.")
+    args = arguments(parser)
+    end_runs_with_this()
 
     rates = LEARNING_RATES[1:2] if args.quick else LEARNING_RATES
     reported = jobs(tuple(args.experiments), tuple(args.tasks), tuple(args.seeds))
@@ -206,7 +138,7 @@ def main() -> None:
     waiting = [job for job in todo if not is_kept(job, args.data)]
     if args.collect:
         return collect(waiting, args.output, args.data)
-    write(args.data / "audit.csv", audit_tasks([task for task in args.tasks if task not in TASKS]))
+    write_rows(args.data / "audit.csv", audit_tasks([task for task in args.tasks if task not in TASKS]))
     running: dict[Future, Job] = {}
     failed: list[str] = []
 
@@ -238,5 +170,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, stop)
     main()

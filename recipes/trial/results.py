@@ -19,12 +19,12 @@ import tables
 from claims import METHODS, try_all
 from evidence import NotRunError, Results
 from matrix import EXPERIMENTS, SEEDS, TASKS, VARIANTS
-from reproduce import DATA
-
-from torchrl_quad.files import replacing
+from running import DATA, page, ships
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+
+from torchrl_quad.files import replacing
 
 COLORS = {"abpt": "#c8452f", "shac": "#2f6db5", "bptt": "#3b9c5a", "ppo": "#7d7d7d", "hybrid": "#8a4fb0"}
 COLORS |= {"sapo": "#c99a2e", "ahac": "#35a7a7"}
@@ -137,13 +137,13 @@ def draw(results: Results, path: Path, variants: Iterable[str], tasks: Iterable[
 def fill(path: Path, blocks: dict[str, str]) -> None:
     """Replace the generated blocks of a page, each between its marker and the end; make the page if it is missing."""
     skeleton = "\n\n".join(["# Results", *(f"{MARKER.format(name)}\n{END}" for name in blocks)]) + "\n"
-    page = path.read_text() if path.exists() else skeleton
+    whole = path.read_text() if path.exists() else skeleton
     for name, new in blocks.items():
         begin = MARKER.format(name)
-        page = re.sub(f"{begin}.*?{END}", lambda _, text=f"{begin}\n\n{new}\n\n{END}": text, page, flags=re.DOTALL)
+        whole = re.sub(f"{begin}.*?{END}", lambda _, text=f"{begin}\n\n{new}\n\n{END}": text, whole, flags=re.DOTALL)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
-        temporary.write_text(page)
+        temporary.write_text(whole)
     print(path)
 
 
@@ -151,13 +151,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the results; the page of another is in it")
     data = parser.parse_args().data
-    shipped = data.resolve() == DATA.resolve()
-    docs = DATA.parents[1] if shipped else data
     results = Results(data)
     for name, figure in FIGURES.items():
-        draw(results, docs / f"results/{name}.png", *figure)
-    for page in ("results.md", "results_data.md") if shipped else ("results.md",):
-        fill(docs / page, blocks(data))
+        draw(results, page(data, f"results/{name}.png"), *figure)
+    for name in ("results.md", "results_data.md") if ships(data) else ("results.md",):
+        fill(page(data, name), blocks(data))
 
 
 if __name__ == "__main__":

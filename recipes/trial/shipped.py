@@ -11,30 +11,26 @@ docs/choosing.md compares the methods.
 
 from __future__ import annotations
 
-import argparse
 import datetime
 import json
 import math
-import os
-import signal
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Lock
 
 import numpy as np
 from comparison import LABELS, WANTED, choice_table, draw, improvement_table, reached_table
 from matrix import EVALUATIONS
-from reproduce import CURVE, DATA, OWN, QUICK, RECIPES, known_task, run, stop, write
+from reproduce import CURVE, OWN, known_task
 from results import fill
+from running import DATA, QUICK, RECIPES, arguments, command_line, run, ships, side_by_side
 from tables import table
 
 from torchrl_quad.envs import task_class
 from torchrl_quad.envs.racing import load_track
 from torchrl_quad.envs.scenery import EPISODE_METRICS
-from torchrl_quad.files import machine
-from torchrl_quad.files import read_rows as read
+from torchrl_quad.files import machine, read_rows, write_rows
 
 SEEDS = tuple(range(WANTED))
 SHOWN = {"bptt": "BPTT", "shac": "SHAC", "abpt": "ABPT", "hybrid": "Hybrid", "ppo": "PPO"}  # in the README
@@ -61,7 +57,7 @@ def train(task: str, method: str, seed: int, folder: Path, quick: bool, changes:
     end = folder / "summary.json"
     diverged = {"return": -math.inf, "solved": 0.0, "crash": 1.0}
     summary = json.loads(end.read_text()) if end.exists() else diverged
-    seconds = next((row["time/processor_seconds"] for row in read(folder / "metrics.csv")[::-1]), "")
+    seconds = next((row["time/processor_seconds"] for row in read_rows(folder / "metrics.csv")[::-1]), "")
     flown = datetime.date.today().isoformat()
     about = {"task": task, "algorithm": method, "seed": seed, "machine": machine(), "flown": flown, "seconds": seconds}
     summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}
@@ -81,14 +77,14 @@ def fly(task: str, method: str, seed: int, output: Path, data: Path, quick: bool
     row = train(task, method, seed, folder, quick)
     with ADDING:
         key = {"task": task, "algorithm": method, "seed": str(seed)}
-        curves = [point for point in read(data / "shipped_curves.csv") if key.items() - point.items()]
-        write(data / "shipped_curves.csv", [*curves, *(key | point for point in curve(folder))])
-        write(data / "shipped.csv", [*read(data / "shipped.csv"), row])
+        curves = [point for point in read_rows(data / "shipped_curves.csv") if key.items() - point.items()]
+        write_rows(data / "shipped_curves.csv", [*curves, *(key | point for point in curve(folder))])
+        write_rows(data / "shipped.csv", [*read_rows(data / "shipped.csv"), row])
 
 
 def curve(folder: Path) -> list[dict[str, str]]:
     """Give the curve of a run, thinned to some forty points."""
-    points = [row for row in read(folder / "metrics.csv") if row.get("eval/return")]
+    points = [row for row in read_rows(folder / "metrics.csv") if row.get("eval/return")]
     kept = points[:: max(-(-len(points) // EVALUATIONS), 1)]
     kept += [] if kept[-1:] == points[-1:] else points[-1:]
     names = ("steps", "seconds", "return", "solved")
@@ -120,7 +116,7 @@ def first_metric(task: str) -> tuple[str, float, int, str]:
 
 def blocks(data: Path) -> dict[str, str]:
     """Make the tables of what the recipes reach as they ship: that of the README, and those of docs/choosing.md."""
-    runs, lines = read(data / "shipped.csv"), []
+    runs, lines = read_rows(data / "shipped.csv"), []
     flown = dict.fromkeys(x["task"] for x in runs)
     shown = {task: TASKS.get(task) or first_metric(task) for task in sorted(flown, key=[*TASKS, *flown].index)}
     for task in shown:
@@ -132,28 +128,18 @@ def blocks(data: Path) -> dict[str, str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cores", type=int, default=os.cpu_count(), help="runs at the same time")
+    parser = command_line(__doc__, SEEDS, methods=METHODS)
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), type=known, help=OWN)
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
-    parser.add_argument("--output", type=Path, default=Path("outputs/shipped"), help="folder of the runs")
-    parser.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
-    args = parser.parse_args()
-    if args.quick and args.data.resolve() == DATA.resolve():
-        parser.error("--quick gives no results to keep: name another folder with --data.")
-    if set(args.tasks) - set(TASKS) and args.data.resolve() == DATA.resolve():
+    args = arguments(parser)
+    if set(args.tasks) - set(TASKS) and ships(args.data):
         parser.error("The results here are of the tasks that ship: name another folder with --data.")
-    kept = {(x["task"], x["algorithm"], int(x["seed"])) for x in read(args.data / "shipped.csv")}
+    kept = {(x["task"], x["algorithm"], int(x["seed"])) for x in read_rows(args.data / "shipped.csv")}
     todo = [(task, method, seed) for seed in args.seeds for task in args.tasks for method in args.methods]
-    with ThreadPoolExecutor(args.cores) as pool:
-        waiting = [pool.submit(fly, *job, args.output, args.data, args.quick) for job in todo if job not in kept]
-        for future in waiting:
-            future.result()
-    shipped = args.data.resolve() == DATA.resolve()
+    own = args.output, args.data, args.quick
+    side_by_side(args.cores, [(fly, *job, *own) for job in todo if job not in kept])
+    shipped = ships(args.data)
     pages = (DATA.parents[2] / "README.md", DATA.parents[1] / "choosing.md") if shipped else (args.data / "summary.md",)
-    curves = read(args.data / "shipped_curves.csv")
+    curves = read_rows(args.data / "shipped_curves.csv")
     draw(curves, METHODS, list(TASKS if shipped else args.tasks), pages[-1].parent / "results/shipped.png")
     made = blocks(args.data)
     for page in pages:
@@ -161,5 +147,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, stop)
     main()

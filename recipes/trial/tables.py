@@ -13,9 +13,10 @@ from claims import METHODS, PUBLISHED, Verdict
 from evidence import NotRunError, Part, Results
 from matrix import EXPERIMENTS, LEARNING_RATES, TASKS, VARIANTS
 from omegaconf import DictConfig, OmegaConf
-from reproduce import best_learning_rate, composed
+from reproduce import best_learning_rate
+from running import composed
 
-from torchrl_quad.files import read_rows as read
+from torchrl_quad.files import read_rows
 
 COLUMNS = {  # of the tables of ends: heading, column of the curves, factor, digits
     "return": ("return", 1, 2),
@@ -75,7 +76,7 @@ def revisions_table(data: Path) -> str:
     """List the revisions of the code that the runs were flown at."""
     experiments = {variant: name for name, variants in EXPERIMENTS.items() for variant in variants}
     groups: dict[tuple[str, str, str], list[str]] = {}
-    for row in read(data / "final.csv"):
+    for row in read_rows(data / "final.csv"):
         revision = re.sub("[0-9a-f]{40}", lambda match: match[0][:7], row.get("revision") or "unknown")
         key = row.get("flown") or "", revision, row.get("dynamics") or ""
         groups.setdefault(key, []).append("search" if row["lr"] else experiments[row["variant"]])
@@ -88,7 +89,7 @@ def revisions_table(data: Path) -> str:
 
 def search_table(data: Path) -> str:
     """Show what the search for learning rates found, and its cost."""
-    finals = [row for row in read(data / "final.csv") if row["lr"]]
+    finals = [row for row in read_rows(data / "final.csv") if row["lr"]]
     rows = []
     for name, variant in VARIANTS.items():
         if not variant.searched:
@@ -222,7 +223,7 @@ def audit_table(data: Path) -> str:
         [x["task"], x["reward"], x["term"]]
         + [f"{float(x[name]):.1%}" for name in ("return_share", "gradient_share")]
         + [x["verdict"]]
-        for x in read(data / "audit.csv")
+        for x in read_rows(data / "audit.csv")
     ]
     return table(["task", "reward", "term", "share of the return", "share of the gradient", "verdict"], rows)
 
@@ -237,7 +238,7 @@ def ascent_table(data: Path) -> str:
         "explained variance of the critic": "explained_variance",
     }
     runs: dict[tuple[str, str], list[dict[str, str]]] = {}
-    for row in read(data / "ascent.csv"):
+    for row in read_rows(data / "ascent.csv"):
         runs.setdefault((row["task"], row["variant"]), []).append(row)
     order = sorted(runs, key=lambda run: (TASKS.index(run[0]), list(VARIANTS).index(run[1])))
     rows = [

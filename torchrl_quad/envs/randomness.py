@@ -88,11 +88,13 @@ class Randomness:
             self.forget_starts()
             return self.draw_start()
         used = torch.zeros_like(mask, dtype=torch.int64) if self._used is None else self._used
+        self._starts = self._starts or [flat(self.draw_start())]
         if not is_free:
-            self._starts = self._starts or [flat(self.draw_start())]
             self._used = used + mask
             row = (torch.arange(len(mask), device=self.device) + used) % len(mask)
             return nested({key: x[row] for key, x in self._starts[0].items()})
+        if not mask.any():
+            return nested(self._starts[0])
         while len(self._starts) <= used[mask].max():
             self._starts.append(flat(self.draw_start()))
         self._used = used + mask

@@ -51,6 +51,7 @@ class Layout:
     convention: frames.Convention = OURS  #: the frames, and the order in which quaternions and motors are named
     onboard: tuple[str, ...] = ()  #: fields by a clock of their own
     time: Columns = Columns(("time",))  #: of CSV files; others have clocks
+    required: frozenset[str] = frozenset()  #: quantities that a caller named: a file without their columns is refused
 
 
 def _c(names: str, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> Columns:
@@ -144,13 +145,15 @@ def choose(columns: str | Layout | Mapping[str, object], default: Layout | None)
         return LAYOUTS[columns]
     chosen = {quantity: (_as_columns(quantity, names),) for quantity, names in columns.items()}
     time = chosen.pop("time", (Columns(("time",)),))[0]
+    required = frozenset(chosen)
     if default is None:
-        return Layout(chosen, onboard=BY_IMU, time=time)
+        return Layout(chosen, onboard=BY_IMU, time=time, required=required)
     if "quaternion" in chosen or "euler" in chosen:
         default_columns = {q: c for q, c in default.columns.items() if q not in ("quaternion", "euler")}
     else:
         default_columns = dict(default.columns)
-    return replace(default, columns=default_columns | chosen, time=time if "time" in columns else default.time)
+    time = time if "time" in columns else default.time
+    return replace(default, columns=default_columns | chosen, time=time, required=required)
 
 
 def _as_columns(quantity: str, names: object) -> Columns:
@@ -178,6 +181,11 @@ def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Si
     found = {}
     for quantity, choices in layout.columns.items():
         choice = next((c for c in choices if all(column in owner for column in c.names)), None)
+        if choice is None and quantity in layout.required:
+            missing = sorted({column for c in choices for column in c.names} - owner.keys())
+            raise MissingColumns(
+                f"{name} has no column {', '.join(missing)}, named for {quantity}. {_columns_there(owner)}"
+            )
         if choice is None:
             continue
         stream = owner[choice.names[0]]

@@ -112,10 +112,11 @@ class IdentificationResult:
     def save(self, folder: str | Path, pictures: bool = True) -> Path:
         """Write ``drone.yaml``, ``randomization.yaml``, ``report.json`` and pictures; each is complete or not there.
 
-        Pictures need matplotlib: ``prediction.png`` shows predictions against the first flight, ``residuals.png`` the
-        errors of all.
+        Pictures come last, and need matplotlib: ``prediction.png`` shows predictions against the first flight,
+        ``residuals.png`` the errors of all.
 
         Raises:
+            ImportError: matplotlib is not installed.
             OSError: the folder cannot be made or written.
         """
         folder = Path(folder)
@@ -124,15 +125,16 @@ class IdentificationResult:
             path.write_text(self.as_yaml(), encoding="utf-8")
         with replacing(folder / "randomization.yaml") as path:
             path.write_text(yaml.safe_dump(self.randomization(), default_flow_style=None), encoding="utf-8")
+        with replacing(folder / "report.json") as path:
+            path.write_text(json.dumps(self.report(), indent=1), encoding="utf-8")
         if pictures and self.flights:
             from torchrl_quad.identification.pictures import draw_prediction, draw_residuals
 
+            span = {"horizon": self.settings["horizon"], "past": self.settings["past"]}
             with replacing(folder / "prediction.png") as path:
-                draw_prediction(self.flights[0], self.drone, path, prior=self.prior)
+                draw_prediction(self.flights[0], self.drone, path, prior=self.prior, **span)
             with replacing(folder / "residuals.png") as path:
-                draw_residuals(self.flights, self.drone, path)
-        with replacing(folder / "report.json") as path:
-            path.write_text(json.dumps(self.report(), indent=1), encoding="utf-8")
+                draw_residuals(self.flights, self.drone, path, **span)
         return folder
 
 

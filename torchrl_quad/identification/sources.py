@@ -88,10 +88,10 @@ def _read_csv(data: bytes, path: Path, columns: Asked) -> tuple[list[Stream], La
         partial = isinstance(columns, Mapping) and "position" not in columns
         layout = choose(columns, match(header, path.name) if partial else None)
     asked = {*layout.time.names, *(n for choices in layout.columns.values() for c in choices for n in c.names)}
-    missing = sorted(asked - set(header))
-    if (isinstance(columns, Mapping) and missing) or layout.time.names[0] not in header:
+    if layout.time.names[0] not in header:
         raise MissingColumns(
-            f"{path.name} has no column {', '.join(missing)}. There are: {', '.join(header[:60])}. Name those."
+            f"{path.name} has no column {layout.time.names[0]} of the time. There are: {', '.join(header[:60])}. "
+            'Name it: columns={"time": ...}.'
         )
     if asked & repeated:
         raise UnreadableLog(f"{path.name} has several columns of one name: {', '.join(sorted(repeated))}. Rename them.")

@@ -1,11 +1,12 @@
-"""A compiled environment follows every change that an eager one follows."""
+"""A compiled environment follows every change that an eager one follows, and its audits are the same."""
 
 import copy
 
+import pytest
 import torch
 from torch._dynamo.utils import counters
 
-from torchrl_quad import HoveringEnv
+from torchrl_quad import HoveringEnv, audit_reward, differentiable_rollout, make_actor
 
 BONUS = 1.0
 
@@ -45,3 +46,17 @@ def test_a_compiled_step_sees_changed_attributes_classes_and_globals(monkeypatch
     copied = copy.deepcopy(compiled)
     copied.extra = 30.0  # a copy shares nothing with what it was made of
     assert step(copied)[0] == [32.0, 32.0] and step(compiled)[0] == [22.0, 22.0]
+
+
+def test_the_gradients_in_actions_are_those_of_a_compiled_horizon():
+    env = HoveringEnv(num_envs=4, max_episode_steps=12, dtype=torch.float64)
+    actor, audits = make_actor(env), []
+    for _ in range(2):
+        env.set_seed(0)
+        torch.manual_seed(0)
+        rollout, _ = differentiable_rollout(env, actor, None, 20)
+        audits.append(audit_reward(rollout, rollout["action"]))
+        env.compile(backend="eager")
+    assert rollout["action"].grad_fn.name() != "StackBackward0"
+    for name, term in audits[0].items():
+        assert audits[1][name].gradient_norm == pytest.approx(term.gradient_norm, rel=1e-9)

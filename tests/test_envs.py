@@ -128,6 +128,9 @@ def test_a_partial_reset_leaves_the_others_alone(env):
     for key, value in after.items():
         assert torch.equal(value[[1, 3]], before[key][[1, 3]])
     assert (after["velocity"][[0, 2]] == 0).all()
+    td["_reset"], before = torch.zeros(4, 1, dtype=torch.bool), td["state"].clone()
+    nobody = env.reset(td, set_state=False)["state"]
+    assert all(torch.equal(value, before[key]) for key, value in nobody.items())
 
 
 def test_a_rollout_resets_only_those_that_are_done():

@@ -1,10 +1,7 @@
 """Time limits and bounds of the gymnasium environments, and the warning that one drone is slow."""
 
-import contextlib
-
 import gymnasium
 import numpy as np
-import pytest
 
 from torchrl_quad.gym import GymEnv, GymVectorEnv
 
@@ -45,14 +42,3 @@ def test_the_space_of_the_observation_has_the_bounds_of_the_task():
     observation, _ = env.reset(seed=0)
     assert observation in env.observation_space
     assert (abs(observation[0, :3]) == [5, 5, 6]).any()
-
-
-def test_one_drone_warns_once_that_a_batch_is_faster(monkeypatch):
-    monkeypatch.setattr("torchrl_quad.gym._MANY", 3)
-    monkeypatch.setattr(GymEnv, "_has_warned", False)
-    for slow in (True, False):
-        env = GymEnv("hovering")
-        env.reset()
-        env.step(np.zeros(4)), env.step(np.zeros(4))
-        with pytest.warns(UserWarning, match="write gymnasium.make_vec") if slow else contextlib.nullcontext():
-            env.step(np.zeros(4))

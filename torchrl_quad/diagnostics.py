@@ -252,6 +252,8 @@ def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
     """The tensors to differentiate with respect to; of a loss or an actor, the actor's parameters."""
     if isinstance(inputs, nn.Module):
         inputs = [p for p in getattr(inputs, "actor_network_params", inputs).parameters() if p.requires_grad]
+    if isinstance(inputs, Tensor) and hasattr(inputs.grad_fn, "actions"):  # a compiled horizon, a node of its own
+        return [inputs.grad_fn.actions]
     if isinstance(inputs, Tensor) and inputs.grad_fn is not None and inputs.grad_fn.name() == "StackBackward0":
         # TorchRL stacks the entries of a rollout afterwards: the reward depends on the tensors before that.
         return [GradientEdge(node, index) for node, index in inputs.grad_fn.next_functions if node is not None]

@@ -9,7 +9,6 @@ flies all drones in one batch, and needs no processes.
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import gymnasium
@@ -25,7 +24,6 @@ from torchrl_quad.envs import make_env
 # An episode ends before an entry of the state exceeds this, where a task does not know better.
 _LIMIT = 1e6
 _NO_LIMIT = 2**31  # control steps: gymnasium.make has a time limit of its own
-_MANY = 1000  # steps of one drone after which a batch would have been worth its while
 _INFO = "success", "crash", "reward_terms", "metrics"
 
 
@@ -194,8 +192,7 @@ class GymVectorEnv(VectorEnv):
 class GymEnv(gymnasium.Env):
     """One drone of a task: ``gymnasium.make("torchrl_quad/Hovering-v0")``; see :class:`GymVectorEnv`.
 
-    One drone makes some 460 steps per second; a batch of 1024, ``gymnasium.make_vec``, makes 330 000. A warning says so
-    after a thousand steps.
+    To train, fly a batch, ``gymnasium.make_vec``: it makes hundreds of times as many steps per second.
 
     The time limit is gymnasium's: ``gymnasium.make`` adds that of the task, or its own ``max_episode_steps``. Built
     without it, ``GymEnv("hovering")`` flies until ``max_episode_steps``, if given.
@@ -210,7 +207,6 @@ class GymEnv(gymnasium.Env):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
-    _has_warned = False  # once for all that a process builds
 
     def __init__(self, task: str, **kwargs: Any) -> None:
         for name in ("num_envs", "autoreset_mode"):
@@ -218,7 +214,6 @@ class GymEnv(gymnasium.Env):
                 raise ValueError(f"{name} is for many drones, and GymEnv flies one. Write gymnasium.make_vec instead.")
         kwargs.setdefault("max_episode_steps", _NO_LIMIT)
         self._drones = GymVectorEnv(task, autoreset_mode=AutoresetMode.DISABLED, **kwargs)
-        self._task, self._steps = task, 0
         self.torchrl_env, self.render_mode = self._drones.torchrl_env, self._drones.render_mode
         self.metadata = {name: self._drones.metadata[name] for name in self.metadata}
         self.observation_space = self._drones.single_observation_space
@@ -233,14 +228,6 @@ class GymEnv(gymnasium.Env):
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Fly one control step with an action (4)."""
         observation, *ends, info = self._drones.step(_checked(action, self.action_space.shape)[None])
-        self._steps += 1
-        if self._steps == _MANY and not GymEnv._has_warned:
-            GymEnv._has_warned = True
-            warnings.warn(
-                f"One drone has flown {_MANY} steps, at some 460 per second. A batch flies 330 000: to train, write "
-                f'gymnasium.make_vec("torchrl_quad/{self._task.title().replace("_", "")}-v0", num_envs=1024).',
-                stacklevel=2,
-            )
         return _row(observation, 0), *(x.item() for x in ends), _first(info)
 
     def render(self) -> np.ndarray | None:

@@ -99,7 +99,7 @@ def read(folder: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     if version != VERSION:
         raise UnknownContract(
             f"{path} has version {version!r}, and this torchrl_quad reads version {VERSION}. It was written by "
-            f"torchrl_quad {contract.get('origin', {}).get('package', 'unknown')}: use that one, or export again."
+            f"{contract.get('origin', {}).get('package', 'an unknown version')}: use that one, or export again."
         )
     try:
         fits = digest(contract) == contract["digest"] and set(listed) == set(FILES)

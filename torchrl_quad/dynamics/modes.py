@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import inspect
 import math
-import numbers
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ from torch import Tensor
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Setpoint, join
 from torchrl_quad.dynamics.parameters import QuadrotorParams
+from torchrl_quad.dynamics.presets import is_number
 from torchrl_quad.dynamics.vector import Vector, cat, clamp, dot, minimum, soft_limit
 
 
@@ -210,6 +210,5 @@ def _entries(vector: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def _require_between(name: str, value: Any, low: float, high: float, what: str) -> None:
-    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not (is_number and low < value < high):
+    if not (is_number(value) and low < value < high):
         raise ValueError(f"control: {name} must be {what} between {low:g} and {high:.4g}, got {value!r}.")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any
+
+from torchrl_quad.dynamics.presets import is_number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,8 +34,7 @@ class MotorCommand:
         }
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
-            is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not (is_number and low <= value <= high):
+            if not (is_number(value) and low <= value <= high):
                 raise ValueError(f"motor_command: {name} must be between {low:g} and {high:g}, got {value!r}.")
 
     @classmethod

@@ -1,6 +1,8 @@
 """YAML presets: by the name of one that ships with the package, by path, or as a mapping."""
 
-from collections.abc import Mapping
+import math
+import numbers
+from collections.abc import Mapping, Sequence
 from importlib.abc import Traversable
 from pathlib import Path
 from typing import Any
@@ -81,3 +83,13 @@ def parse(content: bytes, source: str) -> Any:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError) as error:  # such as the 99th of May
         raise ValueError(f"{source}: not a YAML file: {error}") from error
+
+
+def is_number(value: Any) -> bool:
+    """Whether a setting is one finite number, of Python or of numpy."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def is_numbers(value: Any, count: int) -> bool:
+    """Whether a setting is a list of so many finite numbers."""
+    return isinstance(value, Sequence) and len(value) == count and all(is_number(x) for x in value)

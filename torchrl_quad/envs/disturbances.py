@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import QuadrotorParams, presets, quaternion
 from torchrl_quad.dynamics.parameters import CONTROLLER_FIELDS, PLANT_FIELDS
+from torchrl_quad.dynamics.presets import is_number, is_numbers
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.checks import MAX_DELAY, require_count
 from torchrl_quad.envs.guard import MAX_ANGULAR_VELOCITY, MAX_SPEED
@@ -93,7 +94,7 @@ class DroneRandomization(Disturbance):
                 choices = "; ".join(f"{key}: {numbers}" for key, numbers in _DISTRIBUTIONS.items())
                 raise ValueError(f"{source}: {name} needs one distribution of: {choices}; got {distribution!r}.")
             numbers = next(iter(distribution.values()))
-            if not (_is_numbers(numbers, 2) and numbers[1] >= (0.0 if "normal" in distribution else numbers[0])):
+            if not (is_numbers(numbers, 2) and numbers[1] >= (0.0 if "normal" in distribution else numbers[0])):
                 kind = next(iter(distribution))
                 raise ValueError(f"{source}: {name} needs two numbers, {_DISTRIBUTIONS[kind]}; got {numbers!r}.")
         self.nominal = {name: fields[name] for name in self.spec}
@@ -144,13 +145,13 @@ class Wind(Disturbance):
 
     def __post_init__(self) -> None:
         for name in ("mean", "spread"):
-            if not _is_numbers(getattr(self, name), 3):
+            if not is_numbers(getattr(self, name), 3):
                 raise ValueError(f"wind: {name} must be three numbers [m/s], got {getattr(self, name)!r}.")
         if min(self.spread) < 0:
             raise ValueError(f"wind: spread must not be negative, got {self.spread!r}.")
-        if not (_is_number(self.gust) and self.gust >= 0):
+        if not (is_number(self.gust) and self.gust >= 0):
             raise ValueError(f"wind: gust must be zero or positive [m/s], got {self.gust!r}.")
-        if not (_is_number(self.gust_time) and self.gust_time > 0):
+        if not (is_number(self.gust_time) and self.gust_time > 0):
             raise ValueError(f"wind: gust_time must be positive [s], got {self.gust_time!r}.")
         strongest = max(abs(m) + s for m, s in zip(self.mean, self.spread, strict=True)) + 5.0 * self.gust
         if strongest > MAX_WIND:
@@ -198,7 +199,7 @@ class Sensors(Disturbance):
 
     def __post_init__(self) -> None:
         for name in ("position", "attitude", "velocity", "angular_velocity"):
-            if not (_is_number(getattr(self, name)) and getattr(self, name) >= 0):
+            if not (is_number(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ValueError(f"observation_noise: {name} must be zero or positive, got {getattr(self, name)!r}.")
         require_count("observation_delay", self.delay, 0, MAX_DELAY, "zero or more control steps")
 
@@ -259,7 +260,7 @@ class RandomStart(Disturbance):
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if not (_is_number(value) and value >= 0):
+            if not (is_number(value) and value >= 0):
                 raise ValueError(f"random_start: {field.name} must be zero or positive, got {value!r}.")
         for name, most in (("velocity", MAX_SPEED), ("angular_velocity", MAX_ANGULAR_VELOCITY)):
             if getattr(self, name) > most:
@@ -294,11 +295,3 @@ def build(cls: type, name: str, spec: Any, **more: Any) -> Any:
     if unknown:
         raise ValueError(f"{name}: unknown key {unknown[0]!r}. Allowed: {', '.join(allowed)}.")
     return cls(**spec, **more)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_numbers(value: Any, count: int) -> bool:
-    return isinstance(value, Sequence) and len(value) == count and all(_is_number(x) for x in value)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from torchrl_quad.dynamics import quaternion
+from torchrl_quad.dynamics.presets import is_number
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.episodes import first_episode
@@ -120,9 +121,9 @@ class ForestEnv(QuadrotorEnv):
             raise ValueError(f"Unknown difficulty {difficulty!r}. Choose from: {', '.join(DIFFICULTIES)}.")
         preset = DIFFICULTIES[difficulty]
         density, gap = (own if own is not None else usual for own, usual in zip((density, gap), preset, strict=True))
-        speeds = [speed, speed] if isinstance(speed, int | float) else speed
+        speeds = [speed, speed] if is_number(speed) else speed
         is_range = isinstance(speeds, Sequence) and len(speeds) == 2
-        is_range = is_range and all(isinstance(x, int | float) and 0.1 <= x <= 30.0 for x in speeds)
+        is_range = is_range and all(is_number(x) and 0.1 <= x <= 30.0 for x in speeds)
         if not (is_range and speeds[0] <= speeds[1]):
             raise ValueError(f"speed must be one speed, or the least and the greatest, 0.1 to 30 m/s; got {speed!r}.")
         self.speeds, self.observe_velocity = tuple(speeds), observe_velocity
@@ -263,8 +264,7 @@ class Forest(Scene):
     ) -> None:
         numbers = {"density": density, "gap": gap, "length": length, "half_width": half_width, "height": height}
         for name, value in numbers.items():
-            is_number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not (is_number and 0 <= value < math.inf and (value > 0 or name == "density")):
+            if not (is_number(value) and value >= 0 and (value > 0 or name == "density")):
                 least = "zero or more trees per square metre" if name == "density" else "positive [m]"
                 raise ValueError(f"forest: {name} must be {least}, got {value!r}.")
         self.trees = round(density * 2.0 * half_width * length)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import QuadrotorParams, presets, quaternion
+from torchrl_quad.dynamics.presets import is_number
 from torchrl_quad.engine import looks_are_free
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.disturbances import Disturbance
@@ -87,10 +88,10 @@ class Scene(Disturbance):
         self.source, self.ground, self.clearance, self.drone_radius = source, ground, clearance, drone_radius
         self._require(isinstance(ground, bool), f"ground must be true or false, got {ground!r}.")
         self._require(
-            _is_number(clearance) and clearance >= 0, f"clearance must be zero or positive [m], got {clearance!r}."
+            is_number(clearance) and clearance >= 0, f"clearance must be zero or positive [m], got {clearance!r}."
         )
         self._require(
-            drone_radius is None or (_is_number(drone_radius) and drone_radius > 0),
+            drone_radius is None or (is_number(drone_radius) and drone_radius > 0),
             f"drone_radius must be positive [m], or left out; got {drone_radius!r}.",
         )
         self.fixed: dict[str, list[list[float]]] = {kind: [] for kind in SIZES}
@@ -227,8 +228,8 @@ class Scene(Disturbance):
         """The least and the greatest value of a field, each a list of so many numbers."""
 
         def numbers(x: Any) -> list[float] | None:
-            x = [x] if size == 1 and _is_number(x) else x
-            is_right = isinstance(x, Sequence) and len(x) == size and all(_is_number(y) and abs(y) < 1e4 for y in x)
+            x = [x] if size == 1 and is_number(x) else x
+            is_right = isinstance(x, Sequence) and len(x) == size and all(is_number(y) and abs(y) < 1e4 for y in x)
             return [float(y) for y in x] if is_right else None
 
         one = numbers(value)
@@ -307,7 +308,3 @@ def _draw(random: Randomness, kind: str, group: dict[str, Any], n: int) -> Tenso
 
 def _none(like: Tensor) -> dict[str, Tensor]:
     return {kind: like.new_zeros((len(like), 0, size)) for kind, size in SIZES.items()}
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

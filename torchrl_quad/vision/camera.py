@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
+from torchrl_quad.dynamics.presets import is_number, is_numbers
 from torchrl_quad.vision.primitives import Primitives
 from torchrl_quad.vision.rays import cast_rays
 
@@ -63,9 +64,9 @@ class DepthCamera:
                 f"{name} must be a whole number of {what}, from {least} to {most:,}; got {value!r}.",
             )
         angle = self.field_of_view
-        hint = f" In degrees? {angle:g} degrees are {math.radians(angle):.4g}." if _is_number(angle) else ""
+        hint = f" In degrees? {angle:g} degrees are {math.radians(angle):.4g}." if is_number(angle) else ""
         _require(
-            _is_number(angle) and 0 < angle < MAX_FIELD_OF_VIEW,
+            is_number(angle) and 0 < angle < MAX_FIELD_OF_VIEW,
             f"field_of_view must be an angle above 0 and below 170 degrees, {MAX_FIELD_OF_VIEW:.3f} [rad], since a "
             f"plane shows no more; got {angle!r}.{hint}",
         )
@@ -75,27 +76,27 @@ class DepthCamera:
             f"{self.height} rows of {self.width} square pixels see {math.degrees(tall):.0f} degrees from top to "
             "bottom; 170 are too many. Give fewer rows, or a smaller field_of_view.",
         )
-        _require(_is_numbers(self.position, 3), f"position must be three numbers [m], got {self.position!r}.")
+        _require(is_numbers(self.position, 3), f"position must be three numbers [m], got {self.position!r}.")
         _require(
-            _is_number(self.pitch) and abs(self.pitch) <= math.pi,
+            is_number(self.pitch) and abs(self.pitch) <= math.pi,
             f"pitch must be an angle from -pi to pi [rad], got {self.pitch!r}.",
         )
         q = self.quaternion
-        is_unit = q is None or (_is_numbers(q, 4) and abs(math.sqrt(sum(x * x for x in q)) - 1.0) < 1e-3)
+        is_unit = q is None or (is_numbers(q, 4) and abs(math.sqrt(sum(x * x for x in q)) - 1.0) < 1e-3)
         _require(is_unit, f"quaternion must be four numbers (w, x, y, z) of unit norm, got {q!r}.")
         _require(
             q is None or self.pitch == 0.0, "pitch and quaternion both say where the camera looks. Give one of them."
         )
         _require(
-            _is_number(self.range) and 0 < self.range <= MAX_RANGE,
+            is_number(self.range) and 0 < self.range <= MAX_RANGE,
             f"range must be above 0 and at most {MAX_RANGE:g} m, got {self.range!r}.",
         )
         _require(
-            _is_number(self.noise) and 0 <= self.noise <= 1,
+            is_number(self.noise) and 0 <= self.noise <= 1,
             f"noise must be a share of the depth, from 0 to 1, got {self.noise!r}.",
         )
         _require(
-            _is_number(self.dropout) and 0 <= self.dropout < 1,
+            is_number(self.dropout) and 0 <= self.dropout < 1,
             f"dropout must be a probability, from 0 to below 1, got {self.dropout!r}.",
         )
 
@@ -186,16 +187,3 @@ class DepthCamera:
 def _require(condition: bool, message: str) -> None:
     if not condition:
         raise ValueError(f"camera: {message}")
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_numbers(value: Any, count: int) -> bool:
-    return (
-        isinstance(value, Sequence)
-        and not isinstance(value, str)
-        and len(value) == count
-        and all(_is_number(x) for x in value)
-    )

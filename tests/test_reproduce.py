@@ -305,7 +305,7 @@ def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom():
     made = [comparison.choice_table, comparison.reached_table, comparison.improvement_table]
     choice, table, beaten = (make(rows, shipped.METHODS, shipped.TASKS) for make in made)
     assert (
-        "| hovering | SHAC: 9.1, 99.0%, 5 s, 3 seeds | ABPT: 99, 50.0%, 1 s, 2 seeds | BPTT, SHAC, ABPT, PPO |"
+        "| hovering | SHAC: 9.1, 99.0%, 5 s, 3 seeds | PPO: 9.6, 100.0%, 40 s, 3 seeds | BPTT, SHAC, ABPT, PPO |"
         in choice
     )
     assert "| hovering | ABPT | 2 | 99 | 75.0% (50.0%) |  | 1.0 | 1 |" in table

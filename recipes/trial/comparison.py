@@ -74,7 +74,10 @@ def reached_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mappin
 
 
 def choice_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping[str, Shown]) -> str:
-    """Show for each task the quickest method that works with every seed, and the one of the highest return."""
+    """Show for each task the quickest method that works with every seed, and the one of the highest return.
+
+    They are chosen among the methods that have flown with the most seeds.
+    """
     groups, lines = grouped(rows), []
     for task in shown:
         flown = {method: groups[task, method] for method in methods if (task, method) in groups}
@@ -82,12 +85,13 @@ def choice_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping
             continue
         worst = {method: min(column(own, "solved")) for method, own in flown.items()}
         returns = {method: interquartile_mean(column(own, "return")) for method, own in flown.items()}
-        seconds = {method: np.median(column(own, "seconds")) for method, own in flown.items()}
-        reliable = [method for method in flown if worst[method] >= RELIABLE]
-        quick = min(reliable, key=seconds.get, default=None)
-        most = max(returns, key=returns.get)
+        seconds_of = {method: np.median(column(own, "seconds")) for method, own in flown.items()}
+        seeds = max(map(len, flown.values()))
+        tried = [method for method, own in flown.items() if len(own) == seeds]
+        quick = min((x for x in tried if worst[x] >= RELIABLE), key=seconds_of.get, default=None)
+        most = max(tried, key=returns.get)
         few = {x: f", {len(own)} seed{'s' * (len(own) > 1)}" if len(own) < WANTED else "" for x, own in flown.items()}
-        said = {x: f"{methods[x]}: {returns[x]:.4g}, {worst[x]:.1%}, {seconds[x]:.0f} s{few[x]}" for x in flown}
+        said = {x: f"{methods[x]}: {returns[x]:.4g}, {worst[x]:.1%}, {seconds_of[x]:.0f} s{few[x]}" for x in flown}
         cells = [said.get(x, "none") for x in (quick, most)]
         lines.append([LABELS.get(task, task), *cells, ", ".join(methods[x] for x in flown)])
     return table(["task", "quickest that works with every seed", "highest return", "compared"], lines)

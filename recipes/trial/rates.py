@@ -3,7 +3,7 @@
 python recipes/trial/rates.py --cores 2
 python recipes/trial/rates.py --tasks landing --methods shac ppo
 
-Every method gets the same: three rates, each with three seeds that are reported nowhere else. A rate is judged by the
+Every method gets the same: three rates, each with three seeds that shipped.py does not report. A rate is judged by the
 worst of its seeds. The hybrid has no rate of its own choice: its bound on the KL divergence takes the place.
 
 It may be stopped at any moment. Started again, it skips what is in docs/results/data/rates.csv, and resumes what was

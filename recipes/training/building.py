@@ -138,7 +138,7 @@ class AdaptiveRate:
         for group in self.optimizer.param_groups:
             if moved > self.limit(iteration):
                 group["lr"] = max(group["lr"] / 1.5, low)
-            elif moved < self.limit(iteration) / 1.5:
+            elif moved < self.limit(iteration) / 2.25:
                 group["lr"] = min(group["lr"] * 1.5, high)
 
 

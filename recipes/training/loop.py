@@ -238,7 +238,8 @@ class Run:
         self.logs.add(row)
         every = self.cfg.logger.flight_every
         if every and len(self.rows) % every == 0 and self.steps < self.total_steps:  # at the end the best one is drawn
-            now = {**self.cfg, "episodes": len(flight), "solved": metrics["eval/solved"]}
+            episodes = -(-(self.cfg.eval.episodes or 1) // len(flight)) * len(flight)  # in whole rounds
+            now = {**self.cfg, "episodes": episodes, "solved": metrics["eval/solved"]}
             drawing.draw_flight(flight, self.folder / "flight", self.env, title(now))
             self.logs.show_flight(self.steps)
         score = {name: metrics[f"eval/{name}"] for name in ("solved", "return")}

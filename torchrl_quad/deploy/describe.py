@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_quad.deploy.simulators.vehicle import rate_loop
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
 from torchrl_quad.envs import ForestEnv, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv
 from torchrl_quad.envs.disturbances import DroneRandomization, Sensors, Wind
@@ -300,20 +301,12 @@ def _is_plain(x: Any) -> bool:
 
 
 def _rate_loop(env: QuadrotorEnv, drone: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The rate loop about hover, a second-order system per axis; None where rates follow the command at once.
-
-    torque = J K (desired - rate) - D (angular acceleration) + gyroscopic torque, and rotors that lag by tau, give
-    tau w'' + (1 + D / J) w' + K w = K desired.
-    """
+    """The rate loop about hover, a second-order system per axis; None where rates follow the command at once."""
     if "rotor_speed" not in env.dynamics.sizes:
         return None
     gain, inertia, loss = (np.array(drone[k]) for k in ("rate_gain", "inertia", "rate_damping"))
     tau = np.mean(drone["motor_time_constant"])  # where it differs up and down, their mean
-    frequency = np.sqrt(gain / tau)
-    ratio = (1.0 + loss / inertia) / (2.0 * np.sqrt(gain * tau))
-    part = 1.0 - 2.0 * ratio**2
-    bandwidth = frequency * np.sqrt(part + np.sqrt(part**2 + 1.0))
-    values = {"natural_frequency": frequency, "damping_ratio": ratio, "bandwidth": bandwidth}
+    values = rate_loop(gain, inertia, loss, tau)._asdict()
     law = "tau w'' + 2 damping_ratio sqrt(gain tau) w' + gain w = gain desired, tau = motor_time_constant"
     return {"law": law, "gain": drone["rate_gain"], **{k: numbers(np.float32(v)) for k, v in values.items()}}
 

@@ -137,10 +137,10 @@ class Convention:
         if name == "motors":
             return x[..., np.argsort(self.motors) if back else list(self.motors)]
         if not back:
-            q = _multiply(_multiply(np.array(self.world), x), _conjugate(self.body))
+            q = multiply(multiply(np.array(self.world), x), _conjugate(self.body))
             return np.roll(q, -1, -1) if self.xyzw else q
         q = np.roll(x, 1, -1) if self.xyzw else x
-        return _multiply(_multiply(_conjugate(self.world), q), np.array(self.body))
+        return multiply(multiply(_conjugate(self.world), q), np.array(self.body))
 
 
 _SIZES = {"position": 3, "velocity": 3, "quaternion": 4, "angular_velocity": 3, "body_rate": 3, "motors": 4}
@@ -251,7 +251,7 @@ def _choose(turns: Mapping[str, Quaternion], world: str) -> Quaternion:
     return turns[world]
 
 
-def _multiply(p: Array, q: Array) -> Array:
+def multiply(p: Array, q: Array) -> Array:
     """Hamilton product (..., 4)."""
     pw, pv, qw, qv = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
     scalar = pw * qw - (pv * qv).sum(-1, keepdims=True)

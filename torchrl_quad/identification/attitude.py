@@ -4,16 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchrl_quad.deploy.frames import multiply
 from torchrl_quad.identification.streams import Array
 
 FLIP = np.array([1.0, -1.0, -1.0, -1.0])
-
-
-def multiply(p: Array, q: Array) -> Array:
-    """Hamilton product."""
-    pw, pv, qw, qv = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
-    scalar = pw * qw - (pv * qv).sum(-1, keepdims=True)
-    return np.concatenate((scalar, pw * qv + qw * pv + np.cross(pv, qv)), -1)
 
 
 def rotate(q: Array, v: Array) -> Array:

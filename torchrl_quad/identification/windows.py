@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,9 +51,6 @@ class Push(NamedTuple):
 
     force: Tensor  #: [m/s2], specific force
     torque: Tensor  #: [rad/s2], angular acceleration
-
-
-Beside = Callable[[RigidBodyState, Tensor], Push]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,14 +126,8 @@ class Windows:
         gyro = rate.unflatten(1, (count, span)).sum(2) * self.dt
         return rotation_vector(attitude[:, 1:], attitude[:, :-1]) - gyro
 
-    def fly(
-        self, plant: Plant, start: Trajectory, speed: Tensor, push: Push, beside: Beside | None = None
-    ) -> Trajectory:
-        """Open-loop predictions, from states at the starts, at every step of the body: (W, future / stride + 1, k).
-
-        ``beside(state, wrench)`` adds a specific force [m/s2] and an angular acceleration [rad/s2] of its own, in the
-        body frame, as a network would that learns what the physics leaves out.
-        """
+    def fly(self, plant: Plant, start: Trajectory, speed: Tensor, push: Push) -> Trajectory:
+        """Open-loop predictions, from states at the starts, at every step of the body: (W, future / stride + 1, k)."""
         rotors, steps = Rotors(plant.params), self.future // self.stride
         wrench = rotors.wrench(0.5 * (speed[:, self.past + 1 :] + speed[:, self.past : -1]))
         wrench = wrench[:, : steps * self.stride].unflatten(1, (steps, self.stride)).mean(2).unbind(1)
@@ -146,11 +137,7 @@ class Windows:
 
             def moving(s: RigidBodyState, wrench: Tensor = wrench[k]) -> tuple[Tensor, Tensor]:
                 linear, angular = accelerations(s, wrench, plant.params)
-                force, torque = push
-                if beside is not None:
-                    more = beside(s, wrench)
-                    force, torque = force + more.force, torque + more.torque
-                return linear + quaternion.rotate(s.quaternion, force), angular + torque
+                return linear + quaternion.rotate(s.quaternion, push.force), angular + push.torque
 
             state = rk4(state, moving, self.dt * self.stride)
             states.append(state)

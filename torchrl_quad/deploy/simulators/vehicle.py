@@ -6,7 +6,7 @@ Arrays are (n, ...), one row for each drone. Nothing here imports torch.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,7 +163,7 @@ class PIDLoop(ContractLoop):
 
     def __init__(self, drone: Drone, dt: float) -> None:
         super().__init__(drone, dt)
-        self.integral_gain = self.gain * self.integral_share * bandwidth(drone)
+        self.integral_gain = self.gain * self.integral_share * loop_of(drone).bandwidth
         self.smoothing = 1.0 - np.exp(-2.0 * np.pi * self.cutoff * dt)
         self.integral, self.derivative, self.before = np.zeros(3), np.zeros(3), None
 
@@ -195,15 +195,29 @@ class PDLoop(PIDLoop):
     integral_share = 0.0
 
 
-def damping_ratio(drone: Drone) -> Array:
-    """Of the contract's rate loop, a second-order system about each axis (3); see its ``rate_loop``."""
-    return (1.0 + drone.rate_damping / drone.inertia) / (2.0 * np.sqrt(drone.rate_gain * drone.motor_time_constant))
+class SecondOrder(NamedTuple):
+    """The rate loop about hover, a second-order system about each axis (3).
+
+    torque = J K (desired - rate) - D (angular acceleration) + gyroscopic torque, and rotors that lag by tau, give
+    tau w'' + (1 + D / J) w' + K w = K desired.
+    """
+
+    natural_frequency: Array  #: [rad/s]
+    damping_ratio: Array
+    bandwidth: Array  #: [rad/s], at which the answer to a sine has fallen by 3 dB
 
 
-def bandwidth(drone: Drone) -> Array:
-    """At which the answer of the contract's rate loop to a sine has fallen by 3 dB (3) [rad/s]."""
-    part = 1.0 - 2.0 * damping_ratio(drone) ** 2
-    return np.sqrt(drone.rate_gain / drone.motor_time_constant) * np.sqrt(part + np.sqrt(part**2 + 1.0))
+def rate_loop(gain: Array, inertia: Array, damping: Array, motor_time_constant: float) -> SecondOrder:
+    """The rate loop of a drone: K [1/s], J and D [kg m2] about each axis (3), and tau [s]."""
+    frequency = np.sqrt(gain / motor_time_constant)
+    ratio = (1.0 + damping / inertia) / (2.0 * np.sqrt(gain * motor_time_constant))
+    part = 1.0 - 2.0 * ratio**2
+    return SecondOrder(frequency, ratio, frequency * np.sqrt(part + np.sqrt(part**2 + 1.0)))
+
+
+def loop_of(drone: Drone) -> SecondOrder:
+    """The rate loop of the contract."""
+    return rate_loop(drone.rate_gain, drone.inertia, drone.rate_damping, drone.motor_time_constant)
 
 
 LOOPS: dict[str, type[ContractLoop]] = {"contract": ContractLoop, "pid": PIDLoop, "pd": PDLoop}

@@ -42,7 +42,7 @@ def test_the_gradients_of_every_method_are_compared_with_the_simulator(
     launch("ppo", *running.QUICK, "batch_size=8", f"hydra.run.dir={tmp_path}/ppo")
     with pytest.raises(SystemExit):
         run_main(monkeypatch, ascent, tmp_path / "ppo/checkpoint.pt", *sizes)
-    assert "was trained with PPO, which follows no gradient of the simulator" in capsys.readouterr().err
+    assert "was trained with ppo; choose runs of bptt, abpt, shac." in capsys.readouterr().err
 
 
 def test_backpropagation_through_all_steps_knows_the_true_slopes():

@@ -23,7 +23,6 @@ from omegaconf import DictConfig, OmegaConf
 from running import RECIPES
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.autograd.graph import GradientEdge
 from torch.nn.functional import cosine_similarity
 from torchrl.envs import EnvBase
 from tqdm import tqdm
@@ -31,6 +30,7 @@ from tqdm import tqdm
 from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss, differentiable_rollout, make_qvalue, make_value
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.objectives import PathwiseLoss
+from torchrl_quad.objectives.action_gradients import action_gradient
 from torchrl_quad.objectives.segments import discounts
 
 sys.path.insert(0, str(RECIPES))  # which holds training/
@@ -56,7 +56,7 @@ def load_loss(saved: dict, cfg: DictConfig, env: EnvBase) -> PathwiseLoss:
         loss = BPTTLoss(actor, **cfg.loss).make_value_estimator(gamma=cfg.gamma)
     else:
         kind, make_critic = CRITICS[cfg.algorithm]
-        loss = kind(actor, make_critic(env, **network(cfg, "critic")), **cfg.loss)
+        loss = kind(actor, make_critic(env, **network(cfg, "critic", env)), **cfg.loss)
         loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     loss.load_state_dict(saved["stateful"][0])
     return loss
@@ -64,13 +64,9 @@ def load_loss(saved: dict, cfg: DictConfig, env: EnvBase) -> PathwiseLoss:
 
 def estimates(loss: PathwiseLoss, rollout: TensorDictBase) -> dict[str, Tensor]:
     """Compute the gradients of the objective and of its parts in the first action: each (envs, 4)."""
-    node, index = rollout["action"].grad_fn.next_functions[0]  # of the stack of all actions
     parts = loss.objective_parts(rollout)
     parts |= {"objective": sum(parts.values())}
-    return {
-        name: torch.autograd.grad(part.sum(), GradientEdge(node, index), retain_graph=True)[0].squeeze(1)
-        for name, part in parts.items()
-    }
+    return {name: action_gradient(part.sum(), rollout["action"])[:, 0] for name, part in parts.items()}
 
 
 @torch.no_grad()
@@ -156,8 +152,8 @@ def main() -> None:
     for path in tqdm(args.checkpoints):
         saved = read_checkpoint(path)
         cfg = OmegaConf.create(saved["config"])
-        if cfg.algorithm == "ppo":
-            parser.error(f"{path} was trained with PPO, which follows no gradient of the simulator.")
+        if cfg.algorithm not in ("bptt", *CRITICS):
+            parser.error(f"{path} was trained with {cfg.algorithm}; choose runs of bptt, {', '.join(CRITICS)}.")
         if cfg.normalize:
             parser.error(f"{path} was trained under a normaliser; choose runs with normalize=false.")
         own = name(path, cfg)

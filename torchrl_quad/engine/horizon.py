@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_quad.engine.packing import Key, Rows, flat, flat_key, like, looks_are_free, nested
+from torchrl_quad.engine.packing import Key, Rows, flat, like, looks_are_free, nested
 from torchrl_quad.engine.policy import GivenActions, PlainPolicy, plain
 from torchrl_quad.engine.program import Record, policy_inputs
 from torchrl_quad.engine.simulation import State
@@ -34,9 +34,9 @@ def can_fly(stepper: Stepper, policy: Any, tensordict: TensorDictBase) -> bool:
     """
     if not isinstance(policy, TensorDictModuleBase) or "_" in policy.out_keys:
         return False
-    state = {flat_key("state", *_path(key)) for key in stepper.layout.place}
+    state = {unravel_key(("state", key)) for key in stepper.layout.place}
     needed = {"observation", *stepper.output_layout.place} - {"reward"}
-    writes, reads = ({flat_key(*_path(key)) for key in keys} for keys in (policy.out_keys, policy.in_keys))
+    writes, reads = ({unravel_key(key) for key in keys} for keys in (policy.out_keys, policy.in_keys))
     memory = _memory(policy)
     writes |= {*memory, "is_init"} if memory else set()
     given = set(tensordict.keys(True, True))
@@ -77,7 +77,7 @@ def fly(
     else:
         start = _record(stepper, state, tensordict)
         roots, ends, written = _fly_inside(stepper, source, plain, start, valid, steps, before)
-    rollout = {**roots, **ends, **{flat_key(*_path(key)): x for key, x in written.items()}}
+    rollout = {**roots, **ends, **{unravel_key(key): x for key, x in written.items()}}
     rollout.pop("reward", None)  # there is none before the first step
     return TensorDict(nested(rollout), (len(tensordict), steps), tensordict.device, names=[None, "time"])
 
@@ -88,7 +88,7 @@ def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | GivenActions | None:
     if policy is None:
         return None
     state = stepper.layout.unpack(stepper.example.state)
-    if not {flat_key(*_path(key)) for key in policy.in_keys} <= {"observation", *_of_state(state)}:
+    if not {unravel_key(key) for key in policy.in_keys} <= {"observation", *_of_state(state)}:
         return None
     return policy if policy.fits(policy_inputs(policy, state, stepper.example.observation)) else None
 
@@ -142,7 +142,7 @@ def _call(
     ends: list[Record] = []
     written = []
     kind, done_row, _ = stepper.output_layout.place["done"]
-    reads = any(flat_key(*_path(key)) in stepper.output_layout.place for key in policy.in_keys)
+    reads = any(unravel_key(key) in stepper.output_layout.place for key in policy.in_keys)
     for t in range(steps):
         root = roots[-1]
         outputs = {"observation": root.observation, **(stepper.unpack_outputs(root.outputs) if reads else {})}
@@ -186,11 +186,11 @@ def _fly_eager(
             if _may_restart(done):
                 fresh = flat(source.starts(done[:, 0]))
                 root = {key: torch.where(like(done, x), fresh[key].detach(), x) for key, x in root.items()}
-                state = {key: root[flat_key("state", *_path(key))] for key in state}
+                state = {key: root[unravel_key(("state", key))] for key in state}
             roots.append(root)
     return (
         _over_time(roots),
-        {flat_key("next", *_path(key)): x for key, x in _over_time(ends).items()},
+        {unravel_key(("next", key)): x for key, x in _over_time(ends).items()},
         _over_time(written),
     )
 
@@ -200,7 +200,7 @@ def _act(
 ) -> tuple[Tensor, dict[Any, Tensor]]:
     """The action of a policy that is called, and all that it writes; it sees what it wrote in the step before."""
     handed_on = {key: x for key, x in before.items() if key != "action"}
-    reads, observation = {flat_key(*_path(key)) for key in policy.in_keys}, outputs["observation"]
+    reads, observation = {unravel_key(key) for key in policy.in_keys}, outputs["observation"]
     read = {key: x for key, x in outputs.items() if key in reads or key == "observation"}
     td = TensorDict({**handed_on, **nested(read)}, [len(observation)], observation.device)
     if reads - {"observation"}:
@@ -213,7 +213,7 @@ def _act(
     stepper.simulation.check_action(action)
     written = {key: td.get(key) for key in policy.out_keys}
     for key in memory:
-        after = written[("next", *_path(key))]
+        after = written[unravel_key(("next", key))]
         written[key] = torch.zeros_like(after) if before.get(key) is None else before[key]
     if memory:
         written |= {"is_init": td["is_init"], ("next", "is_init"): torch.zeros_like(td["is_init"])}
@@ -222,8 +222,8 @@ def _act(
 
 def _memory(policy: TensorDictModuleBase) -> list[Any]:
     """The entries in which a recurrent policy remembers: it reads them, and writes them below "next"."""
-    written = {_path(key) for key in policy.out_keys}
-    return [key for key in policy.in_keys if ("next", *_path(key)) in written]
+    written = {unravel_key(key) for key in policy.out_keys}
+    return [key for key in policy.in_keys if unravel_key(("next", key)) in written]
 
 
 def _handed_on(policy: TensorDictModuleBase, written: dict[Any, Tensor], done: Tensor) -> dict[Any, Tensor]:
@@ -234,9 +234,9 @@ def _handed_on(policy: TensorDictModuleBase, written: dict[Any, Tensor], done: T
     memory = _memory(policy)
     if not memory:
         return written
-    before = {key: x for key, x in written.items() if _path(key)[0] != "next"}
+    before = {key: x for key, x in written.items() if not (isinstance(key, tuple) and key[0] == "next")}
     for key in memory:
-        x = written[("next", *_path(key))]
+        x = written[unravel_key(("next", key))]
         before[key] = torch.where(like(done, x), 0.0, x) if _may_restart(done) else x
     return before | {"is_init": done}
 
@@ -248,7 +248,7 @@ def _over_time(steps: list[dict[Key, Tensor]]) -> dict[Key, Tensor]:
 
 def _of_state(state: State) -> dict[Key, Tensor]:
     """The entries of a state by their names in a tensordict."""
-    return {flat_key("state", *_path(key)): x for key, x in state.items()}
+    return {unravel_key(("state", key)): x for key, x in state.items()}
 
 
 def _record(stepper: Stepper, state: State, tensordict: TensorDictBase) -> Record:
@@ -261,7 +261,7 @@ def _record(stepper: Stepper, state: State, tensordict: TensorDictBase) -> Recor
 def _restarted(stepper: Stepper, source: Source, end: Record, done: Tensor) -> Record:
     """The record to continue from, with fresh starts where ``done`` (1, n); gradients stop there."""
     entries = flat(source.starts(done[0]))
-    state = {key: entries[flat_key("state", *_path(key))].detach() for key in stepper.layout.place}
+    state = {key: entries[unravel_key(("state", key))].detach() for key in stepper.layout.place}
     fresh = _record(stepper, state, TensorDict({k: x.detach() for k, x in entries.items()}, done.shape[1:]))
     return Record(
         fresh.state.where(done, end.state),
@@ -289,8 +289,4 @@ def _entries(stepper: Stepper, records: Record, *prefix: str) -> dict[Key, Tenso
     entries = _of_state(stepper.layout.unpack(records.state))
     entries |= stepper.unpack_outputs(records.outputs)
     entries["observation"] = records.observation
-    return {flat_key(*prefix, *_path(key)): x for key, x in entries.items()}
-
-
-def _path(key: Key) -> tuple[str, ...]:
-    return key if isinstance(key, tuple) else (key,)
+    return {unravel_key((*prefix, key)): x for key, x in entries.items()}

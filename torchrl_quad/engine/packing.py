@@ -80,7 +80,8 @@ def flat(entries: Mapping[Any, Any], *prefix: str) -> dict[Key, Tensor]:
     result = {}
     for key, value in entries.items():
         path = (*prefix, *key) if isinstance(key, tuple) else (*prefix, key)
-        result |= flat(value, *path) if isinstance(value, Mapping) else {flat_key(path): value}
+        own = {path if len(path) > 1 else path[0]: value}
+        result |= flat(value, *path) if isinstance(value, Mapping) else own
     return result
 
 
@@ -94,12 +95,6 @@ def nested(entries: Entries) -> dict[str, Any]:
             inner = inner.setdefault(name, {})
         inner[last] = value
     return result
-
-
-def flat_key(key: Any, *more: str) -> Key:
-    """A key of a tensordict as :func:`flat` writes it: a string, or a tuple of two strings and more."""
-    path = (*key, *more) if isinstance(key, tuple) else (key, *more)
-    return path if len(path) > 1 else path[0]
 
 
 def like(flags: Tensor, x: Tensor) -> Tensor:

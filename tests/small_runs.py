@@ -43,7 +43,7 @@ def assert_equal(a, b, path=""):
     elif isinstance(a, torch.Tensor):
         torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True, msg=path)
     else:
-        assert a == b or a != a, path
+        assert a == b or (a != a and b != b), f"{path}: {a} != {b}"
 
 
 def stop_at_save(monkeypatch, number, error=KeyboardInterrupt):

@@ -17,20 +17,30 @@ from torchrl_quad.deploy import (
     NegativeDepth,
     NotFinite,
     StaleState,
+    WrongActions,
+    export,
     export_policy,
     load_bundle,
     transfer,
 )
+from torchrl_quad.deploy.bundle import Bundle
 from torchrl_quad.deploy.judging import judge
 from torchrl_quad.deploy.replaying import environment
 
 
-@pytest.fixture(scope="module")
-def seeing(tmp_path_factory):
+def a_policy_that_sees():
+    """A small one that remembers, with its environment."""
     env = HoveringEnv(num_envs=64, max_episode_steps=16, camera={"width": 3, "height": 2, "rate": 3, "delay": 2})
     actor = make_visual_actor(env, num_cells=(4,), channels=(2,), hidden_size=2)
     with torch.no_grad():
         actor[0][-1].module.mlp[-1].weight.mul_(30.0)
+    return env, actor
+
+
+@pytest.fixture(scope="module")
+def seeing(tmp_path_factory):
+    torch.manual_seed(0)
+    env, actor = a_policy_that_sees()
     return export_policy(actor, env, tmp_path_factory.mktemp("seeing") / "policy")
 
 
@@ -86,6 +96,29 @@ def test_c_leaves_the_memory_as_it_was_where_it_reads_what_is_not_finite(export_
     memory = floats(0.1, 0.2, 0.3, 0.5)
     assert library.policy_action(floats(*9 * [0.0]), floats(*30 * [1.0]), memory, action) == 0
     assert memory[3] != 0.5
+
+
+def test_a_bundle_that_acts_or_remembers_otherwise_than_its_policy_is_not_written(tmp_path, monkeypatch):
+    env, actor = a_policy_that_sees()
+
+    def forgets(self, state, read=Bundle._read):
+        out = read(self, state)
+        self.memory = np.zeros_like(self.memory)
+        return out
+
+    def off(*arguments, fold=export.fold):
+        network = fold(*arguments)
+        *layers, last = network.layers
+        return network._replace(layers=[*layers, last._replace(bias=last.bias + np.float32(1e-3))])
+
+    wrongs = ((Bundle, "_read", forgets, ValueError, "acts otherwise"), (export, "fold", off, WrongActions, "by 0.001"))
+    for owner, name, wrong, error, said in wrongs:
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, wrong)
+            with pytest.raises(error, match=said):
+                export_policy(actor, env, tmp_path / "policy")
+        assert not list(tmp_path.iterdir())
+    assert export_policy(actor, env, tmp_path / "policy").is_dir()
 
 
 def test_no_simulator_flies_what_sees_or_what_flies_through_a_forest(export_once):

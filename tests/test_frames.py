@@ -13,8 +13,7 @@ from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 from torchrl.record.loggers.wandb import WandbLogger
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_env
-
-TASKS = ["hovering", "landing", "racing", "tracking"]
+from torchrl_quad.envs import TASKS
 
 
 def recorded(env, **options):

@@ -3,15 +3,15 @@
 import gymnasium
 import numpy as np
 
+from torchrl_quad.envs import TASKS
 from torchrl_quad.gym import GymEnv, GymVectorEnv
 
-TASKS = ["hovering", "landing", "racing", "tracking"]
 HOVERING = "torchrl_quad/Hovering-v0"
 
 
 def test_the_time_limit_is_the_task_s_own():
     limits = {task: gymnasium.spec(f"torchrl_quad/{task.capitalize()}-v0").max_episode_steps for task in TASKS}
-    assert limits == {"hovering": 256, "landing": 256, "racing": 512, "tracking": 512}
+    assert limits == {"hovering": 256, "landing": 256, "racing": 512, "tracking": 512, "forest": 900}
     envs = gymnasium.make_vec(HOVERING, num_envs=2, max_episode_steps=3)
     for env, actions in ((GymEnv("hovering", max_episode_steps=3), np.zeros(4)), (envs, np.zeros((2, 4)))):
         env.reset()

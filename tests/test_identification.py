@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -16,10 +17,14 @@ from torchrl_quad.identification import (
     TooShort,
     UnknownField,
     estimation,
+    fitting,
     identify,
     prediction_error,
     read_log,
+    stages,
+    windows,
 )
+from torchrl_quad.identification.parameters import UNKNOWNS, Model
 
 ROOT = Path(__file__).parents[1]
 REAL = ROOT / "examples/data/figure8.csv.gz"
@@ -97,6 +102,40 @@ def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(b
     assert report["parameters"]["inertia.x"]["value"] == found["inertia.x"]["value"]
 
 
+def test_a_fit_that_was_stopped_goes_on_as_if_it_had_not(real, tmp_path, monkeypatch, capsys):
+    file, write = tmp_path / "checkpoint.json", stages.Checkpoint.write
+    options = {"fields": ["linear_drag"], "draws": 0, "iterations": 3, "horizon": 0.2, "past": 0.1}
+    short = dataclasses.replace(real, segments=((300, 900),))
+    straight = identify(short, **options)
+
+    def stop(self, stage, state):
+        write(self, stage, state)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stages.Checkpoint, "write", stop)
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                identify(short, **options, checkpoint=file)
+    resumed = identify(short, **options, checkpoint=file, progress=True)
+    assert re.findall(r"step (\d)", capsys.readouterr().out)[:1] == ["3"]
+    assert resumed.report() == straight.report()
+
+
+def test_a_checkpoint_is_of_one_flight_only(real):
+    prior = load_drone("visfly", torch.float64)
+
+    def seen(**changes):
+        return stages.fingerprint([dataclasses.replace(real, **changes)], prior, MotorCommand(500.0, 3.7), "lag")
+
+    assert seen(name="renamed", notes=("one more",)) == seen()  # which no fit reads
+    columns = ["time", "position", "velocity", "quaternion", "angular_velocity", "motor_command", "battery_voltage"]
+    changed = {name: seen(**{name: 1.01 * getattr(real, name)}) for name in columns}
+    changed |= {"no voltage": seen(battery_voltage=None), "one clock": seen(onboard=()), "none": seen(segments=())}
+    assert [name for name, mark in changed.items() if mark == seen()] == []
+    assert len(set(changed.values())) == len(changed)
+
+
 def test_what_a_flight_does_not_tell_gets_no_number_but_a_reason(simulated):
     log, truth = simulated
     hover = dataclasses.replace(
@@ -116,6 +155,26 @@ def test_what_a_flight_does_not_tell_gets_no_number_but_a_reason(simulated):
     assert "nothing in the flights depends on it" in result.not_identifiable["inertia.x"]
     assert "weigh the drone" in result.not_identifiable["mass"]
     torch.testing.assert_close(result.drone.linear_drag, truth.linear_drag)
+
+
+def test_the_jacobian_of_a_fit_is_that_of_central_differences(real):
+    prior = load_drone("crazyflie", torch.float64)
+    free = tuple(name for name in UNKNOWNS if name != "stream")
+    model = Model(prior, prior.motor_command, free)
+    short = windows.cut([real], 0.3, 0.1, 4.0, 2, prior.motor_command.nominal_voltage)
+    problem = fitting.Problem(model, short, moves_streams=True, counts_push=True)
+    x = model.start + 0.1 * torch.randn(len(free), dtype=torch.float64)  # where two time constants are two
+    streams = torch.tensor([windows.stream_delay(real)], dtype=torch.float64)
+    jacobian = problem.linearise(fitting.State(free, x, streams), update_scale=True).jacobian
+    assert jacobian.shape == (len(short), problem.scale.numel(), len(UNKNOWNS))
+    for i, name in enumerate(UNKNOWNS):
+        step = 1e-5 * torch.eye(len(UNKNOWNS), dtype=torch.float64)[i]
+        moved, shift = step[:-1], UNKNOWNS["stream"].scale * step[-1]
+        ends = problem.raw(x + moved, shift, streams), problem.raw(x - moved, -shift, streams)
+        slope = (ends[0] - ends[1]) / 2e-5 / problem.scale
+        size = slope.abs().max()
+        assert size > 0.0, name
+        torch.testing.assert_close(jacobian[..., i], slope, rtol=1e-4, atol=1e-5 * size.item())
 
 
 def test_predictions_of_a_drone_that_is_right_are_right_and_of_one_that_drifts_are_worked_by_hand(simulated, real):
@@ -158,6 +217,10 @@ def test_bad_input_of_a_fit_is_refused_by_name(real, tmp_path):
         prediction_error(real, "crazyflie", (-0.1,))
     with pytest.raises(ValueError, match="motor_command: missing key 'nominal_voltage'"):
         load_drone({**_plain("visfly"), "motor_command": {"speed_per_volt": 500.0}})
+    with pytest.raises(ValueError, match="motor_command: unknown key 'gain'. Allowed: speed_per_volt, nominal_voltage"):
+        load_drone({**_plain("visfly"), "motor_command": {"gain": 1.0}})
+    with pytest.raises(ValueError, match="motor_command must be a mapping of speed_per_volt, .*; got 500.0"):
+        load_drone({**_plain("visfly"), "motor_command": 500.0})
     with pytest.raises(ValueError, match="speed_per_volt must be between"):
         MotorCommand(-1.0, 3.7)
     broken = tmp_path / "checkpoint.json"

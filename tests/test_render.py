@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torchrl.envs import RewardSum, TransformedEnv
 
-from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad import HoveringEnv, differentiable_rollout, envs, make_actor, make_env
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric
 from torchrl_quad.render import animate_flight, frames, plot_episode, plot_flight, write_replay
 from torchrl_quad.render.frames import Scene
@@ -278,7 +278,7 @@ def test_an_episode_of_every_task_is_drawn_with_what_flew(task, saved, tmp_path)
         np.testing.assert_array_equal(line[1:, 1], values)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", envs.TASKS)
 def test_an_episode_of_one_step_is_drawn(task, saved, tmp_path):
     env = make_env(task, num_envs=1, max_episode_steps=1)
     plot_episode(env.rollout(1, break_when_any_done=False), tmp_path / "episode.png", env=env)

@@ -4,7 +4,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -16,13 +15,28 @@ from training.checkpoints import read_checkpoint
 ROOT = Path(__file__).parent.parent
 
 
-@pytest.mark.parametrize("recipe", ["abpt", "bptt", "hybrid", "ppo", "ahac"])
-def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(recipe, train, refused, tmp_path, monkeypatch):
-    options = [
-        *EVERYTHING,
-        *([] if recipe in ("ppo", "hybrid") else ["loss.alpha=auto", "loss.clip_action_gradient=3"]),
-    ]
-    options += ["buffer.capacity=24"] if recipe == "abpt" else []  # full from the start: what is unused is arbitrary
+ENTROPY = ["loss.alpha=auto", "loss.clip_action_gradient=3"]
+SEEING = [  # and remembering: a memory, images on their way, and noise that goes on
+    *("task=forest", "env.density=0.02", "env.camera.width=6", "env.camera.height=4", "+env.camera.rate=2"),
+    *("+env.camera.delay=1", "+env.camera.noise=0.02", "actor.noise_correlation=0.9"),
+]
+
+
+@pytest.mark.parametrize(
+    ("recipe", "options"),
+    [
+        ("abpt", [*EVERYTHING, *ENTROPY, "buffer.capacity=24"]),  # full from the start: what is unused is arbitrary
+        ("bptt", [*EVERYTHING, *ENTROPY]),
+        ("hybrid", EVERYTHING),
+        ("ppo", EVERYTHING),
+        ("ahac", [*EVERYTHING, *ENTROPY]),
+        ("shac", [*EVERYTHING, *ENTROPY]),
+        ("sapo", [*EVERYTHING, *ENTROPY]),
+        ("bptt", SEEING),
+    ],
+    ids=["abpt", "bptt", "hybrid", "ppo", "ahac", "shac", "sapo", "bptt, seeing"],
+)
+def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(recipe, options, train, refused, tmp_path, monkeypatch):
     straight = train(recipe, tmp_path / "straight", *options)
     folder = tmp_path / "stopped"
     with monkeypatch.context() as patch:
@@ -42,20 +56,36 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(recipe, train, refused,
     assert summaries[0] == summaries[1]
 
 
+KILLED = """
+import os, runpy, signal, sys
+sys.path.insert(0, "recipes")
+from training.loop import Run
+
+def save(self, path, save=Run._save, saves=[]):
+    saves.append(path)
+    if len(saves) == 3:  # metrics.csv has the row already
+        os.kill(os.getpid(), signal.SIGKILL)
+    save(self, path)
+
+Run._save = save
+runpy.run_path("recipes/abpt.py", run_name="__main__")
+"""
+
+
 def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint_although_it_left_its_lock(train, tmp_path):
-    options = ["total_steps=480", "buffer.capacity=24"]
-    straight = train("abpt", tmp_path / "straight", *options)
+    straight = train("abpt", tmp_path / "straight", "buffer.capacity=24")
     folder = tmp_path / "killed"
-    command = [sys.executable, "recipes/abpt.py", *SMALL, *options, f"hydra.run.dir={folder}"]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        for _ in range(6000):
-            if (folder / "checkpoint.pt").exists():
-                break
-            time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
-    assert read_checkpoint(folder / "checkpoint.pt")["iteration"] < 20
+    command = [sys.executable, "-c", KILLED, *SMALL, "buffer.capacity=24", f"hydra.run.dir={folder}"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            said = process.communicate(timeout=120)[1]
+        finally:
+            process.kill()
+    assert process.returncode == -signal.SIGKILL, said
+    assert read_checkpoint(folder / "checkpoint.pt")["iteration"] == 4
+    assert [row["iteration"] for row in rows(folder)] == ["2", "4", "6"]
     assert f"process {process.pid} on" in (folder / "run.lock").read_text()
-    assert_equal(straight, train("abpt", folder, *options, "resume=auto"))
+    assert_equal(straight, train("abpt", folder, "buffer.capacity=24", "resume=auto"))
     assert rows(folder) == rows(tmp_path / "straight")
     assert not (folder / "run.lock").exists()
 

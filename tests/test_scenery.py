@@ -4,11 +4,10 @@ import pytest
 import torch
 
 from torchrl_quad import HoveringEnv, make_env
+from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery, describe_metric
 from torchrl_quad.envs.shapes import Shape
 from torchrl_quad.render import animate_flight, canvas, figures, frames, plot_episode, plot_flight
-
-TASKS = ["hovering", "landing", "racing", "tracking"]
 
 
 @pytest.mark.parametrize(

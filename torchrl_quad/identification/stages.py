@@ -287,7 +287,8 @@ def fingerprint(logs: Sequence[FlightLog], prior: QuadrotorParams, motors: Motor
     for value in prior.fields().values():
         digest.update(value.numpy().tobytes())
     for log in logs:
-        for column in (log.position, log.quaternion, log.angular_velocity, log.motor_command):
-            digest.update(np.ascontiguousarray(column).tobytes())
-        digest.update(repr(log.segments).encode())
+        motion = (log.position, log.velocity, log.quaternion, log.angular_velocity)
+        for column in (*motion, log.motor_command, log.battery_voltage):
+            digest.update(b"none" if column is None else np.ascontiguousarray(column).tobytes())
+        digest.update(repr((log.dt, log.segments, log.onboard)).encode())
     return digest.hexdigest()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -36,6 +36,7 @@ class State:
     iteration: int = 0
     cost: float = math.inf
     converged: bool = False
+    scale: Sequence[float] | None = None  #: (m), of the residuals; found in the first iterations
 
 
 @dataclasses.dataclass
@@ -133,8 +134,11 @@ def minimise(
         report: called after each iteration, with the state there.
         max_iterations: at most, counted from the start of the state.
     """
+    if state.scale is not None:
+        problem.scale = state.x.new_tensor(state.scale)
     while not state.converged and state.iteration < max_iterations:
         linear = problem.linearise(state, update_scale=state.iteration < 8)
+        state.scale = problem.scale.tolist()
         state.cost = problem.cost(state)
         hessian, gradient = normal_equations(linear, problem.windows.log, len(state.streams))
         moved = None

@@ -71,7 +71,6 @@ class Model:
     prior: QuadrotorParams  #: float64; its mass is the known one
     motors: MotorCommand
     free: tuple[str, ...]  #: names of unknowns
-    two_lags: bool = False
 
     @property
     def start(self) -> Tensor:

@@ -5,12 +5,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from browsing import browser, open_page  # noqa: F401, fixtures
-from deploying import export_once  # noqa: F401, a fixture
 
-from torchrl_quad import HoveringEnv
-from torchrl_quad.envs.scenery import Scenery
-from torchrl_quad.envs.shapes import Shape
+pytest.register_assert_rewrite("browsing", "deploying", "flying", "log_writers", "small_runs")
+
+from browsing import browser, open_page  # noqa: E402, F401, fixtures
+from deploying import export_once  # noqa: E402, F401, a fixture
+
+from torchrl_quad import HoveringEnv  # noqa: E402
+from torchrl_quad.envs.scenery import Scenery  # noqa: E402
+from torchrl_quad.envs.shapes import Shape  # noqa: E402
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 sys.path.insert(0, str(RECIPES))

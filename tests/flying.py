@@ -14,6 +14,11 @@ def fly(env, td, actions):
     return torch.stack(steps, 1)
 
 
+def hold(env, steps):
+    """The actions that hover, for some steps."""
+    return [env.hover_action.expand(env.num_envs, 4)] * steps
+
+
 def look_at_nothing(patch):
     """Let the code believe that its tensors are on an accelerator, which it must not wait for."""
     for name in ("engine.horizon", "envs.randomness", "envs.guard"):

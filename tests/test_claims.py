@@ -223,45 +223,91 @@ def test_the_page_of_the_project_shows_what_its_data_hold():
 
 
 def test_the_sentences_of_the_page_say_what_its_data_hold():
-    r = Results(running.DATA)
+    r, page = Results(running.DATA), " ".join((PROJECT / "docs/results.md").read_text().split())
+    words = ["no", "one", "two", "three", "four", "five"]
+
+    def says(sentence):
+        assert sentence in page, sentence
 
     def best(task, column="return", suffix=""):
-        return max(matrix.METHODS, key=lambda m: r.end(task, m + suffix, column).mean())
+        return max(matrix.METHODS, key=lambda m: r.end(task, m + suffix, column).mean()).upper()
 
     def crashed(task, variant):
-        return int((r.end(task, variant, "crash") > 0.99).sum())
+        return words[int((r.end(task, variant, "crash") > 0.99).sum())]
 
-    assert [best("hovering"), best("tracking"), best("racing"), best("racing", suffix="-velocity")] == [
-        *("shac", "bptt", "ppo", "shac")
-    ]
+    assert best("hovering") == best("racing", suffix="-velocity")
     landing = [r.end("landing", method).mean() for method in matrix.METHODS]
-    assert min(landing) > 0.98 * max(landing)
-    fallen = [("hovering", "bptt"), ("tracking", "abpt"), ("tracking", "shac"), ("racing", "ppo-velocity")]
-    assert [crashed(*run) for run in fallen] == [2, 2, 1, 2]
-    assert min(matrix.METHODS, key=lambda m: r.end("racing", m).mean()) == "abpt"
+    says(
+        f"{best('hovering')} leads in hovering and in racing with the velocity reward, {best('tracking')} in tracking, "
+        f"{best('racing')} in racing with the position reward, and in landing all four end within "
+        f"{math.ceil(100 * (1 - min(landing) / max(landing)))} % of each other."
+    )
+    says(
+        f"of five seeds, {crashed('hovering', 'bptt')} of BPTT in hovering, {crashed('tracking', 'abpt')} of ABPT and "
+        f"{crashed('tracking', 'shac')} of SHAC in tracking, and {crashed('racing', 'ppo-velocity')} of PPO in racing "
+        "with the velocity reward."
+    )
     verdicts = {claim.id: try_claim(claim, r).verdict for claim in claims.CLAIMS}
     assert [verdicts[x] for x in ("C1", "C7", "C9", "C18", "C22")] == ["refuted", *(4 * ["supported"])]
+    says("PPO's curves are smooth (C7), BPTT lands (C9), the gate bonus has no gradient (C18), and ABPT and SHAC pass")
+    worst = min(matrix.METHODS, key=lambda m: r.end("racing", m).mean()).upper()
+    says(f"C1, does not hold: with the position reward {worst} ends racing last of the four.")
     lift = {task: r.end(task, "abpt-restarts").mean() - r.end(task, "abpt").mean() for task in matrix.TASKS}
     assert [task for task in lift if lift[task] < 0] == ["racing"]
+    says("in the mean it ends hovering, tracking and landing higher than ABPT, and racing lower.")
     assert r.end("landing", "abpt-no-0-step").mean() > r.end("landing", "abpt").mean()
+    more, fewer = (r.end("racing", x, "gates_passed").mean() for x in ("abpt-no-0-step", "abpt"))
+    says(f"own ablation, ends higher in landing and passes {more:.1f} gates instead of {fewer:.1f} in racing.")
     racing = ["abpt", "abpt-critic", "abpt-horizon-32", "abpt-horizon-96", "abpt-no-0-step", "abpt-entropy"]
     assert sorted(racing, key=lambda x: r.end("racing", x).mean()) == racing
+    says("entropy bonus of the published settings does as much for racing, a shorter horizon or better critics do less")
+
+
+def test_the_sentences_about_ascent_and_variants_say_what_the_data_hold():
+    r, page = Results(running.DATA), " ".join((PROJECT / "docs/results.md").read_text().split())
     ascent = {}
     for row in read_rows(running.DATA / "ascent.csv"):
         for name in ("n_step_return", "zero_step_return", "objective", "explained_variance"):
-            if row["zero_step_return"]:
+            if row[name]:
                 ascent.setdefault((row["task"], row["variant"]), {}).setdefault(name, []).append(float(row[name]))
     ascent = {run: {name: round(float(np.mean(x)), 2) for name, x in of.items()} for run, of in ascent.items()}
-    assert min(of["n_step_return"] for of in ascent.values()) >= 0.18
+    least = min(of["n_step_return"] for of in ascent.values() if "n_step_return" in of)
+    ascent = {run: of for run, of in ascent.items() if "zero_step_return" in of}
     assert all(of["zero_step_return"] < of["n_step_return"] for of in ascent.values())
     racing = [of for (task, _), of in ascent.items() if task == "racing"]
-    assert max(of["zero_step_return"] for of in racing) == 0.05 and max(of["objective"] for of in racing) < 0.1
-    assert min(of["explained_variance"] for of in racing) == 0.89
+    assert max(of["objective"] for of in racing) < 0.1
+    hardly = max(of["zero_step_return"] for of in racing)
+    known = min(of["explained_variance"] for (task, _), of in ascent.items() if task in ("racing", "landing"))
+    slow = [(task, x) for task in matrix.TASKS for x in matrix.EXPERIMENTS["rate"]]
+    crashes = math.ceil(100 * max(r.end(*run, "crash").max() for run in slow))
+    for sentence in (
+        f"with a mean cosine of {least} or more.",
+        f"The 0-step return does so less everywhere, and in racing hardly at all ({hardly} at most): with both, the",
+        f"In landing and racing the critics explain at least {100 * known:.0f} % of the variance of their targets",
+        f"at most {crashes} % of the last episodes of a run crash, every seed solves tracking",
+        "in hovering neither ABPT nor SHAC solves an episode, and each of the three solves landing in about half",
+        "The logarithmic bonus helps BPTT to pass gates, and the reciprocal one helps SHAC; the other two pairs pass",
+    ):
+        assert sentence in page, sentence
     gates = {x: r.end("racing", x, "gates_passed").mean() for x in matrix.EXPERIMENTS["relaxation"]}
     plain = {x: r.end("racing", x, "gates_passed").mean() for x in ("bptt", "shac")}
     assert [x for x in gates if gates[x] > plain[x.split("-")[0]]] == ["bptt-log", "shac-reciprocal"]
-    slow = [(task, x) for task in matrix.TASKS for x in matrix.EXPERIMENTS["rate"]]
-    assert max(r.end(*run, "crash").max() for run in slow) < 0.02
     assert min(r.end("tracking", x, "solved").min() for _, x in slow) == 1.0
     assert not r.end("hovering", "abpt-slow", "solved").any() and not r.end("hovering", "shac-slow", "solved").any()
     assert all(0.45 < r.end("landing", x, "solved").mean() < 0.6 for _, x in slow)
+
+
+def test_the_readme_says_how_many_episodes_are_solved_in_a_simulator_that_is_not_ours():
+    readme = (PROJECT / "README.md").read_text()
+    solved = {
+        (row["task"], row["policy"], row["simulator"].split()[0], row["loop"]): float(row["solved"])
+        for row in read_rows(PROJECT / "benchmarks/results/transfer.csv")
+        if (row["mutant"], row["drone"]) == ("none", "nominal")
+    }
+    columns = [
+        *(("shipped", "torchrl_quad", "contract"), ("shipped", "MuJoCo", "contract")),
+        *(("shipped", "MuJoCo", "pid"), ("random", "MuJoCo", "pid")),
+    ]
+    for task in ("hovering", "tracking", "landing", "racing"):
+        cells = [f"{100 * solved[(task, *column)]:.3g} %" for column in columns]
+        assert f"\n| {task} | {' | '.join(cells)} |\n" in readme

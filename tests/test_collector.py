@@ -92,22 +92,27 @@ def test_the_trainer_follows_the_gradient_through_the_dynamics_and_goes_on_from_
     torch.testing.assert_close(torch.nn.utils.parameters_to_vector(resumed.policy.parameters()), after, rtol=0, atol=0)
 
 
-def test_weights_are_copied_from_whatever_form_torchrl_hands_over():
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda policy: {"policy_or_weights": policy},
+        lambda policy: {"policy": policy},
+        lambda policy: {"weights_dict": {"policy": policy}},
+        lambda policy: {"policy_or_weights": policy.state_dict()},
+    ],
+    ids=["the policy", "as policy", "by name", "its state"],
+)
+def test_weights_are_copied_from_whatever_form_torchrl_hands_over(form):
     collector, other = make(), make()
     with torch.no_grad():
         for parameter in other.policy.parameters():
             parameter.uniform_()
-    for given in ((other.policy,), ({"policy": other.policy},), (other.policy.state_dict(),)):
-        collector = make()
-        collector.update_policy_weights_()
-        options = (
-            {"weights_dict": given[0]}
-            if given[0] is not other.policy and "policy" in given[0]
-            else {"policy_or_weights": given[0]}
-        )
-        collector.update_policy_weights_(**options)
-        for ours, theirs in zip(collector.policy.parameters(), other.policy.parameters(), strict=True):
-            assert torch.equal(ours, theirs) and ours is not theirs
+    before = [parameter.detach().clone() for parameter in collector.policy.parameters()]
+    collector.update_policy_weights_()  # without any there is nothing to do
+    assert all(torch.equal(*pair) for pair in zip(collector.policy.parameters(), before, strict=True))
+    collector.update_policy_weights_(**form(other.policy))
+    for ours, theirs in zip(collector.policy.parameters(), other.policy.parameters(), strict=True):
+        assert torch.equal(ours, theirs) and ours is not theirs
 
 
 def test_wrong_numbers_are_refused_with_what_to_write_instead():

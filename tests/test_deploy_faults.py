@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 import torch
 from deploying import build, resting
+from own_task import CornerEnv
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.envs import RewardSum, TransformedEnv
+from torchrl.envs import PendulumEnv, RewardSum, TransformedEnv
 
 import torchrl_quad
-from torchrl_quad import HoveringEnv, RacingEnv, TrackingEnv, make_actor, make_env
+from torchrl_quad import HoveringEnv, ObservationNormalizer, RacingEnv, TrackingEnv, make_actor, make_env
 from torchrl_quad.deploy import (
     MissingQuantity,
     NotFinite,
@@ -166,7 +167,7 @@ def test_a_curve_is_a_few_harmonics(curve):
     np.testing.assert_allclose(rule.points(phase.numpy()), env.curve(phase), atol=1e-7)
 
 
-def test_what_cannot_be_exported_is_refused(tmp_path):
+def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
     env, actor = build("hovering")
 
     class Backwards(HoveringEnv):
@@ -206,11 +207,29 @@ def test_what_cannot_be_exported_is_refused(tmp_path):
     refuses("the weights of the policy, or its normaliser, are not finite", broken)
     other = HoveringEnv(num_envs=2, control="attitude")
     refuses("exports thrust and body rates alone, control=\"rates\"; got 'attitude'", env=other)
+    of_an_error = ObservationNormalizer(env, ("metrics", "position_error"))
+    refuses('the normalizer must be that of "observation", got ', normalizer=of_an_error)
+    refuses("cannot say what CornerEnv observes. It knows forest, .*, tracking, and tasks that", env=CornerEnv(2))
+    refuses("needs an environment of this package, got PendulumEnv", env=PendulumEnv())
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "onnx", None)
+        refuses("needs onnx and onnxruntime: pip install onnx onnxruntime", error=ImportError)
     assert not (tmp_path / "policy").exists()
     (tmp_path / "policy").mkdir()
     (tmp_path / "policy" / "thesis.txt").write_text("")
     refuses("exists and is no bundle", error=FileExistsError)
     assert Own(num_envs=1)  # a task that inherits is known by its parent
+
+
+def test_a_normalizer_is_that_of_the_transforms_or_is_given_beside_a_bare_environment(tmp_path):
+    torch.manual_seed(0)
+    env = HoveringEnv(num_envs=64, max_episode_steps=16)
+    actor, normalizer = make_actor(env, (8,)), ObservationNormalizer(env)
+    normalizer.update(env.rollout(16, break_when_any_done=False))
+    ways = {"none": {}, "given": {"normalizer": normalizer}, "wrapped": {"env": TransformedEnv(env, normalizer)}}
+    bundles = [load_bundle(export_policy(actor, **{"env": env, "folder": tmp_path / x, **ways[x]})) for x in ways]
+    marks = [bundle.contract["origin"]["weights_sha256"] for bundle in bundles]
+    assert marks[0] != marks[1] == marks[2]
 
 
 # -- without torch -----------------------------------------------------------------------------------------------------

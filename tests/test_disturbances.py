@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from flying import fly, hold
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
@@ -22,18 +23,6 @@ EVERYTHING = {
     },
     "random_start": {"tilt": 0.5, "yaw": 3.1, "velocity": 1.0, "angular_velocity": 0.5},
 }
-
-
-def fly(env, td, actions):
-    steps = []
-    for action in actions:
-        steps.append(env.step(td.copy().set("action", action)))
-        td = env.step_mdp(steps[-1])
-    return torch.stack(steps, 1)
-
-
-def hold(env, steps):
-    return [env.hover_action.expand(env.num_envs, 4)] * steps
 
 
 def test_sensors_that_are_given_whole_keep_their_delay():
@@ -243,6 +232,7 @@ def test_random_starts_tilt_turn_and_push_within_their_bounds():
         ({"wind": {"spread": [-1.0, 0.0, 0.0]}}, "wind: spread must not be negative"),
         ({"wind": {"gust": -1.0}}, "wind: gust must be zero or positive"),
         ({"wind": {"gust_time": 0.0}}, "wind: gust_time must be positive"),
+        ({"wind": {"mean": [-60, 0, 0], "spread": [25, 0, 0], "gust": 4.0}}, "add up to 105 m/s; .* to 100 m/s"),
         ({"wind": 3.0}, "wind must be a mapping with any of mean"),
         ({"observation_noise": {"yaw": 1.0}}, "observation_noise: unknown key 'yaw'"),
         ({"observation_noise": {"delay": 1}}, "observation_noise: unknown key 'delay'"),

@@ -11,7 +11,6 @@ from torchrl_quad import (
     HoveringEnv,
     differentiable_rollout,
     load_drone,
-    load_track,
     make_actor,
     make_env,
 )
@@ -126,11 +125,6 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
 def test_an_unknown_task_is_refused_with_the_known_ones(task):
     with pytest.raises(ValueError, match="Unknown task .*. Choose from: forest, hovering, landing, racing, tracking."):
         make_env(task)
-
-
-def test_a_gate_needs_a_finite_radius():
-    with pytest.raises(ValueError, match="gate_radius must be a positive number .m., got inf"):
-        load_track({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": float("inf")})
 
 
 @pytest.mark.parametrize(

@@ -92,19 +92,23 @@ def test_a_file_system_without_locks_is_no_reason_to_stop(tmp_path, monkeypatch)
 
 
 def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
-    script = ROOT / "recipes/bptt.py"
-    command = [sys.executable, script, *SMALL, "total_steps=1_000_000", f"hydra.run.dir={tmp_path}"]
-    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-    options["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # ignored where tests run behind "&"
-    with subprocess.Popen(command, **options) as run:
-        while not (tmp_path / "checkpoint.pt").exists():
-            assert run.poll() is None, run.stderr.read()
-            time.sleep(0.02)
-        run.send_signal(signal.SIGINT)
-        printed = run.communicate(timeout=60)[1]
+    script, folder = ROOT / "recipes/bptt.py", tmp_path / "run"
+    command = [sys.executable, script, *SMALL, "total_steps=1_000_000", f"hydra.run.dir={folder}"]
+    said, deadline = tmp_path / "said.txt", time.monotonic() + 120
+    options = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}  # ignored where tests run behind "&"
+    with said.open("w") as file, subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=file, **options) as run:
+        try:
+            while not (folder / "checkpoint.pt").exists():
+                assert run.poll() is None and time.monotonic() < deadline, said.read_text()
+                time.sleep(0.02)
+            run.send_signal(signal.SIGINT)
+            run.wait(timeout=60)
+        finally:
+            run.kill()
+    printed = said.read_text()
     assert run.returncode == 130
     assert "Traceback" not in printed
-    assert printed.splitlines()[-1] == f"Stopped. Go on with: python {script} resume={tmp_path}/checkpoint.pt"
+    assert printed.splitlines()[-1] == f"Stopped. Go on with: python {script} resume={folder}/checkpoint.pt"
 
 
 def test_ctrl_c_before_the_first_checkpoint_says_so(refused, no_pictures, tmp_path, monkeypatch):

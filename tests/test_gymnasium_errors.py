@@ -38,10 +38,6 @@ def test_one_drone_s_action_is_refused_in_its_own_words():
 def test_unknown_options_are_refused_with_those_that_exist():
     with pytest.raises(ValueError, match="Unknown autoreset_mode 'same'. Choose from: NextStep, SameStep, Disabled."):
         GymVectorEnv("hovering", autoreset_mode="same")
-    with pytest.raises(
-        ValueError, match="Unknown task 'hover'. Choose from: forest, hovering, landing, racing, tracking."
-    ):
-        GymEnv("hover")
     with pytest.raises(ValueError, match="num_envs is for many drones, .* Write gymnasium.make_vec instead."):
         gymnasium.make(HOVERING, num_envs=2)
     for build in (GymEnv, GymVectorEnv):

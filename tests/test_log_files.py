@@ -121,6 +121,9 @@ def test_a_usd_log_is_read_in_both_versions_and_without_its_end(version, tmp_pat
     assert cut.time[-1] == pytest.approx(0.9 * END, abs=0.2)
     with pytest.raises(WrongUnit, match=r"gyro.x.*degrees"):
         read_log(write_usd(path, events, version), {"angular_velocity": ("gyro.x", "gyro.y", "gyro.z")})
+    path.write_bytes(whole.replace(b"gyro.x(f)", b"gyro.x(e)"))
+    with pytest.raises(UnreadableLog, match=r"a variable of unknown type, 'gyro.x\(e\)'. Export it as CSV"):
+        read_log(path)
 
 
 def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
@@ -213,7 +216,8 @@ def ros_messages(store, stamped=True):
             yield topic, kind, int((seconds + at) * 1e9), message
 
 
-def write_bag(path, ros2, storage=None, **options):
+def write_bag(path, ros2, storage=None, twin=None, **options):
+    """A bag of either version; ``twin`` is a topic that it has twice."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -224,10 +228,11 @@ def write_bag(path, ros2, storage=None, **options):
     with writer:
         connections = {}
         for topic, kind, received, message in ros_messages(store, **options):
-            if topic not in connections:
-                connections[topic] = writer.add_connection(f"/drone/{topic}", kind, typestore=store)
             raw = store.serialize_cdr(message, kind) if ros2 else bytes(store.serialize_ros1(message, kind))
-            writer.write(connections[topic], received, raw)
+            for name in (topic, *([f"{topic}2"] if topic == twin else [])):
+                if name not in connections:
+                    connections[name] = writer.add_connection(f"/drone/{name}", kind, typestore=store)
+                writer.write(connections[name], received, raw)
     return path
 
 
@@ -255,3 +260,6 @@ def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path):
     ):
         with pytest.raises(MissingColumns, match=message):
             read_log(file, columns)
+    twins = write_bag(tmp_path / "twins.bag", ros2=False, twin="imu")
+    with pytest.raises(MissingColumns, match="several topics for angular_velocity: /drone/imu, /drone/imu2. Say which"):
+        read_log(twins, battery)

@@ -11,6 +11,7 @@ from torchrl_quad.identification import (
     LAYOUTS,
     Columns,
     MissingColumns,
+    UnreadableLog,
     WrongFrame,
     WrongQuaternion,
     WrongUnit,
@@ -69,6 +70,10 @@ def test_a_mapping_reads_any_table_and_rates_are_matched(tmp_path):
         read_log(path, {"angular_velocity": OURS["angular_velocity"]})
     with pytest.raises(MissingColumns, match="has no motor_command"):
         read_log(path, {k: v for k, v in mapping.items() if k != "motor_command"})
+    twice = tmp_path / "twice.csv"
+    twice.write_text(path.read_text().replace("wz,", "wy,", 1))
+    with pytest.raises(UnreadableLog, match="twice.csv has several columns of one name: wy. Rename them"):
+        read_log(twice, {**mapping, "angular_velocity": ("wx", "wy", "wx")})
     with pytest.raises(MissingColumns, match="No preset knows.*columns="):
         read_log(path)
 

@@ -2,11 +2,19 @@
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.data import Unbounded
 from torchrl.envs import CatTensors, PendulumEnv, StepCounter, TransformedEnv, UnsqueezeTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad import HoveringEnv, load_drone, make_actor, make_qvalue, make_value
+
+
+def make_pendulum():
+    """An environment whose action, a torque, lies between -2 and 2."""
+    angles = ["th", "thdot"]
+    pendulum = TransformedEnv(PendulumEnv(), UnsqueezeTransform(dim=-1, in_keys=angles, in_keys_inv=angles))
+    return pendulum.append_transform(CatTensors(angles, "observation", del_keys=False))
 
 
 @pytest.mark.parametrize("wrap", [False, True])
@@ -25,15 +33,33 @@ def test_the_first_action_can_be_chosen_and_is_the_middle_of_the_range_elsewhere
     wanted = torch.tensor([0.5, -0.5, 0.0, 0.9], dtype=torch.float64)
     actor = make_actor(env, action_init=wanted)
     torch.testing.assert_close(actor(env.reset())["action"], wanted.expand(2, 4), atol=0.02, rtol=0)
-    pendulum = TransformedEnv(
-        PendulumEnv(), UnsqueezeTransform(dim=-1, in_keys=["th", "thdot"], in_keys_inv=["th", "thdot"])
-    )
-    pendulum = pendulum.append_transform(CatTensors(["th", "thdot"], "observation", del_keys=False))
+    pendulum = make_pendulum()
     action = make_actor(pendulum)(pendulum.reset())["action"]
     assert action.shape == (1,)
     assert action.abs() < 0.1
     pendulum.base_env.neutral_action = torch.tensor([1.5])
     assert make_actor(pendulum)(pendulum.reset())["action"].item() == pytest.approx(1.5, abs=0.1)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_an_action_with_bounds_of_its_own_is_a_tanh_gaussian_between_them(rho):
+    actor = make_actor(make_pendulum(), return_log_prob=True, scale_init=0.3, noise_correlation=rho)
+    td = TensorDict({"observation": torch.randn(5, 2)}, [5])
+    with set_exploration_type(ExplorationType.RANDOM):
+        torch.manual_seed(3)
+        written, plain = actor(td.copy()), actor.plain()
+        torch.manual_seed(3)
+        drawn = plain.drawn(1, 5, {})[0]
+    pure = plain.forward(plain.weights, [td["observation"]], drawn)[1]
+    assert {"loc", "scale", "action", "action_log_prob"} <= set(pure)
+    torch.testing.assert_close({key: written[key] for key in pure}, pure)
+    torch.testing.assert_close(plain.drawn_again(written), drawn, rtol=0, atol=1e-5)
+
+    loc, scale, action = (written[key].double() for key in ("loc", "scale", "action"))
+    x = (action / 2).atanh()  # the normal variable
+    torch.testing.assert_close(x, loc + scale * drawn[:, :1].double(), rtol=0, atol=1e-5)
+    density = torch.distributions.Normal(loc, scale).log_prob(x) - (2 * (1 - (action / 2) ** 2)).log()
+    torch.testing.assert_close(written["action_log_prob"].double(), density.sum(-1), rtol=0, atol=1e-5)
 
 
 def test_each_entry_may_have_a_scale_of_its_own():

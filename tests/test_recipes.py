@@ -1,4 +1,4 @@
-"""Every recipe on every task, on a reduced budget."""
+"""Every recipe on a reduced budget."""
 
 import csv
 import json
@@ -23,7 +23,6 @@ from torchrl_quad.envs.scenery import EPISODE_METRICS
 ROOT = Path(__file__).parent.parent
 SMALL = [*SMALL_RUN, "total_steps=96"]
 RECIPES = ["abpt", "bptt", "shac", "ppo", "sapo", "ahac", "hybrid"]
-FIRST_ORDER = ["abpt", "bptt", "shac"]
 
 
 def run(*command, cwd=ROOT):
@@ -50,15 +49,14 @@ def test_a_compiled_run_learns_what_an_eager_one_does(train, no_pictures, tmp_pa
     eager, compiled = (read(tmp_path / mode)[-1] for mode in ("false", "true"))
     for name in ("train/loss_actor", "grad/actor", "eval/return", "eval/position_error"):
         assert float(compiled[name]) == pytest.approx(float(eager[name]), rel=1e-3), name
-    first, last = (float(row["time/seconds"]) for row in read(tmp_path / "true"))
+    first, last = (float(row["time/processor_seconds"]) for row in read(tmp_path / "true"))
     assert first < 5 * (last - first) + 0.5  # compilation, of several seconds, is outside the clock
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_every_recipe_trains_on_every_task_and_leaves_what_it_promises(launch, recipe, tmp_path, request):
-    if recipe != "abpt":  # the others draw by the same functions
-        request.getfixturevalue("no_pictures")
-    tasks = ["landing"] if recipe in ("sapo", "ahac", "hybrid") else TASKS  # they differ in their losses alone
+def test_every_recipe_trains_on_its_tasks_and_leaves_what_it_promises(launch, no_pictures, recipe, tmp_path):
+    tasks = TASKS if recipe == "abpt" else ["landing", "forest"]  # the others differ in their losses alone
+    tasks = ["landing"] if recipe in ("sapo", "ahac", "hybrid") else tasks
     sweep = [f"task={','.join(tasks)}", f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=${task}"]
     printed = launch(recipe, "--multirun", *SMALL, *sweep, "hydra/launcher=basic")
     for task in tasks:
@@ -68,16 +66,10 @@ def test_every_recipe_trains_on_every_task_and_leaves_what_it_promises(launch, r
         steps = [int(row["steps"]) for row in rows]
         assert steps == [48, 96] if recipe != "ahac" else steps[-1] >= 96 > steps[0]  # whose horizon changes
         metrics = {f"eval/{name}" for name in TASKS[task].metric_info}
-        assert {"grad/actor", *metrics} <= set(rows[0])
+        assert {"grad/actor", *metrics, *([] if recipe == "bptt" else ["grad/critic"])} <= set(rows[0])
         assert any(name.startswith("train/loss_") for name in rows[0])
         may_be_missing = {"eval/lap_time", "eval/landing_speed"}
         assert all(math.isfinite(float(row[name])) for row in rows for name in set(row) - may_be_missing)
-        if recipe == "abpt":
-            for picture in ("learning_curve.png", "flight.png"):
-                assert (folder / picture).read_bytes().startswith(b"\x89PNG")
-            assert (folder / "flight.mp4").read_bytes()[4:8] == b"ftyp"
-            assert (folder / "episode.pdf").read_bytes().startswith(b"%PDF")
-            assert (folder / "flight.html").read_text().startswith("<!doctype html>")
         summary = json.loads((folder / "summary.json").read_text())
         assert summary["episodes"] == 256
         assert summary["steps"] == steps[-1]
@@ -136,12 +128,11 @@ def test_two_runs_with_one_seed_are_equal_and_another_seed_differs(train, no_pic
     assert a == b != c
 
 
-@pytest.mark.parametrize("recipe", FIRST_ORDER)
-def test_the_entropy_bonus_is_an_option_and_its_coefficient_can_be_learned(train, no_pictures, recipe, tmp_path):
-    train(recipe, tmp_path, "loss.alpha=auto")
+def test_the_entropy_bonus_is_an_option_and_its_coefficient_can_be_learned(train, no_pictures, tmp_path):
+    train("bptt", tmp_path, "loss.alpha=auto")
     first, last = (float(row["train/alpha"]) for row in read(tmp_path))
     assert first != last
-    train(recipe, tmp_path / "fixed", "loss.alpha=0.01")
+    train("bptt", tmp_path / "fixed", "loss.alpha=0.01")
     assert [float(row["train/alpha"]) for row in read(tmp_path / "fixed")] == pytest.approx([0.01, 0.01])
 
 
@@ -152,8 +143,12 @@ def test_the_entropy_bonus_is_an_option_and_its_coefficient_can_be_learned(train
 def test_make_train_trains_and_leaves_its_results(tmp_path):
     printed = run("make", "train", f"ARGS={' '.join(SMALL)} hydra.run.dir={tmp_path}")
     assert "abpt on hovering, seed 0, 256 fresh episodes" in printed
-    pictures = {"learning_curve.png", "flight.png", "flight.mp4", "flight.html", "episode.pdf"}
-    assert {"checkpoint.pt", "metrics.csv", *pictures} <= {path.name for path in tmp_path.iterdir()}
+    assert {"checkpoint.pt", "metrics.csv"} <= {path.name for path in tmp_path.iterdir()}
+    for picture in ("learning_curve.png", "flight.png"):
+        assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "flight.mp4").read_bytes()[4:8] == b"ftyp"
+    assert (tmp_path / "episode.pdf").read_bytes().startswith(b"%PDF")
+    assert (tmp_path / "flight.html").read_text().startswith("<!doctype html>")
 
 
 def test_an_evaluation_of_more_episodes_than_drones_flies_rounds_from_starts_of_their_own():

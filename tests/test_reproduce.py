@@ -127,12 +127,16 @@ from running import run, side_by_side
 folder = Path({str(tmp_path)!r})
 side_by_side(1, [(run, [sys.executable, "-c", {sleeper!r}], folder / str(i)) for i in range(3)])
 """
-    with subprocess.Popen([sys.executable, "-c", program], stderr=subprocess.DEVNULL) as process:
-        while not (log := tmp_path / "0/log.txt").exists() or not log.read_text():
-            time.sleep(0.1)
-            assert process.poll() is None
-        process.send_signal(number)
-        assert process.wait(30) == 128 + number
+    said, log, deadline = tmp_path / "said.txt", tmp_path / "0/log.txt", time.monotonic() + 120
+    with said.open("w") as file, subprocess.Popen([sys.executable, "-c", program], stderr=file) as process:
+        try:
+            while not log.exists() or not log.read_text():
+                assert process.poll() is None and time.monotonic() < deadline, said.read_text()
+                time.sleep(0.1)
+            process.send_signal(number)
+            assert process.wait(30) == 128 + number
+        finally:
+            process.kill()
     with pytest.raises(ProcessLookupError):
         os.kill(int(log.read_text()), 0)
     assert not (tmp_path / "1").exists()

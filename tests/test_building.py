@@ -1,0 +1,88 @@
+"""The building blocks of a recipe: targets that follow, learning rates, and minibatches."""
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
+from training.building import AdaptiveRate, TargetUpdate, advance, make_optimizer, minibatches, shuffled
+
+from torchrl_quad import ABPTLoss, HoveringEnv, SHACLoss, make_actor, make_qvalue, make_value
+
+
+def adam(lr):
+    return torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr)
+
+
+def numbered(*shape):
+    """A rollout that numbers its steps."""
+    return TensorDict({"step": torch.arange(torch.Size(shape).numel()).view(shape)}, shape)
+
+
+@pytest.mark.parametrize(("kind", "critic"), [(SHACLoss, make_value), (ABPTLoss, make_qvalue)])
+def test_a_target_critic_follows_as_with_torchrl_s_soft_update(kind, critic):
+    env = HoveringEnv(num_envs=1)
+    targets = []
+    for update in (TargetUpdate, SoftUpdate):
+        torch.manual_seed(0)
+        loss = kind(make_actor(env), critic(env))
+        updater = update(loss, tau=0.1)
+        getattr(loss, f"{loss.critic_name}_params").data.apply_(lambda parameter: parameter.add_(1.0))
+        updater.step()
+        targets.append(getattr(loss, f"target_{loss.critic_name}_params").data.clone())
+    own, torchrl = (dict(target.items(True, True)) for target in targets)
+    assert len(own) > 3
+    torch.testing.assert_close(own, torchrl)
+
+
+def test_a_schedule_may_be_set_between_two_iterations():
+    section = {"lr": 1e-2, "final_lr": 1e-4, "betas": [0.9, 0.99], "schedule": "linear"}
+    optimizer, schedule = make_optimizer(OmegaConf.create(section), [torch.nn.Parameter(torch.zeros(1))], 11)
+    optimizer.step()
+    for iteration, rate in ((5.5, 4.555e-3), (0, 1e-2), (10, 1e-4), (20, 1e-4)):
+        advance(schedule, iteration)
+        assert optimizer.param_groups[0]["lr"] == pytest.approx(rate)
+
+
+def test_how_far_a_horizon_may_move_the_policy_falls_to_a_fiftieth():
+    rate = AdaptiveRate(adam(1e-3), 0.2, 10)
+    assert [rate.limit(iteration) for iteration in (0, 5, 9, 10)] == pytest.approx([0.3, 0.15, 0.03, 0.006])
+
+
+def test_the_rate_adapts_to_how_far_the_policy_was_moved_within_its_bounds():
+    for moved, factor, end in ((0.31, 1 / 1.5, 1e-6), (0.2, 1.0, 1e-3), (0.13, 1.5, 0.02)):
+        optimizer = adam(1e-3)
+        rate = AdaptiveRate(optimizer, 0.2, 10)
+        rate.step(0, moved)
+        assert optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 * factor)
+        for _ in range(60):
+            rate.step(0, moved)
+        assert optimizer.param_groups[0]["lr"] == pytest.approx(end)
+    with pytest.raises(ValueError, match="actor.max_kl=null: this recipe sets its rate by it. Write a number"):
+        AdaptiveRate(adam(1e-3), None, 10)
+
+
+def test_minibatches_are_random_steps_of_the_rollout():
+    cfg = OmegaConf.create({"updates": 3, "batch_size": 50})
+    batches = [batch["step"] for batch in minibatches(numbered(3, 4), cfg)]
+    assert [batch.shape for batch in batches] == [(50,)] * 3
+    assert set(torch.cat(batches).tolist()) == set(range(12))
+    assert not torch.equal(batches[0], batches[1])
+
+
+def test_shuffled_batches_hold_every_step_once_in_each_epoch():
+    batches = [batch["step"] for batch in shuffled(numbered(3, 4), 5, 2)]
+    assert [len(batch) for batch in batches] == [5, 5, 2, 5, 5, 2]
+    epochs = [torch.cat(batches[:3]).tolist(), torch.cat(batches[3:]).tolist()]
+    assert epochs[0] != epochs[1]
+    assert [sorted(epoch) for epoch in epochs] == [list(range(12))] * 2
+
+
+def test_the_horizons_of_a_policy_that_remembers_stay_whole():
+    rollout = numbered(3, 4)
+    rollout["is_init"] = torch.zeros(3, 4, 1, dtype=torch.bool)
+    batches = [batch["step"] for batch in shuffled(rollout, 8, 2)]
+    assert [batch.shape for batch in batches] == [(2, 4), (1, 4)] * 2
+    for epoch in (batches[:2], batches[2:]):
+        assert sorted(torch.cat(epoch).tolist()) == rollout["step"].tolist()
+    assert [batch.shape for batch in shuffled(rollout, 3, 1)] == [(1, 4)] * 3

@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_quad.deploy.simulators.vehicle import rate_loop
+from torchrl_quad.deploy.simulators.vehicle import bandwidth, damping_ratio
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
 from torchrl_quad.envs import ForestEnv, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv
 from torchrl_quad.envs.disturbances import DroneRandomization, Sensors, Wind
@@ -306,7 +306,11 @@ def _rate_loop(env: QuadrotorEnv, drone: Mapping[str, Any]) -> dict[str, Any] | 
         return None
     gain, inertia, loss = (np.array(drone[k]) for k in ("rate_gain", "inertia", "rate_damping"))
     tau = np.mean(drone["motor_time_constant"])  # where it differs up and down, their mean
-    values = rate_loop(gain, inertia, loss, tau)._asdict()
+    values = {
+        "natural_frequency": np.sqrt(gain / tau),
+        "damping_ratio": damping_ratio(gain, inertia, loss, tau),
+        "bandwidth": bandwidth(gain, inertia, loss, tau),
+    }
     law = "tau w'' + 2 damping_ratio sqrt(gain tau) w' + gain w = gain desired, tau = motor_time_constant"
     return {"law": law, "gain": drone["rate_gain"], **{k: numbers(np.float32(v)) for k, v in values.items()}}
 

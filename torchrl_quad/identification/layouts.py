@@ -51,7 +51,7 @@ class Layout:
     convention: frames.Convention = OURS  #: the frames, and the order in which quaternions and motors are named
     onboard: tuple[str, ...] = ()  #: fields by a clock of their own
     time: Columns = Columns(("time",))  #: of CSV files; others have clocks
-    required: frozenset[str] = frozenset()  #: quantities that a caller named: a file without their columns is refused
+    required: frozenset[str] = frozenset()  #: quantities that a caller named; a file without their columns is refused
 
 
 def _c(names: str, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> Columns:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rotorpy.vehicles.multirotor import Multirotor
 
 from torchrl_quad.deploy import frames
-from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone, loop_of
+from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone, damping_ratio
 
 NAMES = {"position": "x", "quaternion": "q", "velocity": "v", "angular_velocity": "w"}
 
@@ -46,7 +46,8 @@ class RotorPy:
         nominal, drone = (_squared(x, speed) for x in (contract["drone"], contract["drone"] | contract["plant"]))
         self.frame, self.hover_speed, self.order = frames.rotorpy(), nominal.hover_speed, list(motors)
         self.loop = None if loop == "own" else LOOPS[loop](nominal, self.dt)
-        ratio, tau = loop_of(nominal).damping_ratio, nominal.motor_time_constant
+        tau = nominal.motor_time_constant
+        ratio = damping_ratio(nominal.rate_gain, nominal.inertia, nominal.rate_damping, tau)
         gain = float((1.0 / (4.0 * ratio**2 * tau))[:2].mean())
         kind = "cmd_ctbr" if loop == "own" else "cmd_motor_speeds"
         solver = {"method": "RK23", "first_step": self.dt}  # half the time of its defaults

@@ -6,7 +6,7 @@ Arrays are (n, ...), one row for each drone. Nothing here imports torch.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,7 +163,8 @@ class PIDLoop(ContractLoop):
 
     def __init__(self, drone: Drone, dt: float) -> None:
         super().__init__(drone, dt)
-        self.integral_gain = self.gain * self.integral_share * loop_of(drone).bandwidth
+        loop = drone.rate_gain, drone.inertia, drone.rate_damping, drone.motor_time_constant
+        self.integral_gain = self.gain * self.integral_share * bandwidth(*loop)
         self.smoothing = 1.0 - np.exp(-2.0 * np.pi * self.cutoff * dt)
         self.integral, self.derivative, self.before = np.zeros(3), np.zeros(3), None
 
@@ -195,29 +196,25 @@ class PDLoop(PIDLoop):
     integral_share = 0.0
 
 
-class SecondOrder(NamedTuple):
-    """The rate loop about hover, a second-order system about each axis (3).
+def damping_ratio(gain: Array, inertia: Array, damping: Array, motor_time_constant: float) -> Array:
+    """The damping ratio (3) of a rate loop about hover, which is a second-order system about each axis.
 
     torque = J K (desired - rate) - D (angular acceleration) + gyroscopic torque, and rotors that lag by tau, give
     tau w'' + (1 + D / J) w' + K w = K desired.
+
+    Args:
+        gain: K (3) [1/s].
+        inertia: J (3) [kg m2].
+        damping: D (3) [kg m2].
+        motor_time_constant: tau [s].
     """
-
-    natural_frequency: Array  #: [rad/s]
-    damping_ratio: Array
-    bandwidth: Array  #: [rad/s], at which the answer to a sine has fallen by 3 dB
+    return (1.0 + damping / inertia) / (2.0 * np.sqrt(gain * motor_time_constant))
 
 
-def rate_loop(gain: Array, inertia: Array, damping: Array, motor_time_constant: float) -> SecondOrder:
-    """The rate loop of a drone: K [1/s], J and D [kg m2] about each axis (3), and tau [s]."""
-    frequency = np.sqrt(gain / motor_time_constant)
-    ratio = (1.0 + damping / inertia) / (2.0 * np.sqrt(gain * motor_time_constant))
-    part = 1.0 - 2.0 * ratio**2
-    return SecondOrder(frequency, ratio, frequency * np.sqrt(part + np.sqrt(part**2 + 1.0)))
-
-
-def loop_of(drone: Drone) -> SecondOrder:
-    """The rate loop of the contract."""
-    return rate_loop(drone.rate_gain, drone.inertia, drone.rate_damping, drone.motor_time_constant)
+def bandwidth(gain: Array, inertia: Array, damping: Array, motor_time_constant: float) -> Array:
+    """At which the answer of a rate loop to a sine has fallen by 3 dB (3) [rad/s]; see :func:`damping_ratio`."""
+    part = 1.0 - 2.0 * damping_ratio(gain, inertia, damping, motor_time_constant) ** 2
+    return np.sqrt(gain / motor_time_constant) * np.sqrt(part + np.sqrt(part**2 + 1.0))
 
 
 LOOPS: dict[str, type[ContractLoop]] = {"contract": ContractLoop, "pid": PIDLoop, "pd": PDLoop}

@@ -36,7 +36,7 @@ def evaluate(
     """
     of_episodes = []
     with torch.no_grad():
-        for _ in range(-(-(episodes or 1) // env.batch_size[0])):
+        for _ in range(rounds(episodes, env.batch_size[0])):
             flight, _ = differentiable_rollout(
                 env, actor, None, env.max_episode_steps, exploration_type=ExplorationType.DETERMINISTIC
             )
@@ -50,6 +50,11 @@ def evaluate(
         for name, values in measured["eval"].items()
     }
     return metrics | {f"reward/{name}": term.mean().item() for name, term in measured["reward"].items()}, flight
+
+
+def rounds(episodes: int | None, drones: int) -> int:
+    """How often so many drones fly an episode each until there are as many as asked for; once where nothing is."""
+    return -(-(episodes or 1) // drones)
 
 
 @contextlib.contextmanager

@@ -39,6 +39,7 @@ from training.evaluation import (
     evaluate,
     final_evaluation,
     print_summary,
+    rounds,
     title,
     write_summary,
 )
@@ -238,7 +239,7 @@ class Run:
         self.logs.add(row)
         every = self.cfg.logger.flight_every
         if every and len(self.rows) % every == 0 and self.steps < self.total_steps:  # at the end the best one is drawn
-            episodes = -(-(self.cfg.eval.episodes or 1) // len(flight)) * len(flight)  # in whole rounds
+            episodes = rounds(self.cfg.eval.episodes, len(flight)) * len(flight)
             now = {**self.cfg, "episodes": episodes, "solved": metrics["eval/solved"]}
             drawing.draw_flight(flight, self.folder / "flight", self.env, title(now))
             self.logs.show_flight(self.steps)

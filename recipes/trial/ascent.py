@@ -14,30 +14,26 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from pathlib import Path
 
+import running  # noqa: F401  makes the recipes' code known
 import torch
 from matrix import VARIANTS
 from omegaconf import DictConfig, OmegaConf
-from running import RECIPES
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import cosine_similarity
 from torchrl.envs import EnvBase
 from tqdm import tqdm
-
-from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss, differentiable_rollout, make_qvalue, make_value
-from torchrl_quad.envs.episodes import first_episode
-from torchrl_quad.objectives import PathwiseLoss
-from torchrl_quad.objectives.action_gradients import action_gradient
-from torchrl_quad.objectives.segments import discounts
-
-sys.path.insert(0, str(RECIPES))  # which holds training/
 from training.building import build_env, make_policy, network
 from training.checkpoints import read_checkpoint
 
+from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss, differentiable_rollout, make_qvalue, make_value
+from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.files import read_rows, write_rows
+from torchrl_quad.objectives import PathwiseLoss
+from torchrl_quad.objectives.action_gradients import action_gradient
+from torchrl_quad.objectives.segments import discounts
 
 CRITICS = {"abpt": (ABPTLoss, make_qvalue), "shac": (SHACLoss, make_value)}
 SEED = 3_000_000

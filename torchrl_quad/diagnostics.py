@@ -15,6 +15,7 @@ from torch.autograd.graph import GradientEdge
 from torchrl.envs import EnvBase
 
 from torchrl_quad.data import differentiable_rollout
+from torchrl_quad.objectives.action_gradients import sources_of_steps
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.objectives.segments import discounts
 
@@ -252,11 +253,8 @@ def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
     """The tensors to differentiate with respect to; of a loss or an actor, the actor's parameters."""
     if isinstance(inputs, nn.Module):
         inputs = [p for p in getattr(inputs, "actor_network_params", inputs).parameters() if p.requires_grad]
-    if isinstance(inputs, Tensor) and hasattr(inputs.grad_fn, "actions"):  # a compiled horizon, a node of its own
-        return [inputs.grad_fn.actions]
-    if isinstance(inputs, Tensor) and inputs.grad_fn is not None and inputs.grad_fn.name() == "StackBackward0":
-        # TorchRL stacks the entries of a rollout afterwards: the reward depends on the tensors before that.
-        return [GradientEdge(node, index) for node, index in inputs.grad_fn.next_functions if node is not None]
+    if isinstance(inputs, Tensor) and (steps := sources_of_steps(inputs)) is not None:
+        return [steps] if isinstance(steps, Tensor) else steps
     sources = [inputs] if isinstance(inputs, Tensor) else list(inputs)
     if not sources or not all(isinstance(x, Tensor) and x.requires_grad for x in sources):
         raise ValueError(

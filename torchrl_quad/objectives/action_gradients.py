@@ -24,22 +24,36 @@ def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
     Raises:
         ValueError: the action is a copy or a part of the rollout's, whose steps cannot be told apart.
     """
-    node = action.grad_fn
-    if hasattr(node, "actions"):  # a compiled horizon
-        node.learns = False
-        try:
-            (grad,) = torch.autograd.grad(objective, node.actions, retain_graph=True)
-        finally:
-            node.learns = True
-        return grad.movedim(0, -2)
-    if not _is_stack_of_steps(action):
+    node, steps = action.grad_fn, sources_of_steps(action)
+    if steps is None:
         raise ValueError(
             "The gradient of each action needs one rollout as differentiable_rollout returned it, whole and with its "
             "graph; this one was copied, reshaped or cut. Give the rollout itself to the loss."
         )
-    edges = [GradientEdge(*edge) for edge in node.next_functions]
-    grads = torch.autograd.grad(objective, edges, retain_graph=True, allow_unused=True)
+    if isinstance(steps, Tensor):
+        node.learns = False
+        try:
+            (grad,) = torch.autograd.grad(objective, steps, retain_graph=True)
+        finally:
+            node.learns = True
+        return grad.movedim(0, -2)
+    grads = torch.autograd.grad(objective, steps, retain_graph=True, allow_unused=True)
     return torch.stack([torch.zeros_like(action[..., 0, :]) if g is None else g for g in grads], -2)
+
+
+def sources_of_steps(entry: Tensor) -> Tensor | list[GradientEdge] | None:
+    """What the rewards of a rollout depend on in place of an entry (*, horizon, k), which was put together afterwards.
+
+    A compiled horizon holds the actions of all steps in one tensor (horizon, num_envs, k); without one, each step has
+    its own place in the graph. None: nothing of the kind, as after a copy or a cut.
+    """
+    node = entry.grad_fn
+    if hasattr(node, "actions"):  # a compiled horizon, a node of its own
+        return node.actions
+    if node is None or node.name() != "StackBackward0" or entry.ndim < 2:
+        return None
+    dim = node._saved_dim if node._saved_dim < 2**63 else node._saved_dim - 2**64  # it is kept without its sign
+    return [GradientEdge(*edge) for edge in node.next_functions] if dim % entry.ndim == entry.ndim - 2 else None
 
 
 def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
@@ -164,12 +178,3 @@ class MedianClip(nn.Module):
         factor = torch.where(finite, self.factor * self.median / length.clamp_min(1e-30), 0.0).clamp_max(1.0)
         clipped = (counts & (factor < 1)).sum() / counts.sum().clamp_min(1)
         return torch.where(finite, grad, 0.0) * factor, clipped
-
-
-def _is_stack_of_steps(action: Tensor) -> bool:
-    """Whether the actions (*, horizon, k) of single steps were stacked, and nothing was done to them since."""
-    node = action.grad_fn
-    if node is None or node.name() != "StackBackward0" or len(node.next_functions) != action.shape[-2]:
-        return False
-    dim = node._saved_dim if node._saved_dim < 2**63 else node._saved_dim - 2**64  # it is kept without its sign
-    return dim % action.ndim == action.ndim - 2

@@ -17,7 +17,7 @@ from torchrl_quad import (
     make_qvalue,
     make_value,
 )
-from torchrl_quad.objectives.action_gradients import MedianClip, action_gradient
+from torchrl_quad.objectives.action_gradients import MedianClip, action_gradient, sources_of_steps
 
 LOSSES = {
     "bptt": lambda env, actor, **options: BPTTLoss(actor, **options),
@@ -101,6 +101,18 @@ def test_in_torchrls_loop_actions_have_the_same_gradients(env):
     with set_exploration_type(ExplorationType.RANDOM):
         slow = EnvBase.rollout(env, 9, actor, break_when_any_done=False)
     torch.testing.assert_close(action_gradient(slow["next", "reward"].sum(), slow["action"]), expected)
+
+
+def test_the_sources_of_an_entry_are_its_steps_whatever_their_shape_but_for_those_without_a_graph():
+    images = [torch.full((4, 2, 3), 1.0 + t, requires_grad=t > 0) for t in range(3)]
+    (first, second) = sources_of_steps(torch.stack(images, 1))
+    total = sum((1.0 + t) * image.sum() for t, image in enumerate(images))
+    grads = torch.autograd.grad(total, [first, second])
+    assert [g.unique().tolist() for g in grads] == [[2.0], [3.0]] and grads[0].shape == (4, 2, 3)
+    assert sources_of_steps(images[1]) is None and sources_of_steps(torch.stack(images, 1).clone()) is None
+    for of_steps in (torch.stack([x[:, 0] for x in images], 1), torch.stack([x[:, 0] for x in images[1:]])):
+        with pytest.raises(ValueError, match="this one was copied, reshaped or cut"):  # a step without; another order
+            action_gradient(total, of_steps)
 
 
 def test_a_long_gradient_is_shortened_to_so_many_medians():

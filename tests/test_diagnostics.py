@@ -166,8 +166,9 @@ def test_the_audit_finds_which_rewards_are_fully_and_which_are_partially_differe
     assert sum(term.gradient_share for term in audit.values()) == pytest.approx(1.0)
     if task != "hovering":
         return
-    by_action = audit_reward(rollout, rollout["action"])
-    assert [term.verdict for term in by_action.values()] == [term.verdict for term in audit.values()]
+    for key in ("action", ("state", "quaternion")):  # the first state has no graph
+        by_entry = audit_reward(rollout, rollout[key])
+        assert [term.verdict for term in by_entry.values()] == [term.verdict for term in audit.values()]
 
 
 def test_a_term_that_was_never_paid_is_not_seen():

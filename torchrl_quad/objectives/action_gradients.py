@@ -25,11 +25,6 @@ def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
         ValueError: the action is a copy or a part of the rollout's, whose steps cannot be told apart.
     """
     node, steps = action.grad_fn, sources_of_steps(action)
-    if steps is None:
-        raise ValueError(
-            "The gradient of each action needs one rollout as differentiable_rollout returned it, whole and with its "
-            "graph; this one was copied, reshaped or cut. Give the rollout itself to the loss."
-        )
     if isinstance(steps, Tensor):
         node.learns = False
         try:
@@ -37,23 +32,27 @@ def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
         finally:
             node.learns = True
         return grad.movedim(0, -2)
+    if steps is None or len(steps) != action.shape[-2] or not _is_along_time(action):
+        raise ValueError(
+            "The gradient of each action needs one rollout as differentiable_rollout returned it, whole and with its "
+            "graph; this one was copied, reshaped or cut. Give the rollout itself to the loss."
+        )
     grads = torch.autograd.grad(objective, steps, retain_graph=True, allow_unused=True)
     return torch.stack([torch.zeros_like(action[..., 0, :]) if g is None else g for g in grads], -2)
 
 
 def sources_of_steps(entry: Tensor) -> Tensor | list[GradientEdge] | None:
-    """What the rewards of a rollout depend on in place of an entry (*, horizon, k), which was put together afterwards.
+    """What the rewards of a rollout depend on in place of one of its entries, which was stacked afterwards.
 
-    A compiled horizon holds the actions of all steps in one tensor (horizon, num_envs, k); without one, each step has
-    its own place in the graph. None: nothing of the kind, as after a copy or a cut.
+    A compiled horizon holds the actions of all steps in one tensor (horizon, num_envs, k). Otherwise each step has its
+    own place in the graph, but for those without one, such as the first observation. None: the entry is no stack.
     """
     node = entry.grad_fn
     if hasattr(node, "actions"):  # a compiled horizon, a node of its own
         return node.actions
-    if node is None or node.name() != "StackBackward0" or entry.ndim < 2:
+    if node is None or node.name() != "StackBackward0":
         return None
-    dim = node._saved_dim if node._saved_dim < 2**63 else node._saved_dim - 2**64  # it is kept without its sign
-    return [GradientEdge(*edge) for edge in node.next_functions] if dim % entry.ndim == entry.ndim - 2 else None
+    return [GradientEdge(step, index) for step, index in node.next_functions if step is not None]
 
 
 def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
@@ -178,3 +177,10 @@ class MedianClip(nn.Module):
         factor = torch.where(finite, self.factor * self.median / length.clamp_min(1e-30), 0.0).clamp_max(1.0)
         clipped = (counts & (factor < 1)).sum() / counts.sum().clamp_min(1)
         return torch.where(finite, grad, 0.0) * factor, clipped
+
+
+def _is_along_time(stack: Tensor) -> bool:
+    """Whether the steps were stacked along the dimension before the last."""
+    dim = stack.grad_fn._saved_dim
+    dim = dim if dim < 2**63 else dim - 2**64  # it is kept without its sign
+    return dim % stack.ndim == stack.ndim - 2

@@ -62,6 +62,23 @@ def test_an_action_with_bounds_of_its_own_is_a_tanh_gaussian_between_them(rho):
     torch.testing.assert_close(written["action_log_prob"].double(), density.sum(-1), rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("rho", [0.0, 0.7])
+def test_a_saturated_policy_has_a_likely_action_and_a_gradient_of_usual_size(rho):
+    actor = make_actor(make_pendulum(), return_log_prob=True, scale_init=0.1, noise_correlation=rho)
+    last = actor[0].module.mlp[-1]
+    with torch.no_grad():
+        last.bias[0] = 1600.0  # as in a run of PPO that went on to push where nothing changes any more
+    td = TensorDict({"observation": torch.randn(500, 2)}, [500])
+    with set_exploration_type(ExplorationType.RANDOM):
+        td = actor(td)
+    assert td["action"].min() > 1.9996
+    log_prob = actor.get_dist(td).log_prob(td["action"])
+    torch.testing.assert_close(log_prob, td["action_log_prob"], rtol=0, atol=1e-2)
+    assert log_prob.min() > 0.0  # the density in a range of 2e-4
+    (grad,) = torch.autograd.grad(log_prob.mean(), last.bias)
+    assert grad.abs().max() < 10.0
+
+
 def test_each_entry_may_have_a_scale_of_its_own():
     env = HoveringEnv(num_envs=3)
     keys = ["observation", ("state", "rotor_speed")]

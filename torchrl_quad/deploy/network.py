@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.modules.heads import MAX_LOC
+
 OPSET, IR_VERSION = 20, 10  # onnxruntime reads both since 1.18
-LIMIT = np.float32(1.0 - 1e-6)  # of the action; TorchRL's TanhNormal keeps as far from -1 and 1
+LIMIT = np.float32(math.tanh(MAX_LOC))  # of the action: the policy's mean is bounded before its tanh
 
 Array = NDArray[np.float32]
 

@@ -9,9 +9,15 @@ import torch
 from tensordict.nn import NormalParamExtractor
 from torch import Tensor, nn
 
+MAX_LOC = 5.0  # the largest mean of the normal distribution; tanh(5) is 9e-5 from the bound of the action
+
 
 class GaussianHead(NormalParamExtractor):
     """The normal distribution of an action of ``size`` entries, from what a network returns.
+
+    Its mean stays within ``MAX_LOC``, where an action in float32 determines what was drawn. Further out rounding
+    decides on the log-probability. Beyond 7.25, where the action is clipped, it falls without bound, and the gradient
+    of one sample outweighs all others.
 
     Args:
         size: of the action, k.
@@ -24,7 +30,8 @@ class GaussianHead(NormalParamExtractor):
 
     def forward(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         """loc and scale (*, k), from both (*, 2k), or from loc alone (*, k): the scale stays what it starts as."""
-        return super().forward(raw if raw.shape[-1] > self.size else torch.cat((raw, torch.zeros_like(raw)), -1))
+        loc, scale = super().forward(raw if raw.shape[-1] > self.size else torch.cat((raw, torch.zeros_like(raw)), -1))
+        return loc.clamp(-MAX_LOC, MAX_LOC), scale
 
 
 class CorrelatedHead(GaussianHead):

@@ -39,7 +39,8 @@ def make_actor(
     """A tanh-Gaussian policy a = tanh(mu(s) + sigma(s) noise), stretched to the bounds of the action.
 
     The weights of its last layer start near zero. The first actions are close to ``action_init``, with noise of about
-    ``scale_init`` (before the tanh, in units of half the range). It writes ``loc``, ``scale`` and ``action``.
+    ``scale_init`` (before the tanh, in units of half the range). It writes ``loc``, ``scale`` and ``action``. mu stays
+    between -5 and 5, where the log-probability of an action survives float32.
 
     Args:
         env: any TorchRL environment, for the sizes of its entries, the action's bounds, device and floating-point type.

@@ -17,7 +17,7 @@ from torch import nn
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import HoveringEnv
+from torchrl_quad import HoveringEnv, make_actor, make_visual_actor
 from torchrl_quad.deploy import (
     StaleState,
     UnknownContract,
@@ -150,6 +150,20 @@ def test_every_activation_is_written_alike_as_onnx_and_c(tmp_path):
         function = getattr(library, f"{name}_of")
         function.argtypes, function.restype = [ctypes.c_float], ctypes.c_float
         np.testing.assert_allclose([function(v) for v in x], expected, rtol=2e-6, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("task", ["hovering", "forest"])
+def test_the_bound_of_a_mean_is_written_too(task, tmp_path):
+    env = build(task, num_envs=2)[0]
+    make = make_visual_actor if task == "forest" else make_actor
+    actor = make(env, num_cells=(4,), return_log_prob=True)
+    parts = actor[0][-1] if task == "forest" else actor[0]
+    with torch.no_grad():
+        parts.module.mlp[-1].bias[:2] = torch.tensor([1600.0, -1600.0])
+    folder = export_policy(actor, env, tmp_path / "policy")
+    vectors = dict(np.load(folder / "vectors.npz"))
+    for found in (vectors["action"], run_c(compiled(folder, tmp_path / "policy.so"), vectors)):
+        np.testing.assert_allclose(found[:, :2], np.tile([np.tanh(5), -np.tanh(5)], (len(found), 1)), rtol=0, atol=1e-6)
 
 
 def test_c_answers_what_is_not_finite_with_the_hover_action_and_decodes_commands(hovering, tmp_path):

@@ -22,7 +22,7 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "modules": {UNWRAP},
     "objectives": {UNWRAP},
     "data": set(),
-    "deploy": {"data", "dynamics", "envs", "files", "modules.heads"},
+    "deploy": {"data", "dynamics", "envs", "files"},
     "files": set(),
     "diagnostics": {"data", "objectives"},
     "gym": {"envs"},

@@ -28,7 +28,7 @@ RACING_AS_THEN = (  # of the first-order methods
 )
 PPO_AS_THEN = (
     *("num_envs=256", "horizon=64", "actor.max_kl=null", "actor.noise_correlation=0"),
-    *("actor.schedule=linear", "loss.max_importance_ratio=null"),
+    *("actor.schedule=linear", "loss.max_importance_ratio=null", "loss.entropy_bonus=false", "critic.lmbda=0.95"),
     *("actor.betas=[0.9,0.999]", "critic.betas=[0.9,0.999]", "critic.lr=1e-3", "critic.final_lr=1e-5"),
 )
 RACING = ("env.reward=position", "actor.input_scale=1", "critic.num_cells=[128,128]", "gamma=0.98")  # for all methods

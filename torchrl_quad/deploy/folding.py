@@ -41,7 +41,8 @@ def fold(
         _require_readable(plain.in_keys, ["observation"])
         _require_unit_actions(plain.low, plain.high)
         linear = zip(plain.weights[::2], plain.weights[1::2], [*plain.activations, nn.Tanh()], strict=True)
-        network = Network(_layers(linear, plain.size, np.repeat(plain.scales, plain.widths), normalizer))
+        layers = _layers(linear, plain.size, np.repeat(plain.scales, plain.widths), normalizer)
+        network = Network(layers, max_loc=plain.head.max_loc)
     elif parts is not None:
         network = _seeing(actor, parts, normalizer, image)
     else:
@@ -67,7 +68,7 @@ def _seeing(
         for x in (parts.eyes, parts.trunk)
     )
     memory = parts.memory and Memory(*(_float32(_numbers(getattr(parts.memory, name))) for name in GRU))
-    sight = Network([], _layers(eyes), tuple(image or (0, 0)), parts.nearest, memory)
+    sight = Network([], _layers(eyes), tuple(image or (0, 0)), parts.nearest, memory, parts.max_loc)
     if image is None or sight.found != parts.widths[0] or sight.eyes[0].weight.shape[1] != 1:
         camera = "has no camera" if image is None else f"shows it {image[1]} x {image[0]} pixels"
         raise ValueError(f"export_policy: the policy was built for images of another size; the environment {camera}.")

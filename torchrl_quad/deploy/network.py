@@ -13,10 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_quad.modules.heads import MAX_LOC
-
 OPSET, IR_VERSION = 20, 10  # onnxruntime reads both since 1.18
-LIMIT = np.float32(math.tanh(MAX_LOC))  # of the action: the policy's mean is bounded before its tanh
 
 Array = NDArray[np.float32]
 
@@ -44,7 +41,7 @@ class Layer(NamedTuple):
 
     weight: Array  #: (out, in), of an eye (out, in, 3, 3)
     bias: Array  #: (out)
-    activation: str  #: one of ``ACTIVATIONS``; the last layer's is Tanh, and the action is clamped to ``LIMIT``
+    activation: str  #: one of ``ACTIVATIONS``; the last layer's is Tanh, and the action is clamped
 
 
 class Memory(NamedTuple):
@@ -64,6 +61,12 @@ class Network(NamedTuple):
     image: tuple[int, int] = (0, 0)  #: height and width
     nearest: float = 0.0  #: the eyes read 1 / max(depth, nearest) [m]
     memory: Memory | None = None  #: reads what the last layer reads, which then reads the memory, too
+    max_loc: float | None = None  #: the largest sum of the last layer, if it is bounded
+
+    @property
+    def limit(self) -> float:
+        """The largest action; TorchRL's TanhNormal keeps as far from -1 and 1."""
+        return min(1.0 - 1e-6, math.inf if self.max_loc is None else math.tanh(self.max_loc))
 
     @property
     def images(self) -> list[tuple[int, int, int]]:
@@ -146,7 +149,7 @@ def write_onnx(network: Network) -> bytes:
         after = add("GRU", reads, "after", hidden_size=size, linear_before_reset=1)
         x = add("Concat", [x, add("Squeeze", [after, at], "next_memory")], "recalled", axis=1)
     x = run(network.layers[-1], x, f"{len(network.layers) - 1}")
-    add("Clip", [x, constant("low", -LIMIT), constant("high", LIMIT)], "action")
+    add("Clip", [x, constant("low", -network.limit), constant("high", network.limit)], "action")
     shapes = network.reads
     written = {"action": (len(network.layers[-1].bias),)}
     written |= {"next_memory": shapes["memory"]} if network.memory else {}
@@ -192,7 +195,7 @@ def write_c(network: Network, contract: Mapping[str, Any], vectors: Mapping[str,
         "hover_action": _floats(output["hover_action"]),
         "max_thrust": _float(output["thrust"]["range"][1]),
         "max_rates": _floats(high for _, high in output["body_rate"]["range"]),
-        "limit": _float(LIMIT),
+        "limit": _float(network.limit),
         "activations": "\n".join(
             f"static float {_function(name)}(float x) {{ return {ACTIVATIONS[name][1]}; }}" for name in names
         ),

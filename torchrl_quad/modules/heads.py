@@ -9,29 +9,25 @@ import torch
 from tensordict.nn import NormalParamExtractor
 from torch import Tensor, nn
 
-MAX_LOC = 5.0  # the largest mean of the normal distribution; tanh(5) is 9e-5 from the bound of the action
-
 
 class GaussianHead(NormalParamExtractor):
     """The normal distribution of an action of ``size`` entries, from what a network returns.
 
-    Its mean stays within ``MAX_LOC``, where an action in float32 determines what was drawn. Further out rounding
-    decides on the log-probability. Beyond 7.25, where the action is clipped, it falls without bound, and the gradient
-    of one sample outweighs all others.
-
     Args:
         size: of the action, k.
         scale_mapping: as for NormalParamExtractor.
+        max_loc: the largest mean, by its absolute value; None for any. Beyond 7.25 tanh is clipped, and an action no
+            longer determines what was drawn: its log-probability falls without bound.
     """
 
-    def __init__(self, size: int, scale_mapping: str) -> None:
+    def __init__(self, size: int, scale_mapping: str, max_loc: float | None = None) -> None:
         super().__init__(scale_mapping=scale_mapping)
-        self.size = size
+        self.size, self.max_loc = size, max_loc
 
     def forward(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         """loc and scale (*, k), from both (*, 2k), or from loc alone (*, k): the scale stays what it starts as."""
         loc, scale = super().forward(raw if raw.shape[-1] > self.size else torch.cat((raw, torch.zeros_like(raw)), -1))
-        return loc.clamp(-MAX_LOC, MAX_LOC), scale
+        return loc if self.max_loc is None else loc.clamp(-self.max_loc, self.max_loc), scale
 
 
 class CorrelatedHead(GaussianHead):
@@ -43,11 +39,11 @@ class CorrelatedHead(GaussianHead):
 
     Args:
         rho: the correlation of the noise of two steps that follow each other.
-        size, scale_mapping: as for GaussianHead.
+        size, scale_mapping, max_loc: as for GaussianHead.
     """
 
-    def __init__(self, rho: float, size: int, scale_mapping: str) -> None:
-        super().__init__(size, scale_mapping)
+    def __init__(self, rho: float, size: int, scale_mapping: str, max_loc: float | None = None) -> None:
+        super().__init__(size, scale_mapping, max_loc)
         self.rho, self.rest = rho, math.sqrt(1.0 - rho**2)
 
     def forward(self, raw: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:

@@ -39,8 +39,7 @@ def make_actor(
     """A tanh-Gaussian policy a = tanh(mu(s) + sigma(s) noise), stretched to the bounds of the action.
 
     The weights of its last layer start near zero. The first actions are close to ``action_init``, with noise of about
-    ``scale_init`` (before the tanh, in units of half the range). It writes ``loc``, ``scale`` and ``action``. mu stays
-    between -5 and 5, where the log-probability of an action survives float32.
+    ``scale_init`` (before the tanh, in units of half the range). It writes ``loc``, ``scale`` and ``action``.
 
     Args:
         env: any TorchRL environment, for the sizes of its entries, the action's bounds, device and floating-point type.
@@ -59,7 +58,8 @@ def make_actor(
             drone where independent noise averages out; try 0.9 at 50 Hz. Then loc, scale and the log-probability are
             those of the action given the noise of the step before, which is written to ``noise_before``; ``noise`` is
             that of the step itself.
-        return_log_prob: also write the log-probability of the action, which an entropy bonus and PPO need.
+        return_log_prob: also write the log-probability of the action, which an entropy bonus and PPO need. mu then
+            stays between -5 and 5: further out rounding of the action decides on the log-probability.
 
     Raises:
         ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one;
@@ -71,7 +71,7 @@ def make_actor(
     size = spec.shape[-1]
     net = network_of(env, in_keys, 2 * size if learn_scale else size, num_cells, activation, input_scale)
     start_near(net.mlp[-1], first)
-    params = with_head(net, size, scale_init, noise_correlation, in_keys)
+    params = with_head(net, size, scale_init, noise_correlation, in_keys, return_log_prob)
     actor = (CorrelatedActor if noise_correlation else TanhGaussianActor)(
         params, **sampling(spec), return_log_prob=return_log_prob
     )
@@ -154,7 +154,12 @@ def start_near(layer: nn.Linear, first: Tensor) -> None:
 
 
 def with_head(
-    network: Network, size: int, scale_init: float, noise_correlation: float, in_keys: Sequence[NestedKey]
+    network: Network,
+    size: int,
+    scale_init: float,
+    noise_correlation: float,
+    in_keys: Sequence[NestedKey],
+    return_log_prob: bool,
 ) -> TensorDictModule:
     """Give the last network of a policy, which reads ``in_keys``, a normal distribution of an action of ``size``.
 
@@ -165,11 +170,12 @@ def with_head(
         raise ValueError(f"noise_correlation must lie from 0 to below 1, got {noise_correlation}.")
     least = min(0.01, 0.1 * scale_init)  # to which training can bring the scale down
     mapping, read = f"biased_softplus_{scale_init}_{least}", list(in_keys)
+    max_loc = 5.0 if return_log_prob else None  # as far as TorchRL's TanhNormal goes with tanh_loc=True
     if noise_correlation:
-        network.head = CorrelatedHead(noise_correlation, size, mapping)
+        network.head = CorrelatedHead(noise_correlation, size, mapping, max_loc)
         read.append("noise_before")
     else:
-        network.head = GaussianHead(size, mapping)
+        network.head = GaussianHead(size, mapping, max_loc)
     return TensorDictModule(network, in_keys=read, out_keys=["loc", "scale"])
 
 

@@ -160,7 +160,7 @@ class PlainTanhGaussian:
         self.signature = (
             *map(str, (self.in_keys, self.out_keys, self.scales, self.activations, self.low, self.high)),
             *(tuple(x.shape) for x in self.weights),
-            (self.head.scale_lb, mapping.bias, mapping.min_val, self.rho),
+            (self.head.scale_lb, mapping.bias, mapping.min_val, self.rho, self.head.max_loc),
         )
 
     def normalize(self, key: Any, loc: Tensor, scale: Tensor) -> None:

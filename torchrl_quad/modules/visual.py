@@ -149,7 +149,8 @@ def make_visual_actor(
     last = MLP(sum(widths), outputs, num_cells=[], device=env.device).to(image.dtype)
     start_near(last[-1], first)
     head = Network(last, [1.0] * len(widths), widths)
-    parts.append(with_head(head, size, scale_init, noise_correlation, ["seen", "recalled"][: len(widths)]))
+    in_keys = ["seen", "recalled"][: len(widths)]
+    parts.append(with_head(head, size, scale_init, noise_correlation, in_keys, return_log_prob))
     actor = VisualActor(TensorDictSequential(*parts), **sampling(spec), return_log_prob=return_log_prob)
     return writes_noise(actor) if noise_correlation else actor
 
@@ -183,6 +184,7 @@ class Parts(NamedTuple):
     memory: GRU | None  #: reads what the trunk returns
     head: nn.Linear  #: reads what trunk and memory return; its first outputs are the mean action before the tanh
     size: int  #: of the action
+    max_loc: float | None  #: the largest mean action before the tanh, if it is bounded
 
 
 class VisualActor(ProbabilisticActor):
@@ -240,7 +242,8 @@ class VisualActor(ProbabilisticActor):
         if keys != wanted or len(head.scales) != len(reads):
             return None
         gru = memory[0].gru if memory else None
-        return Parts(eyes, NEAREST, trunk, sight.trunk.widths, sight.trunk.scales, gru, head.mlp[0], head.head.size)
+        last = head.mlp[0], head.head.size, head.head.max_loc
+        return Parts(eyes, NEAREST, trunk, sight.trunk.widths, sight.trunk.scales, gru, *last)
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """TorchRL's transform that gives an environment the memory of this policy, in its precision.

@@ -264,7 +264,7 @@ def test_half_and_twice_a_rate_fly_once_and_are_judged_by_their_worst_seed(run_h
     rows = [row | {"factor": factor, "seed": seed, "return": x, "solved": "0.5"} for (factor, seed), x in ends.items()]
     write_rows(tmp_path / "rates.csv", rows)
     assert "| hovering | BPTT | 1.5, 50.0%, 1 of 3 seeds |  | 7, 50.0% |" in rates.summary(tmp_path)
-    assert rates.scaled("racing", "ppo", "2") == ["actor.lr=0.02", "actor.final_lr=0.0002"]
+    assert rates.scaled("racing", "ppo", "2") == ["actor.lr=0.012", "actor.final_lr=2e-05"]
     assert rates.scaled("hovering", "hybrid", "0.5") == ["actor.max_kl=0.125"]
     with pytest.raises(SystemExit):
         run_main(monkeypatch, rates, "--quick")

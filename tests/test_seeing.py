@@ -207,7 +207,7 @@ def test_losses_take_a_policy_that_sees(recurrent, noise_correlation):
 def test_correlated_noise_of_a_policy_that_sees_is_that_of_its_head(recurrent):
     env = forest(max_episode_steps=4)
     actor = actor_for(env, recurrent=recurrent, scale_init=0.3, noise_correlation=0.9, return_log_prob=True)
-    white = actor_for(env, recurrent=recurrent, scale_init=0.3)
+    white = actor_for(env, recurrent=recurrent, scale_init=0.3, return_log_prob=True)  # whose mean is bounded, too
     white.load_state_dict(actor.state_dict())
     rollout, _ = differentiable_rollout(env, actor, None, 6)
     rollout, rest = rollout.detach(), math.sqrt(1 - 0.9**2)

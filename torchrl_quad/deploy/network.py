@@ -61,12 +61,12 @@ class Network(NamedTuple):
     image: tuple[int, int] = (0, 0)  #: height and width
     nearest: float = 0.0  #: the eyes read 1 / max(depth, nearest) [m]
     memory: Memory | None = None  #: reads what the last layer reads, which then reads the memory, too
-    max_loc: float | None = None  #: the largest sum of the last layer, if it is bounded
+    max_loc: float = math.inf  #: the largest sum of the last layer
 
     @property
     def limit(self) -> float:
         """The largest action; TorchRL's TanhNormal keeps as far from -1 and 1."""
-        return min(1.0 - 1e-6, math.inf if self.max_loc is None else math.tanh(self.max_loc))
+        return min(1.0 - 1e-6, math.tanh(self.max_loc))
 
     @property
     def images(self) -> list[tuple[int, int, int]]:

@@ -16,18 +16,18 @@ class GaussianHead(NormalParamExtractor):
     Args:
         size: of the action, k.
         scale_mapping: as for NormalParamExtractor.
-        max_loc: the largest mean, by its absolute value; None for any. Beyond 7.25 tanh is clipped, and an action no
+        max_loc: the largest mean, by its absolute value. Beyond 7.25 tanh is clipped, and an action no
             longer determines what was drawn: its log-probability falls without bound.
     """
 
-    def __init__(self, size: int, scale_mapping: str, max_loc: float | None = None) -> None:
+    def __init__(self, size: int, scale_mapping: str, max_loc: float = math.inf) -> None:
         super().__init__(scale_mapping=scale_mapping)
         self.size, self.max_loc = size, max_loc
 
     def forward(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         """loc and scale (*, k), from both (*, 2k), or from loc alone (*, k): the scale stays what it starts as."""
         loc, scale = super().forward(raw if raw.shape[-1] > self.size else torch.cat((raw, torch.zeros_like(raw)), -1))
-        return loc if self.max_loc is None else loc.clamp(-self.max_loc, self.max_loc), scale
+        return loc if self.max_loc == math.inf else loc.clamp(-self.max_loc, self.max_loc), scale
 
 
 class CorrelatedHead(GaussianHead):
@@ -42,7 +42,7 @@ class CorrelatedHead(GaussianHead):
         size, scale_mapping, max_loc: as for GaussianHead.
     """
 
-    def __init__(self, rho: float, size: int, scale_mapping: str, max_loc: float | None = None) -> None:
+    def __init__(self, rho: float, size: int, scale_mapping: str, max_loc: float = math.inf) -> None:
         super().__init__(size, scale_mapping, max_loc)
         self.rho, self.rest = rho, math.sqrt(1.0 - rho**2)
 

@@ -170,7 +170,7 @@ def with_head(
         raise ValueError(f"noise_correlation must lie from 0 to below 1, got {noise_correlation}.")
     least = min(0.01, 0.1 * scale_init)  # to which training can bring the scale down
     mapping, read = f"biased_softplus_{scale_init}_{least}", list(in_keys)
-    max_loc = 5.0 if return_log_prob else None  # as far as TorchRL's TanhNormal goes with tanh_loc=True
+    max_loc = 5.0 if return_log_prob else math.inf  # as far as TorchRL's TanhNormal goes with tanh_loc=True
     if noise_correlation:
         network.head = CorrelatedHead(noise_correlation, size, mapping, max_loc)
         read.append("noise_before")

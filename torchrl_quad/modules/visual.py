@@ -184,7 +184,7 @@ class Parts(NamedTuple):
     memory: GRU | None  #: reads what the trunk returns
     head: nn.Linear  #: reads what trunk and memory return; its first outputs are the mean action before the tanh
     size: int  #: of the action
-    max_loc: float | None  #: the largest mean action before the tanh, if it is bounded
+    max_loc: float  #: the largest mean action before the tanh
 
 
 class VisualActor(ProbabilisticActor):

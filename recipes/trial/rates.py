@@ -27,7 +27,6 @@ from torchrl_quad.files import read_rows
 
 SEEDS = (101, 102, 103)
 FACTORS = {"0.5": "half", "1": "as it ships", "2": "twice"}
-OF_METHODS = ("bptt", "shac", "abpt", "hybrid", "ppo")
 
 
 @cache
@@ -44,7 +43,7 @@ def summary(data: Path) -> str:
     for row in read_rows(data / "rates.csv"):
         groups.setdefault((row["task"], row["algorithm"]), {}).setdefault(row["factor"], []).append(row)
     lines = []
-    for task, method in sorted(groups, key=lambda x: (list(TASKS).index(x[0]), OF_METHODS.index(x[1]))):
+    for task, method in sorted(groups, key=lambda x: (list(TASKS).index(x[0]), list(METHODS).index(x[1]))):
         cells = []
         for factor in FACTORS:
             runs = groups[task, method].get(factor, [])
@@ -55,7 +54,7 @@ def summary(data: Path) -> str:
 
 
 def main() -> None:
-    args = arguments(command_line(__doc__, SEEDS, tasks=TASKS, methods=OF_METHODS, factors=FACTORS))
+    args = arguments(command_line(__doc__, SEEDS, tasks=TASKS, methods=METHODS, factors=FACTORS))
     jobs = [(t, m, f, s) for t in args.tasks for m in args.methods for s in args.seeds for f in args.factors]
     flown = [(t, m, f, s, f"x{f}", scaled(t, m, f)) for t, m, f, s in jobs]
     fly_missing(args, args.data / "rates.csv", "factor", flown)

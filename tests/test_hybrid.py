@@ -2,11 +2,14 @@
 
 import pytest
 import torch
+from torch.distributions import Normal
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import TanhNormal
 from torchrl.objectives import ValueEstimators
 
 from torchrl_quad import HoveringEnv, HybridLoss, differentiable_rollout, make_actor, make_value
+from torchrl_quad.objectives.action_gradients import distribution_again
 
 GAMMA, LAMBDA = 0.9, 0.8
 
@@ -84,7 +87,7 @@ def test_the_loss_is_the_surrogate_of_the_rest_and_the_pathwise_term(env):
     with loss.actor_network_params.to_module(actor):
         parameters = actor.get_dist_params(data.select("observation"))
     loc, scale = parameters["loc"], parameters["scale"]
-    log_prob = torch.distributions.Normal(loc, scale).log_prob(data["latent"]).sum(-1, keepdim=True)
+    log_prob = Normal(loc, scale).log_prob(data["latent"]).sum(-1, keepdim=True)
     by_hand = -(log_prob * data["advantage"]).mean() - (data["location_gradient"] * loc).sum(-1).mean()
     torch.testing.assert_close(gradient(loss, losses["loss_actor"]), gradient(loss, by_hand))
     torch.testing.assert_close(losses["loss_actor"], -data["advantage"].mean())
@@ -98,6 +101,24 @@ def test_the_loss_is_the_surrogate_of_the_rest_and_the_pathwise_term(env):
     slope = (x * y).mean() / x.square().mean()
     torch.testing.assert_close(slope, loss.pathwise_weight)
     loss(data.flatten()[:5])["loss_value"].backward()
+
+
+def test_the_entropy_is_that_of_the_tanh_normal(env):
+    without, loss = make_loss(env), make_loss(env, entropy_coeff=0.1)
+    data = loss.write_targets(flight(env, loss))
+    torch.manual_seed(1)
+    losses = loss(data)
+    torch.manual_seed(1)
+    parameters = distribution_again(loss.actor_network, loss.actor_network_params, data)
+    slope = 1.0 - TanhNormal(*parameters).rsample().square()  # of the tanh
+    entropy = (Normal(*parameters).entropy() + slope.log()).sum(-1)
+    assert set(losses.keys()) == set(loss.out_keys)
+    torch.testing.assert_close(losses["entropy"], entropy.mean().detach())
+    without.pathwise_weight.copy_(loss.pathwise_weight)
+    by_hand = without(data)["loss_actor"] - 0.1 * entropy.mean()
+    torch.testing.assert_close(losses["loss_actor"], by_hand.detach())
+    both = gradient(without, without(data)["loss_actor"]) - 0.1 * gradient(loss, entropy.mean())
+    torch.testing.assert_close(gradient(loss, losses["loss_actor"]), both)
 
 
 def test_the_weight_tells_a_true_derivative_from_none(env):
@@ -138,6 +159,7 @@ def test_errors(env):
     for options, named in (
         ({"gradient_lmbda": 0.0}, "gradient_lmbda"),
         ({"clip_epsilon": 1.0}, "clip_epsilon"),
+        ({"entropy_coeff": -0.1}, "entropy_coeff"),
         ({"decay": 1.0}, "decay"),
     ):
         with pytest.raises(ValueError, match=named):

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
+from torch.nn.functional import softplus
 from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again, location_gradient
@@ -36,6 +37,8 @@ class HybridLoss(SHACLoss):
     noise of its own step. This is the control variate of Q-Prop (Gu et al. 2017), with the derivative of a simulated
     flight in place of a critic's.
 
+    With ``entropy_coeff`` the surrogate gets that multiple of the policy's entropy in each state, as PPO has it.
+
     The lambda-return of p_t bootstraps with V at every step, and each p_t is not discounted from the start of the
     horizon. With noise that is correlated in time, an action's noise goes on in later actions, and
     p_t + c p_(t+1) + c^2 p_(t+2) + ... takes the place of p_t, as it does in A_t: c = rho gamma lambda,
@@ -57,6 +60,7 @@ class HybridLoss(SHACLoss):
         gradient_lmbda: lambda of the return that p_t differentiates, in (0, 1]. That of the advantage and of the
             critic's targets is ``make_value_estimator(lmbda=...)``.
         clip_epsilon: how far the ratio of probabilities may move from 1.
+        entropy_coeff: of the entropy, next to advantages of standard deviation 1; 0 for none.
         clip_action_gradient: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
         decay: of the running weight, for each rollout.
         average: of a scalar over the processes that train together, if there are several.
@@ -96,6 +100,7 @@ class HybridLoss(SHACLoss):
         *,
         gradient_lmbda: float = 0.9,
         clip_epsilon: float = 0.2,
+        entropy_coeff: float = 0.0,
         clip_action_gradient: float | None = 2.0,
         decay: float = 0.9,
         average: Callable[[Tensor], Tensor] = lambda x: x,
@@ -105,12 +110,16 @@ class HybridLoss(SHACLoss):
             raise ValueError(f"gradient_lmbda must lie in (0, 1], got {gradient_lmbda}; 0.9 is usual.")
         if not 0 < clip_epsilon < 1:
             raise ValueError(f"clip_epsilon must lie between 0 and 1, got {clip_epsilon}; 0.2 is usual.")
+        if not 0 <= entropy_coeff < math.inf:
+            raise ValueError(f"entropy_coeff must be finite and not negative, got {entropy_coeff}; 0.01 is usual.")
         if not 0 <= decay < 1:
             raise ValueError(f"decay must lie in [0, 1), got {decay}.")
         options = {"clip_action_gradient": clip_action_gradient, "reduction": reduction}
         super().__init__(actor_network, value_network, delay_value=False, **options)
-        self.gradient_lmbda, self.clip_epsilon, self.decay, self.average = gradient_lmbda, clip_epsilon, decay, average
+        self.gradient_lmbda, self.clip_epsilon, self.entropy_coeff = gradient_lmbda, clip_epsilon, entropy_coeff
+        self.decay, self.average = decay, average
         self.out_keys = [name for name in self.out_keys if name != "clipped"]  # minibatches clip no gradient
+        self.out_keys += ["entropy"] * (entropy_coeff > 0)
         weight = torch.full((), math.nan, device=self._default_device, dtype=self._precision)
         self.register_buffer("pathwise_weight", weight)
 
@@ -154,7 +163,7 @@ class HybridLoss(SHACLoss):
         return data
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The actor's loss, and its metadata: the weight, and KL(policy that flew || policy).
+        """The actor's loss, and its metadata: the weight, KL(policy that flew || policy), and the entropy if it counts.
 
         Args:
             tensordict: as for :meth:`forward`.
@@ -167,8 +176,12 @@ class HybridLoss(SHACLoss):
         score = torch.minimum(ratio * advantage, clipped * advantage).squeeze(-1)
         pathwise = (tensordict.get(keys.location_gradient) * (new.loc - old.loc)).sum(-1)
         kl = kl_divergence(old, new).sum(-1).mean().detach()
-        weight = self.pathwise_weight.clamp(0.0, 1.0)
-        return self._reduce_loss(-(score + pathwise)), {"pathwise_weight": weight, "kl": kl}
+        objective, metadata = score + pathwise, {"pathwise_weight": self.pathwise_weight.clamp(0.0, 1.0), "kl": kl}
+        if self.entropy_coeff:
+            entropy = self._policy_entropy(new)
+            objective = objective + self.entropy_coeff * entropy
+            metadata["entropy"] = entropy.detach().mean()
+        return self._reduce_loss(-objective), metadata
 
     def _with_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
         written = {self.tensor_keys.advantage, self.tensor_keys.location_gradient, self.tensor_keys.latent}
@@ -222,6 +235,12 @@ class HybridLoss(SHACLoss):
         new = distribution_again(self.actor_network, self.actor_network_params, tensordict)
         old = tensordict.get("loc"), tensordict.get("scale")
         return Normal(*new), Normal(*old)
+
+    def _policy_entropy(self, policy: Normal) -> Tensor:
+        """The entropy of tanh(u), estimated by one u of a policy in each state: (*)."""
+        latent = policy.rsample()
+        log_slope = 2.0 * (math.log(2.0) - latent - softplus(-2.0 * latent))  # of the tanh
+        return (policy.entropy() + log_slope).sum(-1)
 
     def _ratio(self, new: Normal, old: Normal, tensordict: TensorDictBase) -> Tensor:
         """The ratio of the probabilities of the action that was flown: (*, 1)."""

@@ -16,7 +16,7 @@ times the way that the ball comes closer, and -10 if it falls, which ends the ep
 lasts 200 steps at most. All forces between bar, ball and agents act by contact.
 
 The return is the mean over 256 episodes without exploration noise. All losses have the same networks, rates and number
-of steps. The hybrid has the settings of its recipe instead, and as many steps.
+of steps. The hybrid has the networks and rates of its recipe instead, noise of a fixed size, and as many steps.
 """
 
 from __future__ import annotations
@@ -228,7 +228,7 @@ def optimise(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: floa
 
 
 def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
-    """As :func:`train`, with the loop and the settings of recipes/hybrid.py."""
+    """As :func:`train`, with the loop, networks and rates of recipes/hybrid.py, and noise of a fixed size."""
     torch.manual_seed(seed)
     envs, horizon, batch_size = min(128, ENVS), 2 * HORIZON, 1024
     place = ENVIRONMENTS[environment](seed, envs)

@@ -7,7 +7,7 @@ import torch
 from torchrl_quad import BPTTLoss
 
 SMALL = [
-    *("num_envs=4", "horizon=6", "total_steps=192", "env.max_episode_steps=30", "compile=false"),
+    *("num_envs=4", "horizon=6", "total_steps=192", "env.max_episode_steps=15", "compile=false"),
     *("eval.interval=2", "eval.episodes=null"),
 ]
 EVERYTHING = [  # that draws random numbers or keeps a memory

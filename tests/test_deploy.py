@@ -154,7 +154,7 @@ def test_every_activation_is_written_alike_as_onnx_and_c(tmp_path):
 
 @pytest.mark.parametrize("task", ["hovering", "forest"])
 def test_the_bound_of_a_mean_is_written_too(task, tmp_path):
-    env = build(task, num_envs=2)[0]
+    env = build(task)[0]
     make = make_visual_actor if task == "forest" else make_actor
     actor = make(env, num_cells=(4,), return_log_prob=True)
     parts = actor[0][-1] if task == "forest" else actor[0]

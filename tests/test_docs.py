@@ -16,10 +16,11 @@ import yaml
 from markdown_it import MarkdownIt
 from packaging.requirements import Requirement
 from sphinx.util.inventory import InventoryFile
-from test_examples import BUDGET, EXAMPLES
+from test_examples import EXAMPLES, reduced
 from test_recipes import RECIPES, ROOT, SMALL, run
 
 from torchrl_quad.envs import TASKS
+from torchrl_quad.identification import estimation
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
 PAGES += sorted(path for path in ROOT.glob("docs/**/*.md") if "_build" not in path.parts)
@@ -224,8 +225,9 @@ def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
             continue  # the others import it, or test_own_tasks.py does
         lines += [""] * (line - len(lines)) + content.splitlines()
     program = tmp_path / f"{page.stem}.py"
-    program.write_text(BUDGET.sub(r"\1 = 2", "\n".join(lines)))
+    program.write_text(reduced("\n".join(lines)))
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(estimation, "_BODY_STEP", 0.05)  # quicker fits
     monkeypatch.setenv("WANDB_MODE", "offline")
     if "examples/data" in program.read_text():
         (tmp_path / "examples").symlink_to(ROOT / "examples")
@@ -257,6 +259,7 @@ def test_every_command_runs(command, launch, request, monkeypatch, capsys, tmp_p
         recipe(program, words, launch, tmp_path)
     elif program == "python" and script == "recipes/identify.py":
         monkeypatch.chdir(ROOT)  # where the flight is
+        monkeypatch.setattr(estimation, "_BODY_STEP", 0.05)
         arguments = [word for word in words if "=" in word and not word.startswith("iterations=")]
         launch("identify", *arguments, f"folder={tmp_path}", "iterations=1", "draws=0")
     elif program == "python" and script.startswith("examples/"):

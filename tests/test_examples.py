@@ -8,15 +8,24 @@ import gymnasium
 import numpy as np
 import pytest
 
+from torchrl_quad.identification import estimation
+
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 BUDGET = re.compile(r"^(STEPS|ITERATIONS) = [\d_]+$", flags=re.MULTILINE)
+EPISODE = re.compile(r"(?<=rollout\()256\b|(?<=actor, None, )256\b")
+
+
+def reduced(program):
+    """A program on a budget of two, whose final flights are short."""
+    return EPISODE.sub("20", BUDGET.sub(r"\1 = 2", program))
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_every_example_runs(example, tmp_path, monkeypatch):
     small = tmp_path / example.name
-    small.write_text(BUDGET.sub(r"\1 = 2", example.read_text()))
+    small.write_text(reduced(example.read_text()))
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(estimation, "_BODY_STEP", 0.05)  # quicker fits
     runpy.run_path(str(small), run_name="__main__")
 
 

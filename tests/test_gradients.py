@@ -45,10 +45,9 @@ def test_with_respect_to_actions_with_each_other_integrator_and_delay():
         assert gradients_agree(lambda a, env=env, state=state: flight(env, a, state), actions)
 
 
-@pytest.mark.parametrize("max_episode_steps", [256, 12])
-def test_with_respect_to_every_entry_of_the_initial_state_also_through_resets(max_episode_steps):
-    env, actions, state = setup(max_episode_steps=max_episode_steps)
-    state["step"] = torch.tensor([[3], [0], [7]])
+def test_with_respect_to_every_entry_of_the_initial_state_also_through_resets():
+    env, actions, state = setup(max_episode_steps=24)
+    state["step"] = torch.tensor([[15], [0], [19]])  # the second drone flies through
     actions = actions.detach()
     for key, value in state.items():
         if not value.is_floating_point():

@@ -130,7 +130,7 @@ def break_drones(env, parameter):
 
 def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
     options = {**EVERYTHING, "reward": "position", "control": "velocity"}
-    env = RacingEnv(num_envs=4, max_episode_steps=40, dtype=torch.float64, **options)
+    env = RacingEnv(num_envs=4, max_episode_steps=20, dtype=torch.float64, **options)
     drag = env.nominal.linear_drag.clone().requires_grad_()
     env.params = env.nominal.replace(linear_drag=drag)
     actor = make_actor(env, in_keys=["observation", ("state", "velocity")], return_log_prob=True)
@@ -145,7 +145,7 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
         start["state", "position"][:2] = start["state", "target"][:2] - torch.tensor([0.5, 0.0, 0.0])
         start["state", "velocity"][:2, 0] = 3.0  # through the gate, which is an event
         start["state", "velocity"].requires_grad_()
-        flight, carry = differentiable_rollout(env, policy, start, 50)
+        flight, carry = differentiable_rollout(env, policy, start, 24)
         assert flight["next", "state", "gate_passed"].any()
         more, _ = differentiable_rollout(env, policy, carry, 7)
         wanted = [drag, start["state", "velocity"], *policy.parameters()]
@@ -153,19 +153,19 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
 
     def train_in_torchrls_loop():
         env.set_seed(0)
-        return fly(lambda *a, **k: EnvBase.rollout(env, *a, **k), env, actor, env.reset(), 45)
+        return fly(lambda *a, **k: EnvBase.rollout(env, *a, **k), env, actor, env.reset(), 22)
 
     def optimise_actions():
         env.set_seed(0)
-        actions = (env.hover_action + 0.05 * torch.ones(50, 4, 4, dtype=env.dtype)).requires_grad_()
-        flight, _ = differentiable_rollout(env, ActionSequence(actions), None, 50)
+        actions = (env.hover_action + 0.05 * torch.ones(24, 4, 4, dtype=env.dtype)).requires_grad_()
+        flight, _ = differentiable_rollout(env, ActionSequence(actions), None, 24)
         torch.testing.assert_close(flight["action"], actions.transpose(0, 1))
         return flight, torch.autograd.grad(losses_of(flight), actions)
 
     def train_with_clipped_gradients():
         env.set_seed(0)
         torch.manual_seed(0)
-        flight, _ = differentiable_rollout(env, actor, None, 50)
+        flight, _ = differentiable_rollout(env, actor, None, 24)
         loss = BPTTLoss(actor, clip_action_gradient=2.0).loss_actor(flight)[0]
         return flight, torch.autograd.grad(loss, list(actor.parameters()))
 
@@ -189,7 +189,7 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
         env.rollout(3, actor)
     env.rollout(3)
     env.set_initial_state_source(lambda n: train_free["next", "state"][:, 2])
-    env.rollout(40, actor, break_when_any_done=False)["next", "reward"].sum().backward()
+    env.rollout(22, actor, break_when_any_done=False)["next", "reward"].sum().backward()
     assert counters["stats"]["unique_graphs"] == compiled_so_far
     for (flight, grads), (expected, expected_grads) in zip(compiled, eager, strict=True):
         torch.testing.assert_close(entries(flight), entries(expected))

@@ -232,7 +232,7 @@ def test_bad_input_of_a_fit_is_refused_by_name(real, tmp_path):
 
 
 def test_the_recipe_fits_a_real_flight_and_draws_it(launch, refused, tmp_path):
-    arguments = [f"logs=[{REAL}]", "mass=0.027", "fields=[linear_drag]", "iterations=2", "draws=5"]
+    arguments = [f"logs=[{REAL}]", "mass=0.027", "fields=[linear_drag]", "iterations=1", "draws=5"]
     said = launch("identify", *arguments, f"folder={tmp_path}/fit")
     assert "linear_drag.xy" in said
     names = {path.name for path in (tmp_path / "fit").iterdir()}

@@ -112,7 +112,7 @@ def test_tensorboard_gets_the_names_of_the_csv_and_forgets_what_is_flown_again(t
 
 @pytest.mark.parametrize("recipe", ["abpt", "ppo"])
 def test_a_run_with_diagnostics_learns_the_same_bit_for_bit_and_logs_them(recipe, train, tmp_path):
-    options = [*EVERYTHING, "task=landing", "env.event_discount=null"]
+    options = [*EVERYTHING, "task=landing", "env.event_discount=null", "eval.interval=1", "total_steps=96"]
     options += ["buffer.capacity=24"] if recipe == "abpt" else []
     plain = train(recipe, tmp_path / "plain", *options)
     audited = train(recipe, tmp_path / "audited", *options, "diagnostics=2")

@@ -20,7 +20,6 @@ from test_examples import EXAMPLES, reduced
 from test_recipes import RECIPES, ROOT, SMALL, run
 
 from torchrl_quad.envs import TASKS
-from torchrl_quad.identification import estimation
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md", "examples/README.md")]
 PAGES += sorted(path for path in ROOT.glob("docs/**/*.md") if "_build" not in path.parts)
@@ -217,6 +216,7 @@ def test_nothing_escapes_these_tests_behind_another_name(page):
             yaml.safe_load(content)
 
 
+@pytest.mark.usefixtures("quick_fits")
 @pytest.mark.parametrize("page", [page for page in PAGES if code(page, "python")], ids=name_of)
 def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch, importable):
     lines = []  # the code, on the same lines as in the page
@@ -227,7 +227,6 @@ def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
     program = tmp_path / f"{page.stem}.py"
     program.write_text(reduced("\n".join(lines)))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(estimation, "_BODY_STEP", 0.05)  # quicker fits
     monkeypatch.setenv("WANDB_MODE", "offline")
     if "examples/data" in program.read_text():
         (tmp_path / "examples").symlink_to(ROOT / "examples")
@@ -245,6 +244,7 @@ def commands():
                     yield pytest.param(words, id=f"{name_of(page)}: {shlex.join(words)}")
 
 
+@pytest.mark.usefixtures("quick_fits")
 @pytest.mark.parametrize("command", list(commands()))
 def test_every_command_runs(command, launch, request, monkeypatch, capsys, tmp_path, importable):
     program, *words = command
@@ -259,7 +259,6 @@ def test_every_command_runs(command, launch, request, monkeypatch, capsys, tmp_p
         recipe(program, words, launch, tmp_path)
     elif program == "python" and script == "recipes/identify.py":
         monkeypatch.chdir(ROOT)  # where the flight is
-        monkeypatch.setattr(estimation, "_BODY_STEP", 0.05)
         arguments = [word for word in words if "=" in word and not word.startswith("iterations=")]
         launch("identify", *arguments, f"folder={tmp_path}", "iterations=1", "draws=0")
     elif program == "python" and script.startswith("examples/"):

@@ -8,8 +8,6 @@ import gymnasium
 import numpy as np
 import pytest
 
-from torchrl_quad.identification import estimation
-
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 BUDGET = re.compile(r"^(STEPS|ITERATIONS) = [\d_]+$", flags=re.MULTILINE)
 EPISODE = re.compile(r"(?<=rollout\()256\b|(?<=actor, None, )256\b")
@@ -20,12 +18,12 @@ def reduced(program):
     return EPISODE.sub("20", BUDGET.sub(r"\1 = 2", program))
 
 
+@pytest.mark.usefixtures("quick_fits")
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_every_example_runs(example, tmp_path, monkeypatch):
     small = tmp_path / example.name
     small.write_text(reduced(example.read_text()))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(estimation, "_BODY_STEP", 0.05)  # quicker fits
     runpy.run_path(str(small), run_name="__main__")
 
 

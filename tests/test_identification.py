@@ -16,7 +16,6 @@ from torchrl_quad.identification import (
     TooLittleFlight,
     TooShort,
     UnknownField,
-    estimation,
     fitting,
     identify,
     prediction_error,
@@ -29,6 +28,7 @@ from torchrl_quad.identification.parameters import UNKNOWNS, Model
 ROOT = Path(__file__).parents[1]
 REAL = ROOT / "examples/data/figure8.csv.gz"
 sys.path.insert(0, str(ROOT / "benchmarks"))
+pytestmark = pytest.mark.usefixtures("quick_fits")
 
 
 @pytest.fixture(scope="module")
@@ -47,12 +47,6 @@ def simulated(benchmark):
         patch.setattr(benchmark, "SAMPLE", 2)
         truth = benchmark.true_drone()
         return benchmark.simulate_flight(0, truth, seconds=8.0, stream_delay=0.015), truth
-
-
-@pytest.fixture(autouse=True)
-def long_steps(monkeypatch):
-    """Fits are quicker for it, and hardly worse."""
-    monkeypatch.setattr(estimation, "_BODY_STEP", 0.05)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
-from torch.nn.functional import softplus
+from torch.distributions.transforms import TanhTransform
 from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again, location_gradient
@@ -239,8 +239,7 @@ class HybridLoss(SHACLoss):
     def _policy_entropy(self, policy: Normal) -> Tensor:
         """The entropy of tanh(u), estimated by one u of a policy in each state: (*)."""
         latent = policy.rsample()
-        log_slope = 2.0 * (math.log(2.0) - latent - softplus(-2.0 * latent))  # of the tanh
-        return (policy.entropy() + log_slope).sum(-1)
+        return (policy.entropy() + TanhTransform().log_abs_det_jacobian(latent, None)).sum(-1)
 
     def _ratio(self, new: Normal, old: Normal, tensordict: TensorDictBase) -> Tensor:
         """The ratio of the probabilities of the action that was flown: (*, 1)."""

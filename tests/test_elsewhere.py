@@ -26,7 +26,7 @@ def program(monkeypatch):
 def test_a_loss_trains_on_an_environment_that_is_not_ours_once_and_has_a_row_in_the_table(
     environment, losses, program, monkeypatch, tmp_path
 ):
-    losses = losses or list(program["LOSSES"])
+    losses = losses or list(program["NAMES"])
     arguments = ["--environments", environment, "--losses", *losses, "--seeds", "0", "--data", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
     program["main"]()

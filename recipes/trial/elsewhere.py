@@ -16,7 +16,7 @@ times the way that the ball comes closer, and -10 if it falls, which ends the ep
 lasts 200 steps at most. All forces between bar, ball and agents act by contact.
 
 The return is the mean over 256 episodes without exploration noise. All losses have the same networks, rates and number
-of steps. The hybrid has the networks and rates of its recipe instead, noise of a fixed size, and as many steps.
+of steps. The hybrid has the settings of its recipe instead, and as many steps.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import numpy as np
 import torch
 from comparison import column, reached_table
 from results import fill
-from running import DATA, page  # whose import makes the recipes' code known
+from running import DATA, composed, page  # whose import makes the recipes' code known
 from shipped import METHODS, TASKS
 from tables import table
 from tensordict import TensorDictBase
@@ -39,7 +39,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import Compose, PendulumEnv, RewardScaling, Transform, TransformedEnv, VmasEnv
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import SoftUpdate
-from training.building import AdaptiveRate, shuffled
+from training.building import AdaptiveRate, iterations, make_optimizer, network, shuffled
 
 from torchrl_quad import (
     ABPTLoss,
@@ -65,8 +65,8 @@ LOSSES = {
     "ahac": lambda env, actor: AHACLoss(actor, make_value(env), horizon=HORIZON),
     "abpt": lambda env, actor: ABPTLoss(actor, make_qvalue(env)),
     "abpt-simulated": lambda env, actor: ABPTLoss(actor, make_qvalue(env), simulated_steps=1),
-    "hybrid": lambda env, actor: HybridLoss(actor, make_value(env, num_cells=(128, 128))),
 }
+NAMES = (*LOSSES, "hybrid")
 
 
 class CosSin(Transform):
@@ -228,32 +228,34 @@ def optimise(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: floa
 
 
 def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
-    """As :func:`train`, with the loop, networks and rates of recipes/hybrid.py, and noise of a fixed size."""
+    """As :func:`train`, with the settings and the loop of recipes/hybrid.py."""
     torch.manual_seed(seed)
-    envs, horizon, batch_size = min(128, ENVS), 2 * HORIZON, 1024
-    place = ENVIRONMENTS[environment](seed, envs)
-    env = place.env
-    actor = make_actor(env, scale_init=0.2, learn_scale=False, noise_correlation=0.9)
-    loss = LOSSES["hybrid"](env, actor)
-    loss.make_value_estimator(gamma=0.99, lmbda=0.95)
-    actor_optimizer = torch.optim.Adam(loss.actor_network_params.parameters(), 1e-3, betas=(0.9, 0.99))
-    critic_optimizer = torch.optim.Adam(loss.value_network_params.parameters(), 3e-3, betas=(0.9, 0.99))
-    iterations = -(-STEPS // (envs * horizon))
-    rate = AdaptiveRate(actor_optimizer, 0.25, iterations)
+    cfg = composed("hybrid", [f"num_envs={min(128, ENVS)}", f"total_steps={STEPS}"])
+    place = ENVIRONMENTS[environment](seed, cfg.num_envs)
+    env, chosen = place.env, cfg.actor
+    actor = make_actor(
+        env, scale_init=chosen.scale_init, noise_correlation=chosen.noise_correlation, **network(cfg, "actor")
+    )
+    loss = HybridLoss(actor, make_value(env, **network(cfg, "critic")), **cfg.loss)
+    loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
+    count = iterations(cfg)
+    actor_optimizer, _ = make_optimizer(chosen, loss.actor_network_params.parameters(), count)
+    critic_optimizer, critic_schedule = make_optimizer(cfg.critic, loss.value_network_params.parameters(), count)
+    rate = AdaptiveRate(actor_optimizer, chosen.max_kl, count)
 
     before, start = mean_return(environment, actor), time.process_time()
     carry = place.starts()
-    for iteration in range(iterations):
-        critic_optimizer.param_groups[0]["lr"] = 3e-3 * (1.0 - 0.99 * iteration / iterations)
-        rollout, carry = differentiable_rollout(env, actor, carry, horizon)
+    for iteration in range(count):
+        rollout, carry = differentiable_rollout(env, actor, carry, cfg.horizon)
         moved = 0.0
-        for batch in shuffled(loss.write_targets(rollout).exclude("next"), batch_size, 5):
+        for batch in shuffled(loss.write_targets(rollout).exclude("next"), cfg.batch_size, cfg.epochs):
             losses = loss(batch)
             if moved < rate.limit(iteration):
                 moved = max(moved, losses["kl"].item())
-                optimise(actor_optimizer, losses["loss_actor"], 0.5)
-            optimise(critic_optimizer, losses["loss_value"], 1.0)
+                optimise(actor_optimizer, losses["loss_actor"], chosen.max_grad_norm)
+            optimise(critic_optimizer, losses["loss_value"], cfg.critic.max_grad_norm)
         rate.step(iteration, moved)
+        critic_schedule.step()
         carry = place.go_on(carry)
     return before, mean_return(environment, actor), time.process_time() - start
 
@@ -263,7 +265,7 @@ def blocks(data: Path) -> dict[str, str]:
     made, rows, tracks = {}, read_rows(data / "elsewhere.csv"), read_rows(data / "tracks.csv")
     for environment in ENVIRONMENTS:
         lines = []
-        for name in LOSSES:
+        for name in NAMES:
             if own := [row for row in rows if (row["environment"], row["loss"]) == (environment, name)]:
                 before, after, seconds = (column(own, x) for x in ("before", "after", "seconds"))
                 each = ", ".join(f"{x:.4g}" for x in sorted(after))
@@ -278,7 +280,7 @@ def blocks(data: Path) -> dict[str, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--environments", nargs="+", default=list(ENVIRONMENTS), choices=list(ENVIRONMENTS))
-    parser.add_argument("--losses", nargs="+", default=list(LOSSES), choices=list(LOSSES))
+    parser.add_argument("--losses", nargs="+", default=NAMES, choices=NAMES)
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(5)))
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
     args = parser.parse_args()

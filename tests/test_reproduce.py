@@ -210,8 +210,8 @@ def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(run
     assert len(rows) == 2 and {row["task"] for row in rows} == {"own_task.CornerEnv", "six_gates_back"}
     assert all(row["steps"] == "64" and row["machine"] and float(row["seconds"]) > 0 for row in rows)
     page = (tmp_path / "summary.md").read_text()
-    assert "| six gates, backwards |  |  |  |  | 0.0% (0.0%), 0.00 gates passed, " in page
-    assert re.search(r"\| own_task.CornerEnv \|  \|  \|  \|  \| 0.0% \(0.0%\), \d\.\d\d m, ", page)
+    for cell in ("0.00 gates passed", r"\d\.\d\d m"):  # a row for each method, a column for each task
+        assert re.search(rf"^\| PPO \|.* 0.0% \(0.0%\), {cell}, ", page, re.M)
     assert "| six gates, backwards | PPO | 1 | " in page
     curves = read_rows(tmp_path / "shipped_curves.csv")
     assert {row["task"] for row in curves} == {"own_task.CornerEnv", "six_gates_back"} and curves[-1]["steps"] == "64"

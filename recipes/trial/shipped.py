@@ -33,8 +33,7 @@ from torchrl_quad.envs.scenery import EPISODE_METRICS
 from torchrl_quad.files import machine, read_rows, write_rows
 
 SEEDS = tuple(range(WANTED))
-SHOWN = {"bptt": "BPTT", "shac": "SHAC", "abpt": "ABPT", "hybrid": "Hybrid", "ppo": "PPO"}  # in the README
-METHODS = SHOWN | {"sapo": "SAPO", "ahac": "AHAC"}
+METHODS = {name: name.upper() for name in ("bptt", "shac", "abpt", "sapo", "ahac")} | {"hybrid": "Hybrid", "ppo": "PPO"}
 TASKS = {  # what is shown of each beside the solved episodes: column, factor, digits, unit
     "hovering": ("position_error", 100, 1, "cm"),
     "tracking": ("tracking_rmse", 100, 1, "cm"),
@@ -119,12 +118,13 @@ def blocks(data: Path) -> dict[str, str]:
     runs, lines = read_rows(data / "shipped.csv"), []
     flown = dict.fromkeys(x["task"] for x in runs)
     shown = {task: TASKS.get(task) or first_metric(task) for task in sorted(flown, key=[*TASKS, *flown].index)}
-    for task in shown:
-        groups = ([x for x in runs if (x["task"], x["algorithm"]) == (task, method)] for method in SHOWN)
-        lines.append([LABELS.get(task, task), *(cell(group, *shown[task]) for group in groups)])
+    for method, label in METHODS.items():
+        own = [[x for x in runs if (x["task"], x["algorithm"]) == (task, method)] for task in shown]
+        if any(own):
+            lines.append([label, *(cell(group, *how) for group, how in zip(own, shown.values(), strict=True))])
     compared = {"choice": choice_table, "reached": reached_table, "improvement": improvement_table}
     made = {name: make(runs, METHODS, shown) for name, make in compared.items()}
-    return {"summary": table(["", *SHOWN.values()], lines)} | made
+    return {"summary": table(["", *(LABELS.get(task, task) for task in shown)], lines)} | made
 
 
 def main() -> None:

@@ -32,7 +32,8 @@ class PathwiseLoss(LossModule):
         actor_network: the policy that flew the rollout.
         alpha: coefficient of the entropy bonus alpha * mean over the steps of -log pi(a|s): 0 for none, a positive
             number for a fixed one, "auto" to hold the entropy at ``target_entropy``. Needs the log-probability in the
-            rollout (an actor built with ``return_log_prob=True``), since a tanh-Gaussian has no closed entropy.
+            rollout (an actor built with ``return_log_prob=True``), since a tanh-Gaussian has no closed entropy. "auto"
+            suits noise that is learned: with a fixed one the entropy may never reach its target, and alpha only grows.
         target_entropy: with ``alpha="auto"``; "auto" means minus the number of action entries.
         alpha_init: with ``alpha="auto"``, the coefficient to start from.
         clip_action_gradient: shorten the gradient in each single action, of one drone in one step, to so many times

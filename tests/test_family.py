@@ -98,6 +98,7 @@ def test_the_gradient_of_sapo_is_that_of_finite_differences(env64, clip):
     [
         ({"alpha": 0.0}, "needs an alpha above 0, or 'auto': without entropy take SHACLoss"),
         ({"target_entropy": 1.0}, "target_entropy must be 'auto' or a negative number.*got 1.0"),
+        ({"target_entropy": "low"}, "target_entropy must be 'auto' or a negative number.*got low"),
         ({"num_value_nets": 0}, "SAPOLoss needs at least one critic, got num_value_nets=0"),
     ],
 )

@@ -1,5 +1,7 @@
 """The hybrid loss: its two gradients, and the weights that a rollout gives them."""
 
+import pickle
+
 import pytest
 import torch
 from torch.distributions import Normal
@@ -184,3 +186,6 @@ def test_errors(env):
         short.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
     read = loss.write_targets(rollout.select(*loss.in_keys))
     assert loss(read)["loss_actor"].isfinite()
+    with pytest.raises(ValueError, match="reads 'latent', which write_targets writes and these samples have lost"):
+        loss(read.exclude("latent"))
+    pickle.dumps(loss)

@@ -131,6 +131,7 @@ def test_the_running_median_of_the_clip_has_the_precision_of_the_actor():
         ({"alpha": "automatic"}, "alpha must be 'auto'"),
         ({"alpha": "auto", "alpha_init": 0.0}, "alpha_init must be positive and finite, got 0.0"),
         ({"alpha": "auto", "alpha_init": float("nan")}, "alpha_init must be positive and finite, got nan"),
+        ({"alpha": "auto", "target_entropy": "low"}, "target_entropy must be 'auto' or a finite number, got 'low'"),
         ({"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
         ({"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
         ({"num_qvalue_nets": 0}, "at least one critic, got num_qvalue_nets=0"),

@@ -84,6 +84,7 @@ class AHACLoss(SHACLoss):
             num_value_nets=num_value_nets,
             terminal_gradient=terminal_gradient,
             average_over_horizon=average_over_horizon,
+            target_bootstrap=False,
             delay_value=False,
             **kwargs,
         )

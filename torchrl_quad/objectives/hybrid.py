@@ -103,7 +103,7 @@ class HybridLoss(SHACLoss):
         entropy_coeff: float = 0.0,
         clip_action_gradient: float | None = 2.0,
         decay: float = 0.9,
-        average: Callable[[Tensor], Tensor] = lambda x: x,
+        average: Callable[[Tensor], Tensor] | None = None,
         reduction: str = "mean",
     ) -> None:
         if not (isinstance(gradient_lmbda, int | float) and 0 < gradient_lmbda <= 1):
@@ -184,8 +184,16 @@ class HybridLoss(SHACLoss):
         return self._reduce_loss(-objective), metadata
 
     def _with_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
-        written = {self.tensor_keys.advantage, self.tensor_keys.location_gradient, self.tensor_keys.latent}
-        return tensordict if all(key in tensordict for key in written) else self.write_targets(tensordict)
+        keys = self.tensor_keys
+        lost = [key for key in (keys.advantage, keys.location_gradient, keys.latent) if key not in tensordict]
+        if len(lost) == 3:
+            return self.write_targets(tensordict)
+        if lost:
+            raise ValueError(
+                f"HybridLoss reads {lost[0]!r}, which write_targets writes and these samples have lost. Give samples "
+                "of all that it returned."
+            )
+        return tensordict
 
     def _own_gradient(self, tensordict: TensorDictBase) -> Tensor:
         """The gradient of each action's own lambda-return in that action: (*, horizon, k)."""
@@ -224,7 +232,9 @@ class HybridLoss(SHACLoss):
         batch = tuple(i for i, size in enumerate(advantage.shape[:-2]) if size > 1) or (-2,)
         advantage, predicted = (x - x.mean(batch, keepdim=True) for x in (advantage, predicted))
         covariance, variance = (predicted * advantage).mean(), predicted.square().mean()
-        slope = (self.average(covariance) / self.average(variance).clamp_min(1e-12)).clamp(-1.0, 2.0)
+        if self.average is not None:
+            covariance, variance = self.average(covariance), self.average(variance)
+        slope = (covariance / variance.clamp_min(1e-12)).clamp(-1.0, 2.0)
         running = self.pathwise_weight
         slope = torch.where(slope.isfinite(), slope, running)
         running.copy_(torch.where(running.isnan(), slope, torch.lerp(slope, running, self.decay)))

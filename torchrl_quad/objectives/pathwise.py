@@ -102,6 +102,8 @@ class PathwiseLoss(LossModule):
             raise ValueError(
                 f"alpha_init must be positive and finite, got {alpha_init}; set alpha to 0 for no entropy bonus."
             )
+        if target_entropy != "auto" and not (isinstance(target_entropy, int | float) and math.isfinite(target_entropy)):
+            raise ValueError(f"target_entropy must be 'auto' or a finite number, got {target_entropy!r}.")
         if clip_action_gradient is not None and not 0 < clip_action_gradient < math.inf:
             raise ValueError(
                 f"clip_action_gradient must be None or a positive number of medians, got {clip_action_gradient}."
@@ -292,7 +294,8 @@ class PathwiseLoss(LossModule):
         if log_prob is None:
             raise RuntimeError(
                 f"The entropy bonus of {type(self).__name__} reads {self.tensor_keys.sample_log_prob!r}, which is "
-                "not in the rollout. Build the actor with return_log_prob=True, or set the loss's alpha to 0."
+                "not in the rollout. Build the actor with return_log_prob=True, or set the loss's alpha to 0. If it "
+                "has another name there, write loss.set_keys(sample_log_prob=...)."
             )
         return -log_prob.reshape(*tensordict.shape, 1)
 

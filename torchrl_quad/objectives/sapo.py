@@ -50,7 +50,7 @@ class SAPOLoss(SHACLoss):
     ) -> None:
         if alpha == 0:
             raise ValueError("SAPOLoss needs an alpha above 0, or 'auto': without entropy take SHACLoss.")
-        if target_entropy != "auto" and not target_entropy < 0:
+        if target_entropy != "auto" and not (isinstance(target_entropy, int | float) and target_entropy < 0):
             raise ValueError(
                 f"target_entropy must be 'auto' or a negative number, in whose size SAPOLoss measures the entropy; got "
                 f"{target_entropy}."
@@ -64,6 +64,7 @@ class SAPOLoss(SHACLoss):
             target_entropy=target_entropy,
             terminal_gradient=terminal_gradient,
             average_over_horizon=average_over_horizon,
+            target_bootstrap=False,
             delay_value=False,
             **kwargs,
         )

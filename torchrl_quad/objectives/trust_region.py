@@ -48,7 +48,7 @@ class TrustRegion:
         max_kl: float | None,
         *,
         min_scale: float = 0.1,
-        average: Callable[[Tensor], Tensor] = lambda x: x,
+        average: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         if max_kl is not None and not 0 < max_kl < math.inf:
             raise ValueError(f"max_kl must be None or positive and finite, got {max_kl}; 0.01 to 0.1 are usual.")
@@ -69,7 +69,7 @@ class TrustRegion:
         before = [x.detach().clone() for x in parameters]
         yield
         with torch.no_grad():
-            kl = self.average(self.divergence(rollout))
+            kl = self._mean_divergence(rollout)
             self.metrics = {"kl": kl}
             for _ in range(20):
                 if kl <= self.max_kl:
@@ -77,8 +77,12 @@ class TrustRegion:
                 if not kl.isfinite():
                     break
                 torch._foreach_lerp_(parameters, before, 1.0 - (self.max_kl / kl.item()) ** 0.5)
-                kl = self.average(self.divergence(rollout))
+                kl = self._mean_divergence(rollout)
             torch._foreach_copy_(parameters, before)
+
+    def _mean_divergence(self, rollout: TensorDictBase) -> Tensor:
+        kl = self.divergence(rollout)
+        return kl if self.average is None else self.average(kl)
 
     def divergence(self, rollout: TensorDictBase) -> Tensor:
         """KL(policy that flew the rollout || policy as it is now), a scalar."""

@@ -153,8 +153,7 @@ class Loss(Section):
     average_over_horizon: bool = Field(None)
     alpha_init: Positive = Field(None, description="What alpha=auto starts from.")
     target_entropy: Annotated[Real, Field(lt=0)] | Literal["auto"] = Field(
-        None,
-        description="Where alpha=auto holds the entropy; auto for minus the size of the action (SAPO: half of that).",
+        None, description="Where alpha=auto holds the entropy; auto for minus the size of the action (SAPO: half)."
     )
     simulated_steps: int = Field(
         None, ge=0, le=100_000, description="Control steps that ABPT's return of the start flies before its critic."

@@ -79,9 +79,10 @@ def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str,
     return options
 
 
-def actor_parameters(loss: PathwiseLoss) -> list[nn.Parameter]:
-    """The policy's parameters, and the entropy coefficient if it is learned."""
-    return [*loss.actor_network_params.parameters(), *([loss.log_alpha] if loss.automatic_alpha else [])]
+def actor_parameters(loss: PathwiseLoss) -> list[dict[str, Any]]:
+    """The policy's parameters, and the entropy coefficient if it is learned: a group each, whose gradient is clipped."""
+    learned = [[*loss.actor_network_params.parameters()], *([[loss.log_alpha]] if loss.automatic_alpha else [])]
+    return [{"params": parameters} for parameters in learned]
 
 
 def iterations(cfg: DictConfig) -> int:
@@ -90,7 +91,7 @@ def iterations(cfg: DictConfig) -> int:
 
 
 def make_optimizer(
-    cfg: DictConfig, parameters: Iterable[nn.Parameter], iterations: int
+    cfg: DictConfig, parameters: Iterable[nn.Parameter] | list[dict[str, Any]], iterations: int
 ) -> tuple[torch.optim.Adam, lr_scheduler.LRScheduler]:
     """Build Adam, and the schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run."""
     optimizer = torch.optim.Adam(parameters, cfg.lr, betas=tuple(cfg.betas), fused=True)

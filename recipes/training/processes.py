@@ -80,18 +80,20 @@ def mean_of_all(x: Tensor) -> Tensor:
 
 
 def backward(loss: Tensor, optimizer: torch.optim.Optimizer, max_grad_norm: float) -> tuple[Tensor, Tensor]:
-    """Compute the gradient of a loss, average it over the processes, and clip it.
+    """Compute the gradient of a loss, average it over the processes, and clip that of each group of parameters.
 
     Returns:
-        the loss and the norm of its gradient before clipping, both averaged over the processes.
+        the loss and the norm of the gradient of the first group before clipping, both averaged over the processes.
     """
     optimizer.zero_grad()
     loss.backward()
-    parameters = [p for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+    groups = [[p for p in group["params"] if p.grad is not None] for group in optimizer.param_groups]
+    parameters = [p for group in groups for p in group]
     loss = loss.detach()
     if world_size() > 1:
         tensors = [loss, *(p.grad for p in parameters)]
         flat = nn.utils.parameters_to_vector(tensors)
         dist.all_reduce(flat)
         nn.utils.vector_to_parameters(flat / world_size(), tensors)
-    return loss, nn.utils.clip_grad_norm_(parameters, max_grad_norm, foreach=True)
+    norms = [nn.utils.clip_grad_norm_(group, max_grad_norm, foreach=True) for group in groups]
+    return loss, norms[0]

@@ -5,9 +5,18 @@ import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
-from training.building import AdaptiveRate, TargetUpdate, advance, make_optimizer, minibatches, shuffled
+from training.building import (
+    AdaptiveRate,
+    TargetUpdate,
+    actor_parameters,
+    advance,
+    make_optimizer,
+    minibatches,
+    shuffled,
+)
+from training.processes import backward
 
-from torchrl_quad import ABPTLoss, HoveringEnv, SHACLoss, make_actor, make_qvalue, make_value
+from torchrl_quad import ABPTLoss, BPTTLoss, HoveringEnv, SHACLoss, make_actor, make_qvalue, make_value
 
 
 def adam(lr):
@@ -42,6 +51,17 @@ def test_a_schedule_may_be_set_between_two_iterations():
     for iteration, rate in ((5.5, 4.555e-3), (0, 1e-2), (10, 1e-4), (20, 1e-4)):
         advance(schedule, iteration)
         assert optimizer.param_groups[0]["lr"] == pytest.approx(rate)
+
+
+def test_the_gradient_of_alpha_takes_nothing_of_the_actor_s_norm():
+    loss = BPTTLoss(make_actor(HoveringEnv(num_envs=1), return_log_prob=True), alpha="auto")
+    actor = list(loss.actor_network_params.parameters())
+    objective = sum(x.sum() for x in actor) + 1e6 * loss.log_alpha
+    _, norm = backward(objective, torch.optim.Adam(actor_parameters(loss)), 0.5)
+    gradient = torch.cat([x.grad.flatten() for x in actor])
+    assert norm.item() == pytest.approx(gradient.numel() ** 0.5, rel=1e-4)
+    assert gradient.norm().item() == pytest.approx(0.5, rel=1e-4)
+    assert loss.log_alpha.grad.item() == pytest.approx(0.5, rel=1e-4)
 
 
 def test_how_far_a_horizon_may_move_the_policy_falls_to_a_fiftieth():

@@ -80,9 +80,9 @@ def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str,
 
 
 def actor_parameters(loss: PathwiseLoss) -> list[dict[str, Any]]:
-    """The policy's parameters, and the entropy coefficient if it is learned: a group each, whose gradient is clipped."""
-    learned = [[*loss.actor_network_params.parameters()], *([[loss.log_alpha]] if loss.automatic_alpha else [])]
-    return [{"params": parameters} for parameters in learned]
+    """The policy's parameters and, if it is learned, the entropy coefficient: groups that are clipped apart."""
+    learned = [loss.log_alpha] if loss.automatic_alpha else []
+    return [{"params": own} for own in (list(loss.actor_network_params.parameters()), learned) if own]
 
 
 def iterations(cfg: DictConfig) -> int:

@@ -75,7 +75,7 @@ class AHACLoss(SHACLoss):
                 f"horizon={horizon} must lie between min_horizon={low} and max_horizon={high}, and be at least 1."
             )
         if not 1 < max_stiffness < math.inf:
-            raise ValueError(f"max_stiffness must be finite and above 1, got {max_stiffness}; 1.5 to 3 are usual.")
+            raise ValueError(f"max_stiffness must be finite and above 1, got {max_stiffness}; 1.5 to 5 are usual.")
         if not 0 <= horizon_lr < 1:
             raise ValueError(f"horizon_lr must lie from 0 to below 1, got {horizon_lr}.")
         super().__init__(

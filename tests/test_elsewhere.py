@@ -22,7 +22,7 @@ def program(monkeypatch):
     return program
 
 
-@pytest.mark.parametrize(("environment", "losses"), [("pendulum", None), ("balance", ["shac", "hybrid"])])
+@pytest.mark.parametrize(("environment", "losses"), [("pendulum", None), ("balance", ["shac", "hybrid", "ppo"])])
 def test_a_loss_trains_on_an_environment_that_is_not_ours_once_and_has_a_row_in_the_table(
     environment, losses, program, monkeypatch, tmp_path
 ):
@@ -38,7 +38,7 @@ def test_a_loss_trains_on_an_environment_that_is_not_ours_once_and_has_a_row_in_
     assert head == "| loss | before | after | each seed | seconds |"
     assert {line.split(" | ")[0] for line in lines} == {f"| {name}" for name in losses}
     assert all(line in (tmp_path / "elsewhere.md").read_text() for line in lines)
-    for name in ("train", "train_hybrid"):
+    for name in ("train", "train_hybrid", "train_ppo"):
         program["main"].__globals__[name] = lambda *_: pytest.fail("It has been trained.")
     program["main"]()
 

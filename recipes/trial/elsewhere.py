@@ -1,7 +1,7 @@
 """Train the losses on two environments that are not ours: are they what they say?
 
 python recipes/trial/elsewhere.py --environments pendulum
-python recipes/trial/elsewhere.py --environments balance --losses abpt shac hybrid bptt
+python recipes/trial/elsewhere.py --environments balance --losses shac hybrid ppo
 
 It may be stopped at any moment. Started again, it skips what is in docs/results/data/elsewhere.csv, and it fills in the
 tables of docs/elsewhere.md: those of the two environments, and that of a track which no setting was chosen on, from
@@ -16,7 +16,8 @@ times the way that the ball comes closer, and -10 if it falls, which ends the ep
 lasts 200 steps at most. All forces between bar, ball and agents act by contact.
 
 The return is the mean over 256 episodes without exploration noise. All losses have the same networks, rates and number
-of steps. The hybrid has the settings of its recipe instead, and as many steps.
+of steps. The hybrid has the settings of its recipe instead, and as many steps. PPO has those of its recipe for racing,
+and the horizons and minibatches of the hybrid.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import Compose, PendulumEnv, RewardScaling, Transform, TransformedEnv, VmasEnv
 from torchrl.envs.utils import ExplorationType
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import ClipPPOLoss, SoftUpdate
+from torchrl.objectives.value import GAE
 from training.building import AdaptiveRate, iterations, make_optimizer, network, shuffled
 
 from torchrl_quad import (
@@ -66,7 +68,7 @@ LOSSES = {
     "abpt": lambda env, actor: ABPTLoss(actor, make_qvalue(env)),
     "abpt-simulated": lambda env, actor: ABPTLoss(actor, make_qvalue(env), simulated_steps=1),
 }
-NAMES = (*LOSSES, "hybrid")
+NAMES = (*LOSSES, "hybrid", "ppo")
 
 
 class CosSin(Transform):
@@ -260,6 +262,42 @@ def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
     return before, mean_return(environment, actor), time.process_time() - start
 
 
+def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
+    """As :func:`train`, with the loop of recipes/ppo.py, its settings for racing, and the horizons of the hybrid."""
+    torch.manual_seed(seed)
+    size = ["horizon=32", "batch_size=1024", f"num_envs={min(128, ENVS)}", f"total_steps={STEPS}"]
+    cfg = composed("ppo", ["tuned=ppo_racing", *size])
+    place = ENVIRONMENTS[environment](seed, cfg.num_envs)
+    env, chosen = place.env, cfg.actor
+    noise = {"scale_init": chosen.scale_init, "noise_correlation": chosen.noise_correlation}
+    actor = make_actor(env, **noise, **network(cfg, "actor"), return_log_prob=True)
+    value = make_value(env, **network(cfg, "critic"))
+    advantage = GAE(gamma=cfg.gamma, lmbda=cfg.critic.lmbda, value_network=value, vectorized=False)
+    loss = ClipPPOLoss(actor, value, **cfg.loss)
+    optimizers, schedules = zip(
+        *(make_optimizer(cfg[x], y.parameters(), iterations(cfg)) for x, y in (("actor", actor), ("critic", value))),
+        strict=True,
+    )
+
+    before, start = mean_return(environment, actor), time.process_time()
+    carry = place.starts()
+    for _ in range(iterations(cfg)):
+        with torch.no_grad():
+            rollout, carry = differentiable_rollout(env, actor, carry, cfg.horizon)
+            advantage(rollout)
+        moved = 0.0
+        for batch in shuffled(rollout.exclude("next"), cfg.batch_size, cfg.epochs):
+            losses = loss(batch)
+            if moved < chosen.max_kl:
+                moved = abs(losses["kl_approx"].item())
+                optimise(optimizers[0], losses["loss_objective"] + losses["loss_entropy"], chosen.max_grad_norm)
+            optimise(optimizers[1], losses["loss_critic"], cfg.critic.max_grad_norm)
+        for schedule in schedules:
+            schedule.step()
+        carry = place.go_on(carry)
+    return before, mean_return(environment, actor), time.process_time() - start
+
+
 def blocks(data: Path) -> dict[str, str]:
     """Make the tables of docs/elsewhere.md."""
     made, rows, tracks = {}, read_rows(data / "elsewhere.csv"), read_rows(data / "tracks.csv")
@@ -292,7 +330,8 @@ def main() -> None:
         key = {"environment": environment, "loss": name, "seed": str(seed)}
         if any(key.items() <= row.items() for row in read_rows(args.data / "elsewhere.csv")):
             continue
-        flown = train_hybrid(environment, seed) if name == "hybrid" else train(name, environment, seed)
+        own = {"hybrid": train_hybrid, "ppo": train_ppo}
+        flown = own[name](environment, seed) if name in own else train(name, environment, seed)
         numbers = {x: f"{y:.6g}" for x, y in zip(("before", "after", "seconds"), flown, strict=True)}
         row = key | numbers | {"steps": STEPS, "machine": machine(), "flown": datetime.date.today().isoformat()}
         write_rows(args.data / "elsewhere.csv", [*read_rows(args.data / "elsewhere.csv"), row])

@@ -300,18 +300,18 @@ def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom():
         "ppo": [(9.5, 1.0, 40), (9.6, 1.0, 40), (9.7, 1.0, 40)],
         "abpt": [(99.0, 0.5, 1), (99.0, 1.0, 1)],  # few
     }
-    names = ("return", "solved", "seconds", "steps")
+    names = ("return", "solved", "seconds", "steps", "machine")
     rows = [
-        {"task": "hovering", "algorithm": method} | dict(zip(names, map(str, (*x, 1e6)), strict=True))
+        {"task": "hovering", "algorithm": method} | dict(zip(names, map(str, (*x, 1e6, "a box")), strict=True))
         for method, seeds in flown.items()
         for x in seeds
     ]
-    made = [comparison.choice_table, comparison.reached_table, comparison.improvement_table]
-    choice, table, beaten = (make(rows, shipped.METHODS, shipped.TASKS) for make in made)
-    assert (
-        "| hovering | SHAC: 9.1, 99.0%, 5 s, 3 seeds | PPO: 9.6, 100.0%, 40 s, 3 seeds | BPTT, SHAC, ABPT, PPO |"
-        in choice
-    )
+    made = [comparison.choice_table, comparison.reached_table, comparison.improvement_table, comparison.speed_table]
+    choice, table, beaten, speed = (make(rows, shipped.METHODS, shipped.TASKS) for make in made)
+    assert "| hovering | SHAC: 9.1, 99.0%, 5 s, 3 seeds | PPO: 9.6, 100.0%, 40 s, 3 seeds |  |" in choice
+    level = comparison.choice_table([x for x in rows if x["algorithm"] != "ppo"], shipped.METHODS, shipped.TASKS)
+    assert "| BPTT: 9.1, 98.0%, 3 s, 3 seeds | SHAC |" in level
+    assert '| hovering | "a box" | 333 | 200 | 1000 |  |  |  | 25 |' in speed
     assert "| hovering | ABPT | 2 | 99 | 75.0% (50.0%) |  | 1.0 | 1 |" in table
     assert "| PPO | 1.00, 1 | 1.00, 1 |  |" in beaten and "| BPTT |  | 0.50, 1 | 0.00, 1 |" in beaten
 

@@ -186,14 +186,12 @@ class HybridLoss(SHACLoss):
     def _with_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
         keys = self.tensor_keys
         lost = [key for key in (keys.advantage, keys.location_gradient, keys.latent) if key not in tensordict]
-        if len(lost) == 3:
-            return self.write_targets(tensordict)
-        if lost:
+        if lost and not {keys.location_gradient, keys.latent} <= set(lost):  # an advantage alone is somebody else's
             raise ValueError(
                 f"HybridLoss reads {lost[0]!r}, which write_targets writes and these samples have lost. Give samples "
                 "of all that it returned."
             )
-        return tensordict
+        return self.write_targets(tensordict) if lost else tensordict
 
     def _own_gradient(self, tensordict: TensorDictBase) -> Tensor:
         """The gradient of each action's own lambda-return in that action: (*, horizon, k)."""

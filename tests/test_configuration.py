@@ -73,7 +73,10 @@ REFUSED = [  # of ABPT, unless a recipe is named
     ("shac loss.target_bootstrap=1", "loss.target_bootstrap=1: it must be true or false"),
     ("shac loss.average_over_horizon=maybe", "loss.average_over_horizon=maybe: it must be true or false"),
     ("loss.simulated_steps=-1", "loss.simulated_steps=-1: it must be at least 0"),
-    ("sapo loss.target_entropy=1", "loss.target_entropy=1: it must be less than 0. .* for minus the size"),
+    (
+        "sapo loss.target_entropy=1",
+        r"loss.target_entropy=1: it must be less than 0. .* auto for minus the size of the action \(SAPO: half\)",
+    ),
     ("ahac loss.max_stiffness=1", "loss.max_stiffness=1: it must be greater than 1"),
     ("ahac loss.horizon_lr=1", "loss.horizon_lr=1: it must be less than 1"),
     ("logger.backend=csvv", "logger.backend=csvv: it must be 'wandb', 'tensorboard' or 'csv'"),

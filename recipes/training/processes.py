@@ -88,10 +88,9 @@ def backward(loss: Tensor, optimizer: torch.optim.Optimizer, max_grad_norm: floa
     optimizer.zero_grad()
     loss.backward()
     groups = [[p for p in group["params"] if p.grad is not None] for group in optimizer.param_groups]
-    parameters = [p for group in groups for p in group]
     loss = loss.detach()
     if world_size() > 1:
-        tensors = [loss, *(p.grad for p in parameters)]
+        tensors = [loss, *(p.grad for group in groups for p in group)]
         flat = nn.utils.parameters_to_vector(tensors)
         dist.all_reduce(flat)
         nn.utils.vector_to_parameters(flat / world_size(), tensors)

@@ -30,6 +30,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from comparison import column, reached_table
+from omegaconf import DictConfig
 from results import fill
 from running import DATA, composed, page  # whose import makes the recipes' code known
 from shipped import METHODS, TASKS
@@ -39,9 +40,11 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import Compose, PendulumEnv, RewardScaling, Transform, TransformedEnv, VmasEnv
 from torchrl.envs.utils import ExplorationType
+from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss, SoftUpdate
 from torchrl.objectives.value import GAE
-from training.building import AdaptiveRate, iterations, make_optimizer, network, shuffled
+from training.building import AdaptiveRate, iterations, make_optimizer, make_policy, network, shuffled
+from training.processes import backward
 
 from torchrl_quad import (
     ABPTLoss,
@@ -223,38 +226,40 @@ def train(name: str, environment: str, seed: int) -> tuple[float, float, float]:
 
 def optimise(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
     """Take a step down the gradient of a loss, of bounded norm."""
-    optimizer.zero_grad()
-    loss.backward()
-    torch.nn.utils.clip_grad_norm_([x for group in optimizer.param_groups for x in group["params"]], max_grad_norm)
+    backward(loss, optimizer, max_grad_norm)
     optimizer.step()
+
+
+def set_up(
+    algorithm: str, environment: str, seed: int, *overrides: str
+) -> tuple[DictConfig, Pendulum | Balance, ProbabilisticActor, ValueOperator]:
+    """Compose the configuration of a recipe, and build its environment and networks."""
+    torch.manual_seed(seed)
+    cfg = composed(algorithm, [f"num_envs={min(128, ENVS)}", f"total_steps={STEPS}", *overrides])
+    place = ENVIRONMENTS[environment](seed, cfg.num_envs)
+    return cfg, place, make_policy(cfg, place.env), make_value(place.env, **network(cfg, "critic"))
 
 
 def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
     """As :func:`train`, with the settings and the loop of recipes/hybrid.py."""
-    torch.manual_seed(seed)
-    cfg = composed("hybrid", [f"num_envs={min(128, ENVS)}", f"total_steps={STEPS}"])
-    place = ENVIRONMENTS[environment](seed, cfg.num_envs)
-    env, chosen = place.env, cfg.actor
-    actor = make_actor(
-        env, scale_init=chosen.scale_init, noise_correlation=chosen.noise_correlation, **network(cfg, "actor")
-    )
-    loss = HybridLoss(actor, make_value(env, **network(cfg, "critic")), **cfg.loss)
+    cfg, place, actor, value = set_up("hybrid", environment, seed)
+    loss = HybridLoss(actor, value, **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     count = iterations(cfg)
-    actor_optimizer, _ = make_optimizer(chosen, loss.actor_network_params.parameters(), count)
+    actor_optimizer, _ = make_optimizer(cfg.actor, loss.actor_network_params.parameters(), count)
     critic_optimizer, critic_schedule = make_optimizer(cfg.critic, loss.value_network_params.parameters(), count)
-    rate = AdaptiveRate(actor_optimizer, chosen.max_kl, count)
+    rate = AdaptiveRate(actor_optimizer, cfg.actor.max_kl, count)
 
     before, start = mean_return(environment, actor), time.process_time()
     carry = place.starts()
     for iteration in range(count):
-        rollout, carry = differentiable_rollout(env, actor, carry, cfg.horizon)
+        rollout, carry = differentiable_rollout(place.env, actor, carry, cfg.horizon)
         moved = 0.0
         for batch in shuffled(loss.write_targets(rollout).exclude("next"), cfg.batch_size, cfg.epochs):
             losses = loss(batch)
             if moved < rate.limit(iteration):
                 moved = max(moved, losses["kl"].item())
-                optimise(actor_optimizer, losses["loss_actor"], chosen.max_grad_norm)
+                optimise(actor_optimizer, losses["loss_actor"], cfg.actor.max_grad_norm)
             optimise(critic_optimizer, losses["loss_value"], cfg.critic.max_grad_norm)
         rate.step(iteration, moved)
         critic_schedule.step()
@@ -264,36 +269,28 @@ def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
 
 def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
     """As :func:`train`, with the loop of recipes/ppo.py, its settings for racing, and the horizons of the hybrid."""
-    torch.manual_seed(seed)
-    size = ["horizon=32", "batch_size=1024", f"num_envs={min(128, ENVS)}", f"total_steps={STEPS}"]
-    cfg = composed("ppo", ["tuned=ppo_racing", *size])
-    place = ENVIRONMENTS[environment](seed, cfg.num_envs)
-    env, chosen = place.env, cfg.actor
-    noise = {"scale_init": chosen.scale_init, "noise_correlation": chosen.noise_correlation}
-    actor = make_actor(env, **noise, **network(cfg, "actor"), return_log_prob=True)
-    value = make_value(env, **network(cfg, "critic"))
+    cfg, place, actor, value = set_up("ppo", environment, seed, "tuned=ppo_racing", "horizon=32", "batch_size=1024")
     advantage = GAE(gamma=cfg.gamma, lmbda=cfg.critic.lmbda, value_network=value, vectorized=False)
     loss = ClipPPOLoss(actor, value, **cfg.loss)
-    optimizers, schedules = zip(
-        *(make_optimizer(cfg[x], y.parameters(), iterations(cfg)) for x, y in (("actor", actor), ("critic", value))),
-        strict=True,
-    )
+    actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor.parameters(), iterations(cfg))
+    critic_optimizer, critic_schedule = make_optimizer(cfg.critic, value.parameters(), iterations(cfg))
 
     before, start = mean_return(environment, actor), time.process_time()
     carry = place.starts()
     for _ in range(iterations(cfg)):
         with torch.no_grad():
-            rollout, carry = differentiable_rollout(env, actor, carry, cfg.horizon)
+            rollout, carry = differentiable_rollout(place.env, actor, carry, cfg.horizon)
             advantage(rollout)
         moved = 0.0
         for batch in shuffled(rollout.exclude("next"), cfg.batch_size, cfg.epochs):
             losses = loss(batch)
-            if moved < chosen.max_kl:
+            if moved < cfg.actor.max_kl:
                 moved = abs(losses["kl_approx"].item())
-                optimise(optimizers[0], losses["loss_objective"] + losses["loss_entropy"], chosen.max_grad_norm)
-            optimise(optimizers[1], losses["loss_critic"], cfg.critic.max_grad_norm)
-        for schedule in schedules:
-            schedule.step()
+                loss_actor = losses["loss_objective"] + losses["loss_entropy"]
+                optimise(actor_optimizer, loss_actor, cfg.actor.max_grad_norm)
+            optimise(critic_optimizer, losses["loss_critic"], cfg.critic.max_grad_norm)
+        actor_schedule.step()
+        critic_schedule.step()
         carry = place.go_on(carry)
     return before, mean_return(environment, actor), time.process_time() - start
 
@@ -326,11 +323,11 @@ def main() -> None:
     jobs = [
         (environment, name, seed) for seed in args.seeds for environment in args.environments for name in args.losses
     ]
+    own = {"hybrid": train_hybrid, "ppo": train_ppo}
     for environment, name, seed in jobs:
         key = {"environment": environment, "loss": name, "seed": str(seed)}
         if any(key.items() <= row.items() for row in read_rows(args.data / "elsewhere.csv")):
             continue
-        own = {"hybrid": train_hybrid, "ppo": train_ppo}
         flown = own[name](environment, seed) if name in own else train(name, environment, seed)
         numbers = {x: f"{y:.6g}" for x, y in zip(("before", "after", "seconds"), flown, strict=True)}
         row = key | numbers | {"steps": STEPS, "machine": machine(), "flown": datetime.date.today().isoformat()}

@@ -29,6 +29,7 @@ from torchrl_quad.deploy import Bundle, load_bundle
 from torchrl_quad.deploy.judging import PRECISION
 from torchrl_quad.deploy.simulators import make_simulator, simulator_class
 from torchrl_quad.deploy.transfer import MUTANTS, fly
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import machine, read_rows, write_rows
 
 SETTINGS = {
@@ -119,16 +120,20 @@ def settings(arguments: list[str]) -> dict[str, Any]:
     for argument in arguments:
         name, equals, value = argument.partition("=")
         if name not in SETTINGS or not equals:
-            raise ValueError(f"unknown setting {argument!r}. Choose from: {', '.join(f'{x}=...' for x in SETTINGS)}.")
+            raise UserValueError(
+                f"unknown setting {argument!r}. Choose from: {', '.join(f'{x}=...' for x in SETTINGS)}."
+            )
         cfg[name] = yaml.safe_load(value)
         if cfg[name] is None:
             cfg[name] = SETTINGS[name][1]
         elif type(cfg[name]) is not SETTINGS[name][0]:
-            raise ValueError(f"{argument}: {name} must be a {SETTINGS[name][0].__name__}.")
+            raise UserValueError(f"{argument}: {name} must be a {SETTINGS[name][0].__name__}.")
     if cfg["bundle"] is None:
-        raise ValueError("bundle is missing: write bundle=FOLDER, of a policy that recipes/export.py has written.")
+        raise UserValueError("bundle is missing: write bundle=FOLDER, of a policy that recipes/export.py has written.")
     if cfg["late"] < 0 or (cfg["episodes"] is not None and cfg["episodes"] < 1):
-        raise ValueError(f"late must be at least 0, and episodes at least 1; got {cfg['late']} and {cfg['episodes']}.")
+        raise UserValueError(
+            f"late must be at least 0, and episodes at least 1; got {cfg['late']} and {cfg['episodes']}."
+        )
     return cfg
 
 

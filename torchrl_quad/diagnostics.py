@@ -15,6 +15,7 @@ from torch.autograd.graph import GradientEdge
 from torchrl.envs import EnvBase
 
 from torchrl_quad.data import differentiable_rollout
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.action_gradients import sources_of_steps
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.objectives.segments import discounts
@@ -105,7 +106,7 @@ def audit_reward(
     """
     for key in (terms_key, reward_key, done_key):
         if key not in rollout:
-            raise ValueError(
+            raise UserValueError(
                 f"audit_reward reads {key!r}, which is not in the rollout. Name the terms, the reward and the ends of "
                 "episodes as the rollout does: terms_key, reward_key, done_key."
             )
@@ -122,7 +123,7 @@ def audit_reward(
         )
     sources = _sources(inputs)
     if all(g is None for g in torch.autograd.grad(reward.sum(), sources, retain_graph=True, allow_unused=True)):
-        raise ValueError(
+        raise UserValueError(
             f"{reward_key!r} does not depend on the inputs. Give the actor that flew this rollout, or tensors "
             "from which its actions were computed."
         )
@@ -208,7 +209,7 @@ def gradient_statistics(loss: PathwiseLoss, rollout: TensorDictBase, *, max_envs
     """
     objectives = sum(loss.objective_parts(rollout).values()).flatten()[:max_envs]
     if len(objectives) < 2:
-        raise ValueError(
+        raise UserValueError(
             f"A variance over environments needs at least two of them, got {len(objectives)}. Fly more side by side, "
             f"or raise max_envs={max_envs}."
         )
@@ -257,7 +258,7 @@ def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
         return [steps] if isinstance(steps, Tensor) else steps
     sources = [inputs] if isinstance(inputs, Tensor) else list(inputs)
     if not sources or not all(isinstance(x, Tensor) and x.requires_grad for x in sources):
-        raise ValueError(
+        raise UserValueError(
             "There is nothing to differentiate with respect to: give the actor or its loss with parameters that "
             "require grad, or tensors that do."
         )
@@ -291,11 +292,13 @@ def _verdict(term: Tensor, gradient_norm: float) -> str:
 def _require_sum(terms: dict[str, Tensor], reward: Tensor, terms_key: NestedKey, tolerance: float) -> None:
     for name, term in terms.items():
         if term.shape != reward.shape:
-            raise ValueError(f"The term {name!r} has shape {tuple(term.shape)}, and the reward {tuple(reward.shape)}.")
+            raise UserValueError(
+                f"The term {name!r} has shape {tuple(term.shape)}, and the reward {tuple(reward.shape)}."
+            )
     gap = (sum(terms.values()) - reward).detach().abs()
     worst = (gap / (1.0 + sum(term.detach().abs() for term in terms.values()))).max().item()
     if not worst <= tolerance:
-        raise ValueError(
+        raise UserValueError(
             f"The terms under {terms_key!r}, {', '.join(terms)}, do not add up to the reward: they are off by up to "
             f"{gap.max().item():.3g}. Either a term is missing or not weighted, or a transform has changed the reward: "
             "name the one before it, reward_key=..."

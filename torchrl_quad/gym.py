@@ -20,6 +20,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from torchrl_quad.envs import make_env
+from torchrl_quad.errors import UserValueError
 
 # An episode ends before an entry of the state exceeds this, where a task does not know better.
 _LIMIT = 1e6
@@ -74,9 +75,9 @@ class GymVectorEnv(VectorEnv):
     ) -> None:
         modes = [mode.value for mode in AutoresetMode]
         if autoreset_mode not in (*modes, *AutoresetMode):
-            raise ValueError(f"Unknown autoreset_mode {autoreset_mode!r}. Choose from: {', '.join(modes)}.")
+            raise UserValueError(f"Unknown autoreset_mode {autoreset_mode!r}. Choose from: {', '.join(modes)}.")
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(
+            raise UserValueError(
                 f'Unknown render_mode {render_mode!r}. Choose "rgb_array", for pictures as arrays, or leave it out.'
             )
         self.render_mode = render_mode
@@ -105,7 +106,7 @@ class GymVectorEnv(VectorEnv):
         super().reset(seed=seed)
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise ValueError(
+            raise UserValueError(
                 f"reset_mask must be a bool array of shape ({self.num_envs},) that marks at least one drone, got shape "
                 f"{mask.shape}, dtype {mask.dtype}. To reset all drones, leave it out."
             )
@@ -211,7 +212,9 @@ class GymEnv(gymnasium.Env):
     def __init__(self, task: str, **kwargs: Any) -> None:
         for name in ("num_envs", "autoreset_mode"):
             if name in kwargs:
-                raise ValueError(f"{name} is for many drones, and GymEnv flies one. Write gymnasium.make_vec instead.")
+                raise UserValueError(
+                    f"{name} is for many drones, and GymEnv flies one. Write gymnasium.make_vec instead."
+                )
         kwargs.setdefault("max_episode_steps", _NO_LIMIT)
         self._drones = GymVectorEnv(task, autoreset_mode=AutoresetMode.DISABLED, **kwargs)
         self.torchrl_env, self.render_mode = self._drones.torchrl_env, self._drones.render_mode
@@ -243,12 +246,12 @@ class GymEnv(gymnasium.Env):
 def _checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
     action = np.asarray(action, dtype=np.float64)
     if action.shape != shape:
-        raise ValueError(
+        raise UserValueError(
             f"The action has shape {action.shape}, expected {shape}, each entry in [-1, 1]"
             + (", a row for each drone." if len(shape) > 1 else ".")
         )
     if not np.isfinite(action).all():
-        raise ValueError(
+        raise UserValueError(
             f"The action is NaN or infinite at {np.argwhere(~np.isfinite(action)).tolist()}, which no drone can fly. "
             "Check the policy's parameters, or write np.nan_to_num(action)."
         )

@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import ObservationNormalizer, TrustRegion, make_actor, make_env, make_visual_actor
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives import PathwiseLoss
 from training.processes import cat_all, mean_of_all, rank, world_size
 
@@ -125,7 +126,7 @@ class AdaptiveRate:
 
     def __init__(self, optimizer: torch.optim.Optimizer, max_kl: float, iterations: int) -> None:
         if max_kl is None:
-            raise ValueError("actor.max_kl=null: this recipe sets its rate by it. Write a number; 0.25 is usual.")
+            raise UserValueError("actor.max_kl=null: this recipe sets its rate by it. Write a number; 0.25 is usual.")
         self.optimizer, self.max_kl, self.iterations = optimizer, max_kl, iterations
         self.bounds = (1e-6, 20.0 * optimizer.param_groups[0]["lr"])
 

@@ -15,6 +15,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import replacing
 
 FORMAT = 3  # of the content; raise it when older files can no longer be read
@@ -58,26 +59,26 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise FileNotFoundError(f"No checkpoint at {path}. Train one first: python recipes/abpt.py")
     payload, mark, checksum = path.read_bytes().rpartition(MARK)
     if mark and hashlib.sha256(payload).hexdigest().encode() != checksum:
-        raise ValueError(f"{path} is damaged: its checksum does not fit its content. {_way_out(path)}")
+        raise UserValueError(f"{path} is damaged: its checksum does not fit its content. {_way_out(path)}")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
         said = (str(error) or repr(error)).splitlines()[0]
-        raise ValueError(
+        raise UserValueError(
             f"{path} cannot be read: it is cut off or damaged, or no checkpoint of these recipes, which hold tensors "
             f"and plain values only (anything else could run code, and is not loaded). {_way_out(path)} torch says: "
             f"{said}"
         ) from error
     if not isinstance(content, dict) or "config" not in content:
-        raise ValueError(f"{path} is not a checkpoint of these recipes. Give the path of a checkpoint.pt.")
+        raise UserValueError(f"{path} is not a checkpoint of these recipes. Give the path of a checkpoint.pt.")
     if content.get("format") != FORMAT:
-        raise ValueError(
+        raise UserValueError(
             f"{path} has checkpoint format {content.get('format', 0)}, this version reads format {FORMAT}. It was "
             f"written by torchrl_quad {content.get('version', '0.1.0 or before')} at revision "
             f"{content.get('revision', 'unknown')}: use that version, or train again."
         )
     if not mark:
-        raise ValueError(f"{path} is damaged: its checksum is missing. {_way_out(path)}")
+        raise UserValueError(f"{path} is damaged: its checksum is missing. {_way_out(path)}")
     return content
 
 
@@ -110,7 +111,7 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
     for key in ("algorithm", *(override.split("=")[0].lstrip("+~") for override in HydraConfig.get().overrides.task)):
         asked, was = OmegaConf.select(cfg, key), OmegaConf.select(saved, key)
         if asked != was and key.split(".")[0] not in FREE_ON_RESUME:
-            raise ValueError(
+            raise UserValueError(
                 f"{key}={asked} contradicts the checkpoint {cfg.resume}, which was trained with {key}={was}. Leave it "
                 f"out to go on, or start a new run without resume. These may change: {', '.join(FREE_ON_RESUME)}."
             )

@@ -20,6 +20,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl_quad import differentiable_rollout
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.envs.scenery import EPISODE_METRICS, describe_metric
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import replacing
 from training.building import build_env, make_policy
 from training.checkpoints import read_checkpoint
@@ -93,7 +94,7 @@ def best_policy(
         ValueError: there is none.
     """
     if "actor" not in best:
-        raise ValueError(
+        raise UserValueError(
             f"{source} holds no policy: the run stopped before its first evaluation, or no return was finite. Train "
             "longer, or with a lower learning rate."
         )

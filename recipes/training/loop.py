@@ -28,6 +28,7 @@ from torchrl_quad import (
     differentiable_rollout,
     gradient_statistics,
 )
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import replacing
 from torchrl_quad.objectives import PathwiseLoss
 from training import drawing
@@ -324,7 +325,7 @@ class Run:
         """
         saved = read_checkpoint(path)
         if len(saved["processes"]) != world_size():
-            raise ValueError(
+            raise UserValueError(
                 f"{path} was written by {len(saved['processes'])} processes, and {world_size()} want to go on. Start "
                 "as many as before: torchrun --nproc-per-node=N."
             )

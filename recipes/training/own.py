@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 
 from torchrl_quad import QuadrotorEnv, available_tasks
 from torchrl_quad.envs import task_class
+from torchrl_quad.errors import UserValueError
 
 CONFIG = Path(__file__).parents[1] / "config"
 SET_BY_RECIPES = ("num_envs", "device", "seed", "compile")  # settings outside ``env``
@@ -71,7 +72,7 @@ def own_recipe(config: str, settings: Mapping[str, Any]) -> str:
     """
     name = settings.get("algorithm")
     if not isinstance(name, str) or (CONFIG / f"{name}.yaml").exists():
-        raise ValueError(
+        raise UserValueError(
             f"A recipe of your own needs a name of its own: @recipe({config!r}, algorithm='my_{config}', ...); got "
             f"{name!r}."
         )

@@ -12,6 +12,8 @@ import torch.distributed as dist
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
+from torchrl_quad.errors import UserValueError
+
 
 @contextlib.contextmanager
 def joined(cfg: DictConfig) -> Iterator[None]:
@@ -22,7 +24,9 @@ def joined(cfg: DictConfig) -> Iterator[None]:
     """
     if "RANK" in os.environ:
         if ":" in cfg.device:
-            raise ValueError(f"device={cfg.device}: under torchrun each process takes its own GPU. Write device=cuda.")
+            raise UserValueError(
+                f"device={cfg.device}: under torchrun each process takes its own GPU. Write device=cuda."
+            )
         gpu = cfg.device == "cuda"
         if gpu:
             torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))

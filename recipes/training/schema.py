@@ -18,22 +18,23 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from torchrl_quad.envs import task_class
 from torchrl_quad.envs.checks import refuse_unknown
+from torchrl_quad.errors import UserValueError
 from training.own import SET_BY_RECIPES, option_types
 
 
 def available_device(name: str) -> str:
     """The name of a device that this machine has."""
     if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
-        raise ValueError("be cpu, cuda, or one of several GPUs, such as cuda:1")
+        raise UserValueError("be cpu, cuda, or one of several GPUs, such as cuda:1")
     if name.startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError("be cpu: torch finds no CUDA device on this machine")
+        raise UserValueError("be cpu: torch finds no CUDA device on this machine")
     return name
 
 
 def existing_checkpoint(path: str) -> str:
     """The path of a checkpoint to go on from, or auto."""
     if path != "auto" and not Path(path).is_file():
-        raise ValueError("be the path of a checkpoint.pt that exists, or auto")
+        raise UserValueError("be the path of a checkpoint.pt that exists, or auto")
     return path
 
 
@@ -100,7 +101,7 @@ class Optimised(Section):
     @model_validator(mode="after")
     def _exponential_never_reaches_zero(self) -> Optimised:
         if self.schedule == "exponential" and self.final_lr == 0:
-            raise ValueError("have a final_lr above 0 with schedule=exponential, which never reaches 0; try 1e-6")
+            raise UserValueError("have a final_lr above 0 with schedule=exponential, which never reaches 0; try 1e-6")
         return self
 
 
@@ -284,7 +285,7 @@ def check(cfg: DictConfig) -> None:
         values = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
         name = error.full_key or "a setting"
-        raise ValueError(f"{name} is missing: write {name}=... on the command line.") from None
+        raise UserValueError(f"{name} is missing: write {name}=... on the command line.") from None
     _refuse_none(values)
     kinds = {"logs": Identifying, "folder": Exporting, "checkpoint": Flying}
     schema = next((kind for name, kind in kinds.items() if name in values), Training)
@@ -293,7 +294,7 @@ def check(cfg: DictConfig) -> None:
     try:
         schema.model_validate(values)
     except ValidationError as error:
-        raise ValueError(_sentence(schema, error.errors()[0])) from None
+        raise UserValueError(_sentence(schema, error.errors()[0])) from None
 
 
 def _with_options(task: str, env: dict[str, Any]) -> type[Training]:
@@ -301,7 +302,7 @@ def _with_options(task: str, env: dict[str, Any]) -> type[Training]:
     cls = task_class(task)
     for name in env:
         if name in SET_BY_RECIPES:
-            raise ValueError(f"env.{name}: recipes set it for all environments. Write {name}=..., without env.")
+            raise UserValueError(f"env.{name}: recipes set it for all environments. Write {name}=..., without env.")
     refuse_unknown(cls, sorted(set(env) - set(inspect.signature(cls).parameters)))
     kinds = {name: (Real if kind is float else kind, None) for name, kind in option_types(cls).items()}
     kinds = {name: kind for name, kind in kinds.items() if name not in Env.model_fields}
@@ -314,7 +315,7 @@ def _refuse_none(values: Any, name: str = "") -> None:
         for key, value in values.items():
             _refuse_none(value, f"{name}.{key}" if name else str(key))
     elif values in ("None", "none"):
-        raise ValueError(f"{name}={values}: it is the word {values!r} to YAML. For no value write {name}=null.")
+        raise UserValueError(f"{name}={values}: it is the word {values!r} to YAML. For no value write {name}=null.")
 
 
 _TYPES = {  # pydantic's kinds of error in plain words

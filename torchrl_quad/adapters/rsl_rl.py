@@ -10,11 +10,12 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.adapters.torch_vector import TorchVectorEnv
+from torchrl_quad.errors import MissingPackage
 
 try:
     from rsl_rl.env import VecEnv
 except ImportError as error:
-    raise ImportError('RslRlVecEnv needs rsl-rl: pip install ".[adapters]" in a clone') from error
+    raise MissingPackage('RslRlVecEnv needs rsl-rl: pip install ".[adapters]" in a clone') from error
 
 
 class RslRlVecEnv(VecEnv):

@@ -9,11 +9,12 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.adapters.torch_vector import TorchVectorEnv
+from torchrl_quad.errors import MissingPackage
 
 try:
     from skrl.envs.wrappers.torch import Wrapper
 except ImportError as error:
-    raise ImportError('SkrlEnv needs skrl: pip install ".[adapters]" in a clone') from error
+    raise MissingPackage('SkrlEnv needs skrl: pip install ".[adapters]" in a clone') from error
 
 
 class SkrlEnv(Wrapper):

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from torchrl_quad.errors import MissingPackage, UserValueError
+
 try:
     from stable_baselines3.common.vec_env import VecEnv
 except ImportError as error:
-    raise ImportError('DronesVecEnv needs stable-baselines3: pip install ".[adapters]" in a clone') from error
+    raise MissingPackage('DronesVecEnv needs stable-baselines3: pip install ".[adapters]" in a clone') from error
 
 
 class DronesVecEnv(VecEnv):
@@ -35,7 +37,7 @@ class DronesVecEnv(VecEnv):
     def __init__(self, env: VectorEnv) -> None:
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
-            raise ValueError(
+            raise UserValueError(
                 f"The autoreset mode is {getattr(mode, 'value', mode)!r}, and stable-baselines3 expects an episode to "
                 "begin in the step in which the last one ended. Write "
                 'gymnasium.make_vec(..., autoreset_mode="SameStep").'

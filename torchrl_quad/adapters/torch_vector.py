@@ -12,6 +12,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from torchrl_quad.errors import UserValueError
+
 _INFO = "success", "crash", "reward_terms", "metrics"
 
 
@@ -38,7 +40,7 @@ class TorchVectorEnv:
 
     def __init__(self, env: EnvBase) -> None:
         if len(env.batch_size) != 1:
-            raise ValueError(
+            raise UserValueError(
                 f"The environment has the batch size {tuple(env.batch_size)}, and must have one dimension. Build it "
                 "with the number of its drones, HoveringEnv(num_envs=512)."
             )
@@ -79,7 +81,7 @@ class TorchVectorEnv:
         if self.now is None:
             raise RuntimeError("A step needs an episode: call reset() first.")
         if action.shape != self._low.shape:
-            raise ValueError(
+            raise UserValueError(
                 f"The actions have shape {tuple(action.shape)}, expected {tuple(self._low.shape)}: a row a drone."
             )
         # Frameworks act in inference mode, whose tensors could not be differentiated later.

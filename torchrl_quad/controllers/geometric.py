@@ -13,6 +13,7 @@ from torch.nn.functional import normalize, pad
 from torchrl_quad.controllers.policy import Controller, State
 from torchrl_quad.controllers.references import Reference, follow
 from torchrl_quad.dynamics import quaternion
+from torchrl_quad.errors import UserValueError
 
 LEAST_LIFT = 0.3  # vertical part of the thrust, in weights: the drone never turns over to dive
 GREATEST_LIFT = 0.9  # of the greatest thrust: there is always some left to go sideways
@@ -77,9 +78,9 @@ class GeometricController(Controller):
             ("max_error", max_error), ("max_tilt", max_tilt),
         ):  # fmt: skip
             if value is not None and not 0.0 < value < math.inf:
-                raise ValueError(f"GeometricController: {name} must be a positive number, got {value!r}.")
+                raise UserValueError(f"GeometricController: {name} must be a positive number, got {value!r}.")
         if max_tilt >= 0.5 * math.pi:
-            raise ValueError(f"GeometricController: max_tilt must be below pi / 2 [rad], got {max_tilt!r}.")
+            raise UserValueError(f"GeometricController: max_tilt must be below pi / 2 [rad], got {max_tilt!r}.")
         self.position_gain, self.velocity_gain, self.max_error = position_gain, velocity_gain, max_error
         self.max_tilt, self.heading = max_tilt, heading
         nominal = self.nominal

@@ -14,6 +14,7 @@ from torchrl_quad.controllers.policy import Controller, State
 from torchrl_quad.controllers.references import Reference, follow
 from torchrl_quad.controllers.riccati import feedback
 from torchrl_quad.dynamics import quaternion
+from torchrl_quad.errors import UserValueError
 
 # Of the squared residuals: each is the square of what one unit of it weighs, and half of it counts.
 WEIGHTS = {
@@ -73,14 +74,14 @@ class MPC(Controller):
         super().__init__(env, reference)
         for name, value in (("horizon", horizon), ("iterations", iterations)):
             if not (isinstance(value, int) and value >= 1):
-                raise ValueError(f"MPC: {name} must be a whole number of at least 1, got {value!r}.")
+                raise UserValueError(f"MPC: {name} must be a whole number of at least 1, got {value!r}.")
         unknown = sorted(set(weights or {}) - set(WEIGHTS))
         if unknown:
-            raise ValueError(f"MPC: unknown weight {unknown[0]!r}. Choose from: {', '.join(WEIGHTS)}.")
+            raise UserValueError(f"MPC: unknown weight {unknown[0]!r}. Choose from: {', '.join(WEIGHTS)}.")
         self.weights = {**WEIGHTS, **(weights or {})}
         wrong = [name for name, value in self.weights.items() if not value >= 0 or (name == "action" and value == 0)]
         if wrong:
-            raise ValueError(f"MPC: the weight {wrong[0]!r} must be positive, got {self.weights[wrong[0]]!r}.")
+            raise UserValueError(f"MPC: the weight {wrong[0]!r} must be positive, got {self.weights[wrong[0]]!r}.")
         self.out_keys.append("plan")
         self.horizon, self.iterations = horizon, iterations
         self.hover_speed, like = self.dynamics.controller.hover_speed, self.nominal.mass

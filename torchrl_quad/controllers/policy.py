@@ -14,6 +14,7 @@ from torchrl_quad.controllers.references import Reference, task_reference
 from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.dynamics import FlightController, Quadrotor
 from torchrl_quad.envs import QuadrotorEnv
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 State = dict[Any, Tensor]
 
@@ -41,14 +42,16 @@ class Controller(TensorDictModuleBase):
     def __init__(self, env: Any, reference: Reference | None = None) -> None:
         env, name = base_env(env), type(self).__name__
         if not isinstance(env, QuadrotorEnv):
-            raise TypeError(f"{name} flies a QuadrotorEnv, such as HoveringEnv(num_envs=64); got {type(env).__name__}.")
+            raise UserTypeError(
+                f"{name} flies a QuadrotorEnv, such as HoveringEnv(num_envs=64); got {type(env).__name__}."
+            )
         if type(env.dynamics) is not Quadrotor:
-            raise ValueError(
+            raise UserValueError(
                 f"{name} needs a body with attitude and rotors, and this environment flies "
                 f"{type(env.dynamics).__name__}. Build it with dynamics='quadrotor'."
             )
         if type(env.dynamics.controller) is not FlightController:
-            raise ValueError(
+            raise UserValueError(
                 f"{name} commands thrust and body rates, and actions here are {', '.join(env.action_units)}. Build the "
                 "environment with control='rates'."
             )

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrl_quad.controllers.laps import plan_lap
 from torchrl_quad.envs import HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv
+from torchrl_quad.errors import UserValueError
 
 Reference = Callable[[dict[Any, Tensor], Tensor], Tensor]
 
@@ -51,7 +52,7 @@ def task_reference(env: QuadrotorEnv, lead: float, name: str) -> Reference:
     for task, make in REFERENCES.items():
         if isinstance(env, task):
             return make(env, lead)
-    raise ValueError(
+    raise UserValueError(
         f"{name} knows no reference for {type(env).__name__}. Write {name}(env, reference=function), with a function "
         "from the state and times (T) [s] to positions (num_envs, T, 3) [m], such as "
         'lambda state, t: state["target"].unsqueeze(1).expand(-1, len(t), 3).'

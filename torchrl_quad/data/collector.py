@@ -15,6 +15,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl_quad.data.rollout import differentiable_rollout
 from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.data.visited_states import restart
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 
 class DifferentiableCollector(BaseCollector):
@@ -61,12 +62,12 @@ class DifferentiableCollector(BaseCollector):
         self.horizon, rest = divmod(frames_per_batch, self.env.numel())
         if rest or self.horizon < 1:
             nearest = max(self.horizon, 1) * self.env.numel()
-            raise ValueError(
+            raise UserValueError(
                 f"frames_per_batch={frames_per_batch} must be a multiple of the number of environments, "
                 f"{self.env.numel()}. Try {nearest}, a horizon of {nearest // self.env.numel()} control steps."
             )
         if not 0.0 <= restart_fraction <= 1.0:
-            raise ValueError(f"restart_fraction must lie between 0 and 1, got {restart_fraction}.")
+            raise UserValueError(f"restart_fraction must lie between 0 and 1, got {restart_fraction}.")
         self.frames_per_batch = self.requested_frames_per_batch = frames_per_batch
         self.total_frames: float = float("inf") if total_frames < 0 else total_frames
         self.carry: TensorDictBase | None = None
@@ -85,7 +86,7 @@ class DifferentiableCollector(BaseCollector):
 
     def __len__(self) -> int:
         if self.total_frames == float("inf"):
-            raise TypeError("A collector without total_frames goes on for ever, and has no length.")
+            raise UserTypeError("A collector without total_frames goes on for ever, and has no length.")
         return -(self.total_frames // -self.frames_per_batch)
 
     def update_policy_weights_(

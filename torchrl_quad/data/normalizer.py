@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ObservationNorm
 
 from torchrl_quad.data.unwrap import base_env
+from torchrl_quad.errors import UserValueError
 
 
 class ObservationNormalizer(ObservationNorm):
@@ -41,17 +42,17 @@ class ObservationNormalizer(ObservationNorm):
 
     def __init__(self, env: EnvBase, key: NestedKey = "observation", *, min_scale: float = 0.01) -> None:
         if key not in env.observation_spec.keys(True, True):
-            raise ValueError(
+            raise UserValueError(
                 f"The environment does not observe {key!r}. Choose from: "
                 f"{', '.join(map(str, env.observation_spec.keys(True, True)))}."
             )
         if key in base_env(env).state_keys:
-            raise ValueError(
+            raise UserValueError(
                 f"{key!r} is part of the state from which the next step starts, and cannot be overwritten. Copy it: "
                 f'CatTensors([{key!r}], "features", del_keys=False), and normalise "features".'
             )
         if not min_scale > 0:
-            raise ValueError(f"min_scale must be positive, since the normalizer divides by it; got {min_scale}.")
+            raise UserValueError(f"min_scale must be positive, since the normalizer divides by it; got {min_scale}.")
         spec = env.observation_spec[key]
         loc = torch.zeros(spec.shape[-1], device=spec.device, dtype=spec.dtype)
         super().__init__(loc, torch.ones_like(loc), in_keys=[key], standard_normal=True)

@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.normalizer import NormalizedPolicy, ObservationNormalizer
 from torchrl_quad.data.unwrap import base_env, memory_keys, require_whole_state
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 
 def differentiable_rollout(
@@ -48,19 +49,19 @@ def differentiable_rollout(
         TypeError: the actor is not a TensorDictModule, or the carry is not a tensordict.
     """
     if not (isinstance(horizon, numbers.Integral) and horizon >= 1):
-        raise ValueError(f"horizon must be at least 1 control step, got {horizon}.")
+        raise UserValueError(f"horizon must be at least 1 control step, got {horizon}.")
     if hasattr(actor, "_orig_mod"):
-        raise TypeError(
+        raise UserTypeError(
             "torch.compile(actor) is no TensorDictModule. Write actor.compile() instead, which compiles it in place, "
             "or give the environment compile=True, which compiles the whole horizon."
         )
     if not isinstance(actor, TensorDictModuleBase):
-        raise TypeError(
+        raise UserTypeError(
             f"actor must be a TensorDictModule that writes the action, got {type(actor).__name__}. "
             'Wrap a plain module: TensorDictModule(module, in_keys=["observation"], out_keys=["action"]).'
         )
     if not (carry is None or isinstance(carry, TensorDictBase)):
-        raise TypeError(
+        raise UserTypeError(
             f"carry must be the tensordict to start from, or None to reset the environment; got {type(carry).__name__}."
         )
     try:
@@ -70,7 +71,7 @@ def differentiable_rollout(
             rollout = _rollout(env, actor, carry, horizon)
     except KeyError as error:
         if "not found in the environment outputs" in str(error):
-            raise ValueError(
+            raise UserValueError(
                 f"ExcludeTransform: {error.args[0]} TorchRL's transform leaves out single entries, and no groups: name "
                 'each, such as ("reward_terms", "velocity"). Keep the state, from which the next step starts.'
             ) from error
@@ -78,11 +79,11 @@ def differentiable_rollout(
         if not missing:
             raise
         if set(missing) & {*memory_keys(actor), "is_init"}:
-            raise ValueError(
+            raise UserValueError(
                 f"The actor remembers, and the tensordict it starts from has no {missing[0]!r}. Give the environment "
                 "TorchRL's transforms: Compose(InitTracker(), module.make_tensordict_primer())."
             ) from error
-        raise ValueError(
+        raise UserValueError(
             f"The actor reads {missing[0]!r}, which is not in the tensordict it starts from. Choose its in_keys from "
             f"what env.reset() writes: {', '.join(map(str, env.observation_spec.keys(True, True)))}."
         ) from error

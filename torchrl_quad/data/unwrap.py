@@ -4,6 +4,8 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
+from torchrl_quad.errors import UserValueError
+
 
 def base_env(env: EnvBase) -> EnvBase:
     """The innermost environment, under all transforms; the environment itself where there are none."""
@@ -22,7 +24,7 @@ def require_whole_state(env: EnvBase) -> None:
     state = set(map(unravel_key, base.state_keys))
     lost = state & {*base.observation_spec.keys(True, True)} - {*env.observation_spec.keys(True, True)}
     if lost:
-        raise ValueError(
+        raise UserValueError(
             f"A transform leaves out {min(lost, key=str)!r}, and every step would start where the first one did. No "
             "transform may drop a part of the state, from which the next step starts: let SelectTransform keep it, too."
         )
@@ -30,7 +32,7 @@ def require_whole_state(env: EnvBase) -> None:
         for transform in env.transform if isinstance(env.transform, Compose) else [env.transform]:
             kept = set(map(unravel_key, transform.in_keys_inv))
             for key in sorted(state & set(map(unravel_key, transform.out_keys)) - kept, key=str):
-                raise ValueError(
+                raise UserValueError(
                     f"{type(transform).__name__} overwrites {key!r}, from which the next step starts, and so changes "
                     f"the flight. Write into another entry: out_keys=[...], or CatTensors([{key!r}], 'features', "
                     "del_keys=False) before it."

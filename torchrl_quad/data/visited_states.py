@@ -14,6 +14,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
 from torchrl_quad.data.unwrap import base_env, memory_keys
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 
 class VisitedStateBuffer(TensorDictReplayBuffer):
@@ -49,7 +50,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         seed: int = 0,
     ) -> None:
         if not (isinstance(capacity, numbers.Integral) and capacity >= 1):
-            raise ValueError(f"capacity must be at least 1 state, got {capacity}.")
+            raise UserValueError(f"capacity must be at least 1 state, got {capacity}.")
         if state_keys is None:
             state_keys = ("state",) if env is None else _state_keys(env)
         self.state_keys = tuple(state_keys)
@@ -72,7 +73,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         """
         missing = [key for key in (*self.state_keys, *self.memory_keys) if key not in tensordicts]
         if missing:
-            raise ValueError(
+            raise UserValueError(
                 f"The visited-state buffer keeps {self.state_keys}, and the rollout lacks {missing[0]!r}. Give the "
                 "buffer the environment, VisitedStateBuffer(env=env), or the entries of its Markov state, state_keys."
             )
@@ -129,7 +130,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         _require_fraction(fraction)
         base = base_env(env)
         if not _draws_starts(base):
-            raise TypeError(
+            raise UserTypeError(
                 f"{type(base).__name__} has no sample_start(n), from which a source takes its fresh starts. Define it, "
                 "or start horizons with buffer.initial_state(env, fraction)."
             )
@@ -178,9 +179,9 @@ def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictB
     keys = _state_keys(env)
     missing = [key for key in base_env(env).state_keys if key not in carry]
     if missing:
-        raise ValueError(f"restart needs the whole state, {keys}, and the carry lacks {missing[0]!r}.")
+        raise UserValueError(f"restart needs the whole state, {keys}, and the carry lacks {missing[0]!r}.")
     if carry.shape != env.batch_size:
-        raise ValueError(
+        raise UserValueError(
             f"The carry has batch size {tuple(carry.shape)}, and the environment {tuple(env.batch_size)}. Build one of "
             "that batch size, such as num_envs=..., to start flights of it afresh."
         )
@@ -212,7 +213,7 @@ def _draws_starts(base: EnvBase) -> bool:
 
 def _require_fraction(fraction: float) -> None:
     if not 0.0 <= fraction <= 1.0:
-        raise ValueError(f"fraction must lie between 0 and 1, got {fraction}.")
+        raise UserValueError(f"fraction must lie between 0 and 1, got {fraction}.")
 
 
 def _require_same(states: TensorDictBase, kept: TensorDictBase) -> None:
@@ -220,7 +221,7 @@ def _require_same(states: TensorDictBase, kept: TensorDictBase) -> None:
     ours, theirs = ({key: x.shape[1:] for key, x in td.items(True, True)} for td in (kept, states))
     different = sorted({str(key) for key, _ in ours.items() ^ theirs.items()})
     if different:
-        raise ValueError(
+        raise UserValueError(
             f"These are other states than those in the visited-state buffer: {', '.join(different)} differ in name or "
             "shape. Keep a buffer for each task and its options, such as action_delay."
         )

@@ -27,6 +27,7 @@ from torchrl_quad.deploy.contract import (
 )
 from torchrl_quad.deploy.simulators.vehicle import rotate
 from torchrl_quad.deploy.tasks import RULES
+from torchrl_quad.errors import MissingPackage, UserTypeError, UserValueError
 
 QUANTITIES = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}  # that each state must have
 START = np.array([1.0, 0.0, 0.0, 0.0])  # the quaternion that the first one of a flight takes its sign from
@@ -62,11 +63,11 @@ class Bundle:
         self, contract: dict[str, Any], files: Mapping[str, bytes], on_fault: Literal["raise", "hover"]
     ) -> None:
         if on_fault not in ("raise", "hover"):
-            raise ValueError(f'on_fault must be "raise" or "hover", got {on_fault!r}.')
+            raise UserValueError(f'on_fault must be "raise" or "hover", got {on_fault!r}.')
         try:
             import onnxruntime
         except ImportError as error:
-            raise ImportError("A bundle flies with onnxruntime: pip install onnxruntime") from error
+            raise MissingPackage("A bundle flies with onnxruntime: pip install onnxruntime") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
@@ -108,7 +109,7 @@ class Bundle:
         for name in progress:
             if name not in known:
                 task = self.contract["task"]["name"]
-                raise TypeError(f"reset: {task} has no {name!r}. Choose from: {', '.join(known)}.")
+                raise UserTypeError(f"reset: {task} has no {name!r}. Choose from: {', '.join(known)}.")
         self.rule.reset(**progress)
         self.queue = np.tile(self._hover, (self.contract["action_delay"], 1))
         self.action = self._hover.copy()

@@ -9,23 +9,25 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from torchrl_quad.errors import UserValueError
+
 VERSION = 3  # of the contract; raise it when a reader of the older one would misunderstand the new one
 FILES = ("README.md", "policy.c", "policy.h", "policy.onnx", "starts.npz", "vectors.npz")  # beside contract.json
 
 
-class TamperedBundle(ValueError):
+class TamperedBundle(UserValueError):
     """A file of a bundle is missing, damaged, or not the one that was exported."""
 
 
-class UnknownContract(ValueError):
+class UnknownContract(UserValueError):
     """A contract has a version that this package cannot read."""
 
 
-class WrongActions(ValueError):
+class WrongActions(UserValueError):
     """The policy, run here, does not give the actions that it gave when it was exported."""
 
 
-class Fault(ValueError):
+class Fault(UserValueError):
     """A policy cannot fly from the state that it was given. Its subclasses say why."""
 
 

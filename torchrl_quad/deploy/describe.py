@@ -17,6 +17,7 @@ from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
 from torchrl_quad.envs import ForestEnv, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv
 from torchrl_quad.envs.disturbances import DroneRandomization, Sensors, Wind
 from torchrl_quad.envs.scenery import describe_metric
+from torchrl_quad.errors import UserValueError
 
 MAX_HARMONICS = 64  # of a curve
 Inputs = list[tuple[str, int, str, str, float, str]]  # of each name, size, unit, frame, scale and meaning
@@ -154,7 +155,7 @@ def _harmonics(env: TrackingEnv) -> dict[str, Any]:
     count = int(np.flatnonzero((np.abs(spectrum) > 1e-6).any(1)).max(initial=0))
     spectrum[np.abs(spectrum) < 1e-7] = 0.0
     if count > MAX_HARMONICS:
-        raise ValueError(
+        raise UserValueError(
             f"export_policy: the curve has corners: it needs more than {MAX_HARMONICS} harmonics of above 1e-6 m. "
             "Give TrackingEnv a smoother curve."
         )
@@ -179,12 +180,14 @@ def describe(env: QuadrotorEnv, sees: bool = False, memory: int = 0) -> dict[str
     """
     kind = next((cls for cls in type(env).__mro__ if cls in _TASKS), None)
     if kind is None:
-        raise ValueError(
+        raise UserValueError(
             f"export_policy cannot say what {type(env).__name__} observes. It knows "
             f"{', '.join(name for name, _ in _TASKS.values())}, and tasks that inherit from these."
         )
     if env.control != "rates":
-        raise ValueError(f'export_policy exports thrust and body rates alone, control="rates"; got {env.control!r}.')
+        raise UserValueError(
+            f'export_policy exports thrust and body rates alone, control="rates"; got {env.control!r}.'
+        )
     name, describe_task = _TASKS[kind]
     task = describe_task(env)
     box, layout = task.pop("box"), task.pop("inputs")
@@ -262,7 +265,9 @@ def _single(name: str, value: Tensor, dim: int) -> Tensor:
     if value.dim() == dim:
         return value
     if not (value == value[:1]).all():
-        raise ValueError(f"export_policy: {name} differs between environments; a contract is for one nominal drone.")
+        raise UserValueError(
+            f"export_policy: {name} differs between environments; a contract is for one nominal drone."
+        )
     return value[0]
 
 

@@ -33,6 +33,7 @@ from torchrl_quad.deploy.network import write_c, write_onnx
 from torchrl_quad.deploy.page import write_page
 from torchrl_quad.deploy.tasks import PROGRESS, Rule, progress_of
 from torchrl_quad.envs import QuadrotorEnv
+from torchrl_quad.errors import MissingPackage, UserValueError
 
 VECTORS, SELF_TEST_VECTORS = 1024, 16
 IMAGES, SELF_TEST_IMAGES = 256, 4  # the same with images, which are large
@@ -95,7 +96,7 @@ def export_policy(
         import onnx  # noqa: F401, asked for before anything flies
         import onnxruntime  # noqa: F401
     except ImportError as error:
-        raise ImportError("export_policy needs onnx and onnxruntime: pip install onnx onnxruntime") from error
+        raise MissingPackage("export_policy needs onnx and onnxruntime: pip install onnx onnxruntime") from error
     env, normalizer = _unwrapped(env, normalizer)
     place = Path(folder).resolve()  # a link stays, what it points to is replaced
     require_replaceable(place)
@@ -108,7 +109,7 @@ def export_policy(
     (width,), size = reads["observation"], contract["inputs"][-1]["stop"]
     shape = env.observation_spec["observation"].shape
     if not width == size == shape[-1]:
-        raise ValueError(
+        raise UserValueError(
             f"export_policy: the policy reads {width} numbers, the environment observes {shape[-1]}, and "
             f"{type(env).__name__} is known to observe {size}."
         )
@@ -144,15 +145,15 @@ def _unwrapped(
     """The environment under its normaliser, and the normaliser."""
     if isinstance(env, TransformedEnv):
         if not isinstance(env.transform, ObservationNormalizer) or isinstance(env.base_env, TransformedEnv):
-            raise ValueError(
+            raise UserValueError(
                 "export_policy knows one transform, a single ObservationNormalizer: what others do to the observation "
                 f"would be missing on the drone. Got {env.transform}."
             )
         normalizer = env.transform if normalizer is None else normalizer
     if not isinstance(base_env(env), QuadrotorEnv):
-        raise ValueError(f"export_policy needs an environment of this package, got {type(env).__name__}.")
+        raise UserValueError(f"export_policy needs an environment of this package, got {type(env).__name__}.")
     if normalizer is not None and list(normalizer.in_keys) != ["observation"]:
-        raise ValueError(f'export_policy: the normalizer must be that of "observation", got {normalizer.in_keys}.')
+        raise UserValueError(f'export_policy: the normalizer must be that of "observation", got {normalizer.in_keys}.')
     return base_env(env), normalizer
 
 
@@ -256,7 +257,7 @@ def _require_the_same_flight(
             acted.append(bundle.action)
             gap = np.abs(bundle.observation - episode["observation"][t].float().cpu().numpy()).max()
             if not gap <= OBSERVATION_TOLERANCE:
-                raise ValueError(
+                raise UserValueError(
                     f"export_policy: {type(env).__name__} observes something else than the contract says, by {gap:.3g} "
                     f"in step {t}. A contract describes the package's own observations and rules; this environment has "
                     "others."
@@ -266,7 +267,7 @@ def _require_the_same_flight(
         again = _act(policy, env, {key: x[None] for key, x in read.items()})["action"][0].float().cpu().numpy()
         gap = np.abs(np.stack(acted) - again).max()
         if not gap <= MEMORY_TOLERANCE:
-            raise ValueError(
+            raise UserValueError(
                 f"export_policy: the bundle acts otherwise than the policy, by {gap:.3g} within an episode."
             )
 

@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_quad.data import ObservationNormalizer
 from torchrl_quad.data.normalizer import NormalizedPolicy
 from torchrl_quad.deploy.network import ACTIVATIONS, Layer, Memory, Network
+from torchrl_quad.errors import UserValueError
 
 GRU = ("weight_ih_l0", "bias_ih_l0", "weight_hh_l0", "bias_hh_l0")  # torch's names, in the order of Memory
 
@@ -46,13 +47,13 @@ def fold(
     elif parts is not None:
         network = _seeing(actor, parts, normalizer, image)
     else:
-        raise ValueError(
+        raise UserValueError(
             "export_policy exports what make_actor and make_visual_actor build, with its parts as they are and without "
             f"hooks: tanh-Gaussian policies. This {type(actor).__name__} is something else; build the policy with "
             "make_actor(env, ...) or make_visual_actor(env, ...), and load your weights into it."
         )
     if not all(np.isfinite(x).all() for x in network.weights()):
-        raise ValueError("export_policy: the weights of the policy, or its normaliser, are not finite.")
+        raise UserValueError("export_policy: the weights of the policy, or its normaliser, are not finite.")
     return network
 
 
@@ -71,7 +72,9 @@ def _seeing(
     sight = Network([], _layers(eyes), tuple(image or (0, 0)), parts.nearest, memory, parts.max_loc)
     if image is None or sight.found != parts.widths[0] or sight.eyes[0].weight.shape[1] != 1:
         camera = "has no camera" if image is None else f"shows it {image[1]} x {image[0]} pixels"
-        raise ValueError(f"export_policy: the policy was built for images of another size; the environment {camera}.")
+        raise UserValueError(
+            f"export_policy: the policy was built for images of another size; the environment {camera}."
+        )
     last = parts.head.weight, parts.head.bias, nn.Tanh()
     return sight._replace(layers=_layers([*trunk, last], parts.size, np.repeat(parts.scales, parts.widths), normalizer))
 
@@ -96,7 +99,7 @@ def _layers(
     weights, biases, activations = zip(*parts, strict=True)
     for activation in activations:
         if type(activation).__name__ not in ACTIVATIONS or repr(activation) != repr(type(activation)()):
-            raise ValueError(
+            raise UserValueError(
                 f"export_policy cannot write {activation} as ONNX and C. Choose from: {', '.join(ACTIVATIONS)}, with "
                 "their default arguments."
             )
@@ -115,7 +118,7 @@ def _layers(
 
 def _require_readable(found: Sequence[Any], known: list[str]) -> None:
     if found != known:
-        raise ValueError(
+        raise UserValueError(
             f'export_policy: the policy reads {found}. A drone can give it the "observation" alone: train it with '
             'in_keys=[\'observation\']. A policy that sees may also read "depth", with image_key="depth".'
         )
@@ -123,7 +126,7 @@ def _require_readable(found: Sequence[Any], known: list[str]) -> None:
 
 def _require_unit_actions(low: Any, high: Any) -> None:
     if low is not None:
-        raise ValueError(f"export_policy: actions must lie from -1 to 1, got {low} to {high}.")
+        raise UserValueError(f"export_policy: actions must lie from -1 to 1, got {low} to {high}.")
 
 
 def _numbers(x: Tensor) -> NDArray[np.float64]:

@@ -24,6 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchrl_quad.errors import UserValueError
+
 Array = NDArray[np.float64]
 Quaternion = tuple[float, float, float, float]
 
@@ -94,7 +96,7 @@ class Convention:
         """
         x = np.asarray(newtons, float)
         if not np.isfinite(x).all():
-            raise ValueError(f"newtons must be finite: there is no command for {newtons!r}. Give the thrust [N].")
+            raise UserValueError(f"newtons must be finite: there is no command for {newtons!r}. Give the thrust [N].")
         if self.thrust_range is None:
             return x
         low, high = self.thrust_range
@@ -112,7 +114,7 @@ class Convention:
 
     def _full_thrust(self, value: float | None) -> float:
         if value is None or not 0.0 < value < np.inf:
-            raise ValueError(
+            raise UserValueError(
                 f"full_thrust must be the thrust [N] of the full command of {self.name}, above 0, got {value!r}: it "
                 "turns newtons into a share. Write weight / hover command."
             )
@@ -120,12 +122,12 @@ class Convention:
 
     def _checked(self, name: str, value: ArrayLike) -> Array:
         if name not in _SIZES:
-            raise ValueError(f"Unknown quantity {name!r}. Choose from: {', '.join(_SIZES)}.")
+            raise UserValueError(f"Unknown quantity {name!r}. Choose from: {', '.join(_SIZES)}.")
         if name == "motors" and self.motors is None:
-            raise ValueError(f"{self.name} has no order of motors of its own: name them by their places.")
+            raise UserValueError(f"{self.name} has no order of motors of its own: name them by their places.")
         x = np.asarray(value, float)
         if x.shape[-1:] != (_SIZES[name],):
-            raise ValueError(f"{name} must have shape (..., {_SIZES[name]}), got {x.shape}.")
+            raise UserValueError(f"{name} must have shape (..., {_SIZES[name]}), got {x.shape}.")
         return x
 
     def _translate(self, name: str, x: Array, back: bool) -> Array:
@@ -190,7 +192,7 @@ def mavros(world: str = "enu", thrust_scaling: float = 1.0) -> Convention:
     ``setpoint_raw/attitude``: mavros multiplies it by its parameter ``setpoint_raw/thrust_scaling``, and clips the
     product to 0 to 1. Give that parameter here; with 1 / full_thrust the command is in newtons."""
     if not 0.0 < thrust_scaling < np.inf:
-        raise ValueError(
+        raise UserValueError(
             f"thrust_scaling must be above 0, got {thrust_scaling!r}: mavros multiplies the thrust by it. Write its "
             "parameter setpoint_raw/thrust_scaling."
         )
@@ -234,7 +236,7 @@ def crazyflie_percentage(command: ArrayLike) -> Array:
 
 def _model_factor(value: float) -> float:
     if not 0.0 <= value <= 1.0:
-        raise ValueError(
+        raise UserValueError(
             f"model_factor must lie from 0 to 1, got {value!r}: it is f of the thrust curve f s^2 + (1 - f) s. Write 0 "
             "where the target undoes the curve itself."
         )
@@ -247,7 +249,9 @@ def _to_ned(world: str) -> Quaternion:
 
 def _choose(turns: Mapping[str, Quaternion], world: str) -> Quaternion:
     if world not in turns:
-        raise ValueError(f'Unknown world {world!r}. Choose from: "enu", x east and y north; "nwu", x north and y west.')
+        raise UserValueError(
+            f'Unknown world {world!r}. Choose from: "enu", x east and y north; "nwu", x north and y west.'
+        )
     return turns[world]
 
 

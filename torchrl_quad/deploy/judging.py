@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.tasks import Curve
+from torchrl_quad.errors import UserValueError
 
 Array = NDArray[np.float64]
 Flight = Mapping[str, NDArray[Any]]
@@ -91,7 +92,7 @@ def judge(contract: Mapping[str, Any], flight: Flight) -> dict[str, Array]:
     """
     task, limits = contract["task"], contract["task"]["criteria"]
     if task["name"] not in PRECISION:
-        raise ValueError(f"judge knows the tasks {', '.join(PRECISION)}; {task['name']!r} has obstacles to hit.")
+        raise UserValueError(f"judge knows the tasks {', '.join(PRECISION)}; {task['name']!r} has obstacles to hit.")
     steps, crash = episode_steps(contract, flight)
     target, passed = targets(contract, flight)
     number = np.arange(flight["position"].shape[1])  # of each state, 0 at the start

@@ -13,6 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchrl_quad.errors import UserValueError
+
 Vector = NDArray[np.float64]
 
 
@@ -60,7 +62,7 @@ class Course:
         self.target = _point("target", self.task["target"] if target is None else target)
         speed = self.task["speed"] if speed is None else speed
         if not (isinstance(speed, int | float | np.number) and 0.0 < speed < math.inf):
-            raise ValueError(f"speed must be a positive number [m/s], got {speed!r}.")
+            raise UserValueError(f"speed must be a positive number [m/s], got {speed!r}.")
         self.speed = float(speed)
 
     def advance(self, before: Vector | None, position: Vector | None) -> None:
@@ -90,7 +92,7 @@ class Curve:
     def reset(self, phase: float = 0.0) -> None:
         """Start anew, where the point has a phase [rad]."""
         if not math.isfinite(phase):
-            raise ValueError(f"phase must be a finite number [rad], got {phase!r}.")
+            raise UserValueError(f"phase must be a finite number [rad], got {phase!r}.")
         self.phase = float(phase) % (2 * math.pi)
 
     def advance(self, before: Vector | None, position: Vector | None) -> None:
@@ -121,7 +123,7 @@ class Gates:
     def reset(self, gate: int = 0) -> None:
         """Start anew, with the index of the gate to pass first."""
         if isinstance(gate, bool) or gate not in range(len(self.gates)):
-            raise ValueError(f"gate must be a whole number from 0 to {len(self.gates) - 1}, got {gate!r}.")
+            raise UserValueError(f"gate must be a whole number from 0 to {len(self.gates) - 1}, got {gate!r}.")
         self.gate, self.passed = int(gate), 0
 
     def advance(self, before: Vector | None, position: Vector | None) -> None:
@@ -159,5 +161,5 @@ def progress_of(rule: str, start: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 def _point(name: str, value: ArrayLike) -> Vector:
     point = np.array(value, float)
     if point.shape != (3,) or not np.isfinite(point).all():
-        raise ValueError(f"{name} must be three finite numbers [m], got {value!r}.")
+        raise UserValueError(f"{name} must be three finite numbers [m], got {value!r}.")
     return point

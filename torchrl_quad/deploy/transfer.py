@@ -22,6 +22,7 @@ from torchrl_quad.deploy.bundle import QUANTITIES, Bundle, load_bundle
 from torchrl_quad.deploy.judging import endings, judge
 from torchrl_quad.deploy.simulators import make_simulator
 from torchrl_quad.deploy.tasks import PROGRESS, progress_of
+from torchrl_quad.errors import UserValueError
 
 Array = NDArray[np.float64]
 # Fields of the rate loop, which does not know the true drone.
@@ -135,7 +136,7 @@ def other_drone(contract: Mapping[str, Any], scale: Mapping[str, float]) -> dict
     fields = [name for name in drone if name not in OF_THE_LOOP]
     for name, factor in scale.items():
         if name not in fields:
-            raise ValueError(f"scale: the drone has no {name!r} to scale. Choose from: {', '.join(fields)}.")
+            raise UserValueError(f"scale: the drone has no {name!r} to scale. Choose from: {', '.join(fields)}.")
         plant[name] = (factor * np.array(drone[name], float)).tolist()
     return {**contract, "plant": plant}
 

@@ -29,6 +29,7 @@ from torchrl_quad.dynamics.vector import (
     where_positive,
     where_same,
 )
+from torchrl_quad.errors import UserValueError
 
 
 class Setpoint(NamedTuple):
@@ -184,12 +185,12 @@ def join(*parts: Tensor) -> Tensor:
 def _require_hover(nominal: QuadrotorParams, speed: Tensor) -> None:
     low, high = nominal.rotor_speed_min, nominal.rotor_speed_max
     if not ((low < speed) & (speed < high)).all():
-        raise ValueError(
+        raise UserValueError(
             f"drone: to hover, its rotors would have to turn at {speed.tolist()} rad/s, and they can at "
             f"{low.tolist()} to {high.tolist()}. Check mass [kg], gravity, thrust_map and rotor_positions."
         )
     if not (nominal.max_thrust_to_weight > 1).all():
-        raise ValueError(
+        raise UserValueError(
             "drone: max_thrust_to_weight is what full thrust commands, in units of the weight, and must be above 1 to "
             f"hover; got {nominal.max_thrust_to_weight.tolist()}."
         )
@@ -201,7 +202,7 @@ def _inverse(allocation: Tensor) -> Tensor:
     rows = rows / rows.norm(dim=-1, keepdim=True).clamp_min(1e-30)
     inverse, _ = torch.linalg.inv_ex(allocation)
     if not (torch.linalg.cond(rows) < 1e4).all():
-        raise ValueError(
+        raise UserValueError(
             "drone: with these rotor_positions and rotor_spin the four rotors cannot make thrust and torque about each "
             "axis on their own. Put them off one line, and let two of them spin each way."
         )

@@ -18,6 +18,7 @@ from torchrl_quad.dynamics.control import FlightController, Setpoint, join
 from torchrl_quad.dynamics.parameters import QuadrotorParams
 from torchrl_quad.dynamics.presets import is_number
 from torchrl_quad.dynamics.vector import Vector, cat, clamp, dot, minimum, soft_limit
+from torchrl_quad.errors import UserValueError
 
 
 class AttitudeSetpoint(NamedTuple):
@@ -196,12 +197,14 @@ def make_controller(control: str | Mapping[str, Any], nominal: QuadrotorParams) 
     mode = limits.pop("mode", None)
     if not isinstance(mode, str) or mode not in CONTROLS:
         what = f"Unknown control {mode!r}" if mode is not None else f"control={control!r} names no mode"
-        raise ValueError(f'{what}. Choose from: {", ".join(CONTROLS)}; or {{"mode": "velocity", "max_speed": 5.0}}.')
+        raise UserValueError(
+            f'{what}. Choose from: {", ".join(CONTROLS)}; or {{"mode": "velocity", "max_speed": 5.0}}.'
+        )
     known = [x.name for x in inspect.signature(CONTROLS[mode]).parameters.values() if x.kind is x.KEYWORD_ONLY]
     unknown = [str(name) for name in limits if name not in known]
     if unknown:
         has = f"Choose from: {', '.join(known)}" if known else "It has none; those of the drone hold"
-        raise ValueError(f"control: {mode!r} has no limit {unknown[0]!r}. {has}.")
+        raise UserValueError(f"control: {mode!r} has no limit {unknown[0]!r}. {has}.")
     return CONTROLS[mode](nominal, **limits)
 
 
@@ -211,4 +214,4 @@ def _entries(vector: Vector) -> tuple[Vector, Vector, Vector]:
 
 def _require_between(name: str, value: Any, low: float, high: float, what: str) -> None:
     if not (is_number(value) and low < value < high):
-        raise ValueError(f"control: {name} must be {what} between {low:g} and {high:.4g}, got {value!r}.")
+        raise UserValueError(f"control: {name} must be {what} between {low:g} and {high:.4g}, got {value!r}.")

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from torchrl_quad.dynamics.presets import is_number
+from torchrl_quad.errors import UserValueError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +36,7 @@ class MotorCommand:
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
             if not (is_number(value) and low <= value <= high):
-                raise ValueError(f"motor_command: {name} must be between {low:g} and {high:g}, got {value!r}.")
+                raise UserValueError(f"motor_command: {name} must be between {low:g} and {high:g}, got {value!r}.")
 
     @classmethod
     def read(cls, source: str, values: Any) -> MotorCommand:
@@ -48,14 +49,16 @@ class MotorCommand:
             return values
         names = [field.name for field in dataclasses.fields(cls)]
         if not isinstance(values, Mapping):
-            raise ValueError(f"{source}: motor_command must be a mapping of {', '.join(names)}; got {values!r}.")
+            raise UserValueError(f"{source}: motor_command must be a mapping of {', '.join(names)}; got {values!r}.")
         for name in values:
             if name not in names:
-                raise ValueError(f"{source}: motor_command: unknown key {name!r}. Allowed: {', '.join(names)}.")
+                raise UserValueError(f"{source}: motor_command: unknown key {name!r}. Allowed: {', '.join(names)}.")
         for name in names[:2]:
             if name not in values:
-                raise ValueError(f"{source}: motor_command: missing key {name!r}. Required: {', '.join(names[:2])}.")
+                raise UserValueError(
+                    f"{source}: motor_command: missing key {name!r}. Required: {', '.join(names[:2])}."
+                )
         try:
             return cls(**values)
         except ValueError as error:
-            raise ValueError(f"{source}: {error}") from error
+            raise UserValueError(f"{source}: {error}") from error

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import presets
 from torchrl_quad.dynamics.motors import MotorCommand
+from torchrl_quad.errors import UserValueError
 
 _DRONES = resources.files(__package__) / "drones"
 
@@ -89,14 +90,14 @@ class QuadrotorParams:
             _check(name, value, "QuadrotorParams")
         low, high = self.rotor_speed_min.detach(), self.rotor_speed_max.detach()
         if not (low < high).all():
-            raise ValueError(
+            raise UserValueError(
                 "QuadrotorParams: rotor_speed_min must be below rotor_speed_max, "
                 f"got {low.tolist()} and {high.tolist()}."
             )
 
         k2, k1, _ = self.thrust_map.detach().split(1, -1)
         if not (k1 + 2.0 * k2 * low >= 0).all():
-            raise ValueError(
+            raise UserValueError(
                 "QuadrotorParams: thrust_map must not fall with rotor speed: k1 + 2 k2 rotor_speed_min must be zero "
                 f"or positive, got {(k1 + 2.0 * k2 * low).tolist()}."
             )
@@ -116,7 +117,7 @@ class QuadrotorParams:
         """
         unknown = sorted(set(changes) - set(_FIELDS))
         if unknown:
-            raise ValueError(f"QuadrotorParams has no field {unknown[0]!r}. Choose from: {', '.join(_FIELDS)}.")
+            raise UserValueError(f"QuadrotorParams has no field {unknown[0]!r}. Choose from: {', '.join(_FIELDS)}.")
         like = self.mass
         return dataclasses.replace(
             self, **{k: torch.as_tensor(v, dtype=like.dtype, device=like.device) for k, v in changes.items()}
@@ -163,15 +164,15 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
     unknown = sorted(str(name) for name in values if name not in _FIELDS)
     if missing:
         required = ", ".join(name for name in _FIELDS if name not in _OPTIONAL)
-        raise ValueError(f"{source}: missing field {missing[0]!r}. Required: {required}.")
+        raise UserValueError(f"{source}: missing field {missing[0]!r}. Required: {required}.")
     if unknown:
-        raise ValueError(f"{source}: unknown field {unknown[0]!r}. Allowed: {', '.join(_FIELDS)}, motor_command.")
+        raise UserValueError(f"{source}: unknown field {unknown[0]!r}. Allowed: {', '.join(_FIELDS)}, motor_command.")
     fields = {}
     for name in _FIELDS:
         try:
             fields[name] = torch.from_numpy(np.array(values[name], dtype=np.float64))
         except (TypeError, ValueError) as error:
-            raise ValueError(
+            raise UserValueError(
                 f"{source}: field {name!r} is not a number or a list of numbers: {values[name]!r}."
             ) from error
         _check(name, fields[name] if fields[name].dim() else fields[name].reshape(1), source)
@@ -189,7 +190,7 @@ def _check(name: str, value: Tensor, source: str) -> None:
     shapes = (shape, _OTHER_SHAPES.get(name))
     if value.shape not in shapes and value.shape[1:] not in shapes:
         batched = ("num_envs", *shape)
-        raise ValueError(
+        raise UserValueError(
             f"{source}: field {name!r} has shape {tuple(value.shape)}; it must be {shape} for one drone, "
             f"or {batched} for one per environment."
         )
@@ -200,4 +201,4 @@ def _check(name: str, value: Tensor, source: str) -> None:
         if name == "thrust_map" and not (value[..., 0] > 0).all():
             fits, rule = value > 0, "rising at high speed, k2 above zero"
         if not fits.all():
-            raise ValueError(f"{source}: field {name!r} must be {rule}, in SI units; got {value.tolist()}.")
+            raise UserValueError(f"{source}: field {name!r} must be {rule}, in SI units; got {value.tolist()}.")

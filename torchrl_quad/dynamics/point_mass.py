@@ -13,6 +13,7 @@ from torchrl_quad.dynamics.modes import RotorThrustController, make_controller
 from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import drag
 from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, split, stack
+from torchrl_quad.errors import UserValueError
 
 
 class PointMass:
@@ -45,12 +46,12 @@ class PointMass:
         control: str | Mapping[str, Any] = "rates",
     ) -> None:
         if integrator != "semi_implicit_euler":
-            raise ValueError(
+            raise UserValueError(
                 f'dynamics="point_mass" knows the integrator "semi_implicit_euler" alone, got {integrator!r}.'
             )
         self.controller = make_controller(control, nominal)
         if isinstance(self.controller, RotorThrustController):
-            raise ValueError(
+            raise UserValueError(
                 'dynamics="point_mass" has no rotors, so control="rotor_thrusts" commands nothing. Take '
                 'dynamics="quadrotor", or another control.'
             )

@@ -9,6 +9,8 @@ from typing import Any
 
 import yaml
 
+from torchrl_quad.errors import UserValueError
+
 MAX_BYTES = 1_000_000  # of a file; the largest that ships with the package has 1 kB
 MAX_DEPTH = 20  # of lists and mappings within each other
 
@@ -40,13 +42,13 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
     elif isinstance(preset, Path) or (isinstance(preset, str) and preset.endswith((".yaml", ".yml"))):
         source, path = str(preset), Path(preset)
     else:
-        raise ValueError(f"Unknown {kind} {preset!r}. {choices} the path of a .yaml file, or a mapping.")
+        raise UserValueError(f"Unknown {kind} {preset!r}. {choices} the path of a .yaml file, or a mapping.")
     if not path.is_file():
         raise FileNotFoundError(f"No {kind} file at {path}. {choices} the path of a .yaml file that exists.")
     with path.open("rb") as file:
         values = parse(file.read(MAX_BYTES + 1), source)
     if not isinstance(values, Mapping):
-        raise ValueError(f"{source}: expected a mapping of names to values, got {type(values).__name__}.")
+        raise UserValueError(f"{source}: expected a mapping of names to values, got {type(values).__name__}.")
     return source, values
 
 
@@ -59,13 +61,13 @@ def parse(content: bytes, source: str) -> Any:
         ValueError: the content is too large, too deep, not in UTF-8, no YAML, or uses an alias.
     """
     if len(content) > MAX_BYTES:
-        raise ValueError(
+        raise UserValueError(
             f"{source}: has more than {MAX_BYTES:,} bytes, which no file of settings needs. Leave out the rest."
         )
     try:
         text = content.decode()
     except UnicodeDecodeError as error:
-        raise ValueError(
+        raise UserValueError(
             f"{source}: not in UTF-8 (byte {error.start} is {content[error.start]:#04x}). Save it as UTF-8."
         ) from None
     depth = 0
@@ -73,16 +75,18 @@ def parse(content: bytes, source: str) -> Any:
         for event in yaml.parse(text, yaml.SafeLoader):
             if isinstance(event, yaml.AliasEvent):
                 line = event.start_mark.line + 1
-                raise ValueError(f"{source}: line {line} uses the alias *{event.anchor}. Write the values out instead.")
+                raise UserValueError(
+                    f"{source}: line {line} uses the alias *{event.anchor}. Write the values out instead."
+                )
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > MAX_DEPTH:
-                raise ValueError(f"{source}: nests more than {MAX_DEPTH} lists or mappings. Write it flatter.")
+                raise UserValueError(f"{source}: nests more than {MAX_DEPTH} lists or mappings. Write it flatter.")
     except yaml.YAMLError as error:
-        raise ValueError(f"{source}: not a YAML file: {error}") from error
+        raise UserValueError(f"{source}: not a YAML file: {error}") from error
     try:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError) as error:  # such as the 99th of May
-        raise ValueError(f"{source}: not a YAML file: {error}") from error
+        raise UserValueError(f"{source}: not a YAML file: {error}") from error
 
 
 def is_number(value: Any) -> bool:

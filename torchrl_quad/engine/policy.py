@@ -9,6 +9,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_quad.errors import UserValueError
+
 
 class PlainPolicy(Protocol):
     """A policy as pure functions of tensors; a TensorDictModule gives it by a method ``plain()``, or gives None.
@@ -110,7 +112,7 @@ class ActionSequence(TensorDictModuleBase):
         """The next actions, (steps, num_envs, k)."""
         left = len(self.actions) - self.played
         if steps > left:
-            raise ValueError(
+            raise UserValueError(
                 f"The sequence has {len(self.actions)} actions, {left} of them unplayed, and the flight wants {steps} "
                 "more. Give as many actions as the flight has steps, and build a new ActionSequence for each flight."
             )

@@ -14,6 +14,7 @@ from torchrl_quad.envs.checks import names, require
 from torchrl_quad.envs.events import Event
 from torchrl_quad.envs.scenery import EPISODE_METRICS
 from torchrl_quad.envs.task import Task
+from torchrl_quad.errors import UserValueError
 
 
 def check_task(env: Any, state: State) -> None:
@@ -28,7 +29,7 @@ def check_task(env: Any, state: State) -> None:
         if not is_right or dtype not in (None, x.dtype):
             got = f"{tuple(x.shape)}, {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
             kind = "" if dtype is None else f", {dtype}"
-            raise ValueError(f"{task}.{method} must be a tensor ({n}, {columns or 'k'}){kind}; got {got}.{hint}")
+            raise UserValueError(f"{task}.{method} must be a tensor ({n}, {columns or 'k'}){kind}; got {got}.{hint}")
 
     def named(method: str, entries: Any) -> Mapping[Any, Any]:
         message = f"{task}.{method} must be a mapping from names to tensors; got {type(entries).__name__}."
@@ -38,7 +39,7 @@ def check_task(env: Any, state: State) -> None:
     taken = {"step", "action_queue", "collided", "drone", "scene"}
     taken |= {key for x in env.disturbances.values() for key in x.start(env.randomness, state) if isinstance(key, str)}
     for key in taken & set(env.task_entries):
-        raise ValueError(f"{task}.initial_state: entry {key!r} is the environment's own; give yours another name.")
+        raise UserValueError(f"{task}.initial_state: entry {key!r} is the environment's own; give yours another name.")
     for key, x in state.items():
         require(
             isinstance(x, Tensor) and x.dim() > 1 and len(x) == n and x.dtype in (env.dtype, torch.int64, torch.bool),

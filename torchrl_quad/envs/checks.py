@@ -16,6 +16,7 @@ from torch import Tensor
 from torchrl_quad.dynamics import DYNAMICS, INTEGRATORS, QuadrotorParams
 from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine.simulation import State
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 # Beyond these an environment would not fit into memory, or take for ever to build.
 MAX_ENVS, MAX_DELAY, MAX_STEPS = 10_000_000, 1_000, 2**31
@@ -24,7 +25,7 @@ MAX_ENVS, MAX_DELAY, MAX_STEPS = 10_000_000, 1_000, 2**31
 def require(condition: bool, message: str) -> None:
     """Raise a ValueError with this message unless the condition holds."""
     if not condition:
-        raise ValueError(message)
+        raise UserValueError(message)
 
 
 def require_count(name: str, value: Any, least: int, most: int, rule: str | None = None) -> None:
@@ -101,7 +102,7 @@ def refuse_unknown(cls: type, unknown: Iterable[str]) -> None:
         known = sorted(set(inspect.signature(cls).parameters) - {"kwargs"})
         close = difflib.get_close_matches(name, known, 1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
-        raise TypeError(
+        raise UserTypeError(
             f"{cls.__name__} got an unexpected keyword argument {name!r}.{hint} Choose from: {names(known)}."
         )
 
@@ -135,7 +136,7 @@ def checked_weights(weights: Any, known: Mapping[str, float]) -> Mapping[str, fl
 def checked_params(params: Any, num_envs: int) -> QuadrotorParams:
     """The drone, if it is one, for this number of environments."""
     if not isinstance(params, QuadrotorParams):
-        raise TypeError(
+        raise UserTypeError(
             f"params must be QuadrotorParams, such as env.params.replace(mass=0.5) or load_drone('visfly'); got "
             f"{type(params).__name__}."
         )
@@ -229,13 +230,13 @@ def check_action(action: Tensor | None, like: Tensor) -> None:
         return
     if action is None or action.shape != (len(like), 4):
         got = "there is none" if action is None else f"got {tuple(action.shape)}"
-        raise ValueError(
+        raise UserValueError(
             f"The action must have shape ({len(like)}, 4), named in env.action_units, for each environment; {got}. A "
             'policy writes it under "action", as make_actor(env) does.'
         )
     if action.device != like.device:
-        raise ValueError(f"The action is on {action.device}, and the environment on {like.device}.")
-    raise ValueError(
+        raise UserValueError(f"The action is on {action.device}, and the environment on {like.device}.")
+    raise UserValueError(
         f"The action is {action.dtype}, and the environment flies in {like.dtype}. Convert the policy, "
         f"policy.to({like.dtype}), or build the environment with dtype={action.dtype}."
     )
@@ -254,7 +255,7 @@ def require_finite(action: Tensor) -> None:
         return
     broken = ~finite if action.dim() == 3 else ~finite.unsqueeze(1)
     at = f", first at step {broken.any(0).nonzero()[0].item()} of the rollout" if action.dim() == 3 else ""
-    raise ValueError(
+    raise UserValueError(
         f"The action is not finite in environments {first_ten(broken.any(1))}{at}: the weights of the policy are "
         "broken, or what it reads is. Look for NaN in both; if training made them, clip the norm of the gradient, and "
         "skip updates whose gradient is not finite."
@@ -284,7 +285,7 @@ def _refuse_entry(entries: Mapping[Any, Any], key: Any, safe_state: State, sourc
     shape, expected = tuple(x.shape), tuple(like.shape)
     require(shape == expected, f"{source}: state {key!r} has shape {shape}, expected {expected}.")
     require(_kind(x) == _kind(like), f"{source}: state {key!r} must be {_kind(like)}, got {x.dtype}.")
-    raise ValueError(
+    raise UserValueError(
         f"{source}: state {key!r} is {x.dtype} on {x.device}, and this environment {like.dtype} on {like.device}. "
         "Convert it: env.reset(tensordict, set_state=True) does."
     )

@@ -18,6 +18,7 @@ from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.checks import MAX_DELAY, require_count
 from torchrl_quad.envs.guard import MAX_ANGULAR_VELOCITY, MAX_SPEED
 from torchrl_quad.envs.randomness import Randomness
+from torchrl_quad.errors import UserValueError
 
 _DISTRIBUTIONS = {
     "uniform": "low and high",
@@ -79,24 +80,24 @@ class DroneRandomization(Disturbance):
         fields = nominal.fields()
         for name, distribution in self.spec.items():
             if name in CONTROLLER_FIELDS:
-                raise ValueError(
+                raise UserValueError(
                     f"{source}: {name!r} belongs to the flight controller, which keeps the nominal drone; a random one "
                     "would change nothing. Give another drone instead."
                 )
             if name not in plant_fields or name == "rotor_spin":
                 allowed = ", ".join(field for field in plant_fields if field != "rotor_spin")
-                raise ValueError(f"{source}: unknown field {name!r}. Choose from: {allowed}.")
+                raise UserValueError(f"{source}: unknown field {name!r}. Choose from: {allowed}.")
             if not (
                 isinstance(distribution, Mapping)
                 and len(distribution) == 1
                 and set(distribution) <= set(_DISTRIBUTIONS)
             ):
                 choices = "; ".join(f"{key}: {numbers}" for key, numbers in _DISTRIBUTIONS.items())
-                raise ValueError(f"{source}: {name} needs one distribution of: {choices}; got {distribution!r}.")
+                raise UserValueError(f"{source}: {name} needs one distribution of: {choices}; got {distribution!r}.")
             numbers = next(iter(distribution.values()))
             if not (is_numbers(numbers, 2) and numbers[1] >= (0.0 if "normal" in distribution else numbers[0])):
                 kind = next(iter(distribution))
-                raise ValueError(f"{source}: {name} needs two numbers, {_DISTRIBUTIONS[kind]}; got {numbers!r}.")
+                raise UserValueError(f"{source}: {name} needs two numbers, {_DISTRIBUTIONS[kind]}; got {numbers!r}.")
         self.nominal = {name: fields[name] for name in self.spec}
         # The least and the greatest of each; and for what has to lie below something else, the other way round.
         for sign in (-1.0, 1.0):
@@ -107,7 +108,7 @@ class DroneRandomization(Disturbance):
             try:
                 nominal.replace(**extreme)
             except ValueError as error:
-                raise ValueError(f"{source}: the drones that may be drawn are not all possible: {error}") from error
+                raise UserValueError(f"{source}: the drones that may be drawn are not all possible: {error}") from error
 
     def start(self, random: Randomness, state: State) -> State:
         """Draw a drone for each start."""
@@ -146,16 +147,16 @@ class Wind(Disturbance):
     def __post_init__(self) -> None:
         for name in ("mean", "spread"):
             if not is_numbers(getattr(self, name), 3):
-                raise ValueError(f"wind: {name} must be three numbers [m/s], got {getattr(self, name)!r}.")
+                raise UserValueError(f"wind: {name} must be three numbers [m/s], got {getattr(self, name)!r}.")
         if min(self.spread) < 0:
-            raise ValueError(f"wind: spread must not be negative, got {self.spread!r}.")
+            raise UserValueError(f"wind: spread must not be negative, got {self.spread!r}.")
         if not (is_number(self.gust) and self.gust >= 0):
-            raise ValueError(f"wind: gust must be zero or positive [m/s], got {self.gust!r}.")
+            raise UserValueError(f"wind: gust must be zero or positive [m/s], got {self.gust!r}.")
         if not (is_number(self.gust_time) and self.gust_time > 0):
-            raise ValueError(f"wind: gust_time must be positive [s], got {self.gust_time!r}.")
+            raise UserValueError(f"wind: gust_time must be positive [s], got {self.gust_time!r}.")
         strongest = max(abs(m) + s for m, s in zip(self.mean, self.spread, strict=True)) + 5.0 * self.gust
         if strongest > MAX_WIND:
-            raise ValueError(
+            raise UserValueError(
                 f"wind: mean, spread and five times the gust add up to {strongest:g} m/s; the model holds up to "
                 f"{MAX_WIND:g} m/s."
             )
@@ -200,7 +201,9 @@ class Sensors(Disturbance):
     def __post_init__(self) -> None:
         for name in ("position", "attitude", "velocity", "angular_velocity"):
             if not (is_number(getattr(self, name)) and getattr(self, name) >= 0):
-                raise ValueError(f"observation_noise: {name} must be zero or positive, got {getattr(self, name)!r}.")
+                raise UserValueError(
+                    f"observation_noise: {name} must be zero or positive, got {getattr(self, name)!r}."
+                )
         require_count("observation_delay", self.delay, 0, MAX_DELAY, "zero or more control steps")
 
     @property
@@ -261,10 +264,10 @@ class RandomStart(Disturbance):
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if not (is_number(value) and value >= 0):
-                raise ValueError(f"random_start: {field.name} must be zero or positive, got {value!r}.")
+                raise UserValueError(f"random_start: {field.name} must be zero or positive, got {value!r}.")
         for name, most in (("velocity", MAX_SPEED), ("angular_velocity", MAX_ANGULAR_VELOCITY)):
             if getattr(self, name) > most:
-                raise ValueError(f"random_start: {name} must be at most {most:g}, got {getattr(self, name)!r}.")
+                raise UserValueError(f"random_start: {name} must be at most {most:g}, got {getattr(self, name)!r}.")
 
     def start(self, random: Randomness, state: State) -> State:
         """Turn and push the starts of a task."""
@@ -290,8 +293,8 @@ def build(cls: type, name: str, spec: Any, **more: Any) -> Any:
         return dataclasses.replace(spec, **{name: value for name, value in more.items() if value})
     allowed = [field.name for field in dataclasses.fields(cls) if field.name not in more]
     if not isinstance(spec, Mapping):
-        raise ValueError(f"{name} must be a mapping with any of {', '.join(allowed)}; got {spec!r}.")
+        raise UserValueError(f"{name} must be a mapping with any of {', '.join(allowed)}; got {spec!r}.")
     unknown = sorted(str(key) for key in spec if key not in allowed)
     if unknown:
-        raise ValueError(f"{name}: unknown key {unknown[0]!r}. Allowed: {', '.join(allowed)}.")
+        raise UserValueError(f"{name}: unknown key {unknown[0]!r}. Allowed: {', '.join(allowed)}.")
     return cls(**spec, **more)

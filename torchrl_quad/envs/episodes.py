@@ -5,6 +5,8 @@ from __future__ import annotations
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_quad.errors import UserValueError
+
 
 def first_episode(rollout: TensorDictBase) -> Tensor:
     """Mark the steps of each environment's first episode, its last one included, bool (num_envs, time, 1)."""
@@ -22,7 +24,7 @@ def summarise_episodes(rollout: TensorDictBase) -> dict[str, Tensor]:
     """Judge the first episode of each environment; see ``QuadrotorEnv.episode_metrics``."""
     missing = [name for name in ("crash", "success", "reward", "done") if ("next", name) not in rollout]
     if missing:
-        raise ValueError(
+        raise UserValueError(
             f'episode_metrics reads ("next", {missing[0]!r}), which is not in the rollout. Judge a rollout before you '
             "leave out entries, and evaluate without the transform that drops this one."
         )

@@ -13,6 +13,7 @@ from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenes import Scene
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.vision import DepthCamera
 
 
@@ -29,7 +30,7 @@ class Eye(Disturbance):
         self.remembers = camera.is_noisy or camera.rate > 1 or camera.delay > 0
         reach = math.sqrt(sum(x * x for x in camera.position))
         if reach > scene.radius:
-            raise ValueError(
+            raise UserValueError(
                 f"camera: its position is {reach:.3g} m from the drone's centre, outside of the sphere of "
                 f"{scene.radius:.3g} m that must not touch anything, so the camera could be inside an obstacle. Move "
                 f"it, or give the scene a drone_radius of {math.ceil(100 * reach) / 100:g} m."

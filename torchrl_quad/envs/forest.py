@@ -19,6 +19,7 @@ from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
 from torchrl_quad.envs.scenes import ELSEWHERE, MAX_OBSTACLES, Scene, left_out
 from torchrl_quad.envs.terms import norm, outside
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.vision import DepthCamera, has_way
 
 #: Trees per square metre, and the least gap between two of them [m].
@@ -118,14 +119,16 @@ class ForestEnv(QuadrotorEnv):
         **kwargs: Any,
     ) -> None:
         if difficulty not in DIFFICULTIES:
-            raise ValueError(f"Unknown difficulty {difficulty!r}. Choose from: {', '.join(DIFFICULTIES)}.")
+            raise UserValueError(f"Unknown difficulty {difficulty!r}. Choose from: {', '.join(DIFFICULTIES)}.")
         preset = DIFFICULTIES[difficulty]
         density, gap = (own if own is not None else usual for own, usual in zip((density, gap), preset, strict=True))
         speeds = [speed, speed] if is_number(speed) else speed
         is_range = isinstance(speeds, Sequence) and len(speeds) == 2
         is_range = is_range and all(is_number(x) and 0.1 <= x <= 30.0 for x in speeds)
         if not (is_range and speeds[0] <= speeds[1]):
-            raise ValueError(f"speed must be one speed, or the least and the greatest, 0.1 to 30 m/s; got {speed!r}.")
+            raise UserValueError(
+                f"speed must be one speed, or the least and the greatest, 0.1 to 30 m/s; got {speed!r}."
+            )
         self.speeds, self.observe_velocity = tuple(speeds), observe_velocity
         if isinstance(camera, Mapping):
             camera = {**CAMERA, **camera}
@@ -143,7 +146,7 @@ class ForestEnv(QuadrotorEnv):
         low = self.tensor([-self.before, -self.half_width, self.scene.radius])
         high, radius = self.tensor([self.length + 1.0, self.half_width, top]), self.scene.radius
         if not has_way(fixed, start, goal, low, high, radius):
-            raise ValueError(
+            raise UserValueError(
                 f"{self.scene.source}: the obstacles leave no way from (x, y, z) = (-1, 0, 1.5) to (30, 0, 1.5) m, "
                 f"within {self.half_width:g} m to both sides and below {top:g} m, for a drone of radius {radius:.3g} m."
                 " Take some away, or open a gap."
@@ -266,17 +269,19 @@ class Forest(Scene):
         for name, value in numbers.items():
             if not (is_number(value) and value >= 0 and (value > 0 or name == "density")):
                 least = "zero or more trees per square metre" if name == "density" else "positive [m]"
-                raise ValueError(f"forest: {name} must be {least}, got {value!r}.")
+                raise UserValueError(f"forest: {name} must be {least}, got {value!r}.")
         self.trees = round(density * 2.0 * half_width * length)
         if self.trees > MAX_OBSTACLES:
-            raise ValueError(f"forest: density={density:g} makes {self.trees:,} trees; {MAX_OBSTACLES:,} are the most.")
+            raise UserValueError(
+                f"forest: density={density:g} makes {self.trees:,} trees; {MAX_OBSTACLES:,} are the most."
+            )
         self.gap, self.length, self.half_width, self.tree_radius, self.height = gap, length, half_width, radius, height
         super().__init__(ground=True, source="forest", **options)
 
     def bound(self, nominal: Any) -> Scene:
         own = super().bound(nominal)
         if self.gap <= 2.0 * own.radius:
-            raise ValueError(
+            raise UserValueError(
                 f"forest: a drone of radius {own.radius:.3g} m does not fit through gaps of {self.gap:g} m, so the "
                 f"trees could leave no way through. Give a gap of more than {2.0 * own.radius:.3g} m."
             )

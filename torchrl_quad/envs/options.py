@@ -9,6 +9,7 @@ from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.envs.disturbances import Disturbance, DroneRandomization, RandomStart, Sensors, Wind, build
 from torchrl_quad.envs.eyes import Eye
 from torchrl_quad.envs.scenes import Scene
+from torchrl_quad.errors import UserTypeError
 from torchrl_quad.vision import DepthCamera
 
 
@@ -36,10 +37,10 @@ def choose_disturbances(
     if sensors.noise_size or sensors.delay:
         chosen["sensors"] = sensors
     if not isinstance(more, Sequence):
-        raise TypeError(f"disturbances must be a list of Disturbance, got {type(more).__name__}.")
+        raise UserTypeError(f"disturbances must be a list of Disturbance, got {type(more).__name__}.")
     for disturbance in more:
         if not isinstance(disturbance, Disturbance):
-            raise TypeError(f"disturbances: each must be a Disturbance, got {type(disturbance).__name__}.")
+            raise UserTypeError(f"disturbances: each must be a Disturbance, got {type(disturbance).__name__}.")
         chosen[f"{type(disturbance).__name__}_{len(chosen)}"] = disturbance
     if scene is not None or camera is not None:
         chosen["scene"] = Scene.of({"ground": True} if scene is None else scene).bound(nominal)

@@ -25,6 +25,7 @@ from torchrl_quad.envs.terms import (
     outside,
     target_reward,
 )
+from torchrl_quad.errors import UserValueError
 
 WEIGHTS = {  # of the reward's terms, by reward
     "position": {**TARGET_WEIGHTS, "gate": 20.0},
@@ -110,7 +111,7 @@ class RacingEnv(QuadrotorEnv):
             ("gate_bonus", gate_bonus, ("binary", "log", "reciprocal")),
         ):
             if value not in choices:
-                raise ValueError(f"Unknown {name} {value!r}. Choose from: {', '.join(choices)}.")
+                raise UserValueError(f"Unknown {name} {value!r}. Choose from: {', '.join(choices)}.")
         self.track, self.reward, self.gate_bonus = load_track(track), reward, gate_bonus
         self.weights = {**WEIGHTS[reward], **RELAXATION_WEIGHTS.get(gate_bonus, {})}
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
@@ -125,7 +126,7 @@ class RacingEnv(QuadrotorEnv):
         for start, point in zip(self.starts, self.track["starts"], strict=True):
             corners = torch.stack((start - self.start_range, start + self.start_range))
             if self.is_crash({"position": corners}).any():
-                raise ValueError(
+                raise UserValueError(
                     f"track: drones start within {self.start_range} m of {point}, which is not all inside the box: x "
                     f"and y at most {self.box_margin} m beyond the gates, 0 < z < {self.ceiling} m. Move that start."
                 )
@@ -245,18 +246,18 @@ def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:
     source, values = presets.read("track", track, _TRACKS)
     unknown = sorted(str(key) for key in set(values) - {"gates", "starts", "gate_radius"})
     if unknown:
-        raise ValueError(f"{source}: unknown key {unknown[0]!r}. Allowed: gates, starts, gate_radius.")
+        raise UserValueError(f"{source}: unknown key {unknown[0]!r}. Allowed: gates, starts, gate_radius.")
     gates = _points(source, "gates", values.get("gates"))
     if len(gates) < 2:
-        raise ValueError(f"{source}: a track needs at least two gates, got {len(gates)}.")
+        raise UserValueError(f"{source}: a track needs at least two gates, got {len(gates)}.")
     before = [gates[-1], *gates[:-1]]
     halfway = [[0.5 * (p + q) for p, q in zip(a, b, strict=True)] for a, b in zip(before, gates, strict=True)]
     starts = _points(source, "starts", values.get("starts", halfway))
     if len(starts) != len(gates):
-        raise ValueError(f"{source}: there must be one start before each gate, got {len(starts)} for {len(gates)}.")
+        raise UserValueError(f"{source}: there must be one start before each gate, got {len(starts)} for {len(gates)}.")
     radius = values.get("gate_radius", 0.3)
     if not (isinstance(radius, int | float) and 0 < radius < float("inf")):
-        raise ValueError(f"{source}: gate_radius must be a positive number [m], got {radius!r}.")
+        raise UserValueError(f"{source}: gate_radius must be a positive number [m], got {radius!r}.")
     return {"gates": gates, "starts": starts, "gate_radius": float(radius)}
 
 
@@ -266,5 +267,7 @@ def _points(source: str, name: str, value: Any) -> list[list[float]]:
     except (TypeError, ValueError):
         points = []
     if not points or any(len(point) != 3 or not all(abs(x) < 1e4 for x in point) or point[2] <= 0 for point in points):
-        raise ValueError(f"{source}: {name} must be a list of points [x, y, z] in metres above ground, got {value!r}.")
+        raise UserValueError(
+            f"{source}: {name} must be a list of points [x, y, z] in metres above ground, got {value!r}."
+        )
     return points

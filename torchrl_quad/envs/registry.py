@@ -15,6 +15,7 @@ from torchrl_quad.envs.hovering import HoveringEnv
 from torchrl_quad.envs.landing import LandingEnv
 from torchrl_quad.envs.racing import RacingEnv
 from torchrl_quad.envs.tracking import TrackingEnv
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 GROUP = "torchrl_quad.tasks"  # the group of entry points by which an installed package offers its tasks
 
@@ -45,11 +46,13 @@ def register_task(name: str, cls: type[QuadrotorEnv]) -> None:
         TypeError: this is no class of a task, or it lacks methods.
     """
     if not (isinstance(name, str) and re.fullmatch(r"[a-z][a-z0-9_]*", name)):
-        raise ValueError(f"A task's name is in small letters, digits and underscores, such as 'window'; got {name!r}.")
+        raise UserValueError(
+            f"A task's name is in small letters, digits and underscores, such as 'window'; got {name!r}."
+        )
     _require_task(cls, f"register_task({name!r}, ...)")
     taken = TASKS.get(name)
     if taken is not None and _path(taken) != _path(cls):  # a module that runs again, as in a notebook, may
-        raise ValueError(f"The task {name!r} is {_path(taken)} already. Choose another name for {_path(cls)}.")
+        raise UserValueError(f"The task {name!r} is {_path(taken)} already. Choose another name for {_path(cls)}.")
     TASKS[name] = cls
     from torchrl_quad import register_envs  # which needs the package whole
 
@@ -72,14 +75,14 @@ def task_class(task: str) -> type[QuadrotorEnv]:
         return TASKS[task]
     offers = _offered().get(task, []) if isinstance(task, str) else []
     if len(offers) > 1:
-        raise ValueError(
+        raise UserValueError(
             f"Several packages offer a task {task!r}: {', '.join(x.value for x in offers)}. Remove all but one."
         )
     if offers:
         return _require_task(offers[0].load(), f"The entry point {task} = {offers[0].value!r}")
     if isinstance(task, str) and re.fullmatch(r"\w+(\.\w+)+", task):
         return _require_task(_imported(task), f"task {task!r}")
-    raise ValueError(
+    raise UserValueError(
         f"Unknown task {task!r}. Choose from: {', '.join(available_tasks())}. For one of your own give the path of "
         "its class, such as 'mypackage.WindowEnv', or call register_task(name, WindowEnv) before."
     )
@@ -113,22 +116,22 @@ def _imported(path: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # the module is there, and needs one that is not
-        raise ValueError(
+        raise UserValueError(
             f"task {path!r}: Python finds no module {error.name!r}. Put its folder on PYTHONPATH, or install its "
             "package."
         ) from None
     if not hasattr(found, name):
-        raise ValueError(f"task {path!r}: the module {module!r} ({found.__file__}) has no {name!r}.")
+        raise UserValueError(f"task {path!r}: the module {module!r} ({found.__file__}) has no {name!r}.")
     return getattr(found, name)
 
 
 def _require_task(cls: Any, source: str) -> type[QuadrotorEnv]:
     if not (isinstance(cls, type) and issubclass(cls, QuadrotorEnv)):
         got = f"the class {cls.__name__}" if isinstance(cls, type) else type(cls).__name__
-        raise TypeError(f"{source}: a task is a subclass of QuadrotorEnv, itself and not an instance; got {got}.")
+        raise UserTypeError(f"{source}: a task is a subclass of QuadrotorEnv, itself and not an instance; got {got}.")
     if inspect.isabstract(cls):
         missing = ", ".join(sorted(cls.__abstractmethods__))
-        raise TypeError(f"{source}: {cls.__name__} lacks {missing}. docs/writing.md says what each of them gives.")
+        raise UserTypeError(f"{source}: {cls.__name__} lacks {missing}. docs/writing.md says what each of them gives.")
     return cls
 
 

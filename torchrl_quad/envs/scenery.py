@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchrl_quad.engine.packing import like
 from torchrl_quad.envs.shapes import Shape, along_the_course, as_points, rings
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.vision.primitives import SIZES
 
 
@@ -91,11 +92,11 @@ class Scenery:
         count = 0 if self.gates is None else len(self.gates)
         radius = torch.as_tensor(self.gate_radius).detach().cpu().float()
         if radius.numel() not in (1, count) or not (radius > 0).all():
-            raise ValueError(f"Scenery: gate_radius must be positive [m], one for all {count} gates or one each.")
+            raise UserValueError(f"Scenery: gate_radius must be positive [m], one for all {count} gates or one each.")
         if self.gate_axes is not None and len(self.gate_axes) != count:
-            raise ValueError(f"Scenery: gate_axes has {len(self.gate_axes)} directions for {count} gates.")
+            raise UserValueError(f"Scenery: gate_axes has {len(self.gate_axes)} directions for {count} gates.")
         if not all(isinstance(shape, Shape) for shape in self.shapes):
-            raise ValueError("Scenery: shapes must be a list of Shape, such as [Shape.sphere((0, 0, 2), 0.5)].")
+            raise UserValueError("Scenery: shapes must be a list of Shape, such as [Shape.sphere((0, 0, 2), 0.5)].")
 
     def rings(self) -> Tensor | None:
         """The rims of the gates (k, 33, 3), if there are any."""

@@ -17,6 +17,7 @@ from torchrl_quad.engine import looks_are_free
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.randomness import Randomness
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.vision import Primitives, closest_approach, nearest
 from torchrl_quad.vision.primitives import SIZES, distances, join
 
@@ -113,7 +114,7 @@ class Scene(Disturbance):
         allowed = ["ground", "spheres", "cylinders", "boxes", "walls", "clearance", "drone_radius"]
         unknown = sorted(str(key) for key in values if key not in allowed)
         if unknown:
-            raise ValueError(f"{source}: unknown key {unknown[0]!r}. Allowed: {', '.join(allowed)}.")
+            raise UserValueError(f"{source}: unknown key {unknown[0]!r}. Allowed: {', '.join(allowed)}.")
         return cls(**values, source=source)
 
     @property
@@ -154,7 +155,7 @@ class Scene(Disturbance):
         if looks_are_free(random.device):
             for complaint, where in self.complaints(state).items():
                 if where.any():
-                    raise ValueError(
+                    raise UserValueError(
                         f"{self.source}: {complaint}, and drones would start there, such as at "
                         f"{[round(x, 2) for x in state['position'][where][0].tolist()]} m. Move one of them."
                     )
@@ -261,7 +262,7 @@ class Scene(Disturbance):
 
     def _require(self, condition: bool, message: str) -> None:
         if not condition:
-            raise ValueError(f"{self.source}: {message}")
+            raise UserValueError(f"{self.source}: {message}")
 
     def _draw_clear(self, random: Randomness, kind: str, group: dict[str, Any], points: Tensor) -> Tensor:
         """The obstacles (n, count, ...) of a group; none stands at the points (n, k, 3)."""

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from torchrl_quad.errors import UserValueError
+
 _RING = 33  # points of a circle, the first again at its end
 
 
@@ -36,15 +38,15 @@ class Shape:
         if self.faces is not None:
             faces = torch.as_tensor(self.faces).detach().cpu().long()
             if faces.dim() != 2 or faces.shape[1] != 3 or not ((faces >= 0) & (faces < len(self.points))).all():
-                raise ValueError(
+                raise UserValueError(
                     f"Shape: faces must be indices (m, 3) of its {len(self.points)} points, three for each triangle; "
                     f"got shape {tuple(faces.shape)}."
                 )
             object.__setattr__(self, "faces", faces)
         if not re.fullmatch("#[0-9a-fA-F]{6}", self.color):
-            raise ValueError(f"Shape: color must be written as #rrggbb, such as #c8452f; got {self.color!r}.")
+            raise UserValueError(f"Shape: color must be written as #rrggbb, such as #c8452f; got {self.color!r}.")
         if not 0 < self.opacity <= 1:
-            raise ValueError(f"Shape: opacity must be above 0 and at most 1, got {self.opacity}.")
+            raise UserValueError(f"Shape: opacity must be above 0 and at most 1, got {self.opacity}.")
 
     @classmethod
     def line(cls, points: Any, **style: Any) -> Shape:
@@ -98,9 +100,9 @@ def as_points(what: str, points: Any) -> Tensor:
             points = torch.stack([torch.as_tensor(point).detach().cpu().float() for point in points])
         points = torch.as_tensor(points).detach().cpu().float()
     except (TypeError, ValueError, RuntimeError):
-        raise ValueError(f"{what} must be points (n, 3) [m], got {points!r}.") from None
+        raise UserValueError(f"{what} must be points (n, 3) [m], got {points!r}.") from None
     if points.dim() != 2 or points.shape[1] != 3 or not len(points):
-        raise ValueError(f"{what} must be points (n, 3) [m], got shape {tuple(points.shape)}.")
+        raise UserValueError(f"{what} must be points (n, 3) [m], got shape {tuple(points.shape)}.")
     return points
 
 

@@ -21,6 +21,7 @@ from torchrl_quad.envs.terms import (
     outside,
     target_reward,
 )
+from torchrl_quad.errors import UserValueError
 
 Curve = Callable[[Tensor], Tensor]
 
@@ -111,14 +112,14 @@ class TrackingEnv(QuadrotorEnv):
     ) -> None:
         if isinstance(curve, str):
             if curve not in CURVES:
-                raise ValueError(
+                raise UserValueError(
                     f"Unknown curve {curve!r}. Choose from: {', '.join(CURVES)}; or give a function from phases (*) "
                     "[rad] to positions (*, 3) [m], and its period [s]."
                 )
             curve, default_period = CURVES[curve]
             period = default_period if period is None else period
         if period is None or not 0 < period < math.inf:
-            raise ValueError(f"A curve of your own needs a period in seconds, such as period=10.0; got {period}.")
+            raise UserValueError(f"A curve of your own needs a period in seconds, such as period=10.0; got {period}.")
         self.curve = functools.partial(curve)  # not itself: an environment registers modules as its own
         self.period = period
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
@@ -197,22 +198,22 @@ def _checked_points(curve: Curve, phase: Tensor, margin: float) -> Tensor:
     try:
         points = curve(phase.repeat(2, 1))
     except Exception as error:
-        raise ValueError(f"{rule}; given a tensor of shape (2, 257) it failed: {error}") from error
+        raise UserValueError(f"{rule}; given a tensor of shape (2, 257) it failed: {error}") from error
     if not isinstance(points, Tensor):
-        raise ValueError(f"{rule}; it made a {type(points).__name__}.")
+        raise UserValueError(f"{rule}; it made a {type(points).__name__}.")
     if points.shape != (2, 257, 3) or points.dtype != phase.dtype:
-        raise ValueError(f"{rule}; from shape (2, 257) it made {tuple(points.shape)}, {points.dtype}.")
+        raise UserValueError(f"{rule}; from shape (2, 257) it made {tuple(points.shape)}, {points.dtype}.")
     points = points[0]
     if not points.isfinite().all():
-        raise ValueError("The curve is not finite everywhere in [0, 2 pi].")
+        raise UserValueError("The curve is not finite everywhere in [0, 2 pi].")
     gap = norm(points[0] - points[-1]).item()
     if gap > 0.01:
-        raise ValueError(
+        raise UserValueError(
             f"The curve is not periodic: from phase 0 to 2 pi it moves by {gap:.3g} m. Make it close at 2 pi."
         )
     lowest = points[:, 2].min().item()
     if lowest <= margin:
-        raise ValueError(
+        raise UserValueError(
             f"The curve goes down to z = {lowest:.3g} m, and drones start up to {margin} m below it. Lift it."
         )
     return points

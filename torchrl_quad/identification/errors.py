@@ -1,7 +1,9 @@
 """What a log may be refused for, by name."""
 
+from torchrl_quad.errors import UserValueError
 
-class LogError(ValueError):
+
+class LogError(UserValueError):
     """A log cannot be used. Each of its classes names one reason, and each message what to do."""
 
 

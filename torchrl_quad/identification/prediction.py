@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import QuadrotorParams, load_drone, quaternion
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.identification.log import FlightLog
 from torchrl_quad.identification.windows import Plant, Trajectory, Windows, cut, rotation_vector, stream_delay
 
@@ -60,7 +61,7 @@ def prediction_error(
     logs = [log] if isinstance(log, FlightLog) else list(log)
     horizons = [float(h) for h in horizons]
     if not horizons or not all(math.isfinite(h) and h > 0 for h in horizons) or not past >= 0 or not every > 0:
-        raise ValueError(
+        raise UserValueError(
             f"prediction_error: horizons and every must be positive [s], and past zero or positive; got {horizons}, "
             f"{every!r} and {past!r}."
         )

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import replacing
 from torchrl_quad.identification.fitting import Linear, Problem, State, bootstrap, covariance, minimise
 from torchrl_quad.identification.log import FlightLog
@@ -231,7 +232,9 @@ class Checkpoint:
             content = json.loads(Path(self.path).read_text())
             return content["stages"] if content["fingerprint"] == self.fingerprint else {}
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{self.path} is no checkpoint of a fit: {error!r}. Delete it, to start anew.") from error
+            raise UserValueError(
+                f"{self.path} is no checkpoint of a fit: {error!r}. Delete it, to start anew."
+            ) from error
 
 
 def held_out(windows: Windows) -> Tensor:

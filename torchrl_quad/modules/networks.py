@@ -17,6 +17,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_quad.data.unwrap import base_env
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead
 from torchrl_quad.modules.plain import CorrelatedActor, Critic, Network, TanhGaussianActor
 
@@ -122,9 +123,9 @@ def first_action(env: EnvBase, action_init: Tensor | None, scale_init: float, na
     """The spec of one action, and what the mean of the first actions is before the tanh, (k); checked for ``name``."""
     spec = env.action_spec_unbatched
     if not isinstance(spec, Bounded):
-        raise ValueError(f"{name} needs an action with bounds, a Bounded spec; got {type(spec).__name__}.")
+        raise UserValueError(f"{name} needs an action with bounds, a Bounded spec; got {type(spec).__name__}.")
     if len(spec.shape) != 1:
-        raise ValueError(
+        raise UserValueError(
             f"{name} writes one action (k) for each environment, and here it has shape {tuple(spec.shape)}: a "
             "transform such as MultiAction asks for several actions at once. Leave it out. To hold each action longer, "
             "give the environment a longer control step, control_dt=0.04."
@@ -136,12 +137,12 @@ def first_action(env: EnvBase, action_init: Tensor | None, scale_init: float, na
         action_init = action_init.mean(0) if action_init.dim() > middle.dim() else action_init
     action_init = torch.as_tensor(action_init).to(middle)
     if action_init.shape != spec.shape or not ((low < action_init) & (action_init < high)).all():
-        raise ValueError(
+        raise UserValueError(
             f"action_init must be {spec.shape[-1]} numbers strictly between {low.tolist()} and {high.tolist()}, got "
             f"{action_init.tolist()}."
         )
     if not 1e-4 <= scale_init < math.inf:  # TorchRL's mapping to a scale ends there
-        raise ValueError(f"scale_init must be finite and at least 1e-4, got {scale_init}.")
+        raise UserValueError(f"scale_init must be finite and at least 1e-4, got {scale_init}.")
     return spec, torch.atanh((action_init - middle) / (0.5 * (high - low)))
 
 
@@ -167,7 +168,7 @@ def with_head(
         ValueError: the correlation is below 0, or not below 1.
     """
     if not 0 <= noise_correlation < 1:
-        raise ValueError(f"noise_correlation must lie from 0 to below 1, got {noise_correlation}.")
+        raise UserValueError(f"noise_correlation must lie from 0 to below 1, got {noise_correlation}.")
     least = min(0.01, 0.1 * scale_init)  # to which training can bring the scale down
     mapping, read = f"biased_softplus_{scale_init}_{least}", list(in_keys)
     max_loc = 5.0 if return_log_prob else math.inf  # as far as TorchRL's TanhNormal goes with tanh_loc=True
@@ -210,16 +211,18 @@ def network_of(
 ) -> Network:
     """A network on entries of an environment; it reads ``more`` numbers first, which are none of these entries."""
     if isinstance(in_keys, str) or not in_keys:
-        raise ValueError(f'in_keys must be a list of entries, such as ["observation"]; got {in_keys!r}.')
+        raise UserValueError(f'in_keys must be a list of entries, such as ["observation"]; got {in_keys!r}.')
     specs = [_spec(env, key) for key in in_keys]
     own = len(in_keys) - (action_scale is not None)  # without the action of a critic
     scales = [input_scale] * own if isinstance(input_scale, numbers.Real) else list(input_scale)
     if len(scales) != own:
-        raise ValueError(f"input_scale must be a number, or one for each of the {own} in_keys; got {input_scale!r}.")
+        raise UserValueError(
+            f"input_scale must be a number, or one for each of the {own} in_keys; got {input_scale!r}."
+        )
     if action_scale is not None:
         scales.append(action_scale)
     if isinstance(num_cells, int) or not all(isinstance(n, numbers.Integral) and n >= 1 for n in num_cells):
-        raise ValueError(f"num_cells must be the widths of the hidden layers, such as (64, 64); got {num_cells!r}.")
+        raise UserValueError(f"num_cells must be the widths of the hidden layers, such as (64, 64); got {num_cells!r}.")
     norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": cells} for cells in num_cells]}
     mlp = MLP(
         in_features=more + sum(spec.shape[-1] for spec in specs),
@@ -246,9 +249,9 @@ def _spec(env: EnvBase, key: NestedKey) -> TensorSpec:
     """The spec of an entry (*, k) that a network can read."""
     known = {**dict(env.observation_spec.items(True, True)), "action": env.action_spec}
     if key not in known:
-        raise ValueError(f"Unknown entry {key!r} in in_keys. Choose from: {', '.join(map(str, known))}.")
+        raise UserValueError(f"Unknown entry {key!r} in in_keys. Choose from: {', '.join(map(str, known))}.")
     if known[key].ndim != len(env.batch_size) + 1:
-        raise ValueError(
+        raise UserValueError(
             f"Entry {key!r} has shape {tuple(known[key].shape)} and a network reads vectors: flatten it, for example "
             "with TorchRL's FlattenObservation."
         )

@@ -16,6 +16,7 @@ from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, TanhNor
 from torchrl.modules.models.utils import SquashDims
 from torchrl.modules.tensordict_module.rnn import GRU
 
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead
 from torchrl_quad.modules.networks import (
     OBSERVATION,
@@ -94,14 +95,14 @@ def make_visual_actor(
     """
     known = dict(env.observation_spec.items(True, True))
     if image_key not in known or known[image_key].ndim != len(env.batch_size) + 3:
-        raise ValueError(
+        raise UserValueError(
             f"make_visual_actor reads an image (channels, height, width) from {image_key!r}, and the environment has "
             f'none there. Give it a camera, camera={{"width": 16, "height": 12}}, or choose image_key from: '
             f"{', '.join(map(str, known))}."
         )
     widths = (*channels, hidden_size) if isinstance(channels, Sequence) and channels else (0,)
     if not all(isinstance(n, numbers.Integral) and n >= 1 for n in widths):
-        raise ValueError(
+        raise UserValueError(
             "channels must be a list of at least one whole number, such as (8, 16), and hidden_size a whole number of "
             f"at least 1; got {channels!r} and {hidden_size!r}."
         )
@@ -125,7 +126,7 @@ def make_visual_actor(
         or not num_cells
         or not all(isinstance(n, numbers.Integral) and n >= 1 for n in num_cells)
     ):
-        raise ValueError(
+        raise UserValueError(
             "num_cells must name the widths of the layers between the convolutions and the head, at least one, such as "
             f"(64,); got {num_cells!r}."
         )
@@ -198,7 +199,7 @@ class VisualActor(ProbabilisticActor):
             ValueError: nobody says where episodes begin.
         """
         if "is_init" in self.in_keys and "is_init" not in tensordict:
-            raise ValueError(
+            raise UserValueError(
                 "A policy with memory reads 'is_init', which says where episodes begin. Fly it by "
                 "differentiable_rollout, or by env.rollout(..., break_when_any_done=False), on an environment without "
                 "transforms; or give the environment TorchRL's: TransformedEnv(env, Compose(InitTracker(), "
@@ -256,7 +257,7 @@ class VisualActor(ProbabilisticActor):
                 weight = part.gru.weight_hh_l0
                 spec = Unbounded((1, weight.shape[-1]), dtype=weight.dtype, device=weight.device)
                 return TensorDictPrimer({MEMORY: spec}, expand_specs=True)
-        raise ValueError("This policy has no memory: it was built with recurrent=False, and needs no primer.")
+        raise UserValueError("This policy has no memory: it was built with recurrent=False, and needs no primer.")
 
 
 class Replay(PlainTanhGaussian):

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.calls import sample_action
 from torchrl_quad.objectives.critic import PathwiseCriticLoss
 from torchrl_quad.objectives.segments import segments, step_in_segment
@@ -78,11 +79,15 @@ class ABPTLoss(PathwiseCriticLoss):
         **kwargs: Any,
     ) -> None:
         if not (n_step_return or zero_step_return):
-            raise ValueError("ABPTLoss needs n_step_return or zero_step_return: with both off there is no objective.")
+            raise UserValueError(
+                "ABPTLoss needs n_step_return or zero_step_return: with both off there is no objective."
+            )
         if not (isinstance(num_qvalue_nets, numbers.Integral) and num_qvalue_nets >= 1):
-            raise ValueError(f"ABPTLoss needs at least one critic, got num_qvalue_nets={num_qvalue_nets}.")
+            raise UserValueError(f"ABPTLoss needs at least one critic, got num_qvalue_nets={num_qvalue_nets}.")
         if not (isinstance(simulated_steps, numbers.Integral) and simulated_steps >= 0):
-            raise ValueError(f"simulated_steps must be a number of control steps, 0 or more; got {simulated_steps}.")
+            raise UserValueError(
+                f"simulated_steps must be a number of control steps, 0 or more; got {simulated_steps}."
+            )
         super().__init__(actor_network, **kwargs)
         self.simulated_steps = simulated_steps
         self.n_step_return, self.zero_step_return = n_step_return, zero_step_return

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.autograd.graph import GradientEdge
 
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.calls import act
 
 
@@ -33,7 +34,7 @@ def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
             node.learns = True
         return grad.movedim(0, -2)
     if steps is None or len(steps) != action.shape[-2] or not _is_along_time(action):
-        raise ValueError(
+        raise UserValueError(
             "The gradient of each action needs one rollout as differentiable_rollout returned it, whole and with its "
             "graph; this one was copied, reshaped or cut. Give the rollout itself to the loss."
         )

@@ -9,6 +9,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.action_gradients import median_length
 from torchrl_quad.objectives.shac import SHACLoss
 
@@ -71,13 +72,13 @@ class AHACLoss(SHACLoss):
         low = max(horizon // 4, 1) if min_horizon is None else min_horizon
         high = 2 * horizon if max_horizon is None else max_horizon
         if not 1 <= low <= horizon <= high:
-            raise ValueError(
+            raise UserValueError(
                 f"horizon={horizon} must lie between min_horizon={low} and max_horizon={high}, and be at least 1."
             )
         if not 1 < max_stiffness < math.inf:
-            raise ValueError(f"max_stiffness must be finite and above 1, got {max_stiffness}; 1.5 to 5 are usual.")
+            raise UserValueError(f"max_stiffness must be finite and above 1, got {max_stiffness}; 1.5 to 5 are usual.")
         if not 0 <= horizon_lr < 1:
-            raise ValueError(f"horizon_lr must lie from 0 to below 1, got {horizon_lr}.")
+            raise UserValueError(f"horizon_lr must lie from 0 to below 1, got {horizon_lr}.")
         super().__init__(
             actor_network,
             value_network,
@@ -89,7 +90,7 @@ class AHACLoss(SHACLoss):
             **kwargs,
         )
         if not {"loc", "scale"} <= set(self.actor_network.out_keys):
-            raise ValueError(
+            raise UserValueError(
                 "AHACLoss needs a policy as make_actor builds it, which writes loc and scale; this one writes "
                 f"{', '.join(map(str, self.actor_network.out_keys))}."
             )

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.utils import ValueEstimators
 
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.calls import predict
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.objectives.segments import segments
@@ -91,7 +92,7 @@ class PathwiseCriticLoss(PathwiseLoss):
         key = getattr(self.tensor_keys, self.prediction_key)
         predictions = predict(network, params, tensordict, key, learning=learning)
         if predictions.shape[1:] != (*tensordict.shape, 1):
-            raise ValueError(
+            raise UserValueError(
                 f"{self.critic_name} must write one number for each state, {key!r} of shape "
                 f"{(*tensordict.shape, 1)}; got {tuple(predictions.shape[1:])}."
             )
@@ -108,7 +109,7 @@ class PathwiseCriticLoss(PathwiseLoss):
             target = self.write_value_target(tensordict.copy()).get(key)
         target, prediction = target.detach(), self._critics(tensordict, learning=True)
         if target.shape != prediction.shape[1:]:
-            raise ValueError(
+            raise UserValueError(
                 f"{key!r} has shape {tuple(target.shape)}, and the critic's predictions {tuple(prediction.shape[1:])}: "
                 "give targets as write_value_target writes them."
             )
@@ -145,7 +146,7 @@ class PathwiseCriticLoss(PathwiseLoss):
     def _require_rollout(self, tensordict: TensorDictBase) -> None:
         critic, key = getattr(self, self.critic_name), getattr(self.tensor_keys, self.prediction_key)
         if key not in critic.out_keys:
-            raise ValueError(
+            raise UserValueError(
                 f"{type(self).__name__} reads {key!r} of its {self.critic_name}, which writes "
                 f"{', '.join(map(str, critic.out_keys))}. Give another network, or set_keys({self.prediction_key}=...)."
             )

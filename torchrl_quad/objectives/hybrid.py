@@ -15,6 +15,7 @@ from torch.distributions import Normal, kl_divergence
 from torch.distributions.transforms import TanhTransform
 from torchrl.objectives.utils import ValueEstimators
 
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again, location_gradient
 from torchrl_quad.objectives.segments import discounts, segments
 from torchrl_quad.objectives.shac import SHACLoss
@@ -107,13 +108,13 @@ class HybridLoss(SHACLoss):
         reduction: str = "mean",
     ) -> None:
         if not (isinstance(gradient_lmbda, int | float) and 0 < gradient_lmbda <= 1):
-            raise ValueError(f"gradient_lmbda must lie in (0, 1], got {gradient_lmbda}; 0.9 is usual.")
+            raise UserValueError(f"gradient_lmbda must lie in (0, 1], got {gradient_lmbda}; 0.9 is usual.")
         if not 0 < clip_epsilon < 1:
-            raise ValueError(f"clip_epsilon must lie between 0 and 1, got {clip_epsilon}; 0.2 is usual.")
+            raise UserValueError(f"clip_epsilon must lie between 0 and 1, got {clip_epsilon}; 0.2 is usual.")
         if not 0 <= entropy_coeff < math.inf:
-            raise ValueError(f"entropy_coeff must be finite and not negative, got {entropy_coeff}; 0.01 is usual.")
+            raise UserValueError(f"entropy_coeff must be finite and not negative, got {entropy_coeff}; 0.01 is usual.")
         if not 0 <= decay < 1:
-            raise ValueError(f"decay must lie in [0, 1), got {decay}.")
+            raise UserValueError(f"decay must lie in [0, 1), got {decay}.")
         options = {"clip_action_gradient": clip_action_gradient, "reduction": reduction}
         super().__init__(actor_network, value_network, delay_value=False, **options)
         self.gradient_lmbda, self.clip_epsilon, self.entropy_coeff = gradient_lmbda, clip_epsilon, entropy_coeff
@@ -187,7 +188,7 @@ class HybridLoss(SHACLoss):
         keys = self.tensor_keys
         lost = [key for key in (keys.advantage, keys.location_gradient, keys.latent) if key not in tensordict]
         if lost and not {keys.location_gradient, keys.latent} <= set(lost):  # an advantage alone is somebody else's
-            raise ValueError(
+            raise UserValueError(
                 f"HybridLoss reads {lost[0]!r}, which write_targets writes and these samples have lost. Give samples "
                 "of all that it returned."
             )
@@ -216,7 +217,7 @@ class HybridLoss(SHACLoss):
         least = 1e6 * torch.finfo(reward.dtype).tiny
         longest = 1 + int(math.log(least) / math.log(discount)) if 0 < discount < 1 else 1
         if discount < 1 and reward.shape[-2] > longest:
-            raise ValueError(
+            raise UserValueError(
                 f"gamma * gradient_lmbda = {discount:.3g} is too small for a horizon of {reward.shape[-2]} steps: "
                 f"{reward.dtype} cannot divide by its power. Fly at most {longest} steps, or raise gradient_lmbda."
             )

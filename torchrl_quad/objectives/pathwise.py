@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import ValueEstimators, default_value_kwargs, dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.objectives.action_gradients import MedianClip, act_again, action_gradient
 from torchrl_quad.objectives.segments import discounts
 
@@ -95,17 +96,17 @@ class PathwiseLoss(LossModule):
     ) -> None:
         super().__init__()
         if reduction not in ("mean", "sum", "none"):
-            raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}.")
+            raise UserValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}.")
         if alpha != "auto" and not (isinstance(alpha, int | float) and 0 <= alpha < math.inf):
-            raise ValueError(f"alpha must be 'auto' or a finite number that is not negative, got {alpha!r}.")
+            raise UserValueError(f"alpha must be 'auto' or a finite number that is not negative, got {alpha!r}.")
         if not 0 < alpha_init < math.inf:
-            raise ValueError(
+            raise UserValueError(
                 f"alpha_init must be positive and finite, got {alpha_init}; set alpha to 0 for no entropy bonus."
             )
         if target_entropy != "auto" and not (isinstance(target_entropy, int | float) and math.isfinite(target_entropy)):
-            raise ValueError(f"target_entropy must be 'auto' or a finite number, got {target_entropy!r}.")
+            raise UserValueError(f"target_entropy must be 'auto' or a finite number, got {target_entropy!r}.")
         if clip_action_gradient is not None and not 0 < clip_action_gradient < math.inf:
-            raise ValueError(
+            raise UserValueError(
                 f"clip_action_gradient must be None or a positive number of medians, got {clip_action_gradient}."
             )
         self._in_keys = None
@@ -127,7 +128,7 @@ class PathwiseLoss(LossModule):
     def convert_to_functional(self, module: TensorDictModule, module_name: str, *args: Any, **kwargs: Any) -> None:
         """As TorchRL's, and refuse anything but a TensorDictModule."""
         if not isinstance(module, TensorDictModuleBase):
-            raise TypeError(
+            raise UserTypeError(
                 f"{module_name} must be a TensorDictModule, got {type(module).__name__}. Wrap a plain module: "
                 'TensorDictModule(module, in_keys=["observation"], out_keys=[...]).'
             )
@@ -188,7 +189,7 @@ class PathwiseLoss(LossModule):
         given = {**default_value_kwargs(self.value_type), **hyperparams}
         for name in {"gamma", "lmbda"} & given.keys():  # TorchRL makes them float32 whatever the rollout is
             if not 0 <= given[name] <= 1:
-                raise ValueError(f"{name} must lie between 0 and 1, got {given[name]}.")
+                raise UserValueError(f"{name} must lie between 0 and 1, got {given[name]}.")
             buffer = getattr(estimator, name)
             setattr(estimator, name, torch.as_tensor(given[name], device=buffer.device, dtype=self._precision))
         self._forward_value_estimator_keys()
@@ -310,27 +311,27 @@ class PathwiseLoss(LossModule):
         # Only the names of its dimensions distinguish a single flight from a batch of single steps.
         has_time = names[-1] == "time" if "time" in names else len(shape) > 1
         if not has_time or shape[-1] == 0:
-            raise ValueError(
+            raise UserValueError(
                 f"{name} needs a rollout of batch size (*, horizon), whose last dimension is time; got {shape}. Give "
                 'it what differentiable_rollout returns, unflattened; name a single flight: rollout.names = ["time"].'
             )
         missing = [key for key in self.in_keys if key not in tensordict and key != self.tensor_keys.sample_log_prob]
         if missing and missing[0] in ("loc", "scale"):
-            raise ValueError(
+            raise UserValueError(
                 f"{name} needs a policy as make_actor builds it, which writes loc and scale: the rollout has no "
                 f"{missing[0]!r}."
             )
         if missing:
-            raise ValueError(
+            raise UserValueError(
                 f"{name} reads {missing[0]!r}, which is not in the rollout. If it has another name there, write "
                 f"loss.set_keys(...), which takes {', '.join(vars(self.tensor_keys))}."
             )
         for key in (("next", getattr(self.tensor_keys, x)) for x in ("reward", "done", "terminated")):
             if (got := tuple(tensordict.get(key).shape)) != (*shape, 1):
-                raise ValueError(f"{name} needs {key!r} of shape {(*shape, 1)} in this rollout; got {got}.")
+                raise UserValueError(f"{name} needs {key!r} of shape {(*shape, 1)} in this rollout; got {got}.")
         device, own = tensordict.get(("next", self.tensor_keys.reward)).device, self._default_device
         if own not in (None, device):
-            raise ValueError(f"{name} is on {own}, and the rollout on {device}: loss.to({str(device)!r}) moves it.")
+            raise UserValueError(f"{name} is on {own}, and the rollout on {device}: loss.to({str(device)!r}) moves it.")
 
     def _require_graph(self, value: Tensor, key: NestedKey) -> None:
         if torch.is_grad_enabled() and not value.requires_grad:

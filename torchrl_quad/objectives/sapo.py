@@ -8,6 +8,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.shac import SHACLoss
 
 
@@ -49,9 +50,9 @@ class SAPOLoss(SHACLoss):
         **kwargs: Any,
     ) -> None:
         if alpha == 0:
-            raise ValueError("SAPOLoss needs an alpha above 0, or 'auto': without entropy take SHACLoss.")
+            raise UserValueError("SAPOLoss needs an alpha above 0, or 'auto': without entropy take SHACLoss.")
         if target_entropy != "auto" and not (isinstance(target_entropy, int | float) and target_entropy < 0):
-            raise ValueError(
+            raise UserValueError(
                 f"target_entropy must be 'auto' or a negative number, in whose size SAPOLoss measures the entropy; got "
                 f"{target_entropy}."
             )

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.critic import PathwiseCriticLoss
 
 
@@ -69,7 +70,9 @@ class SHACLoss(PathwiseCriticLoss):
         **kwargs: Any,
     ) -> None:
         if not (isinstance(num_value_nets, numbers.Integral) and num_value_nets >= 1):
-            raise ValueError(f"{type(self).__name__} needs at least one critic, got num_value_nets={num_value_nets}.")
+            raise UserValueError(
+                f"{type(self).__name__} needs at least one critic, got num_value_nets={num_value_nets}."
+            )
         super().__init__(actor_network, **kwargs)
         self.terminal_gradient, self.target_bootstrap = terminal_gradient, target_bootstrap
         self.average_over_horizon = average_over_horizon
@@ -77,7 +80,7 @@ class SHACLoss(PathwiseCriticLoss):
         self.convert_to_functional(value_network, "value_network", expand_dim=copies, create_target_params=delay_value)
         critic = self.value_network
         if self.tensor_keys.action in critic.in_keys and self.tensor_keys.value in critic.out_keys:
-            raise ValueError(f"{type(self).__name__} needs a V(s), which reads no action: make_value builds one.")
+            raise UserValueError(f"{type(self).__name__} needs a V(s), which reads no action: make_value builds one.")
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The critic's loss (paper, equation 16).

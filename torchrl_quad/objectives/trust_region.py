@@ -12,6 +12,8 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 
+from torchrl_quad.errors import UserValueError
+
 
 class TrustRegion:
     """Shortens an update that would move a Gaussian policy beyond a bound on the Kullback-Leibler divergence.
@@ -51,9 +53,9 @@ class TrustRegion:
         average: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         if max_kl is not None and not 0 < max_kl < math.inf:
-            raise ValueError(f"max_kl must be None or positive and finite, got {max_kl}; 0.01 to 0.1 are usual.")
+            raise UserValueError(f"max_kl must be None or positive and finite, got {max_kl}; 0.01 to 0.1 are usual.")
         if not 0 <= min_scale < math.inf:
-            raise ValueError(f"min_scale must be a finite number that is not negative, got {min_scale}.")
+            raise UserValueError(f"min_scale must be a finite number that is not negative, got {min_scale}.")
         self.actor, self.max_kl, self.min_scale, self.average = actor, max_kl, min_scale, average
         self.metrics: dict[str, Tensor] = {}
 
@@ -64,7 +66,7 @@ class TrustRegion:
             yield
             return
         if "loc" not in rollout or "scale" not in rollout:
-            raise ValueError("TrustRegion reads loc and scale, which are not in the rollout. Give what was flown.")
+            raise UserValueError("TrustRegion reads loc and scale, which are not in the rollout. Give what was flown.")
         parameters = list(self.actor.parameters())
         before = [x.detach().clone() for x in parameters]
         yield

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.envs.scenery import Scenery
+from torchrl_quad.errors import MissingPackage
 
 INK, BLUE, RED = "#222222", "#2f6db5", "#c8452f"
 
@@ -19,7 +20,7 @@ def make_figure(**options: Any) -> Any:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError("Pictures need matplotlib: pip install '.[render]' in a clone.") from error
+        raise MissingPackage("Pictures need matplotlib: pip install '.[render]' in a clone.") from error
     figure = Figure(**options)
     FigureCanvasAgg(figure)
     return figure

@@ -15,6 +15,7 @@ from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.dynamics import FlightController
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.envs.scenery import Scenery, describe_metric, visible_state
+from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.vision import Primitives
 
 
@@ -204,21 +205,21 @@ def check_rollout(
 ) -> None:
     """Refuse what cannot be drawn; arguments and errors are those of :class:`Flight`."""
     if env is not None and not (isinstance(env, EnvBase) and hasattr(env, "scenery")):
-        raise TypeError(
+        raise UserTypeError(
             f"{who}: env must be the quadrotor environment that flew, with or without transforms, or None; got "
             f"{type(env).__name__}."
         )
     if rollout.dim() != 2 or 0 in rollout.shape:
-        raise ValueError(
+        raise UserValueError(
             f"{who} needs a rollout of batch size (num_envs, time), such as env.rollout(...) returns; got "
             f"{tuple(rollout.shape)}. For one drone, write rollout.unsqueeze(0)."
         )
     if num_envs is not None and num_envs < 1:
-        raise ValueError(f"{who}: num_envs must be at least 1, got {num_envs}.")
+        raise UserValueError(f"{who}: num_envs must be at least 1, got {num_envs}.")
     keys = rollout.keys(include_nested=True)
     missing = [key for key in needed if key not in keys]
     if missing:
-        raise ValueError(
+        raise UserValueError(
             f"{who}: the rollout lacks {', '.join(map(str, missing))}. Pass it whole, as env.rollout(...) and "
             "differentiable_rollout(...) return it."
         )

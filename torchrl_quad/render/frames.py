@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs.scenery import Scenery
+from torchrl_quad.errors import MissingPackage, UserValueError
 from torchrl_quad.render.canvas import INK, RED, bounds, box, draw_scenery, drone_colors, make_figure, set_box
 from torchrl_quad.render.flights import Flight, state_keys
 from torchrl_quad.render.obstacles import depth_image, with_obstacles
@@ -141,10 +142,10 @@ def animate_flight(
     """
     write = {".gif": _write_gif, ".mp4": _write_mp4}.get(Path(path).suffix.lower())
     if write is None:
-        raise ValueError(f"animate_flight writes .gif and .mp4, got {Path(path).name}.")
+        raise UserValueError(f"animate_flight writes .gif and .mp4, got {Path(path).name}.")
     for name, value in (("control_dt", control_dt), ("fps", fps), ("max_seconds", max_seconds), ("size", size)):
         if not value > 0:
-            raise ValueError(f"animate_flight: {name} must be positive, got {value!r}.")
+            raise UserValueError(f"animate_flight: {name} must be positive, got {value!r}.")
     scene = getattr(None if env is None else base_env(env), "scene", None)
     num_envs = 1 if scene is not None and scene.is_random else num_envs
     needed = state_keys("position", "quaternion")
@@ -201,7 +202,7 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> N
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise ImportError("Films in MP4 need imageio-ffmpeg: pip install '.[render]' in a clone.") from error
+        raise MissingPackage("Films in MP4 need imageio-ffmpeg: pip install '.[render]' in a clone.") from error
     first, rate = next(frames), 1.0 / (times[-1] - times[-2])
     writer = imageio_ffmpeg.write_frames(
         str(path),
@@ -227,15 +228,15 @@ _scenes: weakref.WeakKeyDictionary[EnvBase, dict[tuple[int, int, bytes], Scene]]
 def draw_frame(env: EnvBase, drones: Sequence[int] | None, size: int) -> np.ndarray:
     """Draw an environment as it is; see :meth:`~torchrl_quad.envs.QuadrotorEnv.render`."""
     if not env.render_state:
-        raise ValueError("render() draws the state after the last reset or step. Call env.reset() first.")
+        raise UserValueError("render() draws the state after the last reset or step. Call env.reset() first.")
     alone = env.scene is not None and env.scene.is_random
     chosen = list(range(min(env.num_envs, 1 if alone else 6)) if drones is None else drones)
     if not chosen or not all(isinstance(i, numbers.Integral) and 0 <= i < env.num_envs for i in chosen):
-        raise ValueError(
+        raise UserValueError(
             f"render: drones are indices from 0 to {env.num_envs - 1}, at least one, such as drones=[0]; got {chosen}."
         )
     if size < 100:
-        raise ValueError(f"render: size must be at least 100 pixels, got {size}.")
+        raise UserValueError(f"render: size must be at least 100 pixels, got {size}.")
     shown = {key: x[chosen].cpu() for key, x in env.render_state.items() if isinstance(key, str)}
     drawn = {key: x[chosen[:1]] for key, x in env.render_state.items() if not isinstance(key, str)}
     points = [x for key, x in shown.items() if key != "quaternion"]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, describe_metric
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.render.canvas import BLUE, INK, make_figure, set_scale
 
 _PANELS = 4
@@ -34,12 +35,12 @@ def plot_learning_curve(
     with open(csv_path, newline="") as file:
         rows = list(csv.DictReader(file))
     if not rows:
-        raise ValueError(f"plot_learning_curve: {csv_path} has no row yet; a run writes one at each evaluation.")
+        raise UserValueError(f"plot_learning_curve: {csv_path} has no row yet; a run writes one at each evaluation.")
     evaluated = [name.removeprefix("eval/") for name in rows[0] if name.startswith("eval/")]
     names = [*(name for name in metrics if name in evaluated), *(name for name in evaluated if name not in metrics)]
     names = names[:_PANELS]
     if not names or not {"time/seconds", "steps"} <= rows[0].keys():
-        raise ValueError(
+        raise UserValueError(
             f"plot_learning_curve needs the columns time/seconds, steps, and at least one eval/NAME, such as "
             f"eval/return; {csv_path} has {', '.join(rows[0])}."
         )

@@ -17,6 +17,7 @@ from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs.scenery import Scenery
 from torchrl_quad.envs.scenes import ELSEWHERE
 from torchrl_quad.envs.shapes import Shape
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.render.canvas import INK, RED, make_figure
 from torchrl_quad.render.flights import Flight, state_keys
 from torchrl_quad.vision import Primitives
@@ -83,7 +84,7 @@ def plot_from_above(
     """
     flight = Flight("plot_from_above", rollout, env, 0.02, state_keys("position", "velocity"), num_envs)
     if flight.env.scene is None:
-        raise ValueError(
+        raise UserValueError(
             f"plot_from_above draws obstacles, and this {type(flight.env).__name__} has none: build it with a scene, "
             "or draw its flights with plot_flight."
         )

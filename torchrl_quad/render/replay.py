@@ -20,6 +20,7 @@ from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.dynamics.parameters import RawParams
 from torchrl_quad.dynamics.rotors import Rotors
 from torchrl_quad.envs.episodes import at_episode_end
+from torchrl_quad.errors import MissingPackage, UserValueError
 from torchrl_quad.files import replacing
 from torchrl_quad.render.flights import Flight
 from torchrl_quad.render.obstacles import depth_image, obstacle_shapes
@@ -230,7 +231,7 @@ def _rotors(flight: Flight, speed: Tensor | None) -> tuple[Tensor, Tensor | None
             value = randomised[:, 0]
         elif value.dim() > QuadrotorParams.dim(name) and len(value) > 1:
             if len(value) < n:
-                raise ValueError(
+                raise UserValueError(
                     f"write_replay: env has a {name} for each of its {len(value)} environments, and the page would "
                     f"show {n}. Pass the environment that flew, or num_envs={len(value)}."
                 )
@@ -255,5 +256,5 @@ def _plotlyjs() -> str:
     try:
         from plotly.offline import get_plotlyjs
     except ImportError as error:
-        raise ImportError("Replays need plotly: pip install '.[render]' in a clone.") from error
+        raise MissingPackage("Replays need plotly: pip install '.[render]' in a clone.") from error
     return get_plotlyjs()

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.presets import is_number, is_numbers
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.vision.primitives import Primitives
 from torchrl_quad.vision.rays import cast_rays
 
@@ -107,7 +108,7 @@ class DepthCamera:
             return spec
         allowed = [field.name for field in dataclasses.fields(cls)]
         if not isinstance(spec, Mapping):
-            raise ValueError(
+            raise UserValueError(
                 f"camera must be a DepthCamera, or a mapping with any of {', '.join(allowed)}; got {spec!r}."
             )
         unknown = sorted(str(key) for key in spec if key not in allowed)
@@ -186,4 +187,4 @@ class DepthCamera:
 
 def _require(condition: bool, message: str) -> None:
     if not condition:
-        raise ValueError(f"camera: {message}")
+        raise UserValueError(f"camera: {message}")

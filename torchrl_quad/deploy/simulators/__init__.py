@@ -9,6 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.errors import MissingPackage, UserValueError
+
 Array = NDArray[np.float64]
 
 # By name: the module here, its class, and what to install.
@@ -51,12 +53,12 @@ def simulator_class(name: str) -> type[Simulator]:
         ImportError: it is not installed.
     """
     if name not in SIMULATORS:
-        raise ValueError(f"Unknown simulator {name!r}. Choose from: {', '.join(SIMULATORS)}.")
+        raise UserValueError(f"Unknown simulator {name!r}. Choose from: {', '.join(SIMULATORS)}.")
     module, cls, package = SIMULATORS[name]
     try:
         return getattr(importlib.import_module(f"{__name__}.{module}"), cls)
     except ImportError as error:
-        raise ImportError(f"Flying in {name} needs {package}: pip install {package} ({error})") from error
+        raise MissingPackage(f"Flying in {name} needs {package}: pip install {package} ({error})") from error
 
 
 def make_simulator(
@@ -71,7 +73,7 @@ def make_simulator(
     require_open_air(contract)
     kind = simulator_class(name)
     if loop not in kind.loops:
-        raise ValueError(f"{name} has no rate loop {loop!r}. Choose from: {', '.join(kind.loops)}.")
+        raise UserValueError(f"{name} has no rate loop {loop!r}. Choose from: {', '.join(kind.loops)}.")
     return kind(contract, loop, motors)
 
 
@@ -84,7 +86,7 @@ def require_open_air(contract: Mapping[str, Any]) -> None:
     task, sees = contract["task"]["name"], contract["camera"]
     if sees or task == "forest":
         why = "its policy reads images, and they have no camera" if sees else "they have no trees"
-        raise ValueError(
+        raise UserValueError(
             f"The simulators here cannot fly this bundle of the task {task!r}: {why}. Fly it in the package's own "
             "environment: python recipes/evaluate.py checkpoint=..."
         )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from torchrl_quad.deploy.simulators.vehicle import Array
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams, load_drone
+from torchrl_quad.errors import UserValueError
 
 
 class Ours:
@@ -27,7 +28,7 @@ class Ours:
         self, contract: Mapping[str, Any], loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
     ) -> None:
         if tuple(motors) != (0, 1, 2, 3):
-            raise ValueError("torchrl_quad flies motors as they are: swap them in another simulator.")
+            raise UserValueError("torchrl_quad flies motors as they are: swap them in another simulator.")
         about = contract["simulator"]
         self.version = contract["origin"]["package"]
         nominal, substeps = load_drone(contract["drone"]), round(contract["control_dt"] / about["dt"])

@@ -11,6 +11,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.errors import UserValueError
+
 Array = NDArray[np.float64]
 
 
@@ -33,7 +35,7 @@ class Drone:
         unknown = {"drag_height": self.fields.get("drag_height", np.zeros(1)).any()}
         unknown["two motor_time_constants"] = self.fields["motor_time_constant"].size > 1
         if any(unknown.values()):
-            raise ValueError(
+            raise UserValueError(
                 f"Other simulators do not fly drones with {' and '.join(x for x in unknown if unknown[x])}. Export the "
                 "policy of a drone without: env.drone with drag_height: 0 and one motor_time_constant."
             )

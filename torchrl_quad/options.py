@@ -167,7 +167,7 @@ def _is_plain(kind: Any) -> bool:
         return typing.get_args(kind)[0] is Any or _is_plain(typing.get_args(kind)[0])
     if origin in (typing.Union, types.UnionType):
         return all(map(_is_plain, typing.get_args(kind)))
-    if origin is Literal or kind in (..., Any) and origin is None:
+    if origin is Literal or (kind in (..., Any) and origin is None):
         return kind is not Any
     return (origin or kind) in _PLAIN and all(x is Any or _is_plain(x) for x in typing.get_args(kind))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -126,8 +126,18 @@ class Windows:
         gyro = rate.unflatten(1, (count, span)).sum(2) * self.dt
         return rotation_vector(attitude[:, 1:], attitude[:, :-1]) - gyro
 
-    def fly(self, plant: Plant, start: Trajectory, speed: Tensor, push: Push) -> Trajectory:
-        """Open-loop predictions, from states at the starts, at every step of the body: (W, future / stride + 1, k)."""
+    def fly(
+        self,
+        plant: Plant,
+        start: Trajectory,
+        speed: Tensor,
+        push: Push,
+        beside: Callable[[RigidBodyState, Tensor], Push] | None = None,
+    ) -> Trajectory:
+        """Open-loop predictions, from states at the starts, at every step of the body: (W, future / stride + 1, k).
+
+        ``beside(state, wrench)`` adds to the push in every state (``benchmarks/real_flights.py`` lets a network do so).
+        """
         rotors, steps = Rotors(plant.params), self.future // self.stride
         wrench = rotors.wrench(0.5 * (speed[:, self.past + 1 :] + speed[:, self.past : -1]))
         wrench = wrench[:, : steps * self.stride].unflatten(1, (steps, self.stride)).mean(2).unbind(1)
@@ -137,7 +147,10 @@ class Windows:
 
             def moving(s: RigidBodyState, wrench: Tensor = wrench[k]) -> tuple[Tensor, Tensor]:
                 linear, angular = accelerations(s, wrench, plant.params)
-                return linear + quaternion.rotate(s.quaternion, push.force), angular + push.torque
+                force, torque = push
+                if beside is not None:
+                    force, torque = (x + more for x, more in zip(push, beside(s, wrench), strict=True))
+                return linear + quaternion.rotate(s.quaternion, force), angular + torque
 
             state = rk4(state, moving, self.dt * self.stride)
             states.append(state)

@@ -16,5 +16,13 @@ class UserTypeError(UserError, TypeError):
     """A value has the wrong type, or an argument is unknown."""
 
 
+class WrongState(UserValueError, RuntimeError):
+    """Something is of the right kind, and cannot be used as it is: a rollout without its graph, an empty buffer."""
+
+
+class Unsupported(UserValueError, NotImplementedError):
+    """Something is valid elsewhere, and not offered here."""
+
+
 class MissingPackage(UserError, ImportError):
     """An optional package is not installed."""

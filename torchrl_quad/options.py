@@ -19,6 +19,7 @@ converted but numpy's scalars. What has another type, such as a tensor or a netw
 
 from __future__ import annotations
 
+import difflib
 import functools
 import inspect
 import re
@@ -29,9 +30,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 Real = Annotated[float, Field(allow_inf_nan=False, ge=-1e30, le=1e30)]
 Positive = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e30)]
@@ -41,6 +42,19 @@ Share = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1)]
 Count = Annotated[int, Field(ge=0, le=10**9)]
 Size = Annotated[int, Field(ge=1, le=10_000_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Below1 = Annotated[float, Field(allow_inf_nan=False, ge=0, lt=1)]
+Scale = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e6)]
+Width = Annotated[int, Field(ge=1, le=65_536)]
+Copies = Annotated[int, Field(ge=1, le=64)]
+
+
+def _entry(key: Any) -> Any:
+    if isinstance(key, str) or (isinstance(key, tuple) and key and all(isinstance(part, str) for part in key)):
+        return key
+    raise UserValueError('be the name of an entry, such as "observation" or ("state", "velocity")')
+
+
+Entry = Annotated[Any, AfterValidator(_entry)]
 
 _PLAIN = (bool, int, float, str, type(None), Path, list, tuple, dict, Mapping, Sequence)
 _MUST = {  # pydantic's kinds of error in plain words
@@ -57,26 +71,32 @@ _MUST = {  # pydantic's kinds of error in plain words
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
-def checked(target: _F) -> _F:
+def checked(target: _F, described_by: type | None = None) -> _F:
     """Make a function, or a class when it is built, refuse arguments that do not fit its annotations.
+
+    Args:
+        target: the function or the class.
+        described_by: of a method, the class whose docstring describes the arguments.
 
     Raises:
         UserValueError: (in use) the first argument that has the wrong type or is out of its range.
+        UserTypeError: (in use) an argument is unknown, missing, or given twice.
     """
     if isinstance(target, type):
-        target.__init__ = checked(target.__init__)  # type: ignore[misc]
+        target.__init__ = checked(target.__init__, target)  # type: ignore[misc]
         return target
-    signature, adapters = inspect.signature(target), functools.cache(lambda: _adapters(target))
+    signature = inspect.signature(target)
 
     @functools.wraps(target)
     def function(*args: Any, **kwargs: Any) -> Any:
         try:
-            bound = signature.bind_partial(*args, **kwargs)
-        except TypeError:  # Python's own error says it best
-            return target(*args, **kwargs)
+            bound = signature.bind(*args, **kwargs)
+        except TypeError as error:
+            raise UserTypeError(_misfit(target, args, kwargs, error)) from None
+        adapters = _adapters(target, described_by)
         for name, value in bound.arguments.items():
-            if name in adapters():
-                bound.arguments[name] = _checked(name, value, *adapters()[name])
+            if name in adapters:
+                bound.arguments[name] = _checked(name, value, *adapters[name])
         return target(*bound.args, **bound.kwargs)
 
     return function
@@ -108,10 +128,10 @@ def must(error: Mapping[str, Any]) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value in a message, shortened to a hundred characters."""
+    """A value in a message, in one line of a hundred characters."""
     try:
-        text = repr(value)
-    except ValueError:  # Python writes no integer of more than 4300 digits
+        text = " ".join(repr(value).split())
+    except (ValueError, RecursionError):  # Python writes no integer of more than 4300 digits, and no list in a thousand
         text = f"a whole number of {value.bit_length()} bits" if isinstance(value, int) else type(value).__name__
     return text if len(text) <= 100 else f"{text[:97]}..."
 
@@ -130,15 +150,43 @@ def _checked(name: str, value: Any, adapter: TypeAdapter[Any], description: str)
 
 
 def _without_numpy(value: Any) -> Any:
-    if isinstance(value, np.generic):
+    if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.ndim == 0):
         return value.item()
     if type(value) in (list, tuple):
         return type(value)(map(_without_numpy, value))
     return value
 
 
-def _adapters(function: Callable[..., Any]) -> dict[str, tuple[TypeAdapter[Any], str]]:
-    described = _descriptions(function)
+def _misfit(target: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any], error: TypeError) -> str:
+    """Python's words for arguments that a function does not take, with the closest one that it takes."""
+    called = type(args[0]) if target.__name__ == "__init__" and args else target
+    known = _names(called)
+    unknown = next((name for name in kwargs if name not in known), None)
+    if unknown is None:
+        return f"{called.__name__}: {error}."
+    close = difflib.get_close_matches(unknown, known, 1)
+    hint = f" Did you mean {close[0]!r}?" if close else ""
+    said = f"{called.__name__} got an unexpected keyword argument {shown(unknown)}."
+    return f"{said}{hint} Choose from: {', '.join(known)}."
+
+
+def _names(called: Callable[..., Any]) -> list[str]:
+    """The names of all arguments; those of a class include what it hands on to its bases."""
+    names: set[str] = set()
+    for owner in called.__mro__ if isinstance(called, type) else (called,):
+        function = vars(owner).get("__init__") if isinstance(owner, type) else owner
+        parameters = {} if function is None else inspect.signature(function).parameters
+        names |= {name for name, x in parameters.items() if x.kind not in (x.VAR_KEYWORD, x.VAR_POSITIONAL)}
+        if parameters and not any(x.kind is x.VAR_KEYWORD for x in parameters.values()):
+            break
+    return sorted(names - {"self"})
+
+
+@functools.cache
+def _adapters(
+    function: Callable[..., Any], described_by: type | None = None
+) -> dict[str, tuple[TypeAdapter[Any], str]]:
+    described = _descriptions(described_by or function)
     config = ConfigDict(strict=True)
     return {
         name: (TypeAdapter(kind, config=config), described.get(name, ""))
@@ -183,6 +231,7 @@ def _descriptions(owner: Any) -> dict[str, str]:
 
 def _sentences(section: str) -> Iterator[tuple[str, str]]:
     for names, said in re.findall(r"^ {4}([\w, ]+): (.*(?:\n {6,}.*)*)", section, re.MULTILINE):
-        sentence = " ".join(said.split()).split(". ")[0].rstrip(".:") + "."
+        plain = re.sub(r":\w+:`~?([^`]+)`", r"\1", said).replace("``", "")
+        sentence = " ".join(plain.split()).split(". ")[0].rstrip(".:") + "."
         for name in names.split(", "):
             yield name, sentence[0].upper() + sentence[1:]

@@ -1,6 +1,7 @@
 """The tasks in other frameworks, each tried with the real package."""
 
 import importlib
+import itertools
 import sys
 
 import gymnasium
@@ -14,10 +15,12 @@ from skrl.trainers.torch import SequentialTrainer
 from skrl.utils.model_instantiators.torch import deterministic_model, gaussian_model
 from stable_baselines3 import PPO as StablePPO
 from stable_baselines3.common.vec_env import VecMonitor
-from torchrl.envs import RewardScaling, TransformedEnv
+from tensordict import TensorDict
+from torchrl.envs import PendulumEnv, RewardScaling, TransformedEnv
 
 from torchrl_quad import HoveringEnv, adapters, make_env
 from torchrl_quad.adapters import DronesVecEnv, RslRlVecEnv, SkrlEnv, TorchVectorEnv
+from torchrl_quad.errors import UserError
 
 NETWORK = {"class_name": "MLPModel", "hidden_dims": [8]}
 RSL_RL = {
@@ -131,15 +134,108 @@ def test_stable_baselines3_counts_successes_and_ends():
         env.set_attr("x", 1)
 
 
-def test_what_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match=r"'NextStep', and stable-baselines3 .* autoreset_mode=\"SameStep\""):
-        DronesVecEnv(gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=2))
-    with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
-        TorchVectorEnv(scattered()).step(torch.zeros(8, 4))
-    env = TorchVectorEnv(scattered())
+def drones(**options):
+    return gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=3, seed=0, autoreset_mode="SameStep", **options)
+
+
+FLOWN = torch.linspace(-1, 1, 12).reshape(3, 4)
+WRONG = [
+    None,
+    "up",
+    0.5,
+    [0.0] * 4,
+    [[0.0] * 4, [0.0] * 3],
+    {},
+    object(),
+    np.full((3, 4), "up"),
+    np.zeros((3, 4), object),
+]
+WRONG += [x.numpy() for x in (FLOWN.long(), FLOWN.bool(), FLOWN.to(torch.complex64), FLOWN[:2], FLOWN / 0)]
+WRONG += [FLOWN.long(), FLOWN.bool(), FLOWN.to("meta"), FLOWN.to_sparse(), FLOWN[:2], FLOWN[0], FLOWN.log(), FLOWN / 0]
+OPTIONS = ["reset_mask", ["x"], {"seed": 0}, {"x": 1}]
+SEEDS = [-1, 2**63, 10**5000, 1.5, "0", True, np.array(0), torch.tensor(0)]
+ADAPTERS = {
+    "gymnasium": (drones, FLOWN.numpy()),
+    "sb3": (lambda: DronesVecEnv(drones()), FLOWN.numpy()),
+    "torch": (lambda: TorchVectorEnv(HoveringEnv(3, seed=0)), FLOWN),
+    "skrl": (lambda: SkrlEnv(HoveringEnv(3, seed=0)), FLOWN),
+    "rsl_rl": (lambda: RslRlVecEnv(HoveringEnv(3, seed=0)), FLOWN),
+}
+
+
+def refused(call, *arguments, **options):
+    with pytest.raises(UserError) as error:
+        call(*arguments, **options)
+    assert "\n" not in str(error.value)
+
+
+def resets(env, name):
+    """The calls that take a seed, and those that take options."""
+    if name == "rsl_rl":  # which has no reset
+        return [], []
+    if name == "sb3":
+        return [env.seed], [env.set_options]
+    return [lambda seed: env.reset(seed=seed)], [lambda x: env.reset(options=x), lambda x: env.reset(seed=1, options=x)]
+
+
+@pytest.mark.parametrize("name", ADAPTERS)
+def test_a_refused_call_is_explained_and_leaves_the_flight_as_it_was(name):
+    make, action = ADAPTERS[name]
+    env, undisturbed = make(), make()
+    if name != "rsl_rl":  # which begins by itself
+        refused(env.step, action)
+        env.reset(), undisturbed.reset()
+    for _ in range(3):
+        for wrong in WRONG:
+            refused(env.step, wrong)
+        seeded, with_options = resets(env, name)
+        for call, wrong in [*itertools.product(seeded, SEEDS), *itertools.product(with_options, OPTIONS)]:
+            refused(call, wrong)
+        one, other = env.step(action), undisturbed.step(action)
+        for mine, its in zip(one[:-1], other[:-1], strict=True):
+            mine, its = (x["policy"] if isinstance(x, TensorDict) else x for x in (mine, its))
+            np.testing.assert_array_equal(mine, its)
+    if name == "rsl_rl":
+        return
+    env.close(), env.close()
+    for call in (env.reset, lambda: env.step(action)):
+        refused(call)
+
+
+def test_actions_of_stable_baselines3_wait_for_one_step():
+    env, action = DronesVecEnv(drones(render_mode="rgb_array")), FLOWN.numpy().copy()
+    refused(env.get_images)
+    refused(env.step_wait)
     env.reset()
-    with pytest.raises(ValueError, match=r"shape \(4,\), expected \(8, 4\)"):
-        env.step(torch.zeros(4))
+    env.step_async(action)
+    action[:] = np.nan  # they were kept as they had been
+    refused(env.step_async, FLOWN.numpy())
+    env.step_wait()
+    refused(env.step_wait)
+    env.step_async(FLOWN.numpy())
+    env.reset()  # what waited is forgotten
+    refused(env.step_wait)
+    env.close()
+    refused(env.render)
+
+
+def test_rsl_rl_sets_episode_lengths_within_the_limit_alone():
+    env = RslRlVecEnv(HoveringEnv(3, seed=0, max_episode_steps=10))
+    steps = torch.tensor([0, 5, 9])
+    env.episode_length_buf = steps
+    steps += 1
+    for wrong in (None, 3, [0, 0, 0], steps, -steps, steps.float(), steps[:2], steps[:, None], steps.to("meta")):
+        refused(setattr, env, "episode_length_buf", wrong)
+    assert env.episode_length_buf.tolist() == [0, 5, 9]
+
+
+@pytest.mark.parametrize("adapter", [TorchVectorEnv, SkrlEnv, RslRlVecEnv, DronesVecEnv])
+def test_what_is_no_environment_of_its_kind_is_refused(adapter):
+    for wrong in (None, "hovering", HoveringEnv, 3, gymnasium.make_vec("CartPole-v1", num_envs=2), PendulumEnv()):
+        refused(adapter, wrong)
+    if adapter is DronesVecEnv:
+        with pytest.raises(ValueError, match=r"'NextStep', and stable-baselines3 .* autoreset_mode=\"SameStep\""):
+            adapter(gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=2))
     with pytest.raises(AttributeError, match="no 'Rllib'. Choose from: DronesVecEnv, "):
         adapters.Rllib  # noqa: B018
 

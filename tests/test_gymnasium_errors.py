@@ -3,8 +3,9 @@
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 
+from torchrl_quad.errors import UserError
 from torchrl_quad.gym import GymEnv, GymVectorEnv
 
 HOVERING = "torchrl_quad/Hovering-v0"
@@ -16,13 +17,15 @@ HOVERING = "torchrl_quad/Hovering-v0"
         (np.zeros((3, 3)), r"The action has shape \(3, 3\), expected \(3, 4\), each .*, a row for each drone."),
         (np.zeros(4), r"shape \(4,\), expected \(3, 4\)"),
         (None, r"shape \(\), expected \(3, 4\)"),
+        (np.zeros((3, 4), int), r"must be an array of floats of shape \(3, 4\) .*; got ndarray of int64"),
+        ([[0.0] * 4, [0.0]], "must be an array of floats .* env.action_space.sample.*; got list"),
         ([[0, 0, 0, 0], [0, np.nan, 0, 0], [0, 0, 0, np.inf]], r"NaN or infinite at \[\[1, 1\], \[2, 3\]\]"),
     ],
 )
 def test_an_action_that_cannot_be_flown_is_refused(action, message):
     env = GymVectorEnv("hovering", 3)
     env.reset()
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(UserError, match=message):
         env.step(action)
 
 
@@ -53,8 +56,26 @@ def test_a_reset_mask_has_to_mark_some_of_the_drones(mask):
         GymVectorEnv("hovering", 3).reset(options={"reset_mask": mask})
 
 
+@pytest.mark.parametrize("build", [GymEnv, GymVectorEnv])
+def test_what_cannot_begin_an_episode_is_refused_before_anything_changes(build):
+    env, undisturbed = build("hovering", seed=0), build("hovering", seed=0)
+    for seed in (-1, 2**63, 10**5000, 0.5, "0", True, np.array(0), [0]):
+        with pytest.raises(UserError, match=r"seed must be (a whole number, such as 0|from 0 to 2\*\*63 - 1)"):
+            env.reset(seed=seed)
+    for options in ("reset_mask", [1], {"seed": 0}, {"reset_mask": None}, {"reset_mask": [[True], [True, False]]}):
+        with pytest.raises(UserError, match=r"options|reset_mask must be"):
+            env.reset(seed=1, options=options)
+    np.testing.assert_array_equal(env.reset(options={})[0], undisturbed.reset()[0])
+    env.close()
+    for call in (env.reset, lambda: env.step(env.action_space.sample()), env.render):
+        with pytest.raises(ClosedEnvironmentError, match="has been closed: make another one"):
+            call()
+
+
 def test_a_step_outside_an_episode_is_refused():
     env = GymVectorEnv("hovering", 2, autoreset_mode="Disabled", max_episode_steps=1)
+    with pytest.raises(ResetNeeded, match=r"begin together: call reset\(\) without reset_mask first"):
+        env.reset(options={"reset_mask": [True, False]})
     with pytest.raises(ResetNeeded, match=r"call reset\(\) first"):
         env.step(np.zeros((2, 4)))
     env.reset()

@@ -28,7 +28,7 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "files": set(),
     "diagnostics": {"data", "objectives"},
     "gym": {"envs"},
-    "adapters": set(),
+    "adapters": {"gym"},
     "identification": {"deploy.frames", "dynamics", "files", "render.canvas"},
 }
 # Imports within a function: of what needs an optional package, and of gymnasium's ids, which name all tasks.

@@ -9,18 +9,19 @@ flies all drones in one batch, and needs no processes.
 
 from __future__ import annotations
 
+import numbers
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from torchrl_quad.envs import make_env
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 # An episode ends before an entry of the state exceeds this, where a task does not know better.
 _LIMIT = 1e6
@@ -28,10 +29,18 @@ _NO_LIMIT = 2**31  # control steps: gymnasium.make has a time limit of its own
 _INFO = "success", "crash", "reward_terms", "metrics"
 
 
+class ResetNeeded(UserValueError, gymnasium.error.ResetNeeded, RuntimeError):
+    """A step or a picture needs an episode: ``reset()`` comes first."""
+
+
+class Closed(UserValueError, gymnasium.error.ClosedEnvironmentError):
+    """The environment has been closed."""
+
+
 class GymVectorEnv(VectorEnv):
     """All drones of a task in one batched environment: ``gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=64)``.
 
-    Observations are float32 (num_envs, k), actions (num_envs, 4) in [-1, 1] as
+    Observations are float32 (num_envs, k), actions floats (num_envs, 4), clipped to [-1, 1], as
     :class:`~torchrl_quad.envs.QuadrotorEnv` has them, rewards float64 (num_envs). ``info`` holds ``success``,
     ``crash``, ``reward_terms`` and ``metrics`` by name, each (num_envs), with a mask ``_name`` beside every name as in
     gymnasium's own vector environments.
@@ -58,8 +67,11 @@ class GymVectorEnv(VectorEnv):
             gymnasium.
 
     Raises:
-        ValueError: an argument is out of its range, or an action has another shape or is not finite.
+        TypeError: an argument is unknown, or an action, a seed or the options have another type.
+        ValueError: an argument is out of its range, or an action has another shape or is not finite. What refuses a
+            call leaves the flight as it was.
         ResetNeeded: a step before the first reset, or, with "Disabled", after an episode's end.
+        ClosedEnvironmentError: a call after ``close()``, which may be called twice.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
@@ -74,9 +86,9 @@ class GymVectorEnv(VectorEnv):
         **kwargs: Any,
     ) -> None:
         modes = [mode.value for mode in AutoresetMode]
-        if autoreset_mode not in (*modes, *AutoresetMode):
+        if not isinstance(autoreset_mode, str | AutoresetMode) or autoreset_mode not in (*modes, *AutoresetMode):
             raise UserValueError(f"Unknown autoreset_mode {autoreset_mode!r}. Choose from: {', '.join(modes)}.")
-        if render_mode not in (None, *self.metadata["render_modes"]):
+        if render_mode is not None and not (isinstance(render_mode, str) and render_mode == "rgb_array"):
             raise UserValueError(
                 f'Unknown render_mode {render_mode!r}. Choose "rgb_array", for pictures as arrays, or leave it out.'
             )
@@ -103,13 +115,9 @@ class GymVectorEnv(VectorEnv):
     @torch.no_grad()
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode with all drones, or with those of the bool ``options["reset_mask"]`` (num_envs)."""
+        seed, mask = checked_seed(seed), self._checked_mask(checked_options(options, "reset_mask"))
+        self._require_open()
         super().reset(seed=seed)
-        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
-        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise UserValueError(
-                f"reset_mask must be a bool array of shape ({self.num_envs},) that marks at least one drone, got shape "
-                f"{mask.shape}, dtype {mask.dtype}. To reset all drones, leave it out."
-            )
         if seed is not None:
             self.torchrl_env.set_seed(seed)
         self._restart(mask)
@@ -119,7 +127,8 @@ class GymVectorEnv(VectorEnv):
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Fly one control step with actions (num_envs, 4)."""
         env, over, info = self.torchrl_env, self._over, {}
-        actions = _checked(actions, self.action_space.shape)
+        actions = checked_action(actions, self.action_space)
+        self._require_open()
         if self._now is None:
             raise ResetNeeded("A step needs an episode: call reset() first.")
         if self.autoreset_mode is AutoresetMode.DISABLED and over.any():
@@ -147,7 +156,9 @@ class GymVectorEnv(VectorEnv):
 
         Raises:
             ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close()``.
         """
+        self._require_open()
         if self.render_mode is None:
             gymnasium.logger.warn('render() draws nothing without render_mode="rgb_array", an argument of make_vec.')
             return None
@@ -158,6 +169,26 @@ class GymVectorEnv(VectorEnv):
     def close_extras(self, **kwargs: Any) -> None:
         """Close the TorchRL environment."""
         self.torchrl_env.close()
+
+    def _require_open(self) -> None:
+        if self.closed:
+            raise Closed("The environment has been closed: make another one, gymnasium.make_vec(...).")
+
+    def _checked_mask(self, options: Mapping[str, Any]) -> np.ndarray:
+        """Whose episodes ``reset`` begins, bool (num_envs)."""
+        everyone = np.ones(self.num_envs, dtype=bool)
+        if "reset_mask" not in options:
+            return everyone
+        mask = _as_array(options["reset_mask"])
+        if mask is None or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            got = type(options["reset_mask"]).__name__ if mask is None else f"shape {mask.shape}, dtype {mask.dtype}"
+            raise UserValueError(
+                f"reset_mask must be a bool array of shape ({self.num_envs},) that marks at least one drone, got "
+                f"{got}. To reset all drones, leave it out."
+            )
+        if self._now is None and not mask.all():
+            raise ResetNeeded("The first episodes begin together: call reset() without reset_mask first.")
+        return mask.copy()
 
     def _restart(self, mask: np.ndarray) -> None:
         """Begin anew with the drones of the mask, as a rollout does where their episodes end."""
@@ -203,7 +234,7 @@ class GymEnv(gymnasium.Env):
         **kwargs: as for :class:`GymVectorEnv`, but ``num_envs`` and ``autoreset_mode``.
 
     Raises:
-        ValueError: an argument is out of its range, or an action has another shape or is not finite.
+        TypeError, ValueError, ClosedEnvironmentError: as :class:`GymVectorEnv`.
         ResetNeeded: a step before the first reset, or after the end of an episode.
     """
 
@@ -223,14 +254,16 @@ class GymEnv(gymnasium.Env):
         self.action_space = self._drones.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode."""
-        super().reset(seed=seed)
+        """Begin an episode; there are no options."""
+        seed = checked_seed(seed)
+        checked_options(options)
         observation, info = self._drones.reset(seed=seed)
+        super().reset(seed=seed)
         return _row(observation, 0), _first(info)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Fly one control step with an action (4)."""
-        observation, *ends, info = self._drones.step(_checked(action, self.action_space.shape)[None])
+        observation, *ends, info = self._drones.step(checked_action(action, self.action_space)[None])
         return _row(observation, 0), *(x.item() for x in ends), _first(info)
 
     def render(self) -> np.ndarray | None:
@@ -243,19 +276,77 @@ class GymEnv(gymnasium.Env):
         self._drones.close()
 
 
-def _checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
-    action = np.asarray(action, dtype=np.float64)
-    if action.shape != shape:
+def checked_action(action: Any, space: Box) -> np.ndarray:
+    """An action as a float64 array of the shape of its space, a copy, clipped to the bounds.
+
+    Raises:
+        TypeError: it is no array of floats, nor can be read as one.
+        ValueError: it has another shape, or is not finite.
+    """
+    given, shape = _as_array(action), space.shape
+    if given is not None and given.shape != shape:
         raise UserValueError(
-            f"The action has shape {action.shape}, expected {shape}, each entry in [-1, 1]"
+            f"The action has shape {given.shape}, expected {shape}, each entry in [-1, 1]"
             + (", a row for each drone." if len(shape) > 1 else ".")
         )
-    if not np.isfinite(action).all():
-        raise UserValueError(
-            f"The action is NaN or infinite at {np.argwhere(~np.isfinite(action)).tolist()}, which no drone can fly. "
-            "Check the policy's parameters, or write np.nan_to_num(action)."
+    if given is None or given.dtype.kind != "f":
+        got = type(action).__name__ + ("" if given is None else f" of {given.dtype}")
+        raise UserTypeError(
+            f"The action must be an array of floats of shape {shape} in the memory of the CPU, each entry in [-1, 1], "
+            f"as env.action_space.sample() returns it; got {got}."
         )
-    return action
+    if not np.isfinite(given).all():
+        broken = np.argwhere(~np.isfinite(given)).tolist()
+        raise UserValueError(
+            f"The action is NaN or infinite at {broken[:10]}{' and others' * (len(broken) > 10)}, which no drone can "
+            "fly. Check the policy's parameters, or write np.nan_to_num(action)."
+        )
+    return given.clip(space.low, space.high).astype(np.float64)
+
+
+def checked_seed(seed: Any) -> int | None:
+    """A seed as a Python integer, or None.
+
+    Raises:
+        TypeError: it is no whole number.
+        ValueError: it is negative or too large.
+    """
+    if seed is None:
+        return None
+    if not isinstance(seed, numbers.Integral) or isinstance(seed, bool):
+        raise UserTypeError(f"seed must be a whole number, such as 0, or None; got {type(seed).__name__}.")
+    if not 0 <= seed < 2**63:
+        raise UserValueError("seed must be from 0 to 2**63 - 1; got one that is negative or larger.")
+    return int(seed)
+
+
+def checked_options(options: Any, *known: str) -> Mapping[str, Any]:
+    """The options of a reset, none for None.
+
+    Raises:
+        TypeError: they are no mapping.
+        ValueError: one is unknown.
+    """
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise UserTypeError(
+            f"options must be a dictionary, {{}} or with {', '.join(known)}, or None; got {type(options).__name__}."
+            if known
+            else f"There are no options, {{}} or None; got {type(options).__name__}."
+        )
+    if unknown := [str(name) for name in options if name not in known]:
+        choice = f"Choose from: {', '.join(known)}." if known else "There are none: leave options out."
+        raise UserValueError(f"Unknown options {', '.join(unknown[:10])}. {choice}")
+    return options
+
+
+def _as_array(x: Any) -> np.ndarray | None:
+    """Whatever was given as an array; None if it is none, as a ragged list or a tensor of another device."""
+    try:
+        return np.asarray(x.detach() if isinstance(x, torch.Tensor) else x)
+    except Exception:  # numpy lets every error of other people's objects pass
+        return None
 
 
 def _bounds(env: Any) -> np.ndarray:

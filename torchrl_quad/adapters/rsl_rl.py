@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.adapters.torch_vector import TorchVectorEnv
-from torchrl_quad.errors import MissingPackage
+from torchrl_quad.errors import MissingPackage, UserTypeError, UserValueError
 
 try:
     from rsl_rl.env import VecEnv
@@ -26,17 +26,23 @@ class RslRlVecEnv(VecEnv):
     and the metrics over the episodes that end in the step.
 
     ``episode_length_buf`` (num_envs) is the step in the state of the task. Setting it, as ``init_at_random_ep_len``
-    does, brings the time limit of each episode nearer.
+    does, to whole numbers from 0 to ``max_episode_length`` - 1, brings the time limit of each episode nearer.
 
     Args:
         env: as for :class:`~torchrl_quad.adapters.TorchVectorEnv`; a task, or transforms around one.
 
     Raises:
         ImportError: rsl-rl is missing.
+        TypeError, ValueError: the environment is no task; or as :class:`~torchrl_quad.adapters.TorchVectorEnv`.
     """
 
     def __init__(self, env: EnvBase) -> None:
         self.drones = TorchVectorEnv(env)
+        if not hasattr(env, "max_episode_steps"):
+            raise UserTypeError(
+                f"RslRlVecEnv needs a task, whose episodes have a time limit, and {type(env).__name__} is none: build "
+                "HoveringEnv(num_envs=512), or derive your task from QuadrotorEnv."
+            )
         self.num_envs, self.device = self.drones.num_envs, self.drones.device
         self.num_actions = env.action_spec.shape[-1]
         self.max_episode_length = env.max_episode_steps
@@ -50,7 +56,17 @@ class RslRlVecEnv(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, steps: Tensor) -> None:
-        self.drones.now["state", "step"] = steps.unsqueeze(-1)
+        now, limit = self.episode_length_buf, self.max_episode_length
+        if not isinstance(steps, Tensor) or steps.dtype not in (torch.int32, torch.int64):
+            got = steps.dtype if isinstance(steps, Tensor) else type(steps).__name__
+            raise UserTypeError(f"episode_length_buf must be a tensor of whole numbers, torch.int64; got {got}.")
+        fits = steps.layout is torch.strided and steps.shape == now.shape and steps.device == now.device
+        if not fits or not ((steps >= 0) & (steps < limit)).all():
+            raise UserValueError(
+                f"episode_length_buf must have shape ({self.num_envs},), on {now.device}, with steps from 0 to "
+                f"{limit - 1}. Write torch.randint_like(env.episode_length_buf, high={limit})."
+            )
+        self.drones.now["state", "step"] = steps.unsqueeze(-1).to(now.dtype, copy=True)
 
     def get_observations(self) -> TensorDict:
         """The present observations: ``policy`` (num_envs, k)."""

@@ -43,12 +43,12 @@ class SkrlEnv(Wrapper):
         """That of one drone."""
         return self._env.single_action_space
 
-    def reset(self) -> tuple[Tensor, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Tensor, dict[str, Any]]:
         """Begin an episode with all drones: observations (num_envs, k), and ``info``."""
-        return self._env.reset()
+        return self._env.reset(seed=seed, options=options)
 
     def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Fly one control step with actions (num_envs, 4)."""
+        """Fly one control step with actions (num_envs, 4); it refuses what the adapter inside refuses."""
         observation, *ends, info = self._env.step(actions)
         return observation, *(x.unsqueeze(-1) for x in ends), info
 

@@ -6,14 +6,20 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from torchrl_quad.errors import MissingPackage, UserValueError
+from torchrl_quad.errors import MissingPackage, UserError, UserTypeError, UserValueError
+from torchrl_quad.gym import checked_action, checked_options, checked_seed
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
 except ImportError as error:
     raise MissingPackage('DronesVecEnv needs stable-baselines3: pip install ".[adapters]" in a clone') from error
+
+
+class Shared(UserError, NotImplementedError):
+    """The drones are one environment, and none can be changed or called alone."""
 
 
 class DronesVecEnv(VecEnv):
@@ -31,10 +37,16 @@ class DronesVecEnv(VecEnv):
 
     Raises:
         ImportError: stable-baselines3 is missing.
-        ValueError: the autoreset mode is another.
+        TypeError: it is no vector environment with actions of floats.
+        ValueError: the autoreset mode is another. Of a call: as :class:`~torchrl_quad.gym.GymVectorEnv`.
     """
 
     def __init__(self, env: VectorEnv) -> None:
+        if not isinstance(env, VectorEnv) or not isinstance(env.single_action_space, Box):
+            raise UserTypeError(
+                f"DronesVecEnv wraps a vector environment of drones, got {type(env).__name__}. Write "
+                'gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=128, autoreset_mode="SameStep").'
+            )
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise UserValueError(
@@ -43,28 +55,45 @@ class DronesVecEnv(VecEnv):
                 'gymnasium.make_vec(..., autoreset_mode="SameStep").'
             )
         self.env = env
+        self.actions: np.ndarray | None = None  # for the step that is to come
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> Any:
         """Begin an episode with all drones, from the seed if ``seed()`` has set one."""
         observation, _ = self.env.reset(seed=self._seeds[0])
         self._reset_seeds()
+        self.actions = None
         return observation
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed the next :meth:`reset`; None takes a random one."""
+        return super().seed(checked_seed(seed))
+
+    def set_options(self, options: list[dict] | dict | None = None) -> None:
+        """Refuse options for :meth:`reset`: all drones begin together."""
+        for each in options if isinstance(options, list) else [options]:
+            checked_options(each)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions (num_envs, 4) for :meth:`step_wait`."""
-        self.actions = actions
+        if self.actions is not None:
+            raise UserValueError("Actions are waiting to be flown: call step_wait() before the next step_async().")
+        self.actions = checked_action(actions, self.env.action_space)
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Fly one control step: observations (num_envs, k), rewards and ends (num_envs), an ``info`` of each drone."""
-        observation, reward, terminated, truncated, info = self.env.step(self.actions)
+        if self.actions is None:
+            raise UserValueError("No actions are waiting: call step_async(actions) first, or step(actions) for both.")
+        actions, self.actions = self.actions, None
+        observation, reward, terminated, truncated, info = self.env.step(actions)
         done, infos = terminated | truncated, [{} for _ in reward]
         for i in np.flatnonzero(done):
             infos[i] = {
                 "terminal_observation": info["final_obs"][i],
                 "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                "is_success": bool(info["final_info"]["success"][i]),
             }
+            if "success" in info["final_info"]:
+                infos[i]["is_success"] = bool(info["final_info"]["success"][i])
         return observation, reward.astype(np.float32), done, infos
 
     def close(self) -> None:
@@ -72,8 +101,18 @@ class DronesVecEnv(VecEnv):
         self.env.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """A picture of each drone."""
-        return self.env.render()
+        """A picture of each drone; None without a render mode."""
+        pictures = self.env.render()
+        return [None] * self.num_envs if pictures is None else pictures
+
+    def render(self, mode: str | None = None) -> np.ndarray | None:
+        """All pictures as one; the mode "human" shows it in a window, with OpenCV."""
+        try:
+            return super().render(mode)
+        except ModuleNotFoundError as error:
+            raise MissingPackage(
+                'render("human") needs OpenCV: pip install opencv-python, or write render("rgb_array").'
+            ) from error
 
     def get_attr(self, name: str, indices: Any = None) -> list[Any]:
         """An attribute of the vector environment, once for each drone of the indices."""
@@ -85,10 +124,8 @@ class DronesVecEnv(VecEnv):
 
     def set_attr(self, name: str, value: Any, indices: Any = None) -> None:
         """Refused: the drones are one environment, and none can change alone."""
-        raise NotImplementedError(
-            f"Drones of one environment share {name!r}. Set it on the environment before training."
-        )
+        raise Shared(f"Drones of one environment share {name!r}. Set it on the environment before training.")
 
     def env_method(self, name: str, *arguments: Any, indices: Any = None, **keywords: Any) -> list[Any]:
         """Refused: the drones are one environment, and none can be called alone."""
-        raise NotImplementedError(f"Drones of one environment share {name!r}. Call it on the environment, `.env`.")
+        raise Shared(f"Drones of one environment share {name!r}. Call it on the environment, `.env`.")

@@ -10,10 +10,13 @@ from gymnasium.spaces import Box
 from gymnasium.vector.utils import batch_space
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.data import Bounded, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.gym import Closed, ResetNeeded, checked_options, checked_seed
 
+_FLOATS = torch.float16, torch.bfloat16, torch.float32, torch.float64
 _INFO = "success", "crash", "reward_terms", "metrics"
 
 
@@ -33,22 +36,33 @@ class TorchVectorEnv:
             with one ``observation`` and one ``action``; transforms around a task work, too.
 
     Raises:
+        TypeError: it is no such environment.
         ValueError: the environment has another batch size.
     """
 
     metadata = {"autoreset_mode": "SameStep"}
 
     def __init__(self, env: EnvBase) -> None:
+        if not isinstance(env, EnvBase):
+            raise UserTypeError(
+                "The environment must be a task or another TorchRL environment, such as HoveringEnv(num_envs=512); got "
+                f"{type(env).__name__}."
+            )
         if len(env.batch_size) != 1:
             raise UserValueError(
                 f"The environment has the batch size {tuple(env.batch_size)}, and must have one dimension. Build it "
                 "with the number of its drones, HoveringEnv(num_envs=512)."
             )
-        self.torchrl_env = env
+        action, observation = env.action_spec, env.observation_spec.get("observation", None)
+        if not (isinstance(action, Bounded | Unbounded) and action.dtype in _FLOATS) or observation is None:
+            raise UserTypeError(
+                'The environment must have one action of floats and an entry "observation"; its actions are '
+                f"{type(action).__name__}, and it shows {', '.join(map(str, env.observation_spec.keys()))}."
+            )
+        self.torchrl_env, self.closed = env, False
         self.num_envs, self.device = env.batch_size[0], env.device
-        action = env.action_spec.space
-        self._low, self._high = action.low, action.high
-        size = env.observation_spec["observation"].shape[-1]
+        self._low, self._high = action.space.low, action.space.high
+        size = observation.shape[-1]
         self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = Box(*(x[0].numpy(force=True).astype(np.float32) for x in (self._low, self._high)))
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -61,7 +75,15 @@ class TorchVectorEnv:
         return self
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Tensor, dict[str, Any]]:
-        """Begin an episode with all drones: observations (num_envs, k), and an empty ``info``."""
+        """Begin an episode with all drones: observations (num_envs, k), and an empty ``info``; there are no options.
+
+        Raises:
+            TypeError, ValueError: the seed is no whole number from 0, or there are options.
+            ClosedEnvironmentError: after ``close()``.
+        """
+        seed = checked_seed(seed)
+        checked_options(options)
+        self._require_open()
         with torch.inference_mode(False), torch.no_grad():
             if seed is not None:
                 self.torchrl_env.set_seed(seed)
@@ -75,15 +97,16 @@ class TorchVectorEnv:
             observations (num_envs, k); rewards, and bool ``terminated`` and ``truncated``, each (num_envs); ``info``.
 
         Raises:
-            RuntimeError: before the first reset.
-            ValueError: the actions have another shape.
+            ResetNeeded: before the first reset.
+            ClosedEnvironmentError: after ``close()``.
+            TypeError: the actions are no tensor of floats.
+            ValueError: the actions have another shape, are on another device, or are not finite. What refuses a call
+                leaves the flight as it was.
         """
+        self._require_open()
         if self.now is None:
-            raise RuntimeError("A step needs an episode: call reset() first.")
-        if action.shape != self._low.shape:
-            raise UserValueError(
-                f"The actions have shape {tuple(action.shape)}, expected {tuple(self._low.shape)}: a row a drone."
-            )
+            raise ResetNeeded("A step needs an episode: call reset() first.")
+        self._check(action)
         # Frameworks act in inference mode, whose tensors could not be differentiated later.
         with torch.inference_mode(False), torch.no_grad():
             action = action.to(self._low).clamp(self._low, self._high)
@@ -96,7 +119,41 @@ class TorchVectorEnv:
 
     def close(self) -> None:
         """Close the TorchRL environment."""
-        self.torchrl_env.close()
+        if not self.closed:
+            self.torchrl_env.close()
+        self.closed = True
+
+    def _require_open(self) -> None:
+        if self.closed:
+            raise Closed("The environment has been closed: build the task and its adapter anew.")
+
+    def _check(self, action: Any) -> None:
+        """Refuse actions that cannot be flown."""
+        shape, device, dtype = tuple(self._low.shape), self._low.device, self._low.dtype
+        if not isinstance(action, Tensor) or action.is_nested or action.layout is not torch.strided:
+            layout = f" of layout {action.layout}" if isinstance(action, Tensor) else ""
+            raise UserTypeError(
+                f"The actions must be a dense tensor of floats of shape {shape}, a row a drone; got "
+                f"{type(action).__name__}{layout}. Arrays become one by torch.as_tensor(action, dtype={dtype}, "
+                f"device={str(device)!r})."
+            )
+        if action.dtype not in _FLOATS:
+            raise UserTypeError(
+                f"The actions are {action.dtype}, and must be floats in the bounds of env.action_space. If these are "
+                f"meant, write action.to({dtype})."
+            )
+        if action.shape != shape:
+            raise UserValueError(f"The actions have shape {tuple(action.shape)}, expected {shape}: a row a drone.")
+        if action.device != device:
+            raise UserValueError(
+                f"The actions are on {action.device}, and the environment on {device}. Move the policy there."
+            )
+        if not action.isfinite().all():
+            drones = (~action.isfinite().all(-1)).nonzero().flatten().tolist()
+            raise UserValueError(
+                f"The actions of drones {drones[:10]}{' and others' * (len(drones) > 10)} are NaN or infinite. Check "
+                "the policy's parameters, or write action.nan_to_num()."
+            )
 
 
 def _squeezed(x: Any) -> Any:

@@ -193,11 +193,13 @@ ALIASES = "a0: &a0 [1, 1]\n" + "".join(f"a{i + 1}: &a{i + 1} [*a{i}, *a{i}]\n" f
         (b"mass: " + b"[" * 5000 + b"]" * 5000, "nests more than 20 lists or mappings"),
         ("mass: 1  # Größe".encode("latin-1"), "not in UTF-8 .byte 13 is 0xf6.. Save it as UTF-8"),
         (b"#" * 1_000_001, "has more than 1,000,000 bytes"),
-        (b"mass: 2020-99-99", "not a YAML file: month must be in 1..12"),
+        (b"mass: 1\nmass: 2", "line 2 names 'mass' for the second time"),
+        (b"mass: !!int 1:30", "line 1 uses the tag"),
+        (b"1: 2", "line 1 names a value by 1, and a name must be a word"),
         (b"mass: [1", "not a YAML file"),
-        (b"mass: " + b"9" * 5000, "not a YAML file"),
+        (b"mass: " + b"9" * 5000, "line 1 has a number of 5000 digits"),
     ],
-    ids=["aliases", "deep", "latin-1", "large", "date", "cut off", "long number"],
+    ids=["aliases", "deep", "latin-1", "large", "twice", "tag", "no name", "cut off", "long number"],
 )
 def test_a_yaml_file_that_no_setting_needs_is_refused_by_name(content, message, tmp_path):
     (tmp_path / "mine.yaml").write_bytes(content)

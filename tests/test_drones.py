@@ -1,10 +1,15 @@
 """Loading drones: presets, files, mappings, and what is wrong with a bad one."""
 
+import itertools
+
+import numpy as np
 import pytest
 import torch
 import yaml
 
 from torchrl_quad import HoveringEnv, QuadrotorParams, available_drones, load_drone
+from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import shown
 
 VISFLY = {name: value.squeeze().tolist() for name, value in load_drone("visfly").fields().items()}
 
@@ -24,8 +29,9 @@ def test_every_preset_can_hover_and_reach_its_commanded_thrust(name):
 
 def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
     path = tmp_path / "mine.yaml"
-    path.write_text(yaml.safe_dump({**VISFLY, "mass": 0.5}))
-    for source in (path, str(path), {**VISFLY, "mass": "5e-1"}):
+    path.write_text(yaml.safe_dump({**VISFLY, "mass": 0.5}).replace("mass: 0.5", "mass: 5e-1"))
+    assert "5e-1" in path.read_text()
+    for source in (path, str(path), {**VISFLY, "mass": 0.5}):
         assert load_drone(source).mass.item() == 0.5
 
 
@@ -42,6 +48,7 @@ def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
         ({"rotor_spin": [1, 1, 0, -1]}, r"mine.yaml: field 'rotor_spin' must be \+1 or -1"),
         ({"thrust_map": [0.0, 1.0, 0.0]}, r"mine.yaml: field 'thrust_map' must be rising at high speed, k2 above zero"),
         ({"mass": "heavy"}, r"mine.yaml: field 'mass' is not a number or a list of numbers: 'heavy'"),
+        ({"mass": "1:59:59"}, r"mine.yaml: field 'mass' is not a number or a list of numbers: '1:59:59'"),
         ({"thrust_map": [4e-7, -5e-3, 0.0]}, r"thrust_map must not fall with rotor speed"),
         ({"rotor_speed_min": 4000.0}, r"rotor_speed_min must be below rotor_speed_max, got \[4000.0\] and \[3500.0\]"),
     ],
@@ -99,3 +106,32 @@ def test_gradients_flow_through_replace_to_and_construction():
     QuadrotorParams(**params.fields()).mass.sum().backward()
     assert mass.grad == 1.0
     assert not params.detach().mass.requires_grad
+
+
+NO_NUMBERS = [True, np.True_, [True, 1.0, 1.0], "1", b"1", "", [], [[1.0], [1.0, 2.0]], 10**400, 10**6000, float("nan")]
+NO_NUMBERS += [{}, object(), 1j, np.array(["1"]), torch.tensor(True), torch.tensor(1j), torch.zeros(0)]
+
+
+@pytest.mark.parametrize("value", NO_NUMBERS, ids=lambda value: shown(value)[:20])
+def test_what_is_no_number_is_refused_in_every_field_however_a_drone_is_made(value):
+    params = load_drone("visfly")
+    ways = (
+        lambda change: load_drone({**VISFLY, **change}),
+        lambda change: params.replace(**change),
+        lambda change: QuadrotorParams(**{**params.fields(), **change}),
+    )
+    for name, make in itertools.product(VISFLY, ways):
+        with pytest.raises(UserValueError, match=f"field '{name}' (is not a number|must be|has shape)") as refused:
+            make({name: value})
+        assert "\n" not in str(refused.value)
+
+
+def test_a_drone_of_a_float64_environment_is_in_its_precision_and_may_lie_at_a_limit():
+    drone = {**VISFLY, "mass": 0.027, "inertia": [1e-8, 1e-8, 1e-8], "yaw_torque_coefficient": 1e-5}
+    env = HoveringEnv(num_envs=1, drone=drone, dtype=torch.float64)
+    assert (env.params.mass.item(), env.params.inertia[..., 0].item()) == (0.027, 1e-8)
+    rounded = load_drone(drone, torch.float32)  # whose 1e-8 is a little less
+    assert rounded.to(dtype=torch.float64).inertia[0] < 1e-8
+    for dtype in ("float32", torch.int64, None):
+        with pytest.raises(UserValueError, match="dtype must be torch.float32 or torch.float64"):
+            load_drone("visfly", dtype)

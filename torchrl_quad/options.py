@@ -44,6 +44,7 @@ Size = Annotated[int, Field(ge=1, le=10_000_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Below1 = Annotated[float, Field(allow_inf_nan=False, ge=0, lt=1)]
 Scale = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e6)]
+Horizon = Annotated[int, Field(ge=1, le=100_000)]
 Width = Annotated[int, Field(ge=1, le=65_536)]
 Copies = Annotated[int, Field(ge=1, le=64)]
 
@@ -100,6 +101,15 @@ def checked(target: _F, described_by: type | None = None) -> _F:
         return target(*bound.args, **bound.kwargs)
 
     return function
+
+
+def require(name: str, value: Any, kind: Any, description: str = "") -> Any:
+    """A value that fits an annotation, for what no signature can hold.
+
+    Raises:
+        UserValueError: it does not fit.
+    """
+    return _checked(name, value, TypeAdapter(kind, config=ConfigDict(strict=True)), description)
 
 
 def declared(target: Callable[..., Any]) -> dict[str, tuple[Any, str]]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from torchrl_quad.dynamics.presets import is_number
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import shown
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +37,7 @@ class MotorCommand:
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
             if not (is_number(value) and low <= value <= high):
-                raise UserValueError(f"motor_command: {name} must be between {low:g} and {high:g}, got {value!r}.")
+                raise UserValueError(f"motor_command: {name} must be between {low:g} and {high:g}, got {shown(value)}.")
 
     @classmethod
     def read(cls, source: str, values: Any) -> MotorCommand:
@@ -49,10 +50,14 @@ class MotorCommand:
             return values
         names = [field.name for field in dataclasses.fields(cls)]
         if not isinstance(values, Mapping):
-            raise UserValueError(f"{source}: motor_command must be a mapping of {', '.join(names)}; got {values!r}.")
+            raise UserValueError(
+                f"{source}: motor_command must be a mapping of {', '.join(names)}; got {shown(values)}."
+            )
         for name in values:
             if name not in names:
-                raise UserValueError(f"{source}: motor_command: unknown key {name!r}. Allowed: {', '.join(names)}.")
+                raise UserValueError(
+                    f"{source}: motor_command: unknown key {shown(name)}. Allowed: {', '.join(names)}."
+                )
         for name in names[:2]:
             if name not in values:
                 raise UserValueError(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import collections
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 from torchrl_quad.dynamics import presets
 from torchrl_quad.dynamics.motors import MotorCommand
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import shown
 
 _DRONES = resources.files(__package__) / "drones"
 
@@ -82,9 +84,8 @@ class QuadrotorParams:
 
     def __post_init__(self) -> None:
         for name, value in self.fields().items():
-            if name in _OPTIONAL and not isinstance(value, Tensor):
-                value = torch.as_tensor(self.mass).new_tensor(value)
-            value = torch.as_tensor(value)
+            like = self.mass if isinstance(self.mass, Tensor) and self.mass.is_floating_point() else torch.empty(0)
+            value = _tensor(name, value, like, "QuadrotorParams")
             value = value if value.dim() else value.reshape(1)
             object.__setattr__(self, name, value)
             _check(name, value, "QuadrotorParams")
@@ -120,7 +121,7 @@ class QuadrotorParams:
             raise UserValueError(f"QuadrotorParams has no field {unknown[0]!r}. Choose from: {', '.join(_FIELDS)}.")
         like = self.mass
         return dataclasses.replace(
-            self, **{k: torch.as_tensor(v, dtype=like.dtype, device=like.device) for k, v in changes.items()}
+            self, **{k: _tensor(k, v, like, "QuadrotorParams").to(like) for k, v in changes.items()}
         )
 
     def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> QuadrotorParams:
@@ -154,9 +155,12 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
         dtype: floating-point type of the fields.
 
     Raises:
-        ValueError: the preset is unknown, or a field is missing, unknown, of the wrong shape, or out of its range.
+        ValueError: the preset is unknown, a field is missing, unknown, of the wrong shape, or out of its range, or the
+            dtype is none of floating point.
         FileNotFoundError: the path does not exist.
     """
+    if not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
+        raise UserValueError(f"load_drone: dtype must be torch.float32 or torch.float64, got {shown(dtype)}.")
     source, values = presets.read("drone", drone, _DRONES)
     values = {**_OPTIONAL, **values}
     motors = values.pop("motor_command", None)
@@ -169,12 +173,7 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
         raise UserValueError(f"{source}: unknown field {unknown[0]!r}. Allowed: {', '.join(_FIELDS)}, motor_command.")
     fields = {}
     for name in _FIELDS:
-        try:
-            fields[name] = torch.from_numpy(np.array(values[name], dtype=np.float64))
-        except (TypeError, ValueError) as error:
-            raise UserValueError(
-                f"{source}: field {name!r} is not a number or a list of numbers: {values[name]!r}."
-            ) from error
+        fields[name] = _tensor(name, values[name], torch.empty(0, dtype=torch.float64), source).to(torch.float64)
         _check(name, fields[name] if fields[name].dim() else fields[name].reshape(1), source)
     command = None if motors is None else MotorCommand.read(source, motors)
     return QuadrotorParams(**fields, motor_command=command).to(dtype=dtype)
@@ -183,6 +182,21 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
 def available_drones() -> list[str]:
     """The names of the presets that ship with the package."""
     return presets.names(_DRONES)
+
+
+def _tensor(name: str, value: Any, like: Tensor, source: str) -> Tensor:
+    """A value as a tensor: its own, with its graph, or one like another tensor."""
+    if isinstance(value, Tensor) and value.dtype != torch.bool and not value.is_complex():
+        return value
+    try:
+        parts = value if isinstance(value, Sequence) and any(isinstance(x, Tensor) for x in value) else None
+        if parts is not None:
+            return torch.stack([_tensor(name, x, like, source).to(like) for x in parts])
+        return torch.from_numpy(np.asarray(presets.as_array(value))).to(like)
+    except (ValueError, RuntimeError, RecursionError) as error:
+        raise UserValueError(
+            f"{source}: field {name!r} is not a number or a list of numbers: {shown(value)}."
+        ) from error
 
 
 def _check(name: str, value: Tensor, source: str) -> None:
@@ -195,10 +209,11 @@ def _check(name: str, value: Tensor, source: str) -> None:
             f"or {batched} for one per environment."
         )
     with torch.no_grad():
+        plain, value = value, value.float()  # which finds a limit fit that was rounded to float32 on its way
         fits, rule = (value >= low) & (value <= high), f"between {low:g} and {high:g}"
         if name == "rotor_spin":
             fits, rule = value.abs() == 1, "+1 or -1"
         if name == "thrust_map" and not (value[..., 0] > 0).all():
             fits, rule = value > 0, "rising at high speed, k2 above zero"
         if not fits.all():
-            raise UserValueError(f"{source}: field {name!r} must be {rule}, in SI units; got {value.tolist()}.")
+            raise UserValueError(f"{source}: field {name!r} must be {rule}, in SI units; got {shown(plain.tolist())}.")

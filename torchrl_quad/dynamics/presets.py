@@ -2,17 +2,22 @@
 
 import math
 import numbers
+import re
 from collections.abc import Mapping, Sequence
 from importlib.abc import Traversable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import shown
 
 MAX_BYTES = 1_000_000  # of a file; the largest that ships with the package has 1 kB
 MAX_DEPTH = 20  # of lists and mappings within each other
+MAX_DIGITS = 400  # of a number
 
 
 def names(folder: Traversable) -> list[str]:
@@ -29,21 +34,20 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
         folder: where the package keeps its own; None where it has none.
 
     Raises:
-        ValueError: the name is unknown, or the file is not a YAML mapping in UTF-8, is larger than 1 MB, is nested more
-            than 20 deep, or uses aliases.
+        ValueError: the name is unknown, or :func:`parse` refuses the file, or it is no mapping.
         FileNotFoundError: the path does not exist.
     """
     if isinstance(preset, Mapping):
         return kind, preset
     known = [] if folder is None else names(folder)
     choices = f"Choose from: {', '.join(known)}; or give" if known else "Give"
-    if preset in known:
+    if isinstance(preset, str) and preset in known:
         source, path = f"{preset}.yaml", folder / f"{preset}.yaml"
     elif isinstance(preset, Path) or (isinstance(preset, str) and preset.endswith((".yaml", ".yml"))):
         source, path = str(preset), Path(preset)
     else:
-        raise UserValueError(f"Unknown {kind} {preset!r}. {choices} the path of a .yaml file, or a mapping.")
-    if not path.is_file():
+        raise UserValueError(f"Unknown {kind} {shown(preset)}. {choices} the path of a .yaml file, or a mapping.")
+    if not path.is_file():  # which a pipe or a device is not, whose reading may never end
         raise FileNotFoundError(f"No {kind} file at {path}. {choices} the path of a .yaml file that exists.")
     with path.open("rb") as file:
         values = parse(file.read(MAX_BYTES + 1), source)
@@ -55,10 +59,13 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
 def parse(content: bytes, source: str) -> Any:
     """The content of a YAML file, read in time and memory proportional to its size.
 
-    Aliases are refused, since a file of a few lines can mean billions of values through them.
+    Numbers are those of YAML 1.2: 1e-3 is one, and 1:30 is a string, as are dates. Aliases and tags are refused, since
+    a file of a few lines can mean billions of values through them; so are names that come twice, of which one would
+    be lost.
 
     Raises:
-        ValueError: the content is too large, too deep, not in UTF-8, no YAML, or uses an alias.
+        ValueError: the content is too large, too deep, not in UTF-8, no YAML, or has an alias, a tag, a name that is no
+            string or comes twice, or a number of more than 400 digits.
     """
     if len(content) > MAX_BYTES:
         raise UserValueError(
@@ -70,28 +77,98 @@ def parse(content: bytes, source: str) -> Any:
         raise UserValueError(
             f"{source}: not in UTF-8 (byte {error.start} is {content[error.start]:#04x}). Save it as UTF-8."
         ) from None
-    depth = 0
     try:
-        for event in yaml.parse(text, yaml.SafeLoader):
-            if isinstance(event, yaml.AliasEvent):
-                line = event.start_mark.line + 1
-                raise UserValueError(
-                    f"{source}: line {line} uses the alias *{event.anchor}. Write the values out instead."
-                )
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MAX_DEPTH:
-                raise UserValueError(f"{source}: nests more than {MAX_DEPTH} lists or mappings. Write it flatter.")
+        return _Loader(text).get_single_data()
     except yaml.YAMLError as error:
-        raise UserValueError(f"{source}: not a YAML file: {error}") from error
-    try:
-        return yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError) as error:  # such as the 99th of May
-        raise UserValueError(f"{source}: not a YAML file: {error}") from error
+        raise UserValueError(f"{source}: not a YAML file: {' '.join(str(error).split())}") from error
+    except _Refused as error:
+        raise UserValueError(f"{source}: {error}") from None
+
+
+class _Refused(Exception):
+    """What a file says is YAML, but no setting needs it."""
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain values, each written once."""
+
+    yaml_implicit_resolvers = {}  # those of YAML 1.1 read 1:30 as 90 and 010 as 8, in time that grows with the square
+    depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> yaml.Node:
+        event = self.peek_event()
+        line = event.start_mark.line + 1
+        if isinstance(event, yaml.AliasEvent):
+            raise _Refused(f"line {line} uses the alias *{event.anchor}. Write the values out instead.")
+        if event.tag is not None:
+            raise _Refused(f"line {line} uses the tag {shown(event.tag)}. Write the value without it.")
+        self.depth += 1
+        if self.depth > MAX_DEPTH + 1:  # the innermost is no list or mapping
+            raise _Refused(f"nests more than {MAX_DEPTH} lists or mappings. Write it flatter.")
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for key, value in node.value:
+            name = self.construct_object(key, deep=True) if isinstance(key, yaml.ScalarNode) else None
+            line = key.start_mark.line + 1
+            if not isinstance(name, str):
+                raise _Refused(f"line {line} names a value by {shown(name)}, and a name must be a word.")
+            if name in found:
+                raise _Refused(f"line {line} names {shown(name)} for the second time. Leave one of them out.")
+            found[name] = self.construct_object(value, deep=True)
+        return found
+
+    def construct_number(self, node: yaml.ScalarNode) -> int | float:
+        if len(node.value) > MAX_DIGITS:
+            raise _Refused(f"line {node.start_mark.line + 1} has a number of {len(node.value)} digits.")
+        text = node.value.lower().replace(".inf", "inf").replace(".nan", "nan")
+        if text.startswith(("0x", "0o")):
+            return int(text, 0)
+        return int(text) if re.fullmatch(f"[-+]?{_DIGITS}", text) else float(text)
+
+
+_DIGITS = r"[0-9]+(_[0-9]+)*"
+_NUMBER = rf"""(?xi: [-+]?(\.{_DIGITS} | {_DIGITS}(\.({_DIGITS})?)?) (e[-+]?[0-9]+)?
+                | 0o[0-7]+ | 0x[0-9a-f]+ | [-+]?\.inf | \.nan)$"""
+for _tag, _pattern, _first in (
+    ("number", _NUMBER, "-+.0123456789"),
+    ("bool", r"(?i:true|false|yes|no|on|off)$", "tTfFyYnNoO"),
+    ("null", r"(?i:~|null|)$", ["~", "n", "N", ""]),
+):
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first))
+_Loader.add_constructor("tag:yaml.org,2002:number", _Loader.construct_number)
 
 
 def is_number(value: Any) -> bool:
     """Whether a setting is one finite number, of Python or of numpy."""
-    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    try:
+        return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # an integer beyond what a float holds
+        return False
+
+
+def as_array(value: Any) -> NDArray[np.float64]:
+    """A setting of numbers, or of lists of numbers that are equally long, as an array.
+
+    Raises:
+        ValueError: it holds anything else: a string, true, a number that no float holds, or lists of several lengths.
+    """
+    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf":
+        return value.astype(np.float64)
+    if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str | bytes | bytearray):
+        rows = [as_array(x) for x in value]
+        if len({row.shape for row in rows}) > 1:
+            raise ValueError("its lists have several lengths")
+        return np.array(rows, np.float64)
+    if not isinstance(value, numbers.Real) or isinstance(value, bool | np.bool_):
+        raise ValueError(f"{shown(value)} is no number")
+    try:
+        return np.float64(float(value))
+    except OverflowError:
+        raise ValueError(f"{shown(value)} is more than a float holds") from None
 
 
 def is_numbers(value: Any, count: int) -> bool:

@@ -113,7 +113,7 @@ class QuadrotorEnv(Task, EnvBase):
         self.max_episode_steps, self.observe_last_action = max_episode_steps, observe_last_action
         self.event_discount, self.control, self._drone = event_discount, control, drone
         self.initial_state_source: Callable[[int], TensorDictBase] | None = None
-        params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone)
+        params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone, dtype)
         params = checks.checked_params(params.to(device=self.device, dtype=dtype), num_envs)
         self._make_dynamics = functools.partial(DYNAMICS[dynamics], **options)
         self.dynamics: Dynamics = self._make_dynamics(params)

@@ -21,7 +21,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from torchrl_quad.envs import make_env
-from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
 
 # An episode ends before an entry of the state exceeds this, where a task does not know better.
 _LIMIT = 1e6
@@ -29,11 +29,11 @@ _NO_LIMIT = 2**31  # control steps: gymnasium.make has a time limit of its own
 _INFO = "success", "crash", "reward_terms", "metrics"
 
 
-class ResetNeeded(UserValueError, gymnasium.error.ResetNeeded, RuntimeError):
+class ResetNeeded(WrongState, gymnasium.error.ResetNeeded):
     """A step or a picture needs an episode: ``reset()`` comes first."""
 
 
-class Closed(UserValueError, gymnasium.error.ClosedEnvironmentError):
+class Closed(WrongState, gymnasium.error.ClosedEnvironmentError):
     """The environment has been closed."""
 
 

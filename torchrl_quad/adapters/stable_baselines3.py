@@ -9,17 +9,13 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from torchrl_quad.errors import MissingPackage, UserError, UserTypeError, UserValueError
+from torchrl_quad.errors import MissingPackage, Unsupported, UserTypeError, UserValueError, WrongState
 from torchrl_quad.gym import checked_action, checked_options, checked_seed
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
 except ImportError as error:
     raise MissingPackage('DronesVecEnv needs stable-baselines3: pip install ".[adapters]" in a clone') from error
-
-
-class Shared(UserError, NotImplementedError):
-    """The drones are one environment, and none can be changed or called alone."""
 
 
 class DronesVecEnv(VecEnv):
@@ -77,13 +73,13 @@ class DronesVecEnv(VecEnv):
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions (num_envs, 4) for :meth:`step_wait`."""
         if self.actions is not None:
-            raise UserValueError("Actions are waiting to be flown: call step_wait() before the next step_async().")
+            raise WrongState("Actions are waiting to be flown: call step_wait() before the next step_async().")
         self.actions = checked_action(actions, self.env.action_space)
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Fly one control step: observations (num_envs, k), rewards and ends (num_envs), an ``info`` of each drone."""
         if self.actions is None:
-            raise UserValueError("No actions are waiting: call step_async(actions) first, or step(actions) for both.")
+            raise WrongState("No actions are waiting: call step_async(actions) first, or step(actions) for both.")
         actions, self.actions = self.actions, None
         observation, reward, terminated, truncated, info = self.env.step(actions)
         done, infos = terminated | truncated, [{} for _ in reward]
@@ -124,8 +120,8 @@ class DronesVecEnv(VecEnv):
 
     def set_attr(self, name: str, value: Any, indices: Any = None) -> None:
         """Refused: the drones are one environment, and none can change alone."""
-        raise Shared(f"Drones of one environment share {name!r}. Set it on the environment before training.")
+        raise Unsupported(f"Drones of one environment share {name!r}. Set it on the environment before training.")
 
     def env_method(self, name: str, *arguments: Any, indices: Any = None, **keywords: Any) -> list[Any]:
         """Refused: the drones are one environment, and none can be called alone."""
-        raise Shared(f"Drones of one environment share {name!r}. Call it on the environment, `.env`.")
+        raise Unsupported(f"Drones of one environment share {name!r}. Call it on the environment, `.env`.")

@@ -26,15 +26,29 @@ SMALL = "num_envs=4 horizon=4 env.max_episode_steps=20 compile=false"
         ),
         ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),
         ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
+        pytest.param("identification", "--seeds 1 --seconds 10", 10, marks=pytest.mark.slow),  # it simulates a flight
+        ("real_flights", "--flights flights --network-steps 2 --folder fits", 24),
+        (
+            "identified_training",
+            "--drones before=visfly --judge crazyflie --tasks hovering --seeds 0 --iterations 1 --no-compile",
+            2,
+        ),
     ],
 )
+@pytest.mark.usefixtures("quick_fits")
 def test_a_benchmark_writes_a_table(name, arguments, rows, tmp_path, monkeypatch):
     output = tmp_path / "results.csv"
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "flights").mkdir()
+    for flight in ("circle", "figure8"):  # one to fit, and one that judges
+        (tmp_path / f"flights/{flight}.csv.gz").symlink_to(BENCHMARKS.parent / "examples/data/figure8.csv.gz")
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.syspath_prepend(BENCHMARKS)
     monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments.split(), "--output", str(output)])
-    importlib.import_module(name).main()  # in this process, though some start others
+    module = importlib.import_module(name)  # in this process, though some start others
+    if hasattr(module, "identify"):
+        monkeypatch.setattr(module, "identify", functools.partial(module.identify, fields=["linear_drag"], iterations=1, draws=2))
+    module.main()
     with open(output, newline="") as file:
         results = list(csv.DictReader(file))
     assert len(results) == rows
@@ -79,6 +93,9 @@ def test_the_results_that_are_published_name_their_machine():
         "profile",
         "deployment",
         "controllers",
+        "identification",
+        "identified_training",
+        "real_flights",
     }
     for path in published:
         with open(path, newline="") as file:

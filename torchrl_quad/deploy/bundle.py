@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
-import io
 import math
-import reprlib
+import os
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,23 +16,27 @@ from numpy.typing import NDArray
 
 from torchrl_quad.deploy import contract as contracts
 from torchrl_quad.deploy.contract import (
+    IN_BODY,
+    QUANTITIES,
+    BrokenPolicy,
+    Content,
     Fault,
     MissingQuantity,
     NegativeDepth,
     NotFinite,
     NotUnitQuaternion,
     StaleState,
-    UnknownContract,
+    TamperedBundle,
     WrongActions,
+    shown,
 )
 from torchrl_quad.deploy.simulators.vehicle import rotate
 from torchrl_quad.deploy.tasks import RULES
 from torchrl_quad.errors import MissingPackage, UserTypeError, UserValueError
 
-QUANTITIES = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}  # that each state must have
 START = np.array([1.0, 0.0, 0.0, 0.0])  # the quaternion that the first one of a flight takes its sign from
 UP = np.array([0.0, 0.0, 1.0])
-IN_BODY = "_in_body"  # ends the names of inputs that are vectors of the world frame, turned to the body frame
+SINCE = {"age": ", the time since it was measured [s]", "depth_age": ", the time since the image was taken [s]"}
 
 
 class Bundle:
@@ -50,6 +54,7 @@ class Bundle:
     ``bundle.rule.gate``, for example. A policy that sees also needs ``depth`` and ``depth_age`` in each call.
 
     Attributes:
+        folder: where it came from; every message begins with it.
         contract: the content of ``contract.json``.
         observation: what the network read last, float32 (k).
         action: what it answered, or the hover action after a fault; float32 (4).
@@ -59,22 +64,11 @@ class Bundle:
         last_fault: the last of them, or None.
     """
 
-    def __init__(
-        self, contract: dict[str, Any], files: Mapping[str, bytes], on_fault: Literal["raise", "hover"]
-    ) -> None:
+    def __init__(self, folder: Path, content: Content, on_fault: Literal["raise", "hover"]) -> None:
         if on_fault not in ("raise", "hover"):
-            raise UserValueError(f'on_fault must be "raise" or "hover", got {on_fault!r}.')
-        try:
-            import onnxruntime
-        except ImportError as error:
-            raise MissingPackage("A bundle flies with onnxruntime: pip install onnxruntime") from error
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        provider = ["CPUExecutionProvider"]
-        self._session = onnxruntime.InferenceSession(files["policy.onnx"], options, providers=provider)
-        self._vectors, self._starts = files["vectors.npz"], files["starts.npz"]
-        self.contract, self.on_fault = contract, on_fault
+            raise UserValueError(f'on_fault must be "raise" or "hover", got {shown(on_fault)}.')
+        contract, policy, self._vectors, self._starts = content
+        self.folder, self.contract, self.on_fault = folder, contract, on_fault
         self.faults: Counter[str] = Counter()
         self.last_fault: Fault | None = None
         output, limits = contract["output"], contract["limits"]
@@ -86,16 +80,12 @@ class Bundle:
         self._max_depth_age, self._camera = limits["max_depth_age"], contract["camera"]
         scales = [np.full(x["stop"] - x["start"], x["scale"]) for x in contract["inputs"]]
         self._scale = np.concatenate(scales)
-        if contract["task"]["rule"] not in RULES:
-            raise UnknownContract(
-                f"The contract's task follows the rule {contract['task']['rule']!r}; this torchrl_quad knows "
-                f"{', '.join(RULES)}. Use the one that exported it: {contract['origin']['package']}."
-            )
         self.rule = RULES[contract["task"]["rule"]](contract["task"] | {"control_dt": contract["control_dt"]})
         self._names = [x["name"] for x in contract["inputs"]]
         self._turned = [name for name in self._names if name.endswith(IN_BODY)]
+        self._reads, self._writes = contracts.shapes(contract)
         self.reset()
-        self._require_known_inputs()
+        self._session = self._opened(policy)
 
     def reset(self, **progress: Any) -> None:
         """Start a new flight; the counts of faults go on.
@@ -109,8 +99,9 @@ class Bundle:
         for name in progress:
             if name not in known:
                 task = self.contract["task"]["name"]
-                raise UserTypeError(f"reset: {task} has no {name!r}. Choose from: {', '.join(known)}.")
-        self.rule.reset(**progress)
+                raise UserTypeError(f"{self.folder}: reset: {task} has no {name!r}. Choose from: {', '.join(known)}.")
+        with contracts.naming(self.folder):
+            self.rule.reset(**progress)
         self.queue = np.tile(self._hover, (self.contract["action_delay"], 1))
         self.action = self._hover.copy()
         self.memory = np.zeros(self.contract["memory"], np.float32)
@@ -133,32 +124,34 @@ class Bundle:
             the collective thrust [N] and the body rates (3) [rad/s].
 
         Raises:
-            Fault: the policy cannot fly from this state; the bundle is as before the call. With ``on_fault="hover"``
-                the command is to hover instead, the time goes on, and :attr:`faults` counts it. A gate that is passed
-                meanwhile counts with the next good state.
+            Fault: the policy cannot fly from this state; the bundle is as before the call, as after any other error.
+                With ``on_fault="hover"`` the command is to hover instead, the time goes on, and :attr:`faults` counts
+                it. A gate that is passed meanwhile counts with the next good state.
         """
+        rule = copy.copy(self.rule)
         try:
-            position = self._read(state)
+            after = self._read(state, rule)
         except Fault as fault:
+            fault.args = (f"{self.folder}: {fault}",)
             self.faults[type(fault).__name__] += 1
             self.last_fault = fault
             if self.on_fault == "raise":
                 raise
-            action = self._hover
+            after = {"action": self._hover.copy()}
             if self._begun:
-                self.rule.advance(None, None)
-        else:
-            action, self._position = self._action, position
-        self.action, self._begun = action, True
+                rule.advance(None, None)
+        action = after["action"]
         if len(self.queue):
-            self.queue = np.concatenate((self.queue[1:], action[None]))
-        return self._half_thrust * (float(action[0]) + 1.0), self._max_rates * action[1:]
+            after["queue"] = np.concatenate((self.queue[1:], action[None]))
+        command = self._half_thrust * (float(action[0]) + 1.0), self._max_rates * action[1:]
+        vars(self.rule).update(vars(rule))  # from here on nothing fails
+        vars(self).update(after, _begun=True)
+        return command
 
     def starts(self) -> dict[str, NDArray[Any]]:
         """The fresh starts that came with it: ``position``, ``quaternion``, ``velocity`` and ``angular_velocity``, as a
         call takes them, and what :meth:`reset` takes, each (n, ...). The contract's ``results`` began in them."""
-        with np.load(io.BytesIO(self._starts)) as starts:
-            return dict(starts)
+        return {name: x.copy() for name, x in self._starts.items()}
 
     def check(self, tolerance: float = 1e-5) -> float:
         """Run the policy on all observations that came with it.
@@ -169,24 +162,61 @@ class Bundle:
         Raises:
             WrongActions: the difference is above the tolerance.
         """
-        with np.load(io.BytesIO(self._vectors)) as vectors:
-            given = {x.name: vectors[x.name] for x in self._session.get_inputs()}
-            expected = [vectors[x.name] for x in self._session.get_outputs()]
-        found = self._session.run(None, given)
-        error = max(float(np.abs(x - y).max()) for x, y in zip(found, expected, strict=True))
+        with contracts.naming(self.folder):
+            found = self._run({name: self._vectors[name] for name in self._reads})
+        error = max(float(np.abs(x - self._vectors[name]).max()) for name, x in zip(self._writes, found, strict=True))
         if not error <= tolerance:
             raise WrongActions(
-                f"The policy differs by {error:.3g} from what it did when it was exported, allowed are {tolerance:g}. "
-                "This onnxruntime computes otherwise: do not fly with it."
+                f"{self.folder / 'policy.onnx'}: the policy differs by {error:.3g} from what it did when it was "
+                f"exported, allowed are {tolerance:g}. This onnxruntime computes otherwise: do not fly with it."
             )
         return error
 
-    def _read(self, state: Mapping[str, Any]) -> NDArray[np.float64]:
-        """Compute the action from a state; the position in it. Nothing of the bundle changes before a fault."""
+    def _opened(self, policy: bytes) -> Any:
+        """The network, when it reads and writes what the contract says."""
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise MissingPackage("A bundle flies with onnxruntime: pip install onnxruntime") from error
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 4
+        path = self.folder / "policy.onnx"
+        try:
+            session = onnxruntime.InferenceSession(policy, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime has a dozen kinds, with nothing else in common
+            why = contracts.one_line(error)
+            raise TamperedBundle(f"{path}: onnxruntime cannot read it: {why}. {contracts.AGAIN}") from error
+        for verb, side, shapes in (
+            ("reads", session.get_inputs(), self._reads),
+            ("writes", session.get_outputs(), self._writes),
+        ):
+            found = {x.name: (x.type, *x.shape) for x in side}
+            wanted = {name: ("tensor(float)", "batch", *shape) for name, shape in shapes.items()}
+            if found != wanted:
+                found = contracts.one_line(found)
+                raise TamperedBundle(f"{path} {verb} {found}, and the contract says {wanted}. {contracts.AGAIN}")
+        return session
+
+    def _run(self, given: dict[str, NDArray[np.float32]]) -> list[NDArray[np.float32]]:
+        """What the network makes of arrays (n, ...)."""
+        try:
+            found = self._session.run([*self._writes], given)
+        except Exception as error:  # see above
+            raise BrokenPolicy(f"onnxruntime cannot run the policy: {contracts.one_line(error)}.") from error
+        count = len(given["observation"])
+        if [x.shape for x in found] != [(count, *shape) for shape in self._writes.values()]:
+            raise BrokenPolicy(f"The policy answered arrays of the shapes {', '.join(str(x.shape) for x in found)}.")
+        return found
+
+    def _read(self, state: Mapping[str, Any], rule: Any) -> dict[str, Any]:
+        """What follows from a state: the attributes that this step changes. The rule, a copy, advances."""
         if not isinstance(state, Mapping):
-            raise MissingQuantity(f"The state must be a mapping of {', '.join(QUANTITIES)} and age, got {state!r}.")
+            raise MissingQuantity(
+                f"The state must be a mapping of {', '.join(QUANTITIES)} and age, got {shown(state)}."
+            )
         parts = [self._quantity(state, name, (size,)) for name, size in QUANTITIES.items()]
-        age = self._age(state, "age", "it was measured")
+        age = float(self._quantity(state, "age", ()))
         if not (math.isfinite(age) and np.abs(np.concatenate(parts)).max() <= self._max_value):
             names = [name for name, part in zip(QUANTITIES, parts, strict=True) if not self._is_sane(part)]
             raise NotFinite(f"Not finite, or beyond {self._max_value:g}: {', '.join(names) or 'age'}.")
@@ -199,20 +229,18 @@ class Bundle:
         quaternion = quaternion / (norm if float(quaternion @ self._quaternion) >= 0.0 else -norm)
         seen = {} if self._camera is None else {"depth": self._image(state)}
         remembered = {"memory": self.memory[None]} if len(self.memory) else {}
-        saved = vars(self.rule).copy()
         if self._begun:
-            self.rule.advance(self._position, position)
-        known = self.rule.inputs(position)
+            rule.advance(self._position, position)
+        known = rule.inputs(position)
         known |= {"quaternion": quaternion, "velocity": velocity, "angular_velocity": angular_velocity}
         observation = (self._scale * self._assembled(known)).astype(np.float32)
-        action, *memory = self._session.run(None, {"observation": observation[None], **seen, **remembered})
+        (action,), *memory = self._run({"observation": observation[None], **seen, **remembered})
         if not all(math.isfinite(float(x.sum())) for x in (action, *memory)):
-            vars(self.rule).update(saved)
             raise NotFinite("The action is not finite: the policy, or what runs it, is broken.")
-        self.observation, self._action, self._quaternion = observation, action[0], quaternion
-        if memory:
-            self.memory = memory[0][0]
-        return position
+        if np.abs(action).max() > 1.0:
+            raise BrokenPolicy(f"The action leaves -1 to 1, which no exported policy does: {action.tolist()}.")
+        after = {"action": action, "observation": observation, "_quaternion": quaternion, "_position": position}
+        return after | ({"memory": memory[0][0]} if memory else {})
 
     def _assembled(self, known: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
         """The entries of the observation before scaling, in their order, from vectors by name."""
@@ -229,7 +257,7 @@ class Bundle:
         if isinstance(given, np.ndarray) and given.dtype.kind in "iu":
             raise MissingQuantity(f"depth holds whole numbers, {given.dtype}: give metres. Are they millimetres?")
         depth = self._quantity(state, "depth", (height, width), (1, height, width))
-        age = self._age(state, "depth_age", "the image was taken")
+        age = float(self._quantity(state, "depth_age", ()))
         if not (math.isfinite(age) and np.isfinite(depth).all()):
             name = "depth" if math.isfinite(age) else "depth_age"
             raise NotFinite(f"Not finite: {name}. Give 0 for a pixel that measures nothing, and the range for far.")
@@ -242,45 +270,34 @@ class Bundle:
     def _quantity(self, state: Mapping[str, Any], name: str, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
         """A quantity of a state, in one of these shapes."""
         try:
-            value = np.asarray(state[name], float)
+            given = state[name]
         except KeyError:
             needed = ", ".join((*QUANTITIES, *(["depth", "depth_age"] if self._camera else [])))
-            raise MissingQuantity(f"The state lacks {name!r}: give {needed} and age.") from None
-        except (TypeError, ValueError):
-            raise MissingQuantity(
-                f"{name} must be {math.prod(shapes[0])} numbers, got {reprlib.repr(state[name])}."
-            ) from None
-        except OverflowError:
-            raise NotFinite(f"Not finite, or beyond {self._max_value:g}: {name}.") from None
-        if value.shape not in shapes:
-            raise MissingQuantity(f"{name} must have shape {' or '.join(map(str, shapes))}, got {value.shape}.")
-        return value
-
-    def _age(self, state: Mapping[str, Any], name: str, since: str) -> float:
+            raise MissingQuantity(f"The state lacks {name!r}{SINCE.get(name, '')}: give {needed} and age.") from None
         try:
-            return float(state[name])
-        except KeyError:
-            raise MissingQuantity(f"The state lacks {name!r}, the time since {since} [s].") from None
-        except (TypeError, ValueError):
-            raise MissingQuantity(f"{name} must be a number [s], got {state[name]!r}.") from None
+            value = np.asarray(given)
+            numbers = value if value.dtype.kind in "fiuO" and not isinstance(given, (str, bytes)) else None
+            numbers = None if numbers is None else numbers.astype(float, copy=False)
         except OverflowError:
             raise NotFinite(f"Not finite, or beyond {self._max_value:g}: {name}.") from None
+        except Exception:  # whatever the conversion of somebody else's type raises
+            numbers = None
+        if numbers is None:
+            wanted = f"{math.prod(shapes[0])} numbers" if shapes[0] else "a number [s]"
+            raise MissingQuantity(f"{name} must be {wanted}, got {shown(given)}.")
+        if numbers.shape not in shapes:
+            raise MissingQuantity(f"{name} must have shape {' or '.join(map(str, shapes))}, got {numbers.shape}.")
+        return numbers
 
     def _is_sane(self, x: NDArray[np.float64]) -> bool:
         return bool((np.abs(x) <= self._max_value).all())
 
-    def _require_known_inputs(self) -> None:
-        names = {*self.rule.inputs(np.zeros(3)), "quaternion", "velocity", "angular_velocity", "up", "action_queue"}
-        for name in self._names:
-            if name.removesuffix(IN_BODY) not in names:
-                raise UnknownContract(
-                    f"The contract's policy reads {name!r}; this torchrl_quad knows {', '.join(sorted(names))}. Use "
-                    f"the one that exported it: {self.contract['origin']['package']}."
-                )
-
 
 def load_bundle(folder: str | Path, on_fault: Literal["raise", "hover"] = "raise") -> Bundle:
     """Load what :func:`~torchrl_quad.deploy.export_policy` wrote, and check that nobody changed it since.
+
+    Checksums tell of accidents alone: who changes a file on purpose writes new ones. So the contract is also held
+    against its schema and against itself, and the other files against the contract, before anything is used.
 
     Args:
         folder: with ``contract.json`` in it.
@@ -289,8 +306,10 @@ def load_bundle(folder: str | Path, on_fault: Literal["raise", "hover"] = "raise
 
     Raises:
         FileNotFoundError: there is no bundle.
-        TamperedBundle: a file is missing or was changed.
-        UnknownContract: the contract is of another version.
-        ImportError: onnxruntime is missing.
+        TamperedBundle: a file is missing, damaged or too large, was changed, or does not fit the contract.
+        UnknownContract: the contract has another version, field or range, or contradicts itself.
+        ImportError: onnxruntime or jsonschema is missing.
     """
-    return Bundle(*contracts.read(Path(folder)), on_fault)
+    if not isinstance(folder, (str, os.PathLike)):
+        raise UserTypeError(f"load_bundle: folder must be the path of a folder, got {shown(folder)}.")
+    return Bundle(Path(folder), contracts.read(Path(folder)), on_fault)

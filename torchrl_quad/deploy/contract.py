@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import hashlib
+import io
+import itertools
 import json
+import math
+import reprlib
+import zipfile
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from torchrl_quad.errors import UserValueError
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_quad.deploy.network import foreign_parts
+from torchrl_quad.deploy.tasks import PROGRESS, RULES
+from torchrl_quad.errors import MissingPackage, UserError, UserValueError
 
 VERSION = 3  # of the contract; raise it when a reader of the older one would misunderstand the new one
 FILES = ("README.md", "policy.c", "policy.h", "policy.onnx", "starts.npz", "vectors.npz")  # beside contract.json
+MOST_BYTES = {"contract.json": 2**20}  # of a file; those of policies here take a fiftieth of it
+MOST_BYTES |= dict.fromkeys(FILES, 2**28)
+QUANTITIES = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}  # that each state must have
+IN_BODY = "_in_body"  # ends the names of inputs that are vectors of the world frame, turned to the body frame
+AGAIN = "Export the policy again."
 
 
 class TamperedBundle(UserValueError):
@@ -20,7 +37,7 @@ class TamperedBundle(UserValueError):
 
 
 class UnknownContract(UserValueError):
-    """A contract has a version that this package cannot read."""
+    """A contract has a version, a field or a number that this package does not fly."""
 
 
 class WrongActions(UserValueError):
@@ -51,23 +68,64 @@ class NegativeDepth(Fault):
     """A pixel of the image is below zero."""
 
 
+class BrokenPolicy(Fault):
+    """The network failed, or answered something else than four numbers from -1 to 1."""
+
+
+class Content(NamedTuple):
+    """What a bundle flies with."""
+
+    contract: dict[str, Any]
+    policy: bytes  #: ONNX
+    vectors: dict[str, NDArray[Any]]
+    starts: dict[str, NDArray[Any]]
+
+
 def schema() -> dict[str, Any]:
     """The JSON schema of ``contract.json``."""
     return json.loads((resources.files(__package__) / "contract.schema.json").read_text())
 
 
 def schema_table() -> str:
-    """The fields of the contract with their meaning, as a table in Markdown."""
-    rows = [f"| `{name}` | {meaning} |" for name, meaning in _fields(schema())]
-    return "\n".join(("| field | meaning |", "|---|---|", *rows))
+    """The fields of the contract with their meaning, and what numbers they may hold, as a table in Markdown."""
+    rows = [f"| `{name}` | {entry['description']} | {_range(entry)} |" for name, entry in _fields(schema())]
+    return "\n".join(("| field | meaning | numbers |", "|---|---|---|", *rows))
 
 
-def _fields(part: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+def _fields(part: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
     for name, entry in part["properties"].items():
-        yield prefix + name, entry["description"]
+        yield prefix + name, entry
         inside = entry.get("items", entry)
         if "properties" in inside:
             yield from _fields(inside, f"{prefix}{name}{'[]' if 'items' in entry else ''}.")
+
+
+def _range(entry: Mapping[str, Any]) -> str:
+    """The range of a field's numbers, in words."""
+    while "prefixItems" in entry or "items" in entry:
+        entry = entry["prefixItems"][-1] if "prefixItems" in entry else entry["items"]
+    return ", ".join(f"{word} {entry[rule]:g}" for rule, word in _BOUNDS.items() if rule in entry)
+
+
+def shown(value: Any) -> str:
+    """What somebody wrote, in a few characters of one line."""
+    return one_line(reprlib.repr(value))
+
+
+def one_line(text: object) -> str:
+    """The message of a library in one line of at most 200 characters, without what would garble it."""
+    return "".join(x if x.isprintable() else " " for x in " ".join(str(text).split()))[:200]
+
+
+@contextlib.contextmanager
+def naming(folder: str | Path) -> Iterator[None]:
+    """Put the folder of a bundle before the message of what is refused in this block."""
+    try:
+        yield
+    except UserError as error:
+        if str(error).startswith(str(folder)):
+            raise
+        raise type(error)(f"{folder}: {error}") from error
 
 
 def sha256(content: bytes) -> str:
@@ -81,40 +139,311 @@ def digest(contract: Mapping[str, Any]) -> str:
     return sha256(json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False).encode())
 
 
-def read(folder: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The contract of a bundle and the content of its files, when every checksum fits.
+# -- the folder --------------------------------------------------------------------------------------------------------
+
+
+def read(folder: Path) -> Content:
+    """Read a bundle, when every checksum fits and every file holds what the contract says.
 
     Raises:
         FileNotFoundError: there is no contract in the folder.
-        UnknownContract: it has another version.
-        TamperedBundle: a file is not as it was exported.
+        UnknownContract: it has another version, does not fit the schema, or contradicts itself.
+        TamperedBundle: a file is not as it was exported, or no contract and no policy at all.
+        ImportError: jsonschema is missing.
     """
     path = folder / "contract.json"
     if not path.is_file():
         raise FileNotFoundError(f"No bundle at {folder}: it has no contract.json. Export one: python recipes/export.py")
-    again = "Export the policy again."
-    try:
-        contract = json.loads(path.read_bytes())
-        version, listed = contract["version"], contract["sha256"]
-    except (ValueError, TypeError, KeyError) as error:
-        raise TamperedBundle(f"{path} is no contract of a policy, or is damaged. {again}") from error
-    if version != VERSION:
+    contract = _parsed(path)
+    if type(contract["version"]) is not int or contract["version"] != VERSION:
         raise UnknownContract(
-            f"{path} has version {version!r}, and this torchrl_quad reads version {VERSION}. It was written by "
-            f"{contract.get('origin', {}).get('package', 'an unknown version')}: use that one, or export again."
+            f"{path} has version {shown(contract['version'])}, and this torchrl_quad reads version {VERSION}. It was "
+            f"written by {_writer(contract)}: use that one, or export again."
         )
     try:
-        fits = digest(contract) == contract["digest"] and set(listed) == set(FILES)
-    except (ValueError, TypeError, KeyError):
+        fits = digest(contract) == contract["digest"] and set(contract["sha256"]) == set(FILES)
+    except (ValueError, TypeError, KeyError, RecursionError):
         fits = False
     if not fits:
-        raise TamperedBundle(f"{path} was changed after the export: its checksum does not fit. {again}")
+        raise TamperedBundle(f"{path} was changed after the export: its checksum does not fit. {AGAIN}")
+    check(contract, path)
     files = {}
     for name in FILES:
-        try:
-            files[name] = (folder / name).read_bytes()
-        except OSError as error:
-            raise TamperedBundle(f"{folder / name} cannot be read: {error.strerror}. {again}") from error
-        if sha256(files[name]) != listed[name]:
-            raise TamperedBundle(f"{folder / name} was changed after the export: its checksum does not fit. {again}")
-    return contract, files
+        files[name] = _content(folder / name)
+        if sha256(files[name]) != contract["sha256"][name]:
+            raise TamperedBundle(f"{folder / name} was changed after the export: its checksum does not fit. {AGAIN}")
+    if problem := foreign_parts(files["policy.onnx"]):
+        raise TamperedBundle(f"{folder / 'policy.onnx'} {problem}. {AGAIN}")
+    reads, writes = shapes(contract)
+    vectors = _arrays(folder / "vectors.npz", files["vectors.npz"], reads | writes, single=True)
+    starts = _starts(folder / "starts.npz", files["starts.npz"], contract)
+    return Content(contract, files["policy.onnx"], vectors, starts)
+
+
+def shapes(contract: Mapping[str, Any]) -> tuple[dict[str, tuple[int, ...]], dict[str, tuple[int, ...]]]:
+    """The shapes of what the network reads, and of what it writes, by name and without the batch."""
+    camera, memory = contract["camera"], contract["memory"]
+    reads: dict[str, tuple[int, ...]] = {"observation": (contract["inputs"][-1]["stop"],)}
+    reads |= {"depth": (1, camera["height"], camera["width"])} if camera else {}
+    reads |= {"memory": (memory,)} if memory else {}
+    return reads, {"action": (4,)} | ({"next_memory": (memory,)} if memory else {})
+
+
+def _content(path: Path) -> bytes:
+    most = MOST_BYTES[path.name]
+    try:
+        if path.exists() and not path.is_file():  # who opens a pipe waits for ever
+            raise TamperedBundle(f"{path} is no plain file. {AGAIN}")
+        with open(path, "rb") as file:
+            size = path.stat().st_size
+            content = file.read(most + 1) if size <= most else b""
+    except OSError as error:
+        raise TamperedBundle(f"{path} cannot be read: {error.strerror}. {AGAIN}") from error
+    if max(size, len(content)) > most:
+        raise TamperedBundle(f"{path} is larger than {most >> 20} MiB, the most that is read. {AGAIN}")
+    return content
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    """The JSON of a contract, stricter than Python reads it."""
+    try:
+        contract = json.loads(
+            _content(path).decode(),
+            object_pairs_hook=_unique,
+            parse_int=_whole,
+            parse_float=_finite,
+            parse_constant=_finite,
+        )
+    except (ValueError, RecursionError) as error:  # of a parser: all of it is about the file
+        if isinstance(error, UserError):
+            raise
+        why = "it nests too deep" if isinstance(error, RecursionError) else str(error)
+        raise TamperedBundle(f"{path} is no contract of a policy, or is damaged: {one_line(why)}. {AGAIN}") from error
+    if not isinstance(contract, dict) or not {"version", "sha256", "digest"} <= contract.keys():
+        raise TamperedBundle(f"{path} is no contract of a policy, or is damaged: it lacks its version. {AGAIN}")
+    return contract
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key stands twice in one object")
+    return found
+
+
+def _whole(text: str) -> int:
+    if len(text) > 20:
+        raise ValueError("a whole number has more than 20 digits")
+    return int(text)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:20]} is no finite number")
+    return value
+
+
+def _writer(contract: Mapping[str, Any]) -> str:
+    origin = contract.get("origin")
+    package = origin.get("package") if isinstance(origin, dict) else None
+    return shown(package).strip("'") if isinstance(package, str) else "an unknown version"
+
+
+# -- its arrays --------------------------------------------------------------------------------------------------------
+
+
+def _arrays(
+    path: Path, content: bytes, expected: Mapping[str, tuple[int, ...]], single: bool
+) -> dict[str, NDArray[Any]]:
+    """The arrays (n, ...) of a file, of these shapes without n, all finite, and if ``single`` of float32."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.infolist())
+            names = sorted(entry.filename for entry in archive.infolist())
+        if not stored or names != sorted(f"{name}.npy" for name in expected):
+            raise ValueError(f"it must hold {', '.join(sorted(expected))} alone, and not compressed")
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in expected}
+    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds for damaged files
+        raise TamperedBundle(f"{path} is damaged: {one_line(error)}. {AGAIN}") from error
+    count = len(arrays[next(iter(arrays))]) if arrays[next(iter(arrays))].ndim else 0
+    for name, shape in expected.items():
+        x = arrays[name]
+        if not count or x.shape != (count, *shape):
+            wanted = ", ".join(map(str, ("n", *shape)))
+            raise TamperedBundle(f"{path}: {name} has shape {x.shape}, and must have ({wanted}), n above 0. {AGAIN}")
+        if not ((x.dtype == np.float32 or (not single and x.dtype.kind in "fiu")) and np.isfinite(x).all()):
+            kind = "finite numbers in float32" if single else "finite numbers"
+            raise TamperedBundle(f"{path}: {name} must hold {kind}. {AGAIN}")
+    return arrays
+
+
+def _starts(path: Path, content: bytes, contract: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    task, limits = contract["task"], contract["limits"]
+    progress = {name: (3,) if name == "target" else (1,) for name in PROGRESS[task["rule"]]}
+    starts = _arrays(path, content, {name: (size,) for name, size in QUANTITIES.items()} | progress, single=False)
+    norm = np.linalg.norm(starts["quaternion"].astype(float), axis=1)
+    fits = {name: np.abs(x) <= limits["max_value"] for name, x in starts.items()}
+    fits["quaternion"] = np.abs(norm - 1.0) <= limits["quaternion_norm_error"]
+    if "gate" in fits:
+        fits["gate"] = np.isin(starts["gate"], np.arange(len(task["gates"])))
+    if "speed" in fits:
+        fits["speed"] &= starts["speed"] > 0
+    for name, fit in fits.items():
+        if not fit.all():
+            value = shown(starts[name][np.flatnonzero(~fit.reshape(len(norm), -1).all(1))[0]].tolist())
+            raise TamperedBundle(f"{path}: no flight starts with the {name} {value}. {AGAIN}")
+    return starts
+
+
+# -- what the contract says --------------------------------------------------------------------------------------------
+
+_BOUNDS = {"exclusiveMinimum": "above", "minimum": "at least", "maximum": "at most", "exclusiveMaximum": "below"}
+_MUST = {
+    **_BOUNDS,
+    "type": "of type",
+    "const": "be",
+    "enum": "one of",
+    "minItems": "of a length of at least",
+    "maxItems": "of a length of at most",
+    "maxLength": "of a length of at most",
+    "maxProperties": "of a size of at most",
+    "pattern": "like",
+}
+
+
+def check(contract: Mapping[str, Any], path: Path) -> None:
+    """Hold a contract against its schema, and what it says against itself, before anything uses it.
+
+    Raises:
+        UnknownContract: it does not fit.
+        ImportError: jsonschema is missing.
+    """
+    problem = next(itertools.chain(_misfits(contract), _contradictions(contract)), None)
+    if problem:
+        raise UnknownContract(
+            f"{path}: {problem}. This torchrl_quad does not fly that; it was written by {_writer(contract)}: use that "
+            "one, or export again."
+        )
+
+
+def drone_problem(contract: Mapping[str, Any]) -> str | None:
+    """What is wrong with the drone of a contract that flies, the nominal one with the fields of ``plant``, or None."""
+    return next(_plant_problems(contract), None)
+
+
+def _plant_problems(contract: Mapping[str, Any]) -> Iterator[str]:
+    flies = {**contract["drone"], **contract["plant"]}
+    yield from _misfits(flies, "drone", "plant")
+    yield from _contradictions_of_a_drone(flies, "plant")
+
+
+@functools.cache
+def _validator() -> Any:
+    try:
+        from jsonschema import Draft202012Validator
+        from jsonschema.validators import extend
+    except ImportError as error:
+        raise MissingPackage("A bundle is checked with jsonschema: pip install jsonschema") from error
+    kinds = Draft202012Validator.TYPE_CHECKER.redefine("integer", lambda _, x: type(x) is int)  # 3.0 is none
+    return extend(Draft202012Validator, type_checker=kinds)(schema())
+
+
+def _misfits(value: Any, part: str | None = None, *at: str) -> Iterator[str]:
+    """Where a contract, or a part of it, which stands at another place, does not fit the schema."""
+    validator = _validator()
+    if part is not None:
+        validator = validator.evolve(schema=validator.schema["properties"][part])
+    for error in validator.iter_errors(value):
+        rule, wanted = error.validator, error.validator_value
+        place = "".join(f"[{x}]" if isinstance(x, int) else f".{shown(x)[1:-1]}" for x in (*at, *error.absolute_path))
+        place = place[1:] or "it"
+        if rule == "required":
+            yield f"{place} lacks {next(name for name in wanted if name not in error.instance)}"
+        elif rule == "additionalProperties":
+            known = error.schema.get("properties", {})
+            yield f"{place} has {shown(next(name for name in error.instance if name not in known))}, which is unknown"
+        else:
+            wanted = ", ".join(map(str, wanted)) if isinstance(wanted, list) else wanted
+            yield f"{place} is {shown(error.instance)}, and must be {_MUST.get(rule, rule)} {wanted}"
+
+
+def _contradictions(contract: Mapping[str, Any]) -> Iterator[str]:
+    """Where a contract that fits the schema contradicts itself."""
+    drone, output, limits = contract["drone"], contract["output"], contract["limits"]
+    thrust, rates, ratio = output["thrust"], output["body_rate"]["range"], drone["max_thrust_to_weight"]
+    dt, length, camera = contract["control_dt"], contract["action_delay"], contract["camera"]
+    yield from _contradictions_of_a_drone(drone, "drone", hovers=True)
+    yield from _plant_problems(contract)
+    equal = {
+        "output.thrust.weight": (thrust["weight"], drone["mass"] * drone["gravity"]),
+        "output.thrust.range[1]": (thrust["range"][1], ratio * thrust["weight"]),
+        "output.thrust.range_in_weights[1]": (thrust["range_in_weights"][1], ratio),
+        **{f"output.body_rate.range[{i}][1]": (x[1], drone["max_body_rate"][i]) for i, x in enumerate(rates)},
+        **{f"output.body_rate.range[{i}][0]": (x[0], -drone["max_body_rate"][i]) for i, x in enumerate(rates)},
+        "output.hover_action[0] + 1": (output["hover_action"][0] + 1.0, 2.0 / ratio),
+        "action_queue.length": (contract["action_queue"]["length"], length),
+        "limits.max_state_age": (limits["max_state_age"], (1 + contract["observation_delay"]) * dt),
+    }
+    if camera:
+        equal["limits.max_depth_age"] = (limits["max_depth_age"] or 0.0, (camera["rate"] + camera["delay"]) * dt)
+        equal["the norm of camera.quaternion"] = (math.hypot(*camera["quaternion"]), 1.0)
+    for name, (value, wanted) in equal.items():
+        if not math.isclose(value, wanted, rel_tol=1e-3):
+            yield f"{name} is {value:g}, and must be {wanted:g} by its other fields"
+    if any(output["hover_action"][1:]):
+        yield f"output.hover_action is {output['hover_action']}, and must not turn"
+    steps = dt / contract["simulator"]["dt"]
+    if not math.isclose(steps, max(round(steps), 1), rel_tol=1e-6):
+        yield f"control_dt is {dt:g}, and must be a whole multiple of simulator.dt"
+    low, high = (contract["safety"]["position"][x] for x in ("low", "high"))
+    if not all(a < b for a, b in zip(low, high, strict=True)):
+        yield f"safety.position.low is {low}, and must be below high, {high}"
+    task = contract["task"]
+    if len(task.get("cosine", ())) != len(task.get("sine", ())):
+        yield "task.cosine and task.sine must have one length"
+    if not task.get("speeds", (0, 0))[0] <= task.get("speeds", (0, 0))[1]:
+        yield f"task.speeds is {task['speeds']}, and must rise"
+    yield from _contradictions_of_the_inputs(contract)
+
+
+def _contradictions_of_the_inputs(contract: Mapping[str, Any]) -> Iterator[str]:
+    task, queue = contract["task"], contract["action_queue"]
+    rule = RULES[task["rule"]](task | {"control_dt": contract["control_dt"]})
+    sizes = {name: len(x) for name, x in rule.inputs(np.zeros(3)).items()}
+    sizes |= {"quaternion": 4, "velocity": 3, "angular_velocity": 3, "up": 3, "action_queue": 4 * queue["length"]}
+    sizes |= {f"{name}{IN_BODY}": 3 for name in ("velocity", "up", *sizes) if sizes[name] == 3}
+    begin = 0
+    for i, entry in enumerate(contract["inputs"]):
+        size, seen = entry["stop"] - entry["start"], [entry["seen"][x] for x in ("least", "p1", "p99", "greatest")]
+        if entry["name"] not in sizes:
+            yield f"the policy reads {shown(entry['name'])}, and known are {', '.join(sizes)}"
+        elif entry["start"] != begin or size != sizes[entry["name"]]:
+            yield f"inputs[{i}] must go from {begin} to {begin + sizes[entry['name']]}"
+        begin = entry["stop"]
+        if any(len(x) != size for x in seen):
+            yield f"inputs[{i}].seen must hold lists of {size} numbers"
+        elif not all(a <= b for pair in itertools.pairwise(seen) for a, b in zip(*pair, strict=True)):
+            yield f"inputs[{i}].seen must rise from least to greatest"
+    if queue["observed"] != any(entry["name"] == "action_queue" for entry in contract["inputs"]):
+        yield f"action_queue.observed is {queue['observed']}, and the inputs say otherwise"
+
+
+def _contradictions_of_a_drone(drone: Mapping[str, Any], name: str, hovers: bool = False) -> Iterator[str]:
+    """Why these parts do not make a drone, or one that hovers."""
+    (k2, k1, k0), low, high = drone["thrust_map"], drone["rotor_speed_min"], drone["rotor_speed_max"]
+    if not (k2 > 0 and k1 + 2 * k2 * low >= 0):
+        yield f"{name}.thrust_map is {drone['thrust_map']}, and must rise from rotor_speed_min on"
+    if not low < high:
+        yield f"{name}.rotor_speed_min is {low:g}, and must be below rotor_speed_max, {high:g}"
+    x, y = np.array(drone["rotor_positions"], float).T
+    allocation = np.array([np.ones(4), y, -x, drone["yaw_torque_coefficient"] * np.array(drone["rotor_spin"], float)])
+    rows = allocation / np.maximum(np.linalg.norm(allocation, axis=1, keepdims=True), 1e-30)
+    if not np.linalg.cond(rows) < 1e4:  # as the package's own controller asks
+        yield f"{name}.rotor_positions and rotor_spin cannot make thrust and torque about each axis on their own"
+    elif hovers:
+        share = np.linalg.inv(allocation)[:, 0] * drone["mass"] * drone["gravity"]
+        least, most = (k2 * w * w + k1 * w + k0 for w in (low, high))
+        if not ((least < share) & (share < most)).all():
+            yield f"{name}: to hover each rotor must give {shown(share.round(4).tolist())} N, of {least:g} to {most:g}"

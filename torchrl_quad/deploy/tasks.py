@@ -7,6 +7,7 @@ once in each control step after the first, and asks it for its entries of the ob
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Mapping
 from typing import Any, Protocol
 
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from torchrl_quad.errors import UserValueError
 
 Vector = NDArray[np.float64]
+MOST = 1e6  # of a number that says where a flight starts in the task
 
 
 class Rule(Protocol):
@@ -59,11 +61,11 @@ class Course:
 
     def reset(self, target: ArrayLike | None = None, speed: float | None = None) -> None:
         """Start anew, with a target (3) [m] and a speed [m/s] of your own, or those of the contract."""
-        self.target = _point("target", self.task["target"] if target is None else target)
-        speed = self.task["speed"] if speed is None else speed
-        if not (isinstance(speed, int | float | np.number) and 0.0 < speed < math.inf):
+        target = _point("target", self.task["target"] if target is None else target)
+        speed = _number("speed", self.task["speed"] if speed is None else speed, "a positive number [m/s]")
+        if not speed > 0.0:
             raise UserValueError(f"speed must be a positive number [m/s], got {speed!r}.")
-        self.speed = float(speed)
+        self.target, self.speed = target, speed
 
     def advance(self, before: Vector | None, position: Vector | None) -> None:
         """Nothing changes."""
@@ -82,7 +84,7 @@ class Curve:
 
     def __init__(self, task: Mapping[str, Any]) -> None:
         self.offset = np.array(task["offset"], float)
-        self.amplitudes = np.concatenate((np.array(task["cosine"], float), np.array(task["sine"], float)))
+        self.amplitudes = np.array([*task["cosine"], *task["sine"]], float).reshape(-1, 3)
         self.harmonics = np.arange(1, len(task["cosine"]) + 1)
         self.rate = 2 * math.pi / task["period"]
         self.step = self.rate * task["control_dt"]
@@ -91,9 +93,7 @@ class Curve:
 
     def reset(self, phase: float = 0.0) -> None:
         """Start anew, where the point has a phase [rad]."""
-        if not math.isfinite(phase):
-            raise UserValueError(f"phase must be a finite number [rad], got {phase!r}.")
-        self.phase = float(phase) % (2 * math.pi)
+        self.phase = _number("phase", phase, "a finite number [rad]") % (2 * math.pi)
 
     def advance(self, before: Vector | None, position: Vector | None) -> None:
         """The point moves on, whatever the drone does."""
@@ -122,9 +122,11 @@ class Gates:
 
     def reset(self, gate: int = 0) -> None:
         """Start anew, with the index of the gate to pass first."""
-        if isinstance(gate, bool) or gate not in range(len(self.gates)):
-            raise UserValueError(f"gate must be a whole number from 0 to {len(self.gates) - 1}, got {gate!r}.")
-        self.gate, self.passed = int(gate), 0
+        wanted = f"a whole number from 0 to {len(self.gates) - 1}"
+        number = _number("gate", gate, wanted)
+        if number not in range(len(self.gates)):
+            raise UserValueError(f"gate must be {wanted}, got {gate!r}.")
+        self.gate, self.passed = int(number), 0
 
     def advance(self, before: Vector | None, position: Vector | None) -> None:
         """Count a gate that was passed on the way."""
@@ -158,8 +160,20 @@ def progress_of(rule: str, start: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     return {name: start[name] if start[name].size > 1 else start[name].item() for name in PROGRESS[rule]}
 
 
+def _number(name: str, value: Any, wanted: str) -> float:
+    if isinstance(value, int | float | np.number) and not isinstance(value, bool) and abs(value) <= MOST:
+        return float(value)
+    raise UserValueError(f"{name} must be {wanted}, got {reprlib.repr(value)}.")
+
+
 def _point(name: str, value: ArrayLike) -> Vector:
-    point = np.array(value, float)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise UserValueError(f"{name} must be three finite numbers [m], got {value!r}.")
-    return point
+    try:
+        point = np.array(value)
+        fits = point.dtype.kind in "fiu" and point.shape == (3,) and bool((np.abs(point) <= MOST).all())
+    except Exception:  # whatever the conversion of somebody else's type raises
+        fits = False
+    if not fits:
+        raise UserValueError(
+            f"{name} must be three finite numbers [m], of at most {MOST:g}, got {reprlib.repr(value)}."
+        )
+    return point.astype(float)

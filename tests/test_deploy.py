@@ -16,7 +16,7 @@ from torch import nn
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import HoveringEnv, make_actor, make_visual_actor
+from torchrl_quad import HoveringEnv, files, make_actor, make_visual_actor
 from torchrl_quad.deploy import (
     StaleState,
     UnknownContract,
@@ -299,12 +299,13 @@ def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_pa
     old = (folder / "contract.json").read_bytes()
     with torch.no_grad():
         actor[0].module.mlp[-1].bias.add_(0.1)
-    aside = tmp_path / ".policy.old"
+    dead = f"{files._prefix(folder)}{2**22 + 1}"  # of a process that cannot be
+    aside = tmp_path / f"{dead}.0.old"
     for stopped_by_a_kill in (False, True):  # between the two renames
         if stopped_by_a_kill:
             folder.rename(aside)
             folder.mkdir()  # by somebody who missed it
-            (tmp_path / f".policy.{2**22 + 1}.new").mkdir()  # of a process that cannot be
+            (tmp_path / f"{dead}.1").mkdir()
         with monkeypatch.context() as patch:
             patch.setattr("torchrl_quad.deploy.export._require_the_same_flight", lambda *_: 1 / 0)
             with pytest.raises(ZeroDivisionError):
@@ -322,10 +323,20 @@ def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_pa
         with pytest.raises(OSError, match="no"):
             export_policy(actor, env, folder)
     assert (aside / "contract.json").read_bytes() == old
-    (tmp_path / "link").symlink_to(folder)
-    export_policy(actor, env, tmp_path / "link")
+    export_policy(actor, env, folder)
     assert (folder / "contract.json").read_bytes() != old
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "policy"] and (tmp_path / "link").is_symlink()
+    assert [path.name for path in tmp_path.iterdir()] == ["policy"]
+    (tmp_path / "link").symlink_to(folder)
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("link", "pipe"):
+        with pytest.raises(FileExistsError, match=f"{name} is a {name}, and no folder: it is not replaced"):
+            export_policy(actor, env, tmp_path / name)
+        assert (tmp_path / "pipe").is_fifo() and (tmp_path / "link").is_symlink()
+    (folder / "policy.h").unlink()
+    os.mkfifo(folder / "policy.h")  # which is not the bundle's
+    with pytest.raises(FileExistsError, match=r"policy also holds policy.h"):
+        export_policy(actor, env, folder)
+    (folder / "policy.h").unlink()
     (folder / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match=r"policy also holds notes.txt: .* Move it away, or choose another"):
         export_policy(actor, env, folder)

@@ -1,5 +1,6 @@
 """The folder of a run belongs to it alone, and every run ends with an exit status and a line that says how to go on."""
 
+import errno
 import fcntl
 import json
 import os
@@ -81,11 +82,21 @@ def test_of_many_that_want_a_folder_at_once_one_gets_it(tmp_path):
 
 def test_a_file_system_without_locks_is_no_reason_to_stop(tmp_path, monkeypatch):
     def fail(*_):
-        raise OSError("No locks available")
+        raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", fail)
     with own_folder(tmp_path, named=True) as folder:
         assert folder == tmp_path
+
+
+def test_a_lock_that_is_a_link_empties_nothing(tmp_path):
+    mine, folder = tmp_path / "mine.txt", tmp_path / "run"
+    mine.write_text("mine")
+    folder.mkdir()
+    (folder / "run.lock").symlink_to(mine)
+    with pytest.raises(FileExistsError, match="run.lock is a link, and no plain file"), own_folder(folder, named=True):
+        pass
+    assert mine.read_text() == "mine"
 
 
 # -- how a run ends ----------------------------------------------------------------------------------------------------

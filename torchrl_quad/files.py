@@ -1,49 +1,153 @@
-"""Files that are complete or not there, tables in them, and the name of the machine that results come from."""
+"""Every file and folder that the package writes: complete or not there, never in place of what is neither.
+
+Nothing here follows a link in the last part of a path, or replaces a pipe, a socket or a device. What several processes
+write, on one machine or on a shared disk, they write one after the other.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import csv
+import errno
+import hashlib
+import itertools
 import os
 import platform
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import shutil
+import socket
+import stat
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
+
+_NUMBERS = itertools.count()  # of this process's temporaries, in whatever thread
+_WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EINVAL)  # what a file system says that has none
 
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """Write a file atomically: ``with replacing(path) as temporary: temporary.write_text(...)``.
 
-    The temporary file sits beside ``path``, carries the process id in its name, and keeps the suffix. It replaces
-    ``path`` when the block ends, and disappears when the block raises. What a killed process left behind is deleted by
-    the next one that writes the same path.
+    The temporary file sits beside ``path``, is named after this process, and keeps the suffix. It replaces ``path``
+    when the block ends, and disappears when the block raises. What a killed process of this machine left behind is
+    deleted by the next one that writes the same path.
 
     Raises:
+        FileExistsError: ``path`` is a folder, a link, or anything else but a plain file.
         OSError: the folder does not exist, is read-only or is full; ``path`` is then as it was.
     """
     path = Path(path)
+    require_file(path)
     _delete_leftovers(path)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    temporary = _temporary(path)
+    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     try:
         yield temporary
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
+        require_file(path)  # again: writing took its time
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def is_running(pid: int) -> bool:
-    """Whether a process of this machine is alive."""
+@contextlib.contextmanager
+def replacing_folder(folder: Path, require: Callable[[Path], None]) -> Iterator[Path]:
+    """Replace a folder as a whole by what the block writes into a temporary one, which disappears when it raises.
+
+    Args:
+        folder: which may be missing, and its parents too.
+        require: refuses a folder that must not be replaced; called before the block and after it.
+
+    Raises:
+        FileExistsError: ``folder`` is anything else but a folder.
+    """
+    make_folder(folder.parent)
+    require_folder(folder)
+    _restore(folder)
+    require(folder)
+    temporary = _temporary(folder)
+    old = temporary.with_name(f"{temporary.name}.old")
+    temporary.mkdir()
     try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # it belongs to somebody else
-        return True
-    return True
+        yield temporary
+        require_folder(folder)
+        require(folder)
+        if folder.exists():
+            os.replace(folder, old)
+        os.replace(temporary, folder)
+    except BaseException:
+        if old.exists() and not folder.exists():
+            os.replace(old, folder)
+        raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if folder.exists():
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def make_folder(path: str | Path) -> Path:
+    """Make a folder, with its parents, to write files into. A link to a folder is one.
+
+    Raises:
+        FileExistsError: there is something else of that name.
+    """
+    path = Path(path)
+    if (kind := _kind(path)) and not path.is_dir():
+        raise FileExistsError(f"{path} is {kind}, and no folder. Choose another folder.")
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def require_file(path: Path) -> None:
+    """Refuse to replace what exists and is not a plain file.
+
+    Raises:
+        FileExistsError: it is a folder, a link, a pipe, a socket or a device.
+    """
+    if (kind := _kind(path)) not in (None, "a file"):
+        raise FileExistsError(f"{path} is {kind}, and no plain file: it is not replaced. Choose another path.")
+
+
+def require_folder(path: Path) -> None:
+    """Refuse to replace what exists and is not a folder.
+
+    Raises:
+        FileExistsError: it is a file, a link, a pipe, a socket or a device.
+    """
+    if (kind := _kind(path)) not in (None, "a folder"):
+        raise FileExistsError(f"{path} is {kind}, and no folder: it is not replaced. Choose another folder.")
+
+
+@contextlib.contextmanager
+def locked(path: Path, *, wait: bool = True) -> Iterator[Path]:
+    """Hold a lock file, which is deleted at the end. The system frees the lock of a process that dies.
+
+    Where a file system has no locks, the block runs without.
+
+    Args:
+        path: of the lock file, which the holder may write into.
+        wait: for another holder.
+
+    Raises:
+        FileExistsError: ``path`` is anything else but a plain file.
+        filelock.Timeout: another process or thread holds it, and ``wait`` is false.
+    """
+    require_file(path)
+    lock = FileLock(path, timeout=-1 if wait else 0, fallback_to_soft=False, thread_local=False)
+    try:
+        lock.acquire(poll_interval=0.02)
+    except OSError as error:
+        if isinstance(error, Timeout) or error.errno not in _WITHOUT_LOCKS:
+            raise
+    try:
+        yield path
+    finally:
+        path.unlink(missing_ok=True)  # while it is held: who waits for it makes another
+        lock.release()
 
 
 def machine() -> str:
@@ -61,19 +165,20 @@ def machine() -> str:
         return platform.processor() or platform.machine()
 
 
-def _delete_leftovers(path: Path) -> None:
-    name = re.compile(rf"\.{re.escape(path.stem)}\.(\d+){re.escape(path.suffix)}")
-    for other in path.parent.glob(".*"):
-        match = name.fullmatch(other.name)
-        if match and not is_running(int(match[1])):
-            other.unlink(missing_ok=True)
+# -- tables ------------------------------------------------------------------------------------------------------------
 
 
 def read_rows(path: str | Path) -> list[dict[str, str]]:
-    """Read the rows of a CSV file; no rows where there is no file."""
+    """Read the rows of a CSV file; no rows where there is no file.
+
+    Raises:
+        FileExistsError: there is a folder, a pipe or the like of that name.
+    """
     path = Path(path)
     if not path.exists():
         return []
+    if not path.is_file():
+        raise FileExistsError(f"{path} is {_kind(path)}, and no plain file. Give the path of a CSV file.")
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
 
@@ -81,9 +186,90 @@ def read_rows(path: str | Path) -> list[dict[str, str]]:
 def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]], missing: object = "") -> None:
     """Write rows to a CSV file, all or nothing. It has the columns of all rows; a cell may be ``missing``."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     names = list(dict.fromkeys(name for row in rows for name in row))
     with replacing(path) as temporary, open(temporary, "w", newline="") as file:
         writer = csv.DictWriter(file, names, restval=missing, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def add_rows(path: str | Path, rows: Sequence[Mapping[str, Any]], same: Sequence[str] = ()) -> None:
+    """Add rows to a CSV file to which other processes add at the same time.
+
+    Args:
+        path: of the file, which may be missing.
+        rows: to add.
+        same: columns; rows that agree in all of them with one that is added give way to it.
+    """
+    path = Path(path)
+    make_folder(path.parent)
+    require_file(path)
+    with locked(path.with_name(f".{path.name}.lock")):
+        own = {tuple(str(row[name]) for name in same) for row in rows} if same else set()
+        others = [row for row in read_rows(path) if tuple(row.get(name) for name in same) not in own]
+        write_rows(path, [*others, *rows])
+
+
+# -- temporaries -------------------------------------------------------------------------------------------------------
+
+
+def _temporary(path: Path) -> Path:
+    """A name beside a path that no other process, thread or machine uses."""
+    return path.with_name(f"{_prefix(path)}{os.getpid()}.{next(_NUMBERS)}{path.suffix}")
+
+
+def _prefix(path: Path) -> str:
+    """How this machine's temporaries of a path begin. Containers, whose process numbers overlap, are machines."""
+    try:
+        space = os.readlink("/proc/self/ns/pid")
+    except OSError:
+        space = ""
+    here = hashlib.sha256(f"{socket.gethostname()} {space}".encode()).hexdigest()[:8]
+    return f".{path.stem[:40]}.{here}."
+
+
+def _abandoned(path: Path) -> Iterator[Path]:
+    """What processes of this machine that have died left beside a path."""
+    name = re.compile(rf"{re.escape(_prefix(path))}(\d+)\.\d+{re.escape(path.suffix)}(\.old)?")
+    for other in path.parent.glob(".*"):
+        match = name.fullmatch(other.name)
+        if match and not _is_running(int(match[1])):
+            yield other
+
+
+def _delete_leftovers(path: Path) -> None:
+    for other in _abandoned(path):
+        with contextlib.suppress(OSError):  # another process has deleted it just now
+            other.unlink()
+
+
+def _restore(folder: Path) -> None:
+    """Bring back a folder that a killed process had set aside, and delete what else it left behind."""
+    for other in _abandoned(folder):
+        if other.suffix == ".old" and not any(folder.glob("*")):
+            with contextlib.suppress(OSError):
+                os.replace(other, folder)
+        shutil.rmtree(other, ignore_errors=True)
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):  # it belongs to somebody else, or is none of ours
+        return True
+    return True
+
+
+def _kind(path: Path) -> str | None:
+    """What a path is, in words; None where there is nothing."""
+    try:
+        mode = os.lstat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    if stat.S_ISLNK(mode):
+        return "a link"
+    kinds = {"a folder": stat.S_ISDIR, "a file": stat.S_ISREG, "a pipe": stat.S_ISFIFO, "a socket": stat.S_ISSOCK}
+    return next((name for name, holds in kinds.items() if holds(mode)), "a device")

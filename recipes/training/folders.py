@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import itertools
 import os
 import socket
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
-from typing import IO
 
+from filelock import Timeout
 from omegaconf import OmegaConf
+
+from torchrl_quad.files import locked, make_folder
 
 LOCK = "run.lock"  # names the process that writes into the folder
 
@@ -32,54 +33,37 @@ def own_folder(folder: Path, named: bool) -> Iterator[Path]:
     Raises:
         FileExistsError: another process runs in the folder that was named.
     """
-    folder, lock = _claim(folder, named)
-    try:
-        yield folder
-    finally:
-        (folder / LOCK).unlink(missing_ok=True)
-        lock.close()
-        if not named:
-            with contextlib.suppress(OSError):  # not empty: it has results
-                folder.rmdir()
-
-
-def _claim(folder: Path, named: bool) -> tuple[Path, IO[str]]:
-    for number in itertools.count(1):
-        path = folder if number == 1 else folder.with_name(f"{folder.name}_{number}")
-        path.mkdir(parents=True, exist_ok=True)
-        lock = _lock(path / LOCK)
-        if lock is None and named:
-            holder = "another process"
-            with contextlib.suppress(FileNotFoundError):  # it has ended just now
-                holder = (path / LOCK).read_text().strip() or holder
-            raise FileExistsError(
-                f"{path} is in use by {holder}. Wait for it, stop it, or choose another hydra.run.dir."
-            )
-        if lock is None:
-            continue
-        if not named and any(other.name != LOCK for other in path.iterdir()):  # a run that is over
-            (path / LOCK).unlink()
-            lock.close()
-            continue
-        lock.write(f"process {os.getpid()} on {socket.gethostname()} since {datetime.now():%Y-%m-%d %H:%M:%S}\n")
-        lock.flush()
-        return path, lock
-    raise AssertionError
-
-
-def _lock(path: Path) -> IO[str] | None:
-    """Lock a file, or return None if a live process holds it. The system drops the lock of a process that dies."""
-    while True:
-        file = open(path, "a+")  # noqa: SIM115, it stays open as long as the run has the folder
+    with contextlib.ExitStack() as stack:
+        folder = _claim(folder, named, stack)
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.close()
-            return None
-        except OSError:  # a file system without locks: go on without
-            pass
-        with contextlib.suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                file.truncate(0)
-                return file
-        file.close()  # its holder has deleted it in between
+            yield folder
+        finally:
+            stack.close()
+            if not named:
+                with contextlib.suppress(OSError):  # not empty: it has results
+                    folder.rmdir()
+
+
+def _claim(folder: Path, named: bool, stack: contextlib.ExitStack) -> Path:
+    for number in itertools.count(1):
+        path = make_folder(folder if number == 1 else folder.with_name(f"{folder.name}_{number}"))
+        with contextlib.ExitStack() as claim:
+            try:
+                lock = claim.enter_context(locked(path / LOCK, wait=False))
+            except Timeout:
+                if not named:
+                    continue
+                holder = "another process"
+                with contextlib.suppress(OSError):  # it has ended just now
+                    holder = (path / LOCK).read_text().strip() or holder
+                raise FileExistsError(
+                    f"{path} is in use by {holder}. Wait for it, stop it, or choose another hydra.run.dir."
+                ) from None
+            if not named and any(other.name != LOCK for other in path.iterdir()):  # a run that is over
+                continue
+            lock.write_text(
+                f"process {os.getpid()} on {socket.gethostname()} since {datetime.now():%Y-%m-%d %H:%M:%S}\n"
+            )
+            stack.push(claim.pop_all())
+            return path
+    raise AssertionError

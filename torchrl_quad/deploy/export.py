@@ -27,13 +27,13 @@ from torchrl_quad.data.unwrap import memory_keys
 from torchrl_quad.deploy import contract as contracts
 from torchrl_quad.deploy.bundle import QUANTITIES, load_bundle
 from torchrl_quad.deploy.describe import describe, envelope, results, seen_ranges
-from torchrl_quad.deploy.folder import replacing_folder, require_replaceable, restore
 from torchrl_quad.deploy.folding import fold
 from torchrl_quad.deploy.network import write_c, write_onnx
 from torchrl_quad.deploy.page import write_page
-from torchrl_quad.deploy.tasks import PROGRESS, Rule, progress_of
+from torchrl_quad.deploy.tasks import PROGRESS, RULES, Rule, progress_of
 from torchrl_quad.envs import QuadrotorEnv
 from torchrl_quad.errors import MissingPackage, UserValueError
+from torchrl_quad.files import replacing_folder, require_folder
 
 VECTORS, SELF_TEST_VECTORS = 1024, 16
 IMAGES, SELF_TEST_IMAGES = 256, 4  # the same with images, which are large
@@ -89,7 +89,8 @@ def export_policy(
 
     Raises:
         ValueError: the policy or the task cannot be exported, or the bundle does not fly as they do.
-        FileExistsError: the folder exists and holds something else than a bundle, or files beside it.
+        FileExistsError: there is something of that name that is no folder, or a folder that holds something else than a
+            bundle, or files beside it.
         ImportError: onnx or onnxruntime is missing.
     """
     try:
@@ -98,9 +99,9 @@ def export_policy(
     except ImportError as error:
         raise MissingPackage("export_policy needs onnx and onnxruntime: pip install onnx onnxruntime") from error
     env, normalizer = _unwrapped(env, normalizer)
-    place = Path(folder).resolve()  # a link stays, what it points to is replaced
-    require_replaceable(place)
-    restore(place)
+    place = Path(folder) if Path(folder).name not in ("", "..") else Path(folder).resolve()
+    require_folder(place)
+    require_bundle(place)
     camera = env.camera
     network = fold(actor, normalizer, camera and (camera.height, camera.width))
     reads = network.reads
@@ -130,7 +131,7 @@ def export_policy(
     contract["sha256"] = {name: contracts.sha256(files[name]) for name in contracts.FILES}
     contract["digest"] = contracts.digest(contract)
     files["contract.json"] = (json.dumps(contract, indent=2, allow_nan=False) + "\n").encode()
-    with replacing_folder(place) as temporary:
+    with replacing_folder(place, require_bundle) as temporary:
         for name, content in files.items():
             with open(temporary / name, "wb") as file:
                 file.write(content)
@@ -249,7 +250,8 @@ def _require_the_same_flight(
         states |= {"depth": episode["depth"].cpu().numpy()} if bundle.contract["camera"] else {}
         true = episode["state", "position"].cpu().numpy()
         if not np.array_equal(true, states["position"]):
-            _go_by(bundle.rule, true)  # the environment counts gates from there, a bundle from what it measures
+            # The environment counts gates from there, a bundle from what it measures.
+            _go_by(bundle.rule, RULES[rule], true)
         observed, acted = [], []
         for t in range(length):
             bundle({name: x[t] for name, x in states.items()} | {"age": 0.0, "depth_age": 0.0})
@@ -272,10 +274,10 @@ def _require_the_same_flight(
             )
 
 
-def _go_by(rule: Rule, positions: np.ndarray) -> None:
-    """Let a rule advance along positions (t, 3), whatever the bundle tells it."""
-    advance, steps = type(rule).advance, itertools.pairwise(positions)
-    vars(rule)["advance"] = lambda before, position: advance(rule, *next(steps))
+def _go_by(rule: Rule, kind: type, positions: np.ndarray) -> None:
+    """Let a rule, and its copies, advance along positions (t, 3), whatever the bundle tells it."""
+    steps = itertools.pairwise(positions)
+    rule.__class__ = type(kind.__name__, (kind,), {"advance": lambda self, *_: kind.advance(self, *next(steps))})
 
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -288,3 +290,21 @@ def _version() -> str:
     with contextlib.suppress(metadata.PackageNotFoundError):
         return f"torchrl_quad {metadata.version('torchrl_quad')}"
     return "torchrl_quad"
+
+
+def require_bundle(folder: Path) -> None:
+    """Refuse a folder that holds something else than a bundle, or files beside one.
+
+    Raises:
+        FileExistsError: it does.
+    """
+    found = list(folder.iterdir()) if folder.is_dir() else []
+    plain = {path.name for path in found if path.is_file() and not path.is_symlink()}
+    names = {path.name for path in found}
+    if names and not (folder / "contract.json").is_file():
+        raise FileExistsError(f"{folder} exists and is no bundle. Choose another folder, or empty this one.")
+    if others := sorted(names - (plain & {*contracts.FILES, "contract.json"})):
+        raise FileExistsError(
+            f"{folder} also holds {', '.join(others)}: an export replaces the folder, and would delete that. Move it "
+            "away, or choose another folder."
+        )

@@ -1,0 +1,163 @@
+"""Files and folders are complete or not there, and what is neither file nor folder is never replaced."""
+
+import os
+import socket
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from torchrl_quad import files
+from torchrl_quad.files import add_rows, locked, make_folder, read_rows, replacing, replacing_folder, write_rows
+
+
+def fifo(path):
+    os.mkfifo(path)
+
+
+def socket_file(path):
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(path))
+
+
+def link_to_a_file(path):
+    (path.parent / "target").write_text("mine")
+    path.symlink_to(path.parent / "target")
+
+
+def link_to_a_folder(path):
+    (path.parent / "target").mkdir()
+    path.symlink_to(path.parent / "target")
+
+
+def dangling_link(path):
+    path.symlink_to(path.parent / "nothing")
+
+
+def looping_link(path):
+    path.symlink_to(path)
+
+
+def folder(path):
+    path.mkdir()
+
+
+def plain_file(path):
+    path.write_text("mine")
+
+
+def write_a_file(path):
+    with replacing(path) as temporary:
+        temporary.write_text("ours")
+
+
+def write_a_folder(path):
+    with replacing_folder(path, lambda _: None) as temporary:
+        (temporary / "file").write_text("ours")
+
+
+def lock(path):
+    with locked(path):
+        path.write_text("ours")
+
+
+NEITHER = [fifo, socket_file, link_to_a_file, link_to_a_folder, dangling_link, looping_link]
+WRITERS = {  # what a path must not be for each
+    write_a_file: [*NEITHER, folder],
+    lock: [*NEITHER, folder],
+    lambda path: write_rows(path, [{"a": 1}]): [*NEITHER, folder],
+    lambda path: add_rows(path, [{"a": 1}]): [*NEITHER, folder],
+    write_a_folder: [*NEITHER, plain_file],
+    make_folder: [fifo, socket_file, link_to_a_file, dangling_link, looping_link, plain_file],
+}
+
+
+def everything_in(folder):
+    found = sorted(folder.iterdir())
+    return [(x.name, os.lstat(x).st_ino, os.lstat(x).st_mode, x.read_text() if x.is_file() else "") for x in found]
+
+
+@pytest.mark.parametrize(("write", "make"), [(write, make) for write, kinds in WRITERS.items() for make in kinds])
+def test_what_is_neither_file_nor_folder_is_refused_and_stays(write, make, tmp_path):
+    path = tmp_path / "place"
+    make(path)
+    before = everything_in(tmp_path)
+    with pytest.raises(FileExistsError, match=rf"{path} is a (pipe|socket|link|folder|file), and no"):
+        write(path)
+    assert everything_in(tmp_path) == before
+
+
+@pytest.mark.parametrize("make", [fifo, link_to_a_file])
+def test_what_takes_the_place_while_a_file_is_written_stays_too(make, tmp_path):
+    with pytest.raises(FileExistsError), replacing(tmp_path / "place") as temporary:
+        temporary.write_text("ours")
+        make(tmp_path / "place")
+    with pytest.raises(FileExistsError), replacing_folder(tmp_path / "place", lambda _: None):
+        pass
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_threads_and_nested_writers_of_one_file_do_not_meet(tmp_path):
+    path = tmp_path / "table.csv"
+
+    def write(number):
+        for _ in range(50):
+            with replacing(path) as temporary:
+                temporary.write_text(f"{number}" * 1000)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write, range(8)))
+    assert len(set(path.read_text())) == 1 and len(path.read_text()) == 1000
+    with replacing(path) as outer:
+        outer.write_text("outer")
+        write_a_file(path)
+    assert path.read_text() == "outer"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_leftovers_of_dead_processes_go_and_those_of_other_machines_and_the_living_stay(tmp_path, monkeypatch):
+    path, dead = tmp_path / "table.csv", 2**22 + 1  # more than Linux counts processes
+    prefix = files._prefix(path)
+    left = tmp_path / f"{prefix}{dead}.0.csv"
+    living = tmp_path / f"{prefix}{os.getpid()}.999999.csv"
+    monkeypatch.setattr(socket, "gethostname", lambda: "elsewhere")
+    theirs = tmp_path / f"{files._prefix(path)}{dead}.0.csv"
+    monkeypatch.undo()
+    for other in (left, living, theirs):
+        other.touch()
+    write_a_file(path)
+    assert set(tmp_path.iterdir()) == {path, living, theirs}
+
+
+def test_a_folder_that_a_killed_process_had_set_aside_comes_back(tmp_path):
+    place, dead = tmp_path / "policy", 2**22 + 1
+    aside = tmp_path / f"{files._prefix(place)}{dead}.0.old"
+    aside.mkdir()
+    (aside / "file").write_text("old")
+
+    def require(folder):
+        assert (folder / "file").read_text() == "old"
+
+    with pytest.raises(ZeroDivisionError), replacing_folder(place, require):
+        raise ZeroDivisionError
+    assert (place / "file").read_text() == "old" and list(tmp_path.iterdir()) == [place]
+    write_a_folder(place)
+    assert (place / "file").read_text() == "ours" and list(tmp_path.iterdir()) == [place]
+
+
+def test_processes_that_add_to_one_table_lose_no_row(tmp_path):
+    path = tmp_path / "results.csv"
+    program = (
+        "import sys; from torchrl_quad.files import add_rows\n"
+        "for i in range(20): add_rows(sys.argv[1], [{'who': sys.argv[2], 'i': i, f'own{sys.argv[2]}': 1}])"
+    )
+    running = [subprocess.Popen([sys.executable, "-c", program, path, str(who)]) for who in range(4)]
+    assert [process.wait() for process in running] == [0] * 4
+    assert sorted((row["who"], int(row["i"])) for row in read_rows(path)) == [
+        (str(w), i) for w in range(4) for i in range(20)
+    ]
+    assert list(tmp_path.iterdir()) == [path]
+    add_rows(path, [{"who": "2", "i": 3, "own2": 5}], same=("who", "i"))
+    assert [row["own2"] for row in read_rows(path) if (row["who"], row["i"]) == ("2", "3")] == ["5"]
+    assert len(read_rows(path)) == 80

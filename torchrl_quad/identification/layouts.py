@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from torchrl_quad.deploy import frames
+from torchrl_quad.dynamics.presets import as_array
+from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
 from torchrl_quad.identification.streams import Array, Signal, Stream
+from torchrl_quad.options import shown
 
 SIZES = {  # how many columns a quantity has; setpoints may have any number
     "position": 3,
@@ -42,6 +45,23 @@ class Columns:
     scale: ArrayLike = 1.0
     offset: ArrayLike = 0.0
 
+    def __post_init__(self) -> None:
+        names = (self.names,) if isinstance(self.names, str) else self.names
+        is_names = isinstance(names, Sequence) and len(names) > 0 and all(isinstance(name, str) for name in names)
+        if not is_names:
+            raise UserValueError(f"Columns: names must be the names of columns, got {shown(self.names)}.")
+        object.__setattr__(self, "names", tuple(names))
+        for field in ("scale", "offset"):
+            value = getattr(self, field)
+            try:
+                numbers = as_array(value)
+                fits = numbers.shape in ((), (len(names),)) and (np.abs(numbers) <= 1e30).all()
+            except (ValueError, RecursionError):
+                fits = False
+            if not fits or (field == "scale" and not numbers.all()):
+                rule = "a number, or one for each column" + (", and none may be zero" if field == "scale" else "")
+                raise UserValueError(f"Columns: {field} of {', '.join(names)} must be {rule}; got {shown(value)}.")
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -53,6 +73,24 @@ class Layout:
     time: Columns = Columns(("time",))  #: of CSV files; others have clocks
     required: frozenset[str] = frozenset()  #: quantities that a caller named; a file without their columns is refused
 
+    def __post_init__(self) -> None:
+        rules = {
+            "columns must map quantities to tuples of Columns": isinstance(self.columns, Mapping)
+            and all(isinstance(c, Sequence) and all(isinstance(x, Columns) for x in c) for c in self.columns.values()),
+            "convention must be one of torchrl_quad.deploy.frames": isinstance(self.convention, frames.Convention),
+            "onboard must be a tuple of fields": isinstance(self.onboard, Sequence)
+            and not isinstance(self.onboard, str)
+            and all(isinstance(field, str) for field in self.onboard),
+            "time must be Columns of one name": isinstance(self.time, Columns) and len(self.time.names) == 1,
+            "required must be a set of quantities": isinstance(self.required, Set),
+        }
+        for rule, holds in rules.items():
+            if not holds:
+                raise UserValueError(f"Layout: {rule}, got {shown(getattr(self, rule.split()[0]))}.")
+        for quantity, choices in self.columns.items():
+            for choice in choices:
+                _check_quantity(quantity, choice)
+
 
 def _c(names: str, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> Columns:
     return Columns(tuple(names.split()), scale, offset)
@@ -60,6 +98,18 @@ def _c(names: str, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> Columns:
 
 def _three(stem: str) -> str:
     return " ".join(f"{stem}[{k}]" for k in range(3))
+
+
+def _check_quantity(quantity: object, columns: Columns) -> None:
+    known = [*SIZES, "time", "setpoint.NAME"]
+    is_known = isinstance(quantity, str) and (quantity in known[:-1] or quantity.startswith("setpoint."))
+    if not is_known:
+        raise MissingColumns(f"Unknown quantity {shown(quantity)} in columns. Choose from: {', '.join(known)}.")
+    size = 1 if quantity == "time" else SIZES.get(quantity, len(columns.names))
+    if len(columns.names) != size:
+        raise MissingColumns(
+            f"{quantity} takes {size} column(s), got {len(columns.names)}: {', '.join(columns.names)}. Name each."
+        )
 
 
 LAYOUTS = {
@@ -141,8 +191,13 @@ def choose(columns: str | Layout | Mapping[str, object], default: Layout | None)
         return columns
     if isinstance(columns, str):
         if columns not in LAYOUTS:
-            raise MissingColumns(f"Unknown layout {columns!r}. Choose from: {', '.join(LAYOUTS)}.")
+            raise MissingColumns(f"Unknown layout {shown(columns)}. Choose from: {', '.join(LAYOUTS)}.")
         return LAYOUTS[columns]
+    if not isinstance(columns, Mapping):
+        raise UserTypeError(
+            f"columns must be the name of a layout ({', '.join(LAYOUTS)}), a Layout, or a mapping of quantities to "
+            f"names of columns; got {shown(columns)}."
+        )
     chosen = {quantity: (_as_columns(quantity, names),) for quantity, names in columns.items()}
     time = chosen.pop("time", (Columns(("time",)),))[0]
     required = frozenset(chosen)
@@ -157,17 +212,13 @@ def choose(columns: str | Layout | Mapping[str, object], default: Layout | None)
 
 
 def _as_columns(quantity: str, names: object) -> Columns:
-    known = [*SIZES, "time", "setpoint.NAME"]
-    if quantity not in SIZES and quantity != "time" and not quantity.startswith("setpoint."):
-        raise MissingColumns(f"Unknown quantity {quantity!r} in columns. Choose from: {', '.join(known)}.")
-    if not isinstance(names, Columns):
-        names = Columns((names,) if isinstance(names, str) else tuple(names))  # type: ignore[arg-type]
-    size = 1 if quantity == "time" else SIZES.get(quantity, len(names.names))
-    if len(names.names) != size:
-        raise MissingColumns(
-            f"{quantity} takes {size} column(s), got {len(names.names)}: {', '.join(names.names)}. Name each."
+    if not isinstance(names, Columns | str) and not (isinstance(names, Sequence) and not isinstance(names, bytes)):
+        raise UserTypeError(
+            f"columns: {shown(quantity)} takes the name of a column, a list of them, or Columns; got {shown(names)}."
         )
-    return names
+    columns = names if isinstance(names, Columns) else Columns(names)  # type: ignore[arg-type]
+    _check_quantity(quantity, columns)
+    return columns
 
 
 def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Signal]:

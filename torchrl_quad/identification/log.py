@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from torchrl_quad.deploy.frames import Convention
+from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.identification.attitude import body_rates, continuous, from_euler, rotate, slope
 from torchrl_quad.identification.checks import (
     check_motors,
@@ -17,11 +20,14 @@ from torchrl_quad.identification.checks import (
     check_specific_force,
     check_velocity,
 )
-from torchrl_quad.identification.errors import NoFlight, WrongUnit
-from torchrl_quad.identification.layouts import Columns, Layout, gather
+from torchrl_quad.identification.errors import GapsTooLarge, LogError, NoFlight, WrongUnit
+from torchrl_quad.identification.layouts import SIZES, Columns, Layout, gather
 from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
 from torchrl_quad.identification.sources import read_streams
-from torchrl_quad.identification.streams import Array, Signal, clean, covered, frozen, resample
+from torchrl_quad.identification.streams import LARGEST, Array, Signal, Stream, clean, covered, frozen, resample
+from torchrl_quad.options import NonNegative, checked, shown
+
+LEAST_STEP, MAX_STEPS = 1e-3, 1_000_000  # [s] of a log, and how many: 17 minutes at 1 kHz, half a gigabyte
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,29 @@ class FlightLog:
     onboard: tuple[str, ...]  #: fields by another clock than the position's, late by an unknown, constant delay
     notes: tuple[str, ...]  #: what was found and done, a sentence each
 
+    def __post_init__(self) -> None:
+        shapes = {"time": (), "position": (3,), "quaternion": (4,), "velocity": (3,), "angular_velocity": (3,)}
+        shapes |= {"acceleration": (3,), "motor_command": (4,), "battery_voltage": ()}
+        length = np.shape(self.time)[:1]
+        for field, shape in shapes.items():
+            value = getattr(self, field)
+            if value is None and field in ("acceleration", "battery_voltage"):
+                continue
+            fits = isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.shape == (*length, *shape)
+            if not (fits and len(value) > 1 and (np.abs(value) < LARGEST).all()):
+                raise UserValueError(
+                    f"FlightLog: {field} must be a float array {('T', *shape)} of finite numbers, T of them at least "
+                    f"two; got {shown(value)}."
+                )
+        if not (np.abs(np.diff(self.time) - self.dt) < 1e-3 * self.dt).all():
+            raise UserValueError(f"FlightLog: time must rise in uniform steps [s], got {shown(self.time)}.")
+        ends = [end for piece in self.segments for end in piece]
+        if ends != sorted(ends) or not all(0 <= end <= length[0] for end in ends):
+            raise UserValueError(
+                f"FlightLog: segments must be pairs (start, stop) in order, from 0 to {length[0]}; got "
+                f"{shown(self.segments)}."
+            )
+
     @property
     def dt(self) -> float:
         """The step [s]."""
@@ -57,16 +86,17 @@ class FlightLog:
         return "\n".join(lines + [f"- {note}" for note in self.notes])
 
 
+@checked
 def read_log(
     path: str | Path,
     columns: str | Layout | Mapping[str, str | Sequence[str] | Columns] | None = None,
     *,
     convention: Convention | None = None,
     onboard: Sequence[str] | None = None,
-    dt: float | None = None,
-    clearance: float = 0.1,
-    max_gap: float = 0.05,
-    min_duration: float = 0.5,
+    dt: Annotated[float, Field(ge=LEAST_STEP, lt=0.5)] | None = None,
+    clearance: NonNegative = 0.1,
+    max_gap: NonNegative = 0.05,
+    min_duration: NonNegative = 0.5,
 ) -> FlightLog:
     """Read the log of a flight: CSV (also gz), PX4 ULog, ROS bag, or the uSD log of a Crazyflie.
 
@@ -77,7 +107,8 @@ def read_log(
                        "acceleration": Columns(("ax", "ay", "az"), scale=9.80665)})
         print(log)
 
-    ULog needs pyulog and bags need rosbags: ``pip install '.[logs]'`` in a clone.
+    Bags need rosbags: ``pip install '.[logs]'`` in a clone. Files are read in time and memory proportional to their
+    size, and refused by name beyond the limits of ``docs/flight_logs.md``.
 
     Args:
         path: a file, or the folder of a ROS 2 bag. Its first bytes say of what kind it is.
@@ -88,7 +119,7 @@ def read_log(
         convention: the frames and orders of the file, of :mod:`torchrl_quad.deploy.frames`; by default the preset's,
             and for a mapping of a CSV file ours. Its ``xyzw`` and ``motors`` say how quaternions and motors are named.
         onboard: fields that another clock than the position's has stamped; "setpoint" is one.
-        dt: step of the result [s]; by default that of the attitude.
+        dt: step of the result [s], from 0.001 to below 0.5; by default that of the attitude, or 0.001 if it is less.
         clearance: height above where the drone stood [m] up to which it counts as on the ground.
         max_gap: the longest time without samples [s] that is bridged; at least three usual steps always are. Longer
             gaps separate pieces.
@@ -97,15 +128,40 @@ def read_log(
     Raises:
         LogError: the log cannot be used. Its subclasses name the reason; ``docs/flight_logs.md`` lists them.
     """
+    if not (convention is None or isinstance(convention, Convention)):
+        raise UserTypeError(f"convention must be one of torchrl_quad.deploy.frames, or None; got {shown(convention)}.")
+    known = {*SIZES, "setpoint"} - {"euler", "velocity_body"}
+    for field in onboard or ():
+        if field not in known:
+            raise UserValueError(f"onboard: unknown field {shown(field)}. Choose from: {', '.join(sorted(known))}.")
     path = Path(path)
-    streams, layout, notes = read_streams(path, columns)
-    layout = layout if convention is None else replace(layout, convention=convention)
-    fields = layout.onboard if onboard is None else tuple(onboard)
+    try:
+        streams, layout, notes = read_streams(path, columns)
+        layout = layout if convention is None else replace(layout, convention=convention)
+        fields = layout.onboard if onboard is None else tuple(onboard)
+        return _flight(path, streams, layout, notes, fields, dt, clearance, max_gap, min_duration)
+    except LogError as error:
+        if path.name in str(error):
+            raise
+        raise type(error)(f"{path.name}: {error}") from error
+
+
+def _flight(
+    path: Path,
+    streams: Sequence[Stream],
+    layout: Layout,
+    notes: list[str],
+    fields: tuple[str, ...],
+    dt: float | None,
+    clearance: float,
+    max_gap: float,
+    min_duration: float,
+) -> FlightLog:
     signals = _signals(layout, streams, path.name, notes)
     main = [s for q, s in signals.items() if q != "battery_voltage" and not q.startswith("setpoint.")]
     attitude = signals.get("quaternion") or signals["euler"]
-    step = dt or round(attitude.step, 5)
-    if not 0.0 < step < 0.5:
+    step = dt or max(round(attitude.step, 5), LEAST_STEP)
+    if not 0.0 < attitude.step < 0.5:
         raise WrongUnit(
             f"{path.name}: the clock steps by {attitude.step:.4g} s, which is no flight. Is it in milliseconds? Then "
             'write columns={"time": Columns(("t",), scale=1e-3), ...}.'
@@ -116,6 +172,8 @@ def read_log(
             f"{path.name} is no flight: its streams share {max(stop - start, 0.0):.2f} s. Give a longer log, or name "
             "columns that were recorded at the same time."
         )
+    if stop - start > MAX_STEPS * step:
+        _refuse_length(path.name, main, stop - start, step)
     grid = start + step * np.arange(int((stop - start) / step + 1e-6) + 1)
     valid = _cover(main, grid, step, max_gap, notes)
     at = _at(signals, grid, step)
@@ -168,6 +226,17 @@ def _signals(layout: Layout, streams: Sequence, name: str, notes: list[str]) -> 
     note = check_motors(signals["motor_command"])
     notes += [note] if note else []
     return signals
+
+
+def _refuse_length(name: str, main: Sequence[Signal], span: float, step: float) -> None:
+    """Raise the error of a clock that jumps ahead, or of a log that is too long; before it is put on a grid."""
+    signal = max(main, key=lambda s: np.diff(s.time).max())
+    k = int(np.diff(signal.time).argmax())
+    raise GapsTooLarge(
+        f"{name} spans {span:.4g} s, which are {span / step:.3g} steps of {step:g} s; the most is {MAX_STEPS:,}. The "
+        f"clock of {signal} jumps from {signal.time[k]:.6g} to {signal.time[k + 1]:.6g} s at sample {k + 1}. Cut the "
+        "file there and read the parts, or give a larger dt."
+    )
 
 
 def _cover(main: Sequence[Signal], grid: Array, step: float, max_gap: float, notes: list[str]) -> np.ndarray:

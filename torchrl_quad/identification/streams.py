@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torchrl_quad.identification.errors import ClockJumpsBack, NotFiniteLog
 
 Array = NDArray[np.float64]
+LARGEST = 1e9  # of a quantity, in SI units; only damage makes larger ones
 
 
 @dataclass(frozen=True)
@@ -41,14 +42,14 @@ class Signal:
 
 
 def clean(signal: Signal) -> tuple[Signal, str | None]:
-    """Without samples that are not finite or repeat a time, and what was dropped.
+    """Without samples that are not finite, beyond ``LARGEST`` or repeat a time, and what was dropped.
 
     Raises:
         ClockJumpsBack: the clock runs backwards.
         NotFiniteLog: fewer than two samples are finite.
     """
     time, values = signal.time, signal.values
-    finite = np.isfinite(values).all(-1) & np.isfinite(time)
+    finite = (np.abs(values) < LARGEST).all(-1) & (np.abs(time) < 1e15)  # neither holds for NaN
     if finite.sum() < 2:  # of tables that join several rates, most rows of the slower ones are empty
         raise NotFiniteLog(
             f"{finite.sum()} of {len(finite)} samples of {signal} are finite: nothing was recorded there. Name other "
@@ -67,7 +68,7 @@ def clean(signal: Signal) -> tuple[Signal, str | None]:
     lost, repeated = int((~finite).sum()), int((~new).sum())
     note = []
     if lost:
-        note.append(f"{lost} samples of {signal} are not finite; they count as missing")
+        note.append(f"{lost} samples of {signal} are not finite, or beyond {LARGEST:g}; they count as missing")
     if repeated:
         note.append(f"{repeated} samples of {signal} repeat the time of the sample before, and were dropped")
     return Signal(signal.field, signal.columns, time[new], values[new]), "; ".join(note) or None
@@ -115,7 +116,8 @@ def frozen(signal: Signal, grid: Array, max_gap: float) -> tuple[NDArray[np.bool
     lengths = signal.time[edges[:, 1]] - signal.time[edges[:, 0]]
     usual = float(np.median(lengths)) if len(lengths) > 0.05 * len(signal.time) else 0.0
     long = lengths > max(max_gap, 3.0 * usual)
-    inside = np.zeros(len(grid), bool)
-    for first, last in signal.time[edges[long]]:
-        inside |= (grid > first + 1e-9) & (grid < last - 1e-9)
-    return inside, lengths[long]
+    ends = signal.time[edges[long]]
+    changes = np.zeros(len(grid) + 1, int)
+    np.add.at(changes, np.searchsorted(grid, ends[:, 0] + 1e-9, side="right"), 1)
+    np.add.at(changes, np.searchsorted(grid, ends[:, 1] - 1e-9), -1)
+    return np.cumsum(changes[:-1]) > 0, lengths[long]

@@ -20,10 +20,10 @@ def main(cfg: DictConfig) -> None:
     summary, flight = final_evaluation(trained, actor, normalizer, cfg.episodes, cfg.seed)
     folder, env = Path(cfg.checkpoint).parent, build_env(trained, 1, 0)
     write_summary(folder / "evaluation.json", summary)
+    print_summary(summary, env.metric_info, folder)
     path = folder / "evaluation"
     draw_flight(flight, path, env, title(summary))
     publish_flight(flight, path.with_suffix(".pdf"), path.with_suffix(".html"), env, title(summary))
-    print_summary(summary, env.metric_info, folder)
 
 
 if __name__ == "__main__":

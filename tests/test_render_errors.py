@@ -1,11 +1,16 @@
-"""What pictures refuse, need, and leave alone."""
+"""What pictures refuse, need, and leave alone, and that results do not depend on them."""
 
+import errno
 import sys
 
+import imageio_ffmpeg
 import pytest
+from small_runs import SMALL
+from training import drawing
 
 from torchrl_quad import HoveringEnv
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, write_replay
+from torchrl_quad.render.frames import NoFfmpeg
 
 FILES = {animate_flight: "flight.gif"}
 
@@ -65,3 +70,123 @@ def test_a_film_in_mp4_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ImportError, match=r"MP4 need imageio-ffmpeg: pip install '.\[render\]'"):
         animate_flight(HoveringEnv(num_envs=1).rollout(3), tmp_path / "flight.mp4")
+
+
+# -- an ffmpeg that does not work --------------------------------------------------------------------------------------
+
+WORKS = imageio_ffmpeg.get_ffmpeg_exe()
+TRIED = f'case "$*" in *"h264 -") exec {WORKS} "$@";; esac\n'  # the film of one frame comes out well
+BROKEN = {
+    "missing": None,
+    "not a program": "",
+    "not executable": f'exec {WORKS} "$@"',
+    "fails": "echo no encoder >&2; exit 3",
+    "killed": "kill -9 $$",
+    "does nothing": "cat >/dev/null",
+    "killed later": f"{TRIED} head -c 100 >/dev/null; kill -9 $$",
+    "killed at the end": f'{TRIED} {WORKS} "$@"; kill -9 $$',
+    "forgets the film": f"{TRIED} cat >/dev/null",
+}
+
+
+@pytest.fixture
+def broken_ffmpeg(tmp_path, monkeypatch):
+    def broken(kind):
+        path = tmp_path / "ffmpeg"
+        if (script := BROKEN[kind]) is not None:
+            path.write_text(f"#!/bin/sh\n{script}\n" if script else "")
+            path.chmod(0o644 if kind == "not executable" else 0o755)
+        monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(path))
+
+    return broken
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_where_no_ffmpeg_works_the_film_is_a_gif_and_a_line_says_why(
+    kind, broken_ffmpeg, monkeypatch, capsys, tmp_path
+):
+    env = HoveringEnv(num_envs=1)
+    flight, path = env.rollout(3), tmp_path / "flight"
+    drawing.draw_flight(flight, path, env, "one")
+    assert path.with_suffix(".mp4").exists() and not capsys.readouterr().err
+    broken_ffmpeg(kind)
+    with pytest.raises(NoFfmpeg, match=r"an ffmpeg that writes H.264, and \S+ does not .*unset IMAGEIO_FFMPEG_EXE"):
+        animate_flight(flight, tmp_path / "film.mp4", env=env)
+    drawing.draw_flight(flight, path, env, "one")
+    assert path.with_suffix(".gif").read_bytes().startswith(b"GIF") and not path.with_suffix(".mp4").exists()
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith(f"Warning: {path}.gif takes the place of an MP4. Films in MP4 need ")
+    monkeypatch.delenv("IMAGEIO_FFMPEG_EXE")
+    drawing.draw_flight(flight, path, env, "one")
+    assert path.with_suffix(".mp4").exists() and not path.with_suffix(".gif").exists()
+
+
+def test_an_ffmpeg_that_cannot_be_found_is_installed_anew(monkeypatch, tmp_path):
+    def none():
+        raise RuntimeError("No ffmpeg exe could be found.")
+
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", none)
+    with pytest.raises(NoFfmpeg, match=r"No ffmpeg exe could be found.*pip install --force-reinstall"):
+        animate_flight(HoveringEnv(num_envs=1).rollout(3), tmp_path / "flight.mp4")
+
+
+# -- results do not depend on pictures ---------------------------------------------------------------------------------
+
+FAILURES = {
+    "disk full": (OSError(errno.ENOSPC, "No space left on device"), False),
+    "no plotly": (ImportError("Replays need plotly"), False),
+    "broken font": (RuntimeError("Can not load face\n(unknown file format)"), True),
+    "our mistake": (KeyError("positoin"), True),
+}
+
+
+@pytest.mark.parametrize("kind", FAILURES)
+def test_a_run_whose_pictures_all_fail_has_its_results_and_says_what_is_missing(kind, launch, monkeypatch, tmp_path):
+    (error, traced), said = FAILURES[kind], []
+
+    def fail(*args, **options):
+        raise error
+
+    for name in ("plot_flight", "plot_episode", "animate_flight", "write_replay", "plot_learning_curve"):
+        monkeypatch.setattr(drawing, name, fail)
+    monkeypatch.setattr(drawing, "_warn", said.append)
+    for old in ("flight.mp4", "flight.gif", "flight.html"):
+        (tmp_path / old).touch()
+    launch("bptt", *SMALL, "total_steps=48", f"hydra.run.dir={tmp_path}", "logger.backend=wandb")
+    launch("evaluate", f"checkpoint={tmp_path}/checkpoint.pt")
+    flight, evaluation = (
+        [f"{tmp_path / stem}.{x}" for x in ("png", "mp4", "pdf", "html")] for stem in ("flight", "evaluation")
+    )
+    flight[2:] = [f"{tmp_path}/{name}" for name in ("episode.pdf", "flight.html", "learning_curve.png")]
+    assert [line.split(" is missing. ")[0] for line in said] == flight + evaluation
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"summary.json", "metrics.csv", "checkpoint.pt", "evaluation.json"} <= names
+    assert not {name for name in names if name.endswith((".png", ".mp4", ".gif", ".pdf", ".html"))}
+    assert ("drawing.log" in names) == traced
+    assert not any("\n" in line for line in said)
+    if traced:
+        assert all(f"{type(error).__name__}: " in x and f"traceback is in {tmp_path}/drawing.log" in x for x in said)
+        assert "in fail\n    raise error\n" in (tmp_path / "drawing.log").read_text()
+
+
+def test_a_run_that_is_stopped_while_it_draws_has_its_results(refused, monkeypatch, tmp_path):
+    def stop(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(drawing, "draw_flight", stop)
+    refused("bptt", *SMALL, "total_steps=48", f"hydra.run.dir={tmp_path}", status=130)
+    assert {"summary.json", "metrics.csv", "checkpoint.pt"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_picture_takes_the_place_of_nothing_but_a_picture(capsys, tmp_path):
+    env = HoveringEnv(num_envs=1)
+    kept = tmp_path / "kept.html"
+    kept.write_text("kept")
+    (tmp_path / "flight.html").symlink_to(kept)
+    (tmp_path / "episode.png").mkdir()
+    drawing.publish_flight(env.rollout(3), tmp_path / "episode.png", tmp_path / "flight.html", env, "one")
+    said = capsys.readouterr().err.splitlines()
+    assert [line.split(" is missing. ")[0] for line in said] == [
+        f"Warning: {tmp_path}/{name}" for name in ("episode.png", "flight.html")
+    ]
+    assert kept.read_text() == "kept" and (tmp_path / "flight.html").is_symlink()

@@ -1,9 +1,19 @@
-"""The pictures of a flight, each file complete or not there."""
+"""The pictures of a flight, each file complete or not there.
+
+Pictures are drawn after the results are written, and never cost them: one that cannot be drawn is missing, an older one
+of its name is deleted, and a line on stderr says why. An error that explains itself is that line; of any other, which
+may be a mistake of ours, the traceback goes into ``drawing.log`` beside the picture.
+"""
 
 from __future__ import annotations
 
-from importlib.util import find_spec
+import contextlib
+import functools
+import sys
+import traceback
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -12,30 +22,38 @@ from torchrl.envs import EnvBase
 from torchrl_quad.deploy import Bundle
 from torchrl_quad.deploy.replaying import as_rollout, environment
 from torchrl_quad.deploy.transfer import fly
+from torchrl_quad.errors import UserError
 from torchrl_quad.files import replacing
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, write_replay
+from torchrl_quad.render.frames import NoFfmpeg, find_ffmpeg
+
+EXPLAINED = (UserError, OSError, ImportError, MemoryError)
 
 
 def draw_flight(flight: TensorDictBase, path: Path, env: EnvBase, title: str) -> None:
     """Draw a flight as a picture and as a film: ``path`` with .png and, see :func:`film_of`, .mp4 or .gif."""
-    with replacing(path.with_suffix(".png")) as temporary:
+    picture = path.with_suffix(".png")
+    with _or_without(picture), replacing(picture) as temporary:
         plot_flight(flight, temporary, env=env, title=title)
-    film = film_of(path)
-    sharp = {"fps": 25, "size": 560} if film.suffix == ".mp4" else {}
-    with replacing(film) as temporary:
-        animate_flight(flight, temporary, env=env, **sharp)
+    _film(path, flight, env=env, sharp={"fps": 25, "size": 560})
 
 
 def film_of(path: Path) -> Path:
-    """The film beside a picture: .mp4, or .gif where imageio-ffmpeg is not installed."""
-    return path.with_suffix(".mp4" if find_spec("imageio_ffmpeg") else ".gif")
+    """The film to draw beside a picture: .mp4, or .gif where no ffmpeg works, which a line on stderr then says."""
+    try:
+        find_ffmpeg()
+    except NoFfmpeg as error:
+        _warn(f"{path.with_suffix('.gif')} takes the place of an MP4. {error}")
+        return path.with_suffix(".gif")
+    return path.with_suffix(".mp4")
 
 
 def publish_flight(flight: TensorDictBase, figure: Path, page: Path, env: EnvBase, title: str) -> None:
     """Draw the first episode of a flight as a figure for a paper, and write a page that plays the flight."""
-    with replacing(figure) as temporary:
+    with _or_without(figure), replacing(figure) as temporary:
         plot_episode(flight, temporary, env=env)
-    write_replay(flight, page, env=env, title=title)
+    with _or_without(page):
+        write_replay(flight, page, env=env, title=title)
 
 
 def draw_transfer(bundle: Bundle, simulator: str, loop: str, path: Path, drones: int = 4) -> None:
@@ -45,14 +63,66 @@ def draw_transfer(bundle: Bundle, simulator: str, loop: str, path: Path, drones:
     ]
     ours, theirs = (as_rollout(bundle.contract, flight) for flight in flights)
     env, labels = environment(bundle.contract), tuple(flight["simulator"] for flight in flights)
-    film = film_of(path)
-    with replacing(film) as temporary:
-        animate_flight(ours, temporary, env=env, beside=theirs, labels=labels)
+    _film(path, ours, env=env, beside=theirs, labels=labels)
     title = f"drones 1 to {drones}: {labels[0]}; {drones + 1} to {2 * drones}, from the same starts: {labels[1]}"
-    write_replay(torch.cat((ours, theirs)), path.with_suffix(".html"), env=env, title=title)
+    page = path.with_suffix(".html")
+    with _or_without(page):
+        write_replay(torch.cat((ours, theirs)), page, env=env, title=title)
 
 
 def draw_learning_curve(metrics: Path, path: Path, env: EnvBase) -> None:
     """Draw the evaluations in a metrics.csv over training time and steps."""
-    with replacing(path) as temporary:
+    with _or_without(path), replacing(path) as temporary:
         plot_learning_curve(metrics, temporary, metrics=env.metric_info)
+
+
+def _film(path: Path, flight: TensorDictBase, sharp: dict[str, Any] | None = None, **options: Any) -> None:
+    """Film a flight, in an MP4 ``sharp``; no older film of the other suffix is left beside it."""
+    mp4, gif = path.with_suffix(".mp4"), path.with_suffix(".gif")
+    film = film_of(path)
+    with _or_without(film, mp4, gif):
+        try:
+            if film == mp4:
+                with replacing(mp4) as temporary:
+                    animate_flight(flight, temporary, **options, **(sharp or {}))
+        except NoFfmpeg as error:  # it works, and has failed all the same
+            _warn(f"{gif} takes the place of an MP4. {error}")
+            film = gif
+        if film == gif:
+            with replacing(gif) as temporary:
+                animate_flight(flight, temporary, **options)
+        (mp4 if film == gif else gif).unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _or_without(path: Path, *older: Path) -> Iterator[None]:
+    """Draw a picture, or go on without it: older ones, which would show another flight, are deleted."""
+    try:
+        yield
+    except Exception as error:  # whatever it is, the results stand; a line and a traceback show it
+        for old in older or (path,):
+            with contextlib.suppress(OSError):
+                if old.is_file() and not old.is_symlink():
+                    old.unlink()
+        why = " ".join(str(error).split())[:300] or type(error).__name__
+        if not isinstance(error, EXPLAINED):
+            why = f"{type(error).__name__}: {why.rstrip('.')}. {_log_traceback(path)}"
+        _warn(f"{path} is missing. {why}")
+
+
+def _log_traceback(path: Path) -> str:
+    """Add the traceback of the present error to drawing.log, or print it where that cannot be written; say which."""
+    log = path.with_name("drawing.log")
+    try:
+        with open(log, "a", encoding="utf-8") as file:
+            file.write(f"{path.name} is missing.\n{traceback.format_exc()}\n")
+    except OSError:
+        traceback.print_exc()
+        return "The traceback is above."
+    return f"The traceback is in {log}."
+
+
+@functools.cache
+def _warn(line: str) -> None:
+    """Say something once, although each evaluation may draw."""
+    print(f"Warning: {line}", file=sys.stderr)

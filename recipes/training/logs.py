@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import get_logger
 
 from torchrl_quad.files import write_rows
-from training.drawing import film_of
 from training.evaluation import as_json
 
 ARTIFACT = ("checkpoint.pt", "config.yaml", "policy")  # of a run's folder, where they are there; and summary.json
@@ -81,13 +81,14 @@ class Logs:
             self.backend.log_metrics(metrics, step=row["steps"])
 
     def show_flight(self, steps: int) -> None:
-        """Log flight.png and the film."""
+        """Log flight.png and the film, as far as they have been drawn."""
         if self.cfg.logger.backend == "wandb":
             import wandb
 
-            picture, film = wandb.Image(str(self.folder / "flight.png")), film_of(self.folder / "flight")
-            video = wandb.Video(str(film), format=film.suffix[1:])
-            self.backend.experiment.log({"steps": steps, "eval/flight": picture, "eval/film": video})
+            films = "flight.mp4", "flight.gif"
+            drawn = self._drawn("eval/flight", "flight.png", make=wandb.Image)
+            drawn |= self._drawn("eval/film", *films, make=lambda x: wandb.Video(x, format=x[-3:]))
+            self.backend.experiment.log({"steps": steps, **drawn})
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Log the summary, the learning curve, the replay, and what to keep of the run, and close the logger."""
@@ -95,11 +96,12 @@ class Logs:
             import wandb
 
             experiment = self.backend.experiment
-            curve = wandb.Image(str(self.folder / "learning_curve.png"))
-            page = wandb.Html(str(self.folder / "flight.html"), inject=False)  # as it is
+            drawn = self._drawn("eval/learning_curve", "learning_curve.png", make=wandb.Image)
+            as_it_is = functools.partial(wandb.Html, inject=False)
+            drawn |= self._drawn("eval/replay", "flight.html", make=as_it_is)
             numbers = {x: y for x, y in summary.items() if isinstance(y, float) and x != "seconds"}
             best = {f"best/{x}": y for x, y in {**numbers, "steps": summary["best_steps"]}.items()}
-            experiment.log({"steps": summary["steps"], "eval/learning_curve": curve, "eval/replay": page, **best})
+            experiment.log({"steps": summary["steps"], **drawn, **best})
             name = f"{self.cfg.task}_{self.cfg.algorithm}_{experiment.id}"
             artifact = wandb.Artifact(name, type="model", metadata=json.loads(as_json(summary)))
             for path in map(self.folder.joinpath, ARTIFACT):
@@ -116,6 +118,11 @@ class Logs:
     def state_dict(self) -> dict[str, Any] | None:
         """What a run that goes on needs to log into the same wandb run."""
         return {**self.backend.state_dict(), "name": self.name} if self.cfg.logger.backend == "wandb" else None
+
+    def _drawn(self, name: str, *files: str, make: Callable[[str], Any]) -> dict[str, Any]:
+        """What wandb shows under a name, made of the first of these files that is there."""
+        paths = [str(self.folder / file) for file in files if (self.folder / file).exists()]
+        return {name: make(paths[0])} if paths else {}
 
     def _write(self) -> None:
         write_rows(self.folder / "metrics.csv", self.rows, missing=math.nan)

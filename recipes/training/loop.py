@@ -266,18 +266,18 @@ class Run:
         return metrics
 
     def _finish(self) -> None:
-        """Fly the best policy from fresh starts, draw it, and write the summary last: it marks the run as finished."""
+        """Fly the best policy from fresh starts, write the summary, which marks the run as finished, and draw it."""
         summary, flight = final_evaluation(self.cfg, *best_policy(self.cfg, self.best, self.folder))
         summary |= {"steps": self.steps, "best_steps": self.best["steps"], "seconds": round(self.seconds, 2)}
         summary |= {"revision": self.revision}
+        write_summary(self.folder / "summary.json", summary)
+        print_summary(summary, self.env.metric_info, self.folder)
         picture, figure, page = (self.folder / name for name in ("flight.png", "episode.pdf", "flight.html"))
         drawing.draw_flight(flight, picture, self.env, title(summary))
         drawing.publish_flight(flight, figure, page, self.env, title(summary))
         drawing.draw_learning_curve(self.folder / "metrics.csv", self.folder / "learning_curve.png", self.env)
         self.logs.show_flight(self.steps)
         self.logs.finish(summary)
-        write_summary(self.folder / "summary.json", summary)
-        print_summary(summary, self.env.metric_info, self.folder)
 
     # -- stopping and going on -----------------------------------------------------------------------------------------
 

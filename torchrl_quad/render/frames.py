@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import itertools
 import numbers
+import os
+import subprocess
+import tempfile
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import torch
@@ -23,7 +28,12 @@ from torchrl_quad.render.flights import Flight, state_keys
 from torchrl_quad.render.obstacles import depth_image, with_obstacles
 
 _INCHES = 4.2
+_REINSTALL = "pip install --force-reinstall --no-deps imageio-ffmpeg"
 _ARMS = torch.tensor([[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [0.0, 0.0, 0.0], [1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]])
+
+
+class NoFfmpeg(MissingPackage):
+    """Films cannot be written as MP4 here."""
 
 
 class Scene:
@@ -135,7 +145,7 @@ def animate_flight(
         labels: a word for each of the two, in their corners.
 
     Raises:
-        ImportError: ``path`` is an MP4, and ``imageio-ffmpeg`` is not installed.
+        ImportError: ``path`` is an MP4, and there is no ffmpeg that works: :class:`NoFfmpeg`.
         TypeError: ``env`` is not a quadrotor environment.
         ValueError: the rollout has another shape or lacks the position or the quaternion, a number is not positive, or
             the suffix is another.
@@ -199,25 +209,62 @@ def _write_gif(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> N
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> None:
     """The same in equal intervals: the last frame, of the end, may come later than its time by less than one."""
+    exe, first = find_ffmpeg(), next(frames)
+    rate = Fraction(1.0 / (times[-1] - times[-2])).limit_denominator()
+    target = ["-movflags", "+faststart", "-f", "mp4", f"file:{path.absolute()}"]
+    with tempfile.TemporaryFile() as said:
+        whole = True
+        try:
+            command = _encoding(exe, *first.shape[1::-1], rate, *target)
+            with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said) as process:
+                for frame in itertools.chain([first], frames):
+                    process.stdin.write(frame.tobytes())
+        except BrokenPipeError:  # it has ended before the film
+            whole = False
+        if not whole or process.returncode or not (path.exists() and path.stat().st_size):
+            raise NoFfmpeg(_broken(exe, process.returncode, said))
+
+
+def find_ffmpeg() -> str:
+    """The ffmpeg that films in MP4 are written with, tried on a film of one frame.
+
+    Raises:
+        NoFfmpeg: there is none, or it does not work.
+    """
     try:
-        import imageio_ffmpeg
+        from imageio_ffmpeg import get_ffmpeg_exe
     except ImportError as error:
-        raise MissingPackage("Films in MP4 need imageio-ffmpeg: pip install '.[render]' in a clone.") from error
-    first, rate = next(frames), 1.0 / (times[-1] - times[-2])
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        first.shape[1::-1],
-        fps=rate,
-        codec="libx264",
-        quality=None,  # the one below instead
-        macro_block_size=2,
-        output_params=["-crf", "20", "-movflags", "+faststart"],
-        ffmpeg_log_level="error",
-    )
-    writer.send(None)
-    for frame in itertools.chain([first], frames):
-        writer.send(frame)
-    writer.close()
+        raise NoFfmpeg("Films in MP4 need imageio-ffmpeg: pip install '.[render]' in a clone.") from error
+    exe = "ffmpeg"
+    try:
+        exe = get_ffmpeg_exe()
+        with tempfile.TemporaryFile() as film, tempfile.TemporaryFile() as said:
+            command = _encoding(exe, 16, 16, Fraction(1), "-f", "h264", "-")
+            done = subprocess.run(command, input=bytes(3 * 16 * 16), stdout=film, stderr=said, timeout=20, check=False)
+            film.seek(0)
+            if done.returncode or not film.read(4).startswith(b"\0\0"):  # the mark at which H.264 begins
+                raise NoFfmpeg(_broken(exe, done.returncode, said))
+    except subprocess.TimeoutExpired as error:
+        raise NoFfmpeg(_broken(exe, "no answer in 20 s")) from error
+    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: imageio-ffmpeg finds none
+        raise NoFfmpeg(_broken(exe, " ".join(str(error).split()))) from error
+    return exe
+
+
+def _encoding(exe: str, width: int, height: int, rate: Fraction, *target: str) -> list[str]:
+    """The command that makes H.264 of raw frames."""
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(rate), "-i", "-"]
+    return [exe, "-y", "-v", "error", *source, "-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", *target]
+
+
+def _broken(exe: str, why: int | str, said: IO[bytes] | None = None) -> str:
+    """What is wrong with an ffmpeg: its exit status and the first line that it has said, or an error."""
+    if said is not None:
+        said.seek(0)
+        line = said.readline(200).decode(errors="replace").strip()
+        why = f"exit status {why}{': ' * bool(line)}{line}"
+    mend = "unset IMAGEIO_FFMPEG_EXE" if os.environ.get("IMAGEIO_FFMPEG_EXE") else _REINSTALL
+    return f"Films in MP4 need an ffmpeg that writes H.264, and {exe} does not ({why}). Write a GIF, or {mend}."
 
 
 # The views of each environment, by number of drones and size. They are kept outside the environment, which can be

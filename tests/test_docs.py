@@ -6,18 +6,15 @@ import re
 import runpy
 import shlex
 import sys
-from importlib.metadata import metadata, version
 from itertools import pairwise
-from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
 import yaml
 from markdown_it import MarkdownIt
-from packaging.requirements import Requirement
 from sphinx.util.inventory import InventoryFile
 from test_examples import EXAMPLES, reduced
-from test_recipes import RECIPES, ROOT, SMALL, run
+from test_recipes import ROOT, run
 
 from torchrl_quad.envs import TASKS
 
@@ -37,7 +34,6 @@ PARTS = (
     "render",
     "vision",
 )
-AFTER_TRAINING = ("evaluate", "export")  # recipes that read a checkpoint
 PUBLIC = ["torchrl_quad", *(f"torchrl_quad.{part}" for part in PARTS)]
 # Blocks that are not run: text, data, and Sphinx's directives, except those that hold code.
 NOT_RUN = re.compile(r"(|text|yaml|\{(?!code|sourcecode)[\w-]+\}.*)")
@@ -71,7 +67,7 @@ MEASURE = """() => {
 
 
 def test_the_site_builds_without_a_warning_describes_every_public_name_and_fits_a_browser(tmp_path, request):
-    (command,) = (line for line in make("docs").splitlines() if "-m sphinx" in line)
+    (command,) = (line for line in run("make", "--dry-run", "docs").splitlines() if "-m sphinx" in line)
     _, *options, folder = shlex.split(command)
     assert folder == "docs/_build/html"
     assert {"-W", "--keep-going", "-n"} <= set(options)
@@ -234,80 +230,3 @@ def test_the_programs_of_a_page_run_one_after_the_other(page, tmp_path, monkeypa
         (tmp_path / "outputs/run").mkdir(parents=True)
         (tmp_path / "outputs/run/metrics.csv").write_text("steps,eval/return,eval/crash,grad/actor\n64,1.0,0.0,2.0\n")
     runpy.run_path(str(program), run_name="__main__")
-
-
-def commands():
-    for page in PAGES:
-        for _, content in code(page, "bash"):
-            for command in content.replace("\\\n", " ").splitlines():
-                if words := shlex.split(command, comments=True):
-                    yield pytest.param(words, id=f"{name_of(page)}: {shlex.join(words)}")
-
-
-@pytest.mark.usefixtures("quick_fits")
-@pytest.mark.parametrize("command", list(commands()))
-def test_every_command_runs(command, launch, request, monkeypatch, capsys, tmp_path, importable):
-    program, *words = command
-    if "logger.backend=wandb" not in words:
-        request.getfixturevalue("no_pictures")
-    script = next((word for word in words if word.endswith(".py")), "")
-    if program == "make":
-        make(*words)  # what it does has tests of its own, and `make test` runs this one
-    elif program == "pip":
-        installs(words)
-    elif program in ("python", "torchrun") and Path(script).stem in (*RECIPES, *AFTER_TRAINING):
-        recipe(program, words, launch, tmp_path)
-    elif program == "python" and script == "recipes/identify.py":
-        monkeypatch.chdir(ROOT)  # where the flight is
-        arguments = [word for word in words if "=" in word and not word.startswith("iterations=")]
-        launch("identify", *arguments, f"folder={tmp_path}", "iterations=1", "draws=0")
-    elif program == "python" and script.startswith("examples/"):
-        assert ROOT / script in EXAMPLES and words == [script]  # which have a test of their own
-    elif program == "python" and script.startswith(("recipes/", "benchmarks/")):
-        monkeypatch.setattr(sys, "argv", [*words, "--help"])  # these have tests of their own, too
-        monkeypatch.syspath_prepend((ROOT / script).parent)  # as python does
-        with pytest.raises(SystemExit, match="^0$"):
-            runpy.run_path(str(ROOT / script), run_name="__main__")
-        usage = capsys.readouterr().out
-        assert {word for word in words if word.startswith("--")} <= set(re.findall(r"--[\w-]+", usage))
-    else:
-        pytest.fail(f"No test knows how to try {program!r}: add it here, or fence as text what cannot be tried.")
-
-
-def make(*arguments):
-    """The commands that make would run."""
-    return run("make", "--dry-run", *arguments)
-
-
-def installs(words):
-    """Try as much of pip as works without a network: every name must belong to the project."""
-    assert words.pop(0) == "install"
-    extras, needs = (metadata("torchrl_quad").get_all(name) for name in ("Provides-Extra", "Requires-Dist"))
-    known = {Requirement(need).name for need in needs} | {"torchrl_quad"}
-    while words:
-        word = words.pop(0)
-        if word in ("--constraint", "-c"):
-            assert (ROOT / words.pop(0)).is_file()
-        elif word.endswith(".whl"):
-            assert word == f"dist/torchrl_quad-{version('torchrl_quad')}-py3-none-any.whl"
-        elif word not in ("--editable", "-e"):
-            wanted = Requirement(re.sub(r"^\.(?=\[|$)", "torchrl_quad", word))
-            assert wanted.name in known and wanted.extras <= set(extras)
-
-
-def recipe(program, words, launch, folder):
-    """Run a recipe on a reduced budget; one that resumes, from the checkpoint of another small run."""
-    name = next(Path(word).stem for word in words if word.endswith(".py"))
-    small = [*SMALL, "total_steps=24"]  # one horizon, and one evaluation
-    arguments = [word for word in words if "=" in word and not word.startswith(("-", "hydra.run.", "hydra.sweep."))]
-    if program == "torchrun":  # in one process; a test of its own starts several
-        assert words[0].startswith("--nproc-per-node=")
-    if "--multirun" in words:  # one run of it, in this process; a test of their own has several side by side
-        arguments = [re.sub(r"^([\w.]+=[^,{]*),.*", r"\1", word) for word in arguments]
-        launch(name, "--multirun", *arguments, *small, f"hydra.sweep.dir={folder}", "hydra/launcher=basic")
-    elif "checkpoint.pt" in " ".join(words):
-        launch("abpt" if name in AFTER_TRAINING else name, *small, f"hydra.run.dir={folder}")
-        arguments = [re.sub("=outputs/.*checkpoint.pt", f"={folder}/checkpoint.pt", word) for word in arguments]
-        launch(name, *arguments, *([] if name in AFTER_TRAINING else ["total_steps=48"]))
-    else:
-        launch(name, *arguments, *small, f"hydra.run.dir={folder}")

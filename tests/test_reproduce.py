@@ -27,6 +27,7 @@ import rates
 import reproduce
 import running
 import shipped
+import starts
 import tables
 from matrix import Job
 
@@ -283,6 +284,30 @@ def test_policies_of_the_forest_are_flown_at_the_speeds_and_densities_and_not_tw
     run_main(monkeypatch, forest, *arguments)
     flown = [{**row, "policy": "bptt", "seed": str(seed), "solved": x} for seed, x in enumerate(("0.5", "0.75"))]
     assert "| bptt | 0.0 | " in forest.summary([*rows, *flown]) and "62% (50%, 2 seeds) |" in forest.summary(flown)
+
+
+def test_a_policy_is_flown_from_every_set_of_starts_once(run_here, monkeypatch, tmp_path):
+    monkeypatch.setattr(shipped, "run", run_here)
+    monkeypatch.setattr(starts, "STARTS", 2)
+    monkeypatch.setattr(starts, "SETS", 3)
+    wanted = [
+        "--tasks",
+        "racing",
+        "--methods",
+        "bptt",
+        "--seeds",
+        "0",
+        "--data",
+        tmp_path,
+        "--output",
+        tmp_path / "runs",
+    ]
+    run_main(monkeypatch, starts, *wanted, "--quick")
+    rows = read_rows(tmp_path / "starts.csv")
+    assert [row["starts_seed"] for row in rows] == ["2000000", "2000001", "2000002"]
+    assert len({row["return"] for row in rows}) == 3 and all(row["gates_passed"] == "0" for row in rows)
+    monkeypatch.setattr(starts, "fly", lambda *_: pytest.fail("It has been flown."))
+    run_main(monkeypatch, starts, *wanted, "--quick")
 
 
 def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom():

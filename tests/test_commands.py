@@ -1,0 +1,236 @@
+"""Commands that are written anywhere run: those of blocks here, and every other one in a test that it is known by."""
+
+import argparse
+import importlib
+import re
+import runpy
+import shlex
+import sys
+from importlib.metadata import metadata, version
+from pathlib import Path
+
+import pytest
+from markdown_it import MarkdownIt
+from packaging.requirements import Requirement
+from test_docs import PAGES, code, files, importable, name_of  # noqa: F401, a fixture
+from test_examples import EXAMPLES
+from test_recipes import RECIPES, ROOT, SMALL, run
+from training.schema import check
+
+AFTER_TRAINING = ("evaluate", "export")  # recipes that read a checkpoint
+SMOKE = {  # the test that runs a program on a reduced budget
+    **dict.fromkeys(
+        (f"recipes/{name}.py" for name in RECIPES),
+        "test_recipes: test_every_recipe_trains_on_its_tasks_and_leaves_what_it_promises",
+    ),
+    "recipes/evaluate.py": "test_recipes: test_evaluation_repeats_the_summary_of_the_run_also_with_a_normalizer",
+    "recipes/export.py": "test_deploy_faults: test_the_recipe_exports_the_best_policy_of_a_run_with_its_results",
+    "recipes/identify.py": "test_identification: test_the_recipe_fits_a_real_flight_and_draws_it",
+    "recipes/transfer.py": "test_transfer: "
+    "test_the_recipe_flies_without_torch_keeps_a_table_and_finds_mistakes_of_a_port",
+    "recipes/workspace.py": "test_wandb_page: test_the_workspace_is_built_and_shows_what_runs_log",
+    "recipes/trial/ablations.py": "test_reproduce: test_options_are_changed_one_at_a_time_and_shown_beside_what_ships",
+    "recipes/trial/ascent.py": "test_ascent: test_the_gradients_of_every_method_are_compared_with_the_simulator",
+    "recipes/trial/elsewhere.py": "test_elsewhere: "
+    "test_a_loss_trains_on_an_environment_that_is_not_ours_once_and_has_a_row_in_the_table",
+    "recipes/trial/forest.py": "test_reproduce: "
+    "test_policies_of_the_forest_are_flown_at_the_speeds_and_densities_and_not_twice",
+    "recipes/trial/phases.py": "test_ascent: test_the_phases_of_the_hybrid_are_flown_and_measured_once",
+    "recipes/trial/rates.py": "test_reproduce: test_half_and_twice_a_rate_fly_once_and_are_judged_by_their_worst_seed",
+    "recipes/trial/reproduce.py": "test_reproduce: test_a_shrunken_matrix_runs_and_goes_on_where_it_was_stopped",
+    "recipes/trial/results.py": "test_claims: test_the_page_is_made_of_the_results_and_what_is_written_by_hand_stays",
+    "recipes/trial/shipped.py": "test_reproduce: "
+    "test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again",
+    "recipes/trial/starts.py": "test_reproduce: test_a_policy_is_flown_from_every_set_of_starts_once",
+    **dict.fromkeys(
+        (
+            f"benchmarks/{name}.py"
+            for name in (
+                *("camera", "identification", "identified_training", "memory", "profile_recipes", "real_flights"),
+                *("throughput", "time_to_solve"),
+            )
+        ),
+        "test_benchmarks: test_a_benchmark_writes_a_table",
+    ),
+    "benchmarks/controllers.py": "test_benchmarks: test_the_benchmark_of_controllers_writes_a_table",
+    "benchmarks/deployment.py": "test_benchmarks: test_the_benchmark_of_exported_policies_writes_a_table",
+    "python -m build": "test_package: built",
+    "wandb": "test_wandb_page: test_a_sweep_hands_over_mappings_and_null_as_people_write_them",
+    "tensorboard": "test_logs: test_tensorboard_gets_the_names_of_the_csv_and_forgets_what_is_flown_again",
+}
+
+
+def commands():
+    for page in PAGES:
+        for _, content in code(page, "bash"):
+            for command in content.replace("\\\n", " ").splitlines():
+                if words := shlex.split(command, comments=True):
+                    yield pytest.param(words, id=f"{name_of(page)}: {shlex.join(words)}")
+
+
+@pytest.mark.usefixtures("quick_fits", "importable")
+@pytest.mark.parametrize("command", list(commands()))
+def test_every_command_of_a_block_runs(command, launch, request, monkeypatch, tmp_path):
+    program, *words = command
+    if "logger.backend=wandb" not in words:
+        request.getfixturevalue("no_pictures")
+    script = next((word for word in words if word.endswith(".py")), "")
+    if program == "make":
+        make(*words)  # what it does has tests of its own, and `make test` runs this one
+    elif program == "pip":
+        installs(words)
+    elif program in ("python", "torchrun") and Path(script).stem in (*RECIPES, *AFTER_TRAINING):
+        recipe(program, words, launch, tmp_path)
+    elif program == "python" and script == "recipes/identify.py":
+        monkeypatch.chdir(ROOT)  # where the flight is
+        arguments = [word for word in words if "=" in word and not word.startswith("iterations=")]
+        launch("identify", *arguments, f"folder={tmp_path}", "iterations=1", "draws=0")
+    elif program == "python" and script.startswith("examples/"):
+        assert ROOT / script in EXAMPLES and words == [script]  # which have a test of their own
+    elif program == "python" and script.startswith(("recipes/", "benchmarks/")):
+        understands(words, monkeypatch)
+    else:
+        pytest.fail(f"No test knows how to try {program!r}: add it here, or fence as text what cannot be tried.")
+
+
+class Understood(Exception):
+    """A program has read its arguments."""
+
+
+def understands(words, monkeypatch):
+    """A program takes these arguments, and a test of its own runs it on a reduced budget."""
+    script, *arguments = words
+    is_run(script)
+    arguments = [re.sub(r"\b(mypackage|shuttle)\.\w+", "own_task.CornerEnv", x) for x in arguments]
+    monkeypatch.syspath_prepend(ROOT / "recipes/trial")
+    monkeypatch.syspath_prepend((ROOT / script).parent)  # as python does
+    if script == "recipes/transfer.py":
+        runpy.run_path(str(ROOT / script))["settings"](arguments)
+    elif Path(script).parent.name == "recipes" and script != "recipes/workspace.py":
+        settings = [re.sub(r"^([\w.]+=[^,{\[]*),.*", r"\1", x) for x in arguments if not x.startswith(("--", "hydra"))]
+        check(importlib.import_module("running").composed(Path(script).stem, settings))
+    else:
+
+        def parse(parser, *args, read=argparse.ArgumentParser.parse_args):
+            read(parser, *args)
+            raise Understood
+
+        with monkeypatch.context() as patch:
+            patch.setattr(argparse.ArgumentParser, "parse_args", parse)
+            patch.setattr(sys, "argv", [script, *(x.strip("[]") for x in arguments)])
+            with pytest.raises(Understood):
+                runpy.run_path(str(ROOT / script), run_name="__main__")
+
+
+def is_run(program):
+    """A test runs a program: one that nobody runs may end in an error that nobody has seen."""
+    assert program in SMOKE, f"{program}: no test is known that runs it. Write one, and name it in SMOKE."
+    module, name = SMOKE[program].split(": ")
+    text = (ROOT / f"tests/{module}.py").read_text()
+    assert re.search(rf"^def {name}\(", text, re.MULTILINE), f"{program}: {SMOKE[program]} is no test"
+    assert Path(program.split()[-1]).stem in text, f"{module} knows nothing of {program}"
+
+
+PROGRAM = re.compile(
+    r"(?:[A-Z_]+=\S+ )*(?:\.venv/bin/)?(python|torchrun|make|pip|pytest|pre-commit|wandb|tensorboard) \S"
+)
+IN_CODE = re.compile(r"(?<![\w/])(?:python|torchrun)(?: -\S+)* [\w./]*\.py[^\n`]*")
+
+
+def written():
+    """Commands in the sentences and plain blocks of pages, and in docstrings, comments and messages of the code."""
+    for page in sorted({*PAGES, *ROOT.glob("*.md")}):
+        for token in MarkdownIt().parse(page.read_text()):
+            found = [x.content for x in token.children or () if x.type == "code_inline"]
+            if token.type == "fence" and token.info.strip() != "bash":
+                found += token.content.replace("\\\n", " ").splitlines()
+            yield from ((page, x.strip()) for x in found if PROGRAM.match(x.strip()))
+    for folder in ("benchmarks", "docs", "examples", "recipes", "torchrl_quad"):
+        for path in sorted((*ROOT.glob(f"{folder}/**/*.py"), *ROOT.glob(f"{folder}/**/*.yaml"))):
+            joined = re.sub(r"\\+\n\s*", " ", path.read_text())
+            yield from ((path, match[0]) for match in IN_CODE.finditer(joined))
+
+
+def words_of(command):
+    """The words of a command; in code it may stand in a string, whose end is not part of it."""
+    command = re.sub(r"\{(\w+)\}/", r"\1/", re.sub(r"^(\w+=\S+ )*(\.venv/bin/)?", "", command))
+    try:
+        return shlex.split(command, comments=True)
+    except ValueError:
+        return shlex.split(command.rpartition('"')[0], comments=True)
+
+
+# wandb-workspaces uses pydantic's old decorators.
+@pytest.mark.filterwarnings("ignore:Pydantic V1 style:DeprecationWarning")
+def test_every_command_in_a_sentence_or_a_docstring_is_one_that_a_test_runs(monkeypatch):
+    seen, wrong = {tuple(param.values[0]) for param in commands()}, []
+    for path, command in written():
+        program, *words = words_of(command)
+        if (key := (program, *words)) in seen:
+            continue
+        seen.add(key)
+        try:
+            script = next((x.removeprefix("../torchrl_quad/") for x in words if x.endswith(".py")), "")
+            if program == "make":
+                make(*words)
+            elif program == "pip":
+                assert words[0] == "install"
+                if words[-1].startswith(".["):
+                    installs(words)
+            elif program in ("wandb", "tensorboard"):
+                is_run(program)
+            elif program == "pytest":
+                assert words == ["-m", "slow"]
+            elif program == "pre-commit":
+                assert (ROOT / ".pre-commit-config.yaml").exists()
+            elif words[0] == "-m":
+                is_run(f"python -m {words[1]}")
+            elif script.startswith("examples/"):
+                assert ROOT / script in EXAMPLES
+            elif script in files():  # a program of the pages on writing, which test_own_tasks.py runs
+                continue
+            else:
+                before = next(i for i, word in enumerate(words) if word.endswith(script))  # torchrun's own options
+                understands([script, *words[before + 1 :]], monkeypatch)
+        except (Exception, SystemExit) as error:
+            wrong.append(f"{path.relative_to(ROOT)}: {command}: {error!r}")
+    assert wrong == [], "\n".join(wrong)
+
+
+def make(*arguments):
+    """The commands that make would run."""
+    return run("make", "--dry-run", *arguments)
+
+
+def installs(words):
+    """Try as much of pip as works without a network: every name must belong to the project."""
+    assert words.pop(0) == "install"
+    extras, needs = (metadata("torchrl_quad").get_all(name) for name in ("Provides-Extra", "Requires-Dist"))
+    known = {Requirement(need).name for need in needs} | {"torchrl_quad"}
+    while words:
+        word = words.pop(0)
+        if word in ("--constraint", "-c"):
+            assert (ROOT / words.pop(0)).is_file()
+        elif word.endswith(".whl"):
+            assert word == f"dist/torchrl_quad-{version('torchrl_quad')}-py3-none-any.whl"
+        elif word not in ("--editable", "-e"):
+            wanted = Requirement(re.sub(r"^\.(?=\[|$)", "torchrl_quad", word))
+            assert wanted.name in known and wanted.extras <= set(extras)
+
+
+def recipe(program, words, launch, folder):
+    """Run a recipe on a reduced budget; one that resumes, from the checkpoint of another small run."""
+    name = next(Path(word).stem for word in words if word.endswith(".py"))
+    small = [*SMALL, "total_steps=24"]  # one horizon, and one evaluation
+    arguments = [word for word in words if "=" in word and not word.startswith(("-", "hydra.run.", "hydra.sweep."))]
+    if program == "torchrun":  # in one process; a test of its own starts several
+        assert words[0].startswith("--nproc-per-node=")
+    if "--multirun" in words:  # one run of it, in this process; a test of their own has several side by side
+        arguments = [re.sub(r"^([\w.]+=[^,{]*),.*", r"\1", word) for word in arguments]
+        launch(name, "--multirun", *arguments, *small, f"hydra.sweep.dir={folder}", "hydra/launcher=basic")
+    elif "checkpoint.pt" in " ".join(words):
+        launch("abpt" if name in AFTER_TRAINING else name, *small, f"hydra.run.dir={folder}")
+        arguments = [re.sub("=outputs/.*checkpoint.pt", f"={folder}/checkpoint.pt", word) for word in arguments]
+        launch(name, *arguments, *([] if name in AFTER_TRAINING else ["total_steps=48"]))
+    else:
+        launch(name, *arguments, *small, f"hydra.run.dir={folder}")

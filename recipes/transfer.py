@@ -30,7 +30,7 @@ from torchrl_quad.deploy.judging import PRECISION
 from torchrl_quad.deploy.simulators import make_simulator, simulator_class
 from torchrl_quad.deploy.transfer import MUTANTS, fly
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.files import machine, read_rows, write_rows
+from torchrl_quad.files import add_rows, machine, read_rows
 
 SETTINGS = {
     "bundle": (str, None),
@@ -98,7 +98,7 @@ def measure(bundle: Bundle, cfg: dict, loop: str, mutant: str | None, path: Path
         "faults": sum(flight["faults"].values()),
         "machine": machine(),
     }
-    write_rows(path, [*read_rows(path), {"task": task, **flown, **result}])  # read again: flying took its time
+    add_rows(path, [{"task": task, **flown, **result}])
 
 
 def show(path: Path, bundle: str) -> None:

@@ -322,6 +322,7 @@ def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_pa
         patch.setattr("os.replace", replace)
         with pytest.raises(OSError, match="no"):
             export_policy(actor, env, folder)
+    (aside,) = tmp_path.glob("*.old")
     assert (aside / "contract.json").read_bytes() == old
     export_policy(actor, env, folder)
     assert (folder / "contract.json").read_bytes() != old

@@ -229,28 +229,29 @@ def _prefix(path: Path) -> str:
     return f".{path.stem[:40]}.{here}."
 
 
-def _abandoned(path: Path) -> Iterator[Path]:
-    """What processes of this machine that have died left beside a path."""
+def _left_behind(path: Path) -> Iterator[tuple[Path, bool]]:
+    """What processes of this machine have made beside a path, and whether they have died."""
     name = re.compile(rf"{re.escape(_prefix(path))}(\d+)\.\d+{re.escape(path.suffix)}(\.old)?")
     for other in path.parent.glob(".*"):
-        match = name.fullmatch(other.name)
-        if match and not _is_running(int(match[1])):
-            yield other
+        if match := name.fullmatch(other.name):
+            yield other, not _is_running(int(match[1]))
 
 
 def _delete_leftovers(path: Path) -> None:
-    for other in _abandoned(path):
+    for other, abandoned in _left_behind(path):
         with contextlib.suppress(OSError):  # another process has deleted it just now
-            other.unlink()
+            if abandoned:
+                other.unlink()
 
 
 def _restore(folder: Path) -> None:
-    """Bring back a folder that a killed process had set aside, and delete what else it left behind."""
-    for other in _abandoned(folder):
-        if other.suffix == ".old" and not any(folder.glob("*")):
+    """Bring back a folder that was set aside and not replaced, and delete what dead processes left behind."""
+    for other, abandoned in _left_behind(folder):
+        if other.name.endswith(".old") and not any(folder.glob("*")):
             with contextlib.suppress(OSError):
                 os.replace(other, folder)
-        shutil.rmtree(other, ignore_errors=True)
+        elif abandoned:
+            shutil.rmtree(other, ignore_errors=True)
 
 
 def _is_running(pid: int) -> bool:

@@ -17,10 +17,10 @@ import numpy as np
 from comparison import LABELS, column
 from results import fill
 from running import arguments, command_line, page, side_by_side
-from shipped import ADDING, METHODS, train
+from shipped import METHODS, train
 from tables import table
 
-from torchrl_quad.files import read_rows, write_rows
+from torchrl_quad.files import add_rows, read_rows
 
 Job = tuple[str, str, str, int, str, Sequence[str]]
 
@@ -63,8 +63,7 @@ def fly_missing(args: argparse.Namespace, path: Path, column: str, jobs: Iterabl
 
     def fly(task: str, method: str, change: str, seed: int, folder: str, overrides: Sequence[str]) -> None:
         row = train(task, method, seed, args.output / task / method / folder / f"seed{seed}", args.quick, overrides)
-        with ADDING:
-            write_rows(path, [*read_rows(path), {column: change} | row])
+        add_rows(path, [{column: change} | row])
 
     side_by_side(args.cores, [(fly, *job) for job in jobs if (*job[:3], str(job[3])) not in kept])
 

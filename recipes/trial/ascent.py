@@ -30,7 +30,7 @@ from training.checkpoints import read_checkpoint
 
 from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss, differentiable_rollout, make_qvalue, make_value
 from torchrl_quad.envs.episodes import first_episode
-from torchrl_quad.files import read_rows, write_rows
+from torchrl_quad.files import add_rows, read_rows
 from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.objectives.action_gradients import action_gradient
 from torchrl_quad.objectives.segments import discounts
@@ -159,8 +159,7 @@ def main() -> None:
             )
         seen.append(own)
         if not any(own.items() <= row.items() for row in rows):
-            rows.append(own | examine(saved, cfg, args.states, args.repeats, args.steps, args.size))
-            write_rows(args.output, rows)
+            add_rows(args.output, [own | examine(saved, cfg, args.states, args.repeats, args.steps, args.size)])
 
 
 if __name__ == "__main__":

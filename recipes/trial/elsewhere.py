@@ -58,7 +58,7 @@ from torchrl_quad import (
     make_qvalue,
     make_value,
 )
-from torchrl_quad.files import machine, read_rows, write_rows
+from torchrl_quad.files import add_rows, machine, read_rows
 
 ENVS, HORIZON, EPISODE, EPISODES = 256, 16, 200, 256
 STEPS = 1_024_000  # of all environments together
@@ -331,7 +331,7 @@ def main() -> None:
         flown = own[name](environment, seed) if name in own else train(name, environment, seed)
         numbers = {x: f"{y:.6g}" for x, y in zip(("before", "after", "seconds"), flown, strict=True)}
         row = key | numbers | {"steps": STEPS, "machine": machine(), "flown": datetime.date.today().isoformat()}
-        write_rows(args.data / "elsewhere.csv", [*read_rows(args.data / "elsewhere.csv"), row])
+        add_rows(args.data / "elsewhere.csv", [row])
     fill(page(args.data, "elsewhere.md"), blocks(args.data))
 
 

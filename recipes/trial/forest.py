@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from threading import Lock
 
 import numpy as np
 import torch
@@ -26,7 +25,7 @@ from training.building import build_env
 from training.evaluation import load_policy
 
 from torchrl_quad import differentiable_rollout
-from torchrl_quad.files import machine, read_rows, replacing, write_rows
+from torchrl_quad.files import add_rows, machine, read_rows, replacing
 
 HALF = "total_steps=2_048_000"  # of what BPTT ships with
 POLICIES = {  # recipe, and what differs from what it ships with
@@ -44,7 +43,6 @@ SPEEDS, DIFFICULTIES, SEEDS = (2.0, 4.0, 6.0, 8.0), ("easy", "middle", "hard"), 
 FORESTS, FIRST_FOREST = 256, 3_000_000  # seed of their random numbers: nobody trains or chooses in them
 CHUNK = 50  # control steps between looks at who still flies
 PATIENCE = 2.0  # times the way at the commanded speed, in which a flight must be over
-ADDING = Lock()
 
 
 def success_rates(env: EnvBase, actor: TensorDictModuleBase, steps: int) -> dict[str, float]:
@@ -87,8 +85,7 @@ def fly(policy: str, seed: int, todo: list[tuple[str, float]], args: argparse.Na
         row = {"policy": policy, "seed": seed, "difficulty": difficulty, "speed": speed, "forests": args.forests}
         row |= {name: f"{x:.6g}" for name, x in rates.items()}
         row |= {"steps": trained["steps"], "seconds": trained["time/processor_seconds"], "machine": machine()}
-        with ADDING:
-            write_rows(args.data / "forest.csv", [*read_rows(args.data / "forest.csv"), row])
+        add_rows(args.data / "forest.csv", [row])
         print(row, flush=True)
 
 

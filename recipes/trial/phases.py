@@ -37,7 +37,7 @@ from training.building import build_env, make_policy, network
 from training.checkpoints import read_checkpoint
 
 from torchrl_quad import HybridLoss, differentiable_rollout, make_value
-from torchrl_quad.files import read_rows, replacing, write_rows
+from torchrl_quad.files import add_rows, read_rows, replacing
 from torchrl_quad.objectives.action_gradients import distribution_again
 
 SHARES = (0.05, 0.125, 0.25, 0.5, 0.75, 1.0)  # of the steps of a run
@@ -176,7 +176,7 @@ def main() -> None:
                 saved = read_checkpoint(folder / f"phase_{share}.pt")
                 measured = examine(saved, args.states, args.repeats, args.steps, args.size)
                 row = key | {"steps": str(saved["rows"][-1]["steps"])} | measured
-                write_rows(args.data / "phases.csv", [*read_rows(args.data / "phases.csv"), row])
+                add_rows(args.data / "phases.csv", [row])
     fill(page(args.data, "more_losses.md"), {"phases": block(args.data)})
 
 

@@ -24,7 +24,7 @@ from running import QUICK, RECIPES, arguments, command_line, composed, end_runs_
 from tqdm import tqdm
 
 from torchrl_quad.envs import task_class
-from torchrl_quad.files import machine, read_rows, write_rows
+from torchrl_quad.files import add_rows, machine, read_rows, write_rows
 
 CURVE = {  # columns of a curve, and their names in metrics.csv
     "steps": "steps",
@@ -85,13 +85,12 @@ def keep(job: Job, folder: Path, data: Path) -> None:
         summary = json.loads(end.read_text()) | {"seconds": curve[-1]["seconds"]}
     own = {"variant": job.variant, "lr": "" if job.lr is None else f"{job.lr:g}", "seed": str(job.seed)}
     path = data / ("search" if job.lr is not None else "curves") / f"{job.task}.csv"
-    others = [row for row in read_rows(path) if any(row[name] != own[name] for name in own)]
-    write_rows(path, [*others, *({**own, **row} for row in curve)])
+    add_rows(path, [{**own, **row} for row in curve], same=list(own))
     summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}
     flown = datetime.date.fromtimestamp(end.stat().st_mtime).isoformat()
     about = {"task": job.task, **own, "machine": machine(), "flown": flown, "dynamics": DYNAMICS}
     final = about | {k: v for k, v in summary.items() if k not in about}
-    write_rows(data / "final.csv", [*read_rows(data / "final.csv"), final])
+    add_rows(data / "final.csv", [final])
 
 
 def is_kept(job: Job, data: Path) -> bool:

@@ -17,7 +17,6 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from threading import Lock
 
 import numpy as np
 from comparison import LABELS, WANTED, choice_table, draw, improvement_table, reached_table, speed_table
@@ -30,7 +29,7 @@ from tables import table
 from torchrl_quad.envs import task_class
 from torchrl_quad.envs.racing import load_track
 from torchrl_quad.envs.scenery import EPISODE_METRICS
-from torchrl_quad.files import machine, read_rows, write_rows
+from torchrl_quad.files import add_rows, machine, read_rows
 
 SEEDS = tuple(range(WANTED))
 METHODS = {name: name.upper() for name in ("bptt", "shac", "abpt", "sapo", "ahac")} | {"hybrid": "Hybrid", "ppo": "PPO"}
@@ -46,7 +45,6 @@ VARIANTS = {  # of a task: its overrides
     "six_gates": ["task=racing", "env.track=six_gates"],
     "six_gates_back": ["task=racing", f"env.track={{gates: {load_track('six_gates')['gates'][::-1]}}}"],
 }
-ADDING = Lock()
 
 
 def train(task: str, method: str, seed: int, folder: Path, quick: bool, changes: Sequence[str] = ()) -> dict[str, str]:
@@ -74,11 +72,9 @@ def fly(task: str, method: str, seed: int, output: Path, data: Path, quick: bool
     """Train once, and add the final evaluation to the results."""
     folder = output / task / method / f"seed{seed}"
     row = train(task, method, seed, folder, quick)
-    with ADDING:
-        key = {"task": task, "algorithm": method, "seed": str(seed)}
-        curves = [point for point in read_rows(data / "shipped_curves.csv") if key.items() - point.items()]
-        write_rows(data / "shipped_curves.csv", [*curves, *(key | point for point in curve(folder))])
-        write_rows(data / "shipped.csv", [*read_rows(data / "shipped.csv"), row])
+    key = {"task": task, "algorithm": method, "seed": str(seed)}
+    add_rows(data / "shipped_curves.csv", [key | point for point in curve(folder)], same=list(key))
+    add_rows(data / "shipped.csv", [row])
 
 
 def curve(folder: Path) -> list[dict[str, str]]:

@@ -56,7 +56,51 @@ def _entry(key: Any) -> Any:
 
 
 Entry = Annotated[Any, AfterValidator(_entry)]
+Entries = Annotated[Sequence[Entry], Field(min_length=1)]
 
+class Explained(UserValueError):
+    """What a validator of an annotation raises whose message says all that there is to say."""
+
+
+def real(least: float, most: float) -> Any:
+    """The type of a number from ``least`` to ``most``."""
+    return Annotated[float, Field(allow_inf_nan=False, ge=least, le=most)]
+
+
+def whole(least: int, most: int) -> Any:
+    """The type of a whole number from ``least`` to ``most``."""
+    return Annotated[int, Field(ge=least, le=most)]
+
+
+def list_of(kind: Any, least: int, most: int) -> Any:
+    """The type of a list of ``least`` to ``most`` entries."""
+    return Annotated[Sequence[kind], Field(min_length=least, max_length=most)]
+
+
+def validated(accepts: Callable[[Any], bool], wanted: str) -> Any:
+    """The type of a value that a function accepts; ``wanted`` ends the sentence "It must be ..."."""
+
+    def validate(value: Any) -> Any:
+        if not accepts(value):
+            raise UserValueError(f"be {wanted}")
+        return value
+
+    return Annotated[Any, AfterValidator(validate)]
+
+
+def _is_device(device: Any) -> bool:
+    import torch  # which not all that checks options needs
+
+    try:
+        torch.Generator(torch.device(device))
+    except Exception:  # torch has another one for each thing that may be wrong
+        return False
+    return isinstance(device, str | torch.device)
+
+
+Device = validated(_is_device, "a device of this machine that torch knows, such as 'cpu' or 'cuda'")
+
+_CONFIG = ConfigDict(strict=True, allow_inf_nan=False)
 _PLAIN = (bool, int, float, str, type(None), Path, list, tuple, dict, Mapping, Sequence)
 _MUST = {  # pydantic's kinds of error in plain words
     "int_type": "be a whole number",
@@ -109,29 +153,32 @@ def require(name: str, value: Any, kind: Any, description: str = "") -> Any:
     Raises:
         UserValueError: it does not fit.
     """
-    return _checked(name, value, TypeAdapter(kind, config=ConfigDict(strict=True)), description)
+    return _checked(name, value, TypeAdapter(kind, config=_CONFIG), description)
 
 
 def declared(target: Callable[..., Any]) -> dict[str, tuple[Any, str]]:
     """The plain annotation and the description of each argument of a function or class, with those of its bases."""
     found: dict[str, tuple[Any, str]] = {}
-    for owner in reversed(target.__mro__) if isinstance(target, type) else (target,):
-        function = vars(owner).get("__init__") if isinstance(owner, type) else owner
-        if isinstance(function, types.FunctionType):
-            described = _descriptions(owner) or _descriptions(function)
-            found |= {name: (kind, described.get(name, "")) for name, kind in _annotations(function).items()}
+    for owner, function in reversed(_takers(target)):
+        described = _descriptions(owner) or _descriptions(function)
+        found |= {name: (kind, described.get(name, "")) for name, kind in _annotations(function).items()}
     return found
 
 
 def must(error: Mapping[str, Any]) -> str:
     """What pydantic's error asks for, as the end of a sentence that begins with "it must"."""
-    said = error["msg"].removeprefix("Value error, ").removeprefix("Input should ").replace(" after validation", "")
+    said = error["msg"].removeprefix("Value error, ").replace(" after validation", "")
+    said = re.sub("^[A-Z][a-z]+ should ", "", said)
     for long, short in (("greater than or equal to", "at least"), ("less than or equal to", "at most")):
         said = said.replace(long, short)
+    if isinstance(error.get("ctx", {}).get("error"), Explained):
+        return f"have other entries: {said.rstrip('.')}"
     if error["type"] == "is_instance_of" and error["ctx"]["class"] == "Sequence":
         return "be a list"
-    asked = _MUST.get(error["type"], said.replace("List should have", "have"))
+    asked = _MUST.get(error["type"], said)
     value = error["input"]
+    if error["type"] == "float_type" and isinstance(value, int) and not isinstance(value, bool):
+        asked += " that a float holds"
     if error["type"] == "int_type" and isinstance(value, float) and value.is_integer():
         asked += f", written {int(value)}"
     return asked
@@ -152,6 +199,8 @@ def _checked(name: str, value: Any, adapter: TypeAdapter[Any], description: str)
         adapter.validate_python(plain)
     except ValidationError as refused:
         first, *others = refused.errors()
+        if isinstance(error := first.get("ctx", {}).get("error"), Explained):
+            raise UserValueError(f"{name}: {error}") from None
         place = "".join(f"[{key}]" for key in first["loc"] if isinstance(key, int))
         choices = [must(error) for error in (first, *others) if error["input"] is first["input"]]
         said = f"{name}{place} must {' or '.join(dict.fromkeys(choices))}, got {shown(first['input'])}."
@@ -164,6 +213,8 @@ def _without_numpy(value: Any) -> Any:
         return value.item()
     if type(value) in (list, tuple):
         return type(value)(map(_without_numpy, value))
+    if type(value) is dict:
+        return {key: _without_numpy(x) for key, x in value.items()}
     return value
 
 
@@ -182,14 +233,23 @@ def _misfit(target: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str
 
 def _names(called: Callable[..., Any]) -> list[str]:
     """The names of all arguments; those of a class include what it hands on to its bases."""
-    names: set[str] = set()
-    for owner in called.__mro__ if isinstance(called, type) else (called,):
-        function = vars(owner).get("__init__") if isinstance(owner, type) else owner
-        parameters = {} if function is None else inspect.signature(function).parameters
-        names |= {name for name, x in parameters.items() if x.kind not in (x.VAR_KEYWORD, x.VAR_POSITIONAL)}
-        if parameters and not any(x.kind is x.VAR_KEYWORD for x in parameters.values()):
-            break
-    return sorted(names - {"self"})
+    parameters = (inspect.signature(function).parameters.items() for _, function in _takers(called))
+    variable = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
+    return sorted({name for some in parameters for name, x in some if x.kind not in variable} - {"self"})
+
+
+def _takers(called: Callable[..., Any]) -> list[tuple[Any, Callable[..., Any]]]:
+    """A function; or those of a class and its bases that take arguments of it, up to the one that hands on nothing."""
+    if not isinstance(called, type):
+        return [(called, called)]
+    found = []
+    for owner in called.__mro__:
+        function = vars(owner).get("__init__")
+        if isinstance(function, types.FunctionType):
+            found.append((owner, function))
+            if not any(x.kind is x.VAR_KEYWORD for x in inspect.signature(function).parameters.values()):
+                break
+    return found
 
 
 @functools.cache
@@ -197,9 +257,8 @@ def _adapters(
     function: Callable[..., Any], described_by: type | None = None
 ) -> dict[str, tuple[TypeAdapter[Any], str]]:
     described = _descriptions(described_by or function)
-    config = ConfigDict(strict=True)
     return {
-        name: (TypeAdapter(kind, config=config), described.get(name, ""))
+        name: (TypeAdapter(kind, config=_CONFIG), described.get(name, ""))
         for name, kind in _annotations(function).items()
     }
 

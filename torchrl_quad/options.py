@@ -58,6 +58,7 @@ def _entry(key: Any) -> Any:
 Entry = Annotated[Any, AfterValidator(_entry)]
 Entries = Annotated[Sequence[Entry], Field(min_length=1)]
 
+
 class Explained(UserValueError):
     """What a validator of an annotation raises whose message says all that there is to say."""
 

@@ -161,7 +161,9 @@ def test_with_a_clip_the_entropy_bonus_counts_at_the_states_visited(env):
 def test_what_cannot_be_clipped_is_refused(env):
     actor = make_actor(env)
     for bad in (0.0, -1.0, float("inf")):
-        with pytest.raises(ValueError, match="clip_action_gradient must be None or a positive number of medians"):
+        with pytest.raises(
+            ValueError, match="clip_action_gradient must be .*, got .*in running medians of their length"
+        ):
             BPTTLoss(actor, clip_action_gradient=bad)
     rollout = flight(env, actor)
     loss = BPTTLoss(actor, clip_action_gradient=5.0)
@@ -222,9 +224,9 @@ def test_a_policy_without_noise_may_still_move():
 
 def test_a_trust_region_knows_what_it_needs(env):
     actor = make_actor(env)
-    with pytest.raises(ValueError, match="min_scale must be a finite number that is not negative, got -1"):
+    with pytest.raises(ValueError, match="min_scale must be at least 0, got -1"):
         TrustRegion(actor, 0.1, min_scale=-1)
-    with pytest.raises(ValueError, match="max_kl must be None or positive and finite, got 0"):
+    with pytest.raises(ValueError, match="max_kl must be greater than 0, got 0.0. .* 0.01 to 0.1 are usual"):
         TrustRegion(actor, 0.0)
     free = TrustRegion(actor, None)
     with free.around(env.reset()):

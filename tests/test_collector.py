@@ -121,7 +121,7 @@ def test_wrong_numbers_are_refused_with_what_to_write_instead():
         ValueError, match="frames_per_batch=10 must be a multiple of .* 4. Try 8, a horizon of 2 control"
     ):
         DifferentiableCollector(env, make_actor(env), frames_per_batch=10)
-    with pytest.raises(ValueError, match="restart_fraction must lie between 0 and 1, got 2"):
+    with pytest.raises(ValueError, match="restart_fraction must be at most 1, got 2"):
         DifferentiableCollector(env, make_actor(env), frames_per_batch=8, restart_fraction=2)
     with pytest.raises(TypeError, match="goes on for ever, and has no length"):
         len(make())

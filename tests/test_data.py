@@ -279,14 +279,17 @@ def test_an_empty_buffer_and_a_bad_fraction_are_refused(env, flight):
             use()
     buffer.extend(flight[2])
     for use in (buffer.initial_state, buffer.source, lambda env, fraction: restart(env, flight[3], fraction)):
-        for fraction in (1.5, -0.1, float("nan")):
-            with pytest.raises(ValueError, match=f"fraction must lie between 0 and 1, got {fraction}"):
+        for fraction, must in ((1.5, "at most 1"), (-0.1, "at least 0"), (float("nan"), "a finite number")):
+            with pytest.raises(ValueError, match=f"fraction must be {must}, got {fraction}. The share of"):
                 use(env, fraction)
 
 
-@pytest.mark.parametrize("capacity", [0, 2.5, -1, "many"])
-def test_a_capacity_is_a_whole_number(capacity):
-    with pytest.raises(ValueError, match="capacity must be at least 1 state, got"):
+@pytest.mark.parametrize(
+    ("capacity", "must"),
+    [(0, "at least 1"), (2.5, "a whole number"), (-1, "at least 1"), (10**400, "at most 10000000")],
+)
+def test_a_capacity_is_a_whole_number(capacity, must):
+    with pytest.raises(ValueError, match=f"capacity must be {must}, got .*. Visited states kept; the oldest go first."):
         VisitedStateBuffer(capacity)
 
 

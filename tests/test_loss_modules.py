@@ -21,6 +21,7 @@ from torchrl_quad import (
     make_qvalue,
     make_value,
 )
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 
 @pytest.fixture
@@ -126,16 +127,19 @@ def test_the_running_median_of_the_clip_has_the_precision_of_the_actor():
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"alpha": -1.0}, "alpha must be 'auto' or a finite number that is not negative, got -1.0"),
-        ({"alpha": float("inf")}, "alpha must be 'auto' or a finite number"),
-        ({"alpha": "automatic"}, "alpha must be 'auto'"),
-        ({"alpha": "auto", "alpha_init": 0.0}, "alpha_init must be positive and finite, got 0.0"),
-        ({"alpha": "auto", "alpha_init": float("nan")}, "alpha_init must be positive and finite, got nan"),
-        ({"alpha": "auto", "target_entropy": "low"}, "target_entropy must be 'auto' or a finite number, got 'low'"),
+        ({"alpha": -1.0}, "alpha must be at least 0 or be 'auto', got -1.0. The coefficient of the entropy bonus"),
+        ({"alpha": float("inf")}, "alpha must be a finite number or be 'auto', got inf"),
+        ({"alpha": "automatic"}, "alpha must be a number or be 'auto', got 'automatic'"),
+        ({"alpha": "auto", "alpha_init": 0.0}, "alpha_init must be greater than 0, got 0.0. What alpha=auto starts"),
+        ({"alpha": "auto", "alpha_init": float("nan")}, "alpha_init must be a finite number, got nan"),
+        ({"alpha": "auto", "target_entropy": "low"}, "target_entropy must be a number or be 'auto', got 'low'"),
         ({"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
         ({"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
-        ({"num_qvalue_nets": 0}, "at least one critic, got num_qvalue_nets=0"),
-        ({"num_qvalue_nets": 2.5}, "at least one critic, got num_qvalue_nets=2.5"),
+        ({"n_step_return": "abc"}, "n_step_return must be true or false, got 'abc'. Whether J includes J_N"),
+        ({"zero_step_return": float("nan")}, "zero_step_return must be true or false, got nan"),
+        ({"num_qvalue_nets": 0}, "num_qvalue_nets must be at least 1, got 0. The critics made from it"),
+        ({"num_qvalue_nets": 2.5}, "num_qvalue_nets must be a whole number, got 2.5"),
+        ({"simulated_steps": -1}, "simulated_steps must be at least 0, got -1. Control steps"),
     ],
 )
 def test_bad_arguments_say_what_is_allowed(kwargs, message):
@@ -144,12 +148,30 @@ def test_bad_arguments_say_what_is_allowed(kwargs, message):
         ABPTLoss(actor, qvalue, **kwargs)
 
 
-@pytest.mark.parametrize("numbers", [{"gamma": 2.0}, {"gamma": float("nan")}, {"lmbda": -0.1}])
-def test_discounts_lie_between_0_and_1(numbers):
+@pytest.mark.parametrize(
+    ("numbers", "must"),
+    [({"gamma": 2.0}, "at most 1"), ({"gamma": float("nan")}, "a finite number"), ({"lmbda": -0.1}, "at least 0")],
+)
+def test_discounts_lie_between_0_and_1(numbers, must):
     actor, value, _ = make_networks()
     ((name, number),) = numbers.items()
-    with pytest.raises(ValueError, match=f"{name} must lie between 0 and 1, got {number}"):
+    with pytest.raises(ValueError, match=f"{name} must be {must}, got {number}"):
         SHACLoss(actor, value).make_value_estimator(**numbers)
+
+
+def test_an_estimator_takes_its_own_numbers_alone():
+    actor, value, _ = make_networks()
+    with pytest.raises(
+        UserTypeError, match="BPTTLoss estimates its returns by TD1, which takes no 'lmbda'. Choose from"
+    ):
+        BPTTLoss(actor).make_value_estimator(gamma=0.9, lmbda=0.9)
+    with pytest.raises(UserTypeError, match="SHACLoss estimates its returns by TDLambda, which takes no 'lambda_'"):
+        SHACLoss(actor, value).make_value_estimator(lambda_=0.9)
+    with pytest.raises(UserValueError, match="'abc' is not implemented for loss SHACLoss. Choose from: td0, tdlambda"):
+        SHACLoss(actor, value).make_value_estimator("abc")
+    assert SHACLoss(actor, value).make_value_estimator("TD0", gamma=0.5).value_type is ValueEstimators.TD0
+    with pytest.raises(UserValueError, match="value_target must be the name of an entry, such as .*, got 5"):
+        SHACLoss(actor, value).set_keys(value_target=5)
 
 
 def test_plain_modules_are_refused(env):

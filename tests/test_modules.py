@@ -9,6 +9,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad import HoveringEnv, load_drone, make_actor, make_qvalue, make_value
 
+nan = float("nan")
+
 
 def make_pendulum():
     """An environment whose action, a torque, lies between -2 and 2."""
@@ -119,10 +121,14 @@ def test_every_network_has_the_precision_of_the_environment():
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"num_cells": (0,)}, r"num_cells must be the widths of the hidden layers, such as \(64, 64\); got \(0,\)"),
-        ({"num_cells": (64, -1)}, "num_cells must be the widths"),
-        ({"num_cells": (2.5,)}, "num_cells must be the widths"),
-        ({"num_cells": 64}, "num_cells must be the widths .* got 64"),
+        ({"num_cells": (0,)}, r"num_cells\[0\] must be at least 1, got 0. .*in a list: \[64, 64\]"),
+        ({"num_cells": (64, -1)}, r"num_cells\[1\] must be at least 1, got -1"),
+        ({"num_cells": (2.5,)}, r"num_cells\[0\] must be a whole number, got 2.5"),
+        ({"num_cells": 64}, r"num_cells must be a list, got 64. .*in a list: \[64, 64\]"),
+        ({"num_cells": [65_536] * 3}, "has 8,59.,...,... weights, more than 100,000,000: write smaller widths"),
+        ({"input_scale": nan}, "input_scale must be a finite number or be a list, got nan"),
+        ({"activation": "relu"}, "activation must be a class of activations of torch.nn without arguments, .*'relu'"),
+        ({"activation": torch.nn.GLU}, "activation must be a class of activations"),
         ({"in_keys": ["obs"]}, "Unknown entry 'obs' in in_keys. Choose from: observation, "),
         (
             {"in_keys": [("state", "speed")]},
@@ -142,13 +148,19 @@ def test_a_network_of_wrong_sizes_or_entries_is_refused(env, make, kwargs, messa
     [
         (
             {"in_keys": "observation"},
-            r'in_keys must be a list of entries, such as \["observation"\]; got \'observation',
+            r"in_keys must be a list, got \'observation\'. .*in a list: \[\"observation\"\]",
         ),
-        ({"in_keys": []}, "in_keys must be a list of entries"),
+        ({"in_keys": []}, "in_keys must have at least 1 item"),
+        ({"in_keys": [3]}, r"in_keys\[0\] must be the name of an entry, such as .*, got 3"),
         ({"action_init": [0.0, 0.0, 0.0]}, "action_init must be 4 numbers strictly between"),
         ({"action_init": [1.0, 0.0, 0.0, 0.0]}, r"strictly between .* got \[1.0, 0.0, 0.0, 0.0\]"),
-        ({"action_init": [float("nan"), 0.0, 0.0, 0.0]}, "strictly between"),
-        ({"scale_init": 0.0}, "scale_init must be finite and at least 1e-4, got 0.0"),
+        ({"action_init": [nan, 0.0, 0.0, 0.0]}, "strictly between"),
+        ({"action_init": ["a", 0.0, 0.0, 0.0]}, r"strictly between .* got \['a', 0.0, 0.0, 0.0\]"),
+        ({"scale_init": 1e300}, "scale_init must be at most 100, got 1e.300"),
+        (
+            {"scale_init": 0.0},
+            "scale_init must be at least 0.0001, got 0.0. The standard deviation of the policy's noise",
+        ),
     ],
 )
 def test_a_first_action_out_of_bounds_and_a_wrong_list_of_entries_are_refused(env, kwargs, message):

@@ -130,5 +130,7 @@ def test_the_normalizer_names_what_it_can_normalise(env):
         ObservationNormalizer(env, "obs")
     with pytest.raises(ValueError, match='is part of the state .* normalise "features"'):
         ObservationNormalizer(env, ("state", "position"))
-    with pytest.raises(ValueError, match="min_scale must be positive, since the normalizer divides by it; got 0.0"):
+    with pytest.raises(
+        ValueError, match="min_scale must be greater than 0, got 0.0. The least standard deviation to divide by"
+    ):
         ObservationNormalizer(env, min_scale=0.0)

@@ -9,16 +9,17 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.autograd.graph import GradientEdge
 from torchrl.envs import EnvBase
 
 from torchrl_quad.data import differentiable_rollout
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.data.unwrap import require_env
+from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
 from torchrl_quad.objectives.action_gradients import sources_of_steps
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.objectives.segments import discounts
+from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, checked, require
 
 Inputs = nn.Module | Tensor | Iterable[Tensor]
 
@@ -73,16 +74,17 @@ class RewardAudit(dict[str, TermAudit]):
         return "\n".join([*lines, partially if lost else "fully differentiable"])
 
 
+@checked
 @torch.enable_grad()
 def audit_reward(
     rollout: TensorDictBase,
     inputs: Inputs,
     *,
-    gamma: float = 1.0,
-    terms_key: NestedKey = ("next", "reward_terms"),
-    reward_key: NestedKey = ("next", "reward"),
-    done_key: NestedKey = ("next", "done"),
-    tolerance: float = 1e-4,
+    gamma: Fraction = 1.0,
+    terms_key: Entry = ("next", "reward_terms"),
+    reward_key: Entry = ("next", "reward"),
+    done_key: Entry = ("next", "done"),
+    tolerance: NonNegative = 1e-4,
 ) -> RewardAudit:
     """Find out which terms of a reward have a gradient, and how much each adds to the return and to its gradient.
 
@@ -102,8 +104,10 @@ def audit_reward(
 
     Raises:
         ValueError: an entry is missing, the terms do not add up to the reward, or it does not depend on the inputs.
+        TypeError: the rollout is no tensordict, or the inputs are no tensors.
         RuntimeError: the rollout has lost its graph.
     """
+    _require_rollout("audit_reward", rollout)
     for key in (terms_key, reward_key, done_key):
         if key not in rollout:
             raise UserValueError(
@@ -117,7 +121,7 @@ def audit_reward(
         terms = dict(entry.flatten_keys("/").items())
     _require_sum(terms, reward, terms_key, tolerance)
     if not reward.requires_grad:
-        raise RuntimeError(
+        raise WrongState(
             f"{reward_key!r} carries no gradient. Collectors, ParallelEnv, replay buffers, .detach() and "
             "torch.no_grad() cut it. Use differentiable_rollout(env, actor, carry, horizon) with gradients enabled."
         )
@@ -170,8 +174,10 @@ def compare_gradients(loss: PathwiseLoss, rollout: TensorDictBase) -> GradientCo
 
     Raises:
         ValueError: the loss cannot use the rollout.
+        TypeError: it is no pathwise loss, or the rollout no tensordict.
         RuntimeError: the rollout has lost its graph.
     """
+    _require_loss(loss)
     parts, sources = loss.objective_parts(rollout), _sources(loss)
     value = [parts.pop(loss.value_part)] if loss.value_part in parts else []
     first_order, value = (
@@ -192,8 +198,9 @@ class GradientStatistics:
     signal_to_noise: float  #: the norm of the mean over the standard deviation, the root of the variance
 
 
+@checked
 @torch.enable_grad()
-def gradient_statistics(loss: PathwiseLoss, rollout: TensorDictBase, *, max_envs: int = 16) -> GradientStatistics:
+def gradient_statistics(loss: PathwiseLoss, rollout: TensorDictBase, *, max_envs: Size = 16) -> GradientStatistics:
     """Mean and spread of the policy gradients of single environments, without the entropy bonus.
 
     Each environment takes a backward pass through the whole rollout. No ``.grad`` changes.
@@ -207,6 +214,7 @@ def gradient_statistics(loss: PathwiseLoss, rollout: TensorDictBase, *, max_envs
         ValueError: there are fewer than two environments, or the loss cannot use the rollout.
         RuntimeError: the rollout has lost its graph.
     """
+    _require_loss(loss)
     objectives = sum(loss.objective_parts(rollout).values()).flatten()[:max_envs]
     if len(objectives) < 2:
         raise UserValueError(
@@ -219,6 +227,7 @@ def gradient_statistics(loss: PathwiseLoss, rollout: TensorDictBase, *, max_envs
     return GradientStatistics(norm.item(), variance.item(), (norm / variance.sqrt()).item())
 
 
+@checked
 def gradient_by_horizon(
     env: EnvBase,
     actor: TensorDictModuleBase,
@@ -226,7 +235,7 @@ def gradient_by_horizon(
     horizons: Iterable[int],
     *,
     start: TensorDictBase | None = None,
-    max_envs: int = 16,
+    max_envs: Size = 16,
 ) -> dict[int, GradientStatistics]:
     """Measure how norm and variance of the policy gradient grow with the horizon, flown from the same starts.
 
@@ -240,14 +249,32 @@ def gradient_by_horizon(
 
     Raises:
         ValueError: as ``differentiable_rollout`` and :func:`gradient_statistics` do.
-        TypeError: the policy is not a TensorDictModule.
+        TypeError: ``env`` is no environment, the policy not a TensorDictModule, or the loss no pathwise one.
         RuntimeError: the rollout has lost its graph.
     """
+    if not isinstance(horizons, Iterable):
+        raise UserTypeError(f"horizons must be numbers of control steps, such as (8, 32); got {horizons!r}.")
+    horizons = [require("horizons", horizon, Horizon, "They are numbers of control steps.") for horizon in horizons]
+    require_env(env)
     start = env.reset() if start is None else start
     return {
         horizon: gradient_statistics(loss, differentiable_rollout(env, actor, start, horizon)[0], max_envs=max_envs)
         for horizon in horizons
     }
+
+
+def _require_rollout(name: str, rollout: TensorDictBase) -> None:
+    if not isinstance(rollout, TensorDictBase):
+        raise UserTypeError(
+            f"{name} needs a rollout, the tensordict that differentiable_rollout returns; got {type(rollout).__name__}."
+        )
+
+
+def _require_loss(loss: PathwiseLoss) -> None:
+    if not isinstance(loss, PathwiseLoss):
+        raise UserTypeError(
+            f"loss must be a pathwise loss of the actor, such as BPTTLoss(actor); got {type(loss).__name__}."
+        )
 
 
 def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
@@ -256,6 +283,8 @@ def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
         inputs = [p for p in getattr(inputs, "actor_network_params", inputs).parameters() if p.requires_grad]
     if isinstance(inputs, Tensor) and (steps := sources_of_steps(inputs)) is not None:
         return [steps] if isinstance(steps, Tensor) else steps
+    if not isinstance(inputs, Iterable):
+        raise UserTypeError(f"inputs must be the actor, its loss, or tensors; got {type(inputs).__name__}.")
     sources = [inputs] if isinstance(inputs, Tensor) else list(inputs)
     if not sources or not all(isinstance(x, Tensor) and x.requires_grad for x in sources):
         raise UserValueError(
@@ -289,7 +318,7 @@ def _verdict(term: Tensor, gradient_norm: float) -> str:
     return "constant" if term.min() == term.max() else "no gradient"
 
 
-def _require_sum(terms: dict[str, Tensor], reward: Tensor, terms_key: NestedKey, tolerance: float) -> None:
+def _require_sum(terms: dict[str, Tensor], reward: Tensor, terms_key: Entry, tolerance: float) -> None:
     for name, term in terms.items():
         if term.shape != reward.shape:
             raise UserValueError(

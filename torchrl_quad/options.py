@@ -19,6 +19,7 @@ converted but numpy's scalars. What has another type, such as a tensor or a netw
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import functools
 import inspect
@@ -57,6 +58,9 @@ def _entry(key: Any) -> Any:
 
 Entry = Annotated[Any, AfterValidator(_entry)]
 Entries = Annotated[Sequence[Entry], Field(min_length=1)]
+
+
+Delay = Annotated[int, Field(ge=0, le=1_000)]  # in control steps
 
 
 class Explained(UserValueError):
@@ -115,6 +119,7 @@ _MUST = {  # pydantic's kinds of error in plain words
     "model_type": "be a section with settings of its own",
 }
 _F = TypeVar("_F", bound=Callable[..., Any])
+_T = TypeVar("_T")
 
 
 def checked(target: _F, described_by: type | None = None) -> _F:
@@ -155,6 +160,41 @@ def require(name: str, value: Any, kind: Any, description: str = "") -> Any:
         UserValueError: it does not fit.
     """
     return _checked(name, value, TypeAdapter(kind, config=_CONFIG), description)
+
+
+def build(cls: type[_T], name: str, spec: Any, **more: Any) -> _T:
+    """An object from a mapping of its arguments, or the object itself, with what is given (not zero) beside it.
+
+    Raises:
+        UserValueError: it is neither, has an unknown key, or a value that does not fit.
+    """
+    if isinstance(spec, cls):
+        changes = {key: value for key, value in more.items() if value}
+        return dataclasses.replace(spec, **changes) if changes else spec
+    allowed = [key for key in inspect.signature(cls).parameters if key not in more]
+    if not isinstance(spec, Mapping):
+        raise UserValueError(
+            f"{name} must be a mapping with any of {', '.join(allowed)}, or a {cls.__name__}; got {shown(spec)}."
+        )
+    for key in spec:
+        if key not in allowed:
+            raise UserValueError(f"{name}: unknown key {shown(key)}. Allowed: {', '.join(allowed)}.")
+    try:
+        return cls(**spec, **more)
+    except UserValueError as error:
+        raise UserValueError(f"{name}: {error}") from None
+
+
+def buildable(cls: type, name: str) -> Any:
+    """The type of what :func:`build` makes such an object of, or None."""
+
+    def validate(value: Any) -> Any:
+        try:
+            return value if value is None else build(cls, name, value)
+        except UserValueError as error:
+            raise Explained(str(error).removeprefix(f"{name}: ")) from None
+
+    return Annotated[Any, AfterValidator(validate)]
 
 
 def declared(target: Callable[..., Any]) -> dict[str, tuple[Any, str]]:

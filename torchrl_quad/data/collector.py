@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -12,12 +12,14 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
-from torchrl_quad.data.rollout import differentiable_rollout
-from torchrl_quad.data.unwrap import base_env
+from torchrl_quad.data.rollout import differentiable_rollout, require_actor, require_exploration
+from torchrl_quad.data.unwrap import base_env, require_env
 from torchrl_quad.data.visited_states import restart
 from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.options import Field, Fraction, checked
 
 
+@checked
 class DifferentiableCollector(BaseCollector):
     """Horizons with their graph, for ``torchrl.trainers.Trainer`` and for loops written around collectors.
 
@@ -31,12 +33,14 @@ class DifferentiableCollector(BaseCollector):
         env: any differentiable environment, also under transforms; or a function that builds it.
         policy: a TensorDictModule that writes the action.
         frames_per_batch: control steps of all environments together in a batch, a multiple of their number.
-        total_frames: the iteration ends with the batch that reaches it; -1 for never.
-        restart_fraction: probability, for each environment and batch, of a fresh start; see :func:`restart`.
+        total_frames: control steps of all environments together with which the iteration ends; -1 for never. The batch
+            that reaches them is the last.
+        restart_fraction: the share of flights that each batch gives up for a fresh start; see :func:`restart`.
         exploration_type: RANDOM samples the policy, DETERMINISTIC takes its mode.
 
     Raises:
-        ValueError: a number is out of its range.
+        ValueError: an option has the wrong type or is out of its range.
+        TypeError: ``env`` or ``policy`` is none.
 
     Attributes:
         carry: the tensordict from which the next batch starts; None resets the environment. It may be set, such as to
@@ -51,13 +55,16 @@ class DifferentiableCollector(BaseCollector):
         env: EnvBase | Callable[[], EnvBase],
         policy: TensorDictModuleBase,
         *,
-        frames_per_batch: int,
-        total_frames: int = -1,
-        restart_fraction: float = 0.0,
+        frames_per_batch: Annotated[int, Field(ge=1, le=10**12)],
+        total_frames: Annotated[int, Field(ge=-1, le=10**15)] = -1,
+        restart_fraction: Fraction = 0.0,
         exploration_type: ExplorationType = ExplorationType.RANDOM,
     ) -> None:
         super().__init__()
-        self.env: EnvBase = env if isinstance(env, EnvBase) else env()
+        self.env: EnvBase = env if isinstance(env, EnvBase) or not callable(env) else env()
+        require_env(self.env)
+        require_actor(policy, "policy")
+        require_exploration(exploration_type)
         self.policy, self.exploration_type, self.restart_fraction = policy, exploration_type, restart_fraction
         self.horizon, rest = divmod(frames_per_batch, self.env.numel())
         if rest or self.horizon < 1:
@@ -66,8 +73,6 @@ class DifferentiableCollector(BaseCollector):
                 f"frames_per_batch={frames_per_batch} must be a multiple of the number of environments, "
                 f"{self.env.numel()}. Try {nearest}, a horizon of {nearest // self.env.numel()} control steps."
             )
-        if not 0.0 <= restart_fraction <= 1.0:
-            raise UserValueError(f"restart_fraction must lie between 0 and 1, got {restart_fraction}.")
         self.frames_per_batch = self.requested_frames_per_batch = frames_per_batch
         self.total_frames: float = float("inf") if total_frames < 0 else total_frames
         self.carry: TensorDictBase | None = None

@@ -7,14 +7,15 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, ObservationNorm
 
-from torchrl_quad.data.unwrap import base_env
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.data.unwrap import base_env, require_env
+from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.options import Entry, Positive, checked, shown
 
 
+@checked
 class ObservationNormalizer(ObservationNorm):
     """Subtracts the mean and divides by the standard deviation of all observations seen, fixed within a horizon.
 
@@ -37,10 +38,13 @@ class ObservationNormalizer(ObservationNorm):
         min_scale: the least standard deviation to divide by, in the observation's unit.
 
     Raises:
-        ValueError: the environment does not observe the key, its state holds the key, or min_scale is not positive.
+        ValueError: the environment does not observe the key, its state holds the key, its entry is no vector of
+            floating-point numbers, or min_scale is not positive.
+        TypeError: ``env`` is no environment.
     """
 
-    def __init__(self, env: EnvBase, key: NestedKey = "observation", *, min_scale: float = 0.01) -> None:
+    def __init__(self, env: EnvBase, key: Entry = "observation", *, min_scale: Positive = 0.01) -> None:
+        require_env(env)
         if key not in env.observation_spec.keys(True, True):
             raise UserValueError(
                 f"The environment does not observe {key!r}. Choose from: "
@@ -51,9 +55,12 @@ class ObservationNormalizer(ObservationNorm):
                 f"{key!r} is part of the state from which the next step starts, and cannot be overwritten. Copy it: "
                 f'CatTensors([{key!r}], "features", del_keys=False), and normalise "features".'
             )
-        if not min_scale > 0:
-            raise UserValueError(f"min_scale must be positive, since the normalizer divides by it; got {min_scale}.")
         spec = env.observation_spec[key]
+        if not spec.shape or not spec.dtype.is_floating_point:
+            raise UserValueError(
+                f"{shown(key)} is {tuple(spec.shape)}, {spec.dtype}, and the normalizer takes floating-point vectors "
+                "(*, k). Choose another key."
+            )
         loc = torch.zeros(spec.shape[-1], device=spec.device, dtype=spec.dtype)
         super().__init__(loc, torch.ones_like(loc), in_keys=[key], standard_normal=True)
         self.min_scale = min_scale
@@ -75,7 +82,12 @@ class ObservationNormalizer(ObservationNorm):
         Observations that are not finite are left out. Those written before, such as a carry's, do not change; reset to
         their state to observe them anew.
         """
-        written = rollout.get(("next", self.out_keys[0])).reshape(-1, self.loc.shape[-1])
+        entry = ("next", self.out_keys[0])
+        if not isinstance(rollout, TensorDictBase) or entry not in rollout:
+            raise UserTypeError(
+                f"The normalizer reads {entry!r} of a rollout, the tensordict that differentiable_rollout returns."
+            )
+        written = rollout.get(entry).reshape(-1, self.loc.shape[-1])
         seen = self.undo(written[written.isfinite().all(-1)])
         if len(seen) == 0:
             return

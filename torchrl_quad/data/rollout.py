@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import numbers
+import os
 
 import torch
 from tensordict import TensorDictBase
@@ -12,15 +12,17 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.normalizer import NormalizedPolicy, ObservationNormalizer
-from torchrl_quad.data.unwrap import base_env, memory_keys, require_whole_state
+from torchrl_quad.data.unwrap import base_env, memory_keys, require_env, require_whole_state
 from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.options import Horizon, checked, shown
 
 
+@checked
 def differentiable_rollout(
     env: EnvBase,
     actor: TensorDictModuleBase,
     carry: TensorDictBase | None,
-    horizon: int,
+    horizon: Horizon,
     *,
     exploration_type: ExplorationType = ExplorationType.RANDOM,
 ) -> tuple[TensorDictBase, TensorDictBase]:
@@ -36,7 +38,7 @@ def differentiable_rollout(
         actor: a TensorDictModule that writes the action.
         carry: the reset tensordict to start from: of ``env.reset()``, the last call, ``restart`` or a visited-state
             buffer. It is not modified. None resets the environment.
-        horizon: number of control steps, at least 1.
+        horizon: control steps of the rollout.
         exploration_type: RANDOM samples the policy, DETERMINISTIC takes its mode.
 
     Returns:
@@ -44,22 +46,13 @@ def differentiable_rollout(
         environments whose last step was done.
 
     Raises:
-        ValueError: the horizon is less than 1, the actor reads an entry that nobody writes, or a transform overwrites
-            or leaves out a part of the state.
-        TypeError: the actor is not a TensorDictModule, or the carry is not a tensordict.
+        ValueError: the horizon is out of its range, or its rollout larger than the memory; the actor reads an entry
+            that nobody writes, or a transform overwrites or leaves out a part of the state.
+        TypeError: ``env`` is no environment, the actor is not a TensorDictModule, or the carry is not a tensordict.
     """
-    if not (isinstance(horizon, numbers.Integral) and horizon >= 1):
-        raise UserValueError(f"horizon must be at least 1 control step, got {horizon}.")
-    if hasattr(actor, "_orig_mod"):
-        raise UserTypeError(
-            "torch.compile(actor) is no TensorDictModule. Write actor.compile() instead, which compiles it in place, "
-            "or give the environment compile=True, which compiles the whole horizon."
-        )
-    if not isinstance(actor, TensorDictModuleBase):
-        raise UserTypeError(
-            f"actor must be a TensorDictModule that writes the action, got {type(actor).__name__}. "
-            'Wrap a plain module: TensorDictModule(module, in_keys=["observation"], out_keys=["action"]).'
-        )
+    require_env(env)
+    require_exploration(exploration_type)
+    require_actor(actor, "actor")
     if not (carry is None or isinstance(carry, TensorDictBase)):
         raise UserTypeError(
             f"carry must be the tensordict to start from, or None to reset the environment; got {type(carry).__name__}."
@@ -67,6 +60,8 @@ def differentiable_rollout(
     try:
         require_whole_state(env)
         carry = env.reset() if carry is None else carry.copy()
+        if carry.numel() * horizon > 1_000_000:
+            _require_memory(carry, horizon)
         with set_exploration_type(exploration_type):
             rollout = _rollout(env, actor, carry, horizon)
     except KeyError as error:
@@ -106,6 +101,48 @@ def differentiable_rollout(
         carry.set(key, torch.where(expand_as_right(done.squeeze(-1), memory), 0.0, memory))
         carry.set("is_init", done.clone())
     return rollout, carry
+
+
+def _require_memory(carry: TensorDictBase, horizon: int) -> None:
+    """Refuse a rollout whose entries alone, without their graph, are larger than the memory."""
+    needed = 2 * horizon * sum(x.numel() * x.element_size() for x in carry.values(True, True))
+    if carry.device is not None and carry.device.type == "cuda":
+        has = torch.cuda.get_device_properties(carry.device).total_memory
+    elif hasattr(os, "sysconf"):
+        has = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    else:
+        return
+    if needed > has:
+        raise UserValueError(
+            f"A rollout of {horizon:,} steps of {carry.numel():,} environments takes more than {needed / 1e9:,.0f} GB, "
+            f"and there are {has / 1e9:,.0f}. Fly far fewer than {horizon * has // needed:,} steps at a time, or fewer "
+            "environments."
+        )
+
+
+def require_actor(actor: TensorDictModuleBase, name: str) -> None:
+    """Refuse what is no policy.
+
+    Raises:
+        TypeError: it is not a TensorDictModule.
+    """
+    if hasattr(actor, "_orig_mod"):
+        raise UserTypeError(
+            f"torch.compile({name}) is no TensorDictModule. Write {name}.compile() instead, which compiles it in "
+            "place, or give the environment compile=True, which compiles the whole horizon."
+        )
+    if not isinstance(actor, TensorDictModuleBase):
+        raise UserTypeError(
+            f"{name} must be a TensorDictModule that writes the action, got {type(actor).__name__}. "
+            'Wrap a plain module: TensorDictModule(module, in_keys=["observation"], out_keys=["action"]).'
+        )
+
+
+def require_exploration(kind: ExplorationType) -> None:
+    """Refuse what is no way to explore."""
+    if not isinstance(kind, ExplorationType):
+        names = ", ".join(f"ExplorationType.{x.name}" for x in ExplorationType)
+        raise UserValueError(f"exploration_type must be one of {names}; got {shown(kind)}.")
 
 
 def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> TensorDictBase:

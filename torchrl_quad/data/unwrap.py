@@ -4,7 +4,19 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError
+
+
+def require_env(env: EnvBase) -> None:
+    """Refuse what is no environment.
+
+    Raises:
+        TypeError: it is none.
+    """
+    if not isinstance(env, EnvBase):
+        raise UserTypeError(
+            f"env must be a TorchRL environment, such as make_env('hovering', num_envs=64); got {type(env).__name__}."
+        )
 
 
 def base_env(env: EnvBase) -> EnvBase:

@@ -2,32 +2,38 @@
 
 from __future__ import annotations
 
-import numbers
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
-from torchrl_quad.data.unwrap import base_env, memory_keys
-from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.data.rollout import require_actor
+from torchrl_quad.data.unwrap import base_env, memory_keys, require_env
+from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
+from torchrl_quad.options import Entries, Fraction, Seed, Size, checked
+
+Kinds = dict[NestedKey, tuple[torch.Size, torch.dtype]]  # of the entries of one state
 
 
+@checked
 class VisitedStateBuffer(TensorDictReplayBuffer):
     """States that the policy has visited, from which horizons and episodes can start.
 
     The buffer keeps states and no transitions, so it is no replay for off-policy learning. A state is the complete
     Markov state, including commands on their way and whatever the task keeps, detached from any graph.
 
-    Saving and loading is inherited: ``state_dict``, ``load_state_dict``, ``dumps(path)``, ``loads(path)``. They include
+    ``state_dict`` and ``load_state_dict``, ``dumps(path)`` and ``loads(path)`` save and load the states, n of them, and
     the buffer's random generator, which draws the states and decides which environments get one.
 
     Args:
-        capacity: number of states kept; the oldest go first.
+        capacity: visited states kept; the oldest go first.
         env: the environment whose Markov state is kept; see :mod:`torchrl_quad.data`.
         state_keys: the entries that make up the Markov state. By default those of ``env``, and "state" without one.
         actor: a recurrent policy, whose memory is kept beside the state. Without it, and in :meth:`source`, it begins
@@ -36,29 +42,37 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         seed: of the buffer's own random generator.
 
     Raises:
-        ValueError: the capacity is less than 1.
+        ValueError: an option has the wrong type or is out of its range.
+        TypeError: ``env`` is no environment, or ``actor`` no policy.
     """
 
     def __init__(
         self,
-        capacity: int = 100_000,
+        capacity: Size = 100_000,
         env: EnvBase | None = None,
         *,
-        state_keys: Sequence[NestedKey] | None = None,
+        state_keys: Entries | None = None,
         actor: TensorDictModuleBase | None = None,
         device: torch.device | str = "cpu",
-        seed: int = 0,
+        seed: Seed = 0,
     ) -> None:
-        if not (isinstance(capacity, numbers.Integral) and capacity >= 1):
-            raise UserValueError(f"capacity must be at least 1 state, got {capacity}.")
+        if env is not None:
+            require_env(env)
+        if actor is not None:
+            require_actor(actor, "actor")
+        try:
+            generator = torch.Generator(device=device).manual_seed(seed)
+        except (RuntimeError, TypeError) as error:
+            said = str(error).splitlines()[0]
+            raise UserValueError(f"device must be one that torch has here, such as cpu; it says: {said}") from None
+        # Of each part of a state, as far as it is known.
+        self.kinds: dict[NestedKey, Kinds] = {} if env is None else _kinds_of(env)
         if state_keys is None:
             state_keys = ("state",) if env is None else _state_keys(env)
         self.state_keys = tuple(state_keys)
         self.memory_keys = () if actor is None else memory_keys(actor)
-        super().__init__(
-            storage=LazyTensorStorage(capacity, device=device),
-            generator=torch.Generator(device=device).manual_seed(seed),
-        )
+        self.names = (*self.state_keys, *self.memory_keys)
+        super().__init__(storage=LazyTensorStorage(capacity, device=device), generator=generator)
 
     def extend(self, tensordicts: TensorDictBase) -> Tensor:
         """Add the states in which the steps of a rollout (any batch size) started.
@@ -70,7 +84,12 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
 
         Raises:
             ValueError: the rollout lacks an entry of the state, or its states differ in kind from the buffer's.
+            TypeError: it is no tensordict.
         """
+        if not isinstance(tensordicts, TensorDictBase):
+            raise UserTypeError(
+                f"The visited-state buffer takes a rollout, a tensordict; got {type(tensordicts).__name__}."
+            )
         missing = [key for key in (*self.state_keys, *self.memory_keys) if key not in tensordicts]
         if missing:
             raise UserValueError(
@@ -86,16 +105,17 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             keep &= ~terminated.reshape(-1)
         if not keep.any():
             return torch.zeros(0, dtype=torch.int64)
-        if len(self):
-            _require_same(states, self[:1].select(*self.state_keys, *self.memory_keys))
+        self._require_same(states)
+        self.kinds = {name: _kinds(states, name) for name in self.names}
         return super().extend(states[keep].clone())
 
-    def initial_state(self, env: EnvBase, fraction: float = 0.9) -> TensorDictBase:
+    @checked
+    def initial_state(self, env: EnvBase, fraction: Fraction = 0.9) -> TensorDictBase:
         """Reset an environment: a fraction of its batch to visited states, the rest to fresh starts.
 
         Args:
             env: an environment that can be set to a state, also under transforms.
-            fraction: probability, for each member of the batch, of a visited state.
+            fraction: the share of horizons that start in visited states, a probability for each member of the batch.
 
         Returns:
             the tensordict of the reset, the carry of the next rollout.
@@ -104,6 +124,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             ValueError: the fraction is not in [0, 1], or the environment's states differ in kind from the buffer's.
             RuntimeError: the buffer is empty.
         """
+        require_env(env)
         mixed, visited, pick = self._mixed(_fresh(env, self.state_keys), fraction)
         start = env.reset(mixed, set_state=True)
         for key, x in visited.select(*self.memory_keys).items(True, True):
@@ -111,12 +132,13 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             start.set("is_init", ~pick.unsqueeze(-1))
         return start
 
-    def source(self, env: EnvBase, fraction: float = 0.9) -> Callable[[int], TensorDictBase]:
+    @checked
+    def source(self, env: EnvBase, fraction: Fraction = 0.9) -> Callable[[int], TensorDictBase]:
         """A function for ``env.set_initial_state_source``: resets inside a horizon then start in visited states, too.
 
         Args:
             env: an environment with ``sample_start`` (see :mod:`torchrl_quad.data`), also under transforms.
-            fraction: probability, for each state, of a visited one.
+            fraction: the share of starts that are visited states, a probability for each.
 
         Returns:
             a function from n to n states: the tensordict (n) that ``env`` keeps under its one state key, or, where the
@@ -127,7 +149,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             ValueError: the fraction is not in [0, 1]; (in use) as :meth:`initial_state`.
             RuntimeError: (in use) the buffer is empty.
         """
-        _require_fraction(fraction)
+        require_env(env)
         base = base_env(env)
         if not _draws_starts(base):
             raise UserTypeError(
@@ -143,20 +165,122 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
 
     def _mixed(self, fresh: TensorDictBase, fraction: float) -> tuple[TensorDictBase, TensorDictBase, Tensor]:
         """States to start from, the visited ones and their memory, and which of them were taken, bool."""
-        _require_fraction(fraction)
         if len(self) == 0:
-            raise RuntimeError(
+            raise WrongState(
                 "The visited-state buffer is empty. Fly a first horizon from env.reset() and extend the buffer with it."
             )
         visited = self.sample(fresh.numel()).select(*self.state_keys, *self.memory_keys).to(fresh.device)
         states = visited.select(*self.state_keys)
-        _require_same(fresh.reshape(-1), states)
+        self._require_same(fresh.reshape(-1))
         pick = torch.rand(fresh.shape, generator=self._rng, device=self._rng.device) < fraction
         pick = pick.to(fresh.device)
         return states.reshape(fresh.shape).where(pick, fresh), visited.reshape(fresh.shape), pick
 
+    def _require_same(self, states: TensorDictBase) -> None:
+        """Refuse states (n) of another kind than those that are kept, before they are mixed or broadcast in silence."""
+        different: set[str] = set()
+        for name in filter(states.__contains__, self.names):
+            theirs = _kinds(states, name)
+            different |= {str(key) for key, _ in self.kinds.get(name, theirs).items() ^ theirs.items()}
+        if different:
+            raise UserValueError(
+                f"These are other states than those in the visited-state buffer: {', '.join(sorted(different))} differ "
+                "in name, shape or type. Keep a buffer for each task and its options, such as action_delay."
+            )
 
-def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictBase:
+    # -- saving and loading --------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the buffer holds: of its storage what is filled, (n) of each entry."""
+        state = super().state_dict()
+        storage = state["_storage"]
+        storage["_storage"] = {
+            name: x[: len(self)].clone() if isinstance(x, Tensor) else x for name, x in storage["_storage"].items()
+        }
+        return state
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Hold what :meth:`state_dict` has returned, also that of a smaller buffer.
+
+        Raises:
+            ValueError: the content does not fit the buffer, which stays as it is.
+        """
+        states, cursor, count, generator = self._read(state_dict)
+        self._storage._empty()
+        if len(states):
+            states = states.to(self._storage.device)
+            self.kinds = {name: _kinds(states, name) for name in self.names}
+            index = torch.arange(len(states), device=self._storage.device)
+            self._storage.set(index, states.set("index", index))
+        self._writer.load_state_dict({"_cursor": cursor, "_write_count": count})
+        self.set_rng(generator)
+
+    def dumps(self, path: str | Path) -> None:
+        """Write :meth:`state_dict` into a folder."""
+        Path(path).mkdir(exist_ok=True)
+        torch.save(self.state_dict(), Path(path) / "buffer.pt")
+
+    def loads(self, path: str | Path) -> None:
+        """Read from a folder what :meth:`dumps` has written.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is damaged, or its content does not fit.
+        """
+        file = Path(path) / "buffer.pt"
+        with file.open("rb") as opened:
+            try:
+                content = torch.load(opened, map_location="cpu", weights_only=True)
+            except Exception as error:
+                said = (str(error) or repr(error)).splitlines()[0]
+                raise UserValueError(f"{file} is damaged, or no buffer that dumps wrote: {said}") from None
+        self.load_state_dict(content)
+
+    def _read(self, state: Mapping[str, Any]) -> tuple[TensorDict, int, int, torch.Generator]:
+        """The states, the cursor, the number of states ever written, and the generator of a content that fits."""
+
+        def require(condition: bool, what: str) -> None:
+            if not condition:
+                raise UserValueError(
+                    f"The content does not fit this visited-state buffer of {self._storage.max_size:,} states: {what}. "
+                    "Take what a buffer of the same task and options has saved."
+                )
+
+        try:
+            entries, n, written = state["_storage"]["_storage"], state["_storage"]["_len"], state["_writer"]
+            cursor, count, (random, device) = written["_cursor"], written["_write_count"], state["_rng"]
+        except (TypeError, KeyError, ValueError, IndexError):
+            require(False, "it lacks the storage, the writer or the random generator")
+        require(isinstance(entries, Mapping), "its storage is no mapping")
+        require(all(type(x) is int and x >= 0 for x in (n, cursor, count)), "its numbers of states are none")
+        most = self._storage.max_size
+        require(n <= most, f"it has {n:,} states")
+        require(cursor <= n and count >= n, f"its cursor is {cursor} and its count {count}, with {n} states")
+        rows = {str(name): x for name, x in entries.items() if isinstance(x, Tensor) and name != "index"} if n else {}
+        for name, x in rows.items():
+            usable = x.layout is torch.strided and not x.is_meta and x.ndim > 0 and len(x) >= n
+            require(usable, f"{name} has shape {tuple(x.shape)}")
+            require(bool(x[:n].isfinite().all()), f"{name} is not finite")
+        states = TensorDict({name: x[:n].detach() for name, x in rows.items()}, [n]).unflatten_keys(".")
+        if n:
+            lost = [name for name in self.names if name not in states]
+            more = set(states.keys(True, True)) - set(states.select(*self.names, strict=False).keys(True, True))
+            require(not lost and not more, f"it lacks or adds {(*lost, *more)[:1]}")
+            self._require_same(states)
+        if cursor < n < most:  # a smaller buffer that was full: its oldest state is where it would have written
+            order = torch.arange(n).roll(-cursor)
+            states, cursor = states[order], n
+        try:
+            generator = torch.Generator(device=device)
+            generator.set_state(random)
+        except (RuntimeError, TypeError) as error:
+            require(False, f"its random generator is none ({str(error).splitlines()[0]})")
+        require(generator.device.type == self._rng.device.type, f"its random generator is on {device}")
+        return states, cursor % most, count, generator
+
+
+@checked
+def restart(env: EnvBase, carry: TensorDictBase, fraction: Fraction) -> TensorDictBase:
     """Start a random fraction of the environments afresh, and let the others go on from where they are.
 
     Beside visited states this is the other way to choose where the next horizon starts: most flights go on through many
@@ -167,15 +291,18 @@ def restart(env: EnvBase, carry: TensorDictBase, fraction: float) -> TensorDictB
     Args:
         env: an environment that can be set to a state, also under transforms.
         carry: where the environments are, as ``differentiable_rollout`` returns it.
-        fraction: probability, for each member of the batch, of a fresh start.
+        fraction: the share of flights that are given up for a fresh start, a probability for each.
 
     Returns:
         the tensordict of the reset, the carry of the next rollout.
 
     Raises:
         ValueError: the fraction is not in [0, 1], or the carry lacks an entry of the state or has another batch size.
+        TypeError: ``env`` is no environment, or the carry is no tensordict.
     """
-    _require_fraction(fraction)
+    require_env(env)
+    if not isinstance(carry, TensorDictBase):
+        raise UserTypeError(f"carry must be the tensordict that a rollout ended with; got {type(carry).__name__}.")
     keys = _state_keys(env)
     missing = [key for key in base_env(env).state_keys if key not in carry]
     if missing:
@@ -211,17 +338,15 @@ def _draws_starts(base: EnvBase) -> bool:
     return hasattr(type(base), "sample_start")
 
 
-def _require_fraction(fraction: float) -> None:
-    if not 0.0 <= fraction <= 1.0:
-        raise UserValueError(f"fraction must lie between 0 and 1, got {fraction}.")
+def _kinds(states: TensorDictBase, name: NestedKey) -> Kinds:
+    """Shape and type of each entry of states (n) under a name."""
+    return {key: (x.shape[1:], x.dtype) for key, x in states.select(name).items(True, True)}
 
 
-def _require_same(states: TensorDictBase, kept: TensorDictBase) -> None:
-    """Refuse states (n) of another kind than those that are kept, before they are mixed or broadcast in silence."""
-    ours, theirs = ({key: x.shape[1:] for key, x in td.items(True, True)} for td in (kept, states))
-    different = sorted({str(key) for key, _ in ours.items() ^ theirs.items()})
-    if different:
-        raise UserValueError(
-            f"These are other states than those in the visited-state buffer: {', '.join(different)} differ in name or "
-            "shape. Keep a buffer for each task and its options, such as action_delay."
-        )
+def _kinds_of(env: EnvBase) -> dict[NestedKey, Kinds]:
+    """The same of the states of an environment, by name."""
+    base, kinds = base_env(env), {}
+    for key, spec in base.state_spec.items(True, True):
+        name = key if isinstance(key, str) else key[0]
+        kinds.setdefault(name, {})[unravel_key(key)] = (spec.shape[base.ndim :], spec.dtype)
+    return kinds

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl_quad.engine.packing import Layout, Rows
 from torchrl_quad.engine.policy import GivenActions, PlainPolicy
 from torchrl_quad.engine.program import PolicyProgram, Record, StepProgram, name_in_state, policy_inputs
+from torchrl_quad.errors import Unsupported
 
 LEARNING_BATCH = 1024  # so many steps of one drone make a batch for the gradient of the weights
 
@@ -98,7 +99,7 @@ class _Horizon(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads):
         if torch.is_grad_enabled():  # so it is under create_graph=True alone
-            raise RuntimeError(
+            raise Unsupported(
                 "A compiled flight has first derivatives only. For second ones (create_graph=True) call env.eager() "
                 "and fly again."
             )

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 
 class PlainPolicy(Protocol):
@@ -92,10 +92,17 @@ class ActionSequence(TensorDictModuleBase):
         actions: (horizon, num_envs, k); gradients reach them.
 
     Raises:
+        TypeError: they are no such tensor.
         ValueError: (in use) there are no actions left.
     """
 
     def __init__(self, actions: Tensor) -> None:
+        if not (isinstance(actions, Tensor) and actions.ndim > 1 and actions.is_floating_point()):
+            got = f"{tuple(actions.shape)}, {actions.dtype}" if isinstance(actions, Tensor) else type(actions).__name__
+            raise UserTypeError(
+                "actions must be a floating-point tensor (horizon, num_envs, k), such as "
+                f"torch.zeros(32, env.num_envs, 4, requires_grad=True); got {got}."
+            )
         self.in_keys, self.out_keys = [], ["action"]
         super().__init__()
         self.actions, self.played = actions, 0

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-import numbers
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -16,25 +16,45 @@ from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
-from torchrl_quad.data.unwrap import base_env
+from torchrl_quad.data.unwrap import base_env, require_env
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead
 from torchrl_quad.modules.plain import CorrelatedActor, Critic, Network, TanhGaussianActor
+from torchrl_quad.options import AfterValidator, Below1, Entries, Field, Scale, Width, checked, shown
 
 OBSERVATION = ("observation",)
+MOST_WEIGHTS = 100_000_000  # of a network
 
 
+def _pointwise(activation: Any) -> Any:
+    if isinstance(activation, type) and issubclass(activation, nn.Module):
+        x = torch.zeros(2, 3)
+        try:
+            with torch.random.fork_rng(devices=[]):
+                if activation()(x).shape == x.shape:
+                    return activation
+        except Exception:  # whatever an activation says that is none
+            pass
+    raise UserValueError("be a class of activations of torch.nn without arguments, such as torch.nn.ELU")
+
+
+Activation = Annotated[Any, AfterValidator(_pointwise)]
+Cells = Annotated[Sequence[Width], Field(max_length=64)]
+ScaleInit = Annotated[float, Field(ge=1e-4, le=100)]  # TorchRL's mapping to a scale ends at 1e-4
+
+
+@checked
 def make_actor(
     env: EnvBase,
-    num_cells: Sequence[int] = (64, 64),
+    num_cells: Cells = (64, 64),
     *,
-    in_keys: Sequence[NestedKey] = OBSERVATION,
-    activation: type[nn.Module] = nn.ELU,
-    input_scale: float | Sequence[float] = 1.0,
+    in_keys: Entries = OBSERVATION,
+    activation: Activation = nn.ELU,
+    input_scale: Scale | Sequence[Scale] = 1.0,
     action_init: Tensor | None = None,
-    scale_init: float = 0.1,
+    scale_init: ScaleInit = 0.1,
     learn_scale: bool = True,
-    noise_correlation: float = 0.0,
+    noise_correlation: Below1 = 0.0,
     return_log_prob: bool = False,
 ) -> ProbabilisticActor:
     """A tanh-Gaussian policy a = tanh(mu(s) + sigma(s) noise), stretched to the bounds of the action.
@@ -44,31 +64,33 @@ def make_actor(
 
     Args:
         env: any TorchRL environment, for the sizes of its entries, the action's bounds, device and floating-point type.
-        num_cells: widths of the hidden layers.
-        in_keys: the entries that are concatenated into the network's input, each (*, k).
+        num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
+        in_keys: the entries that are concatenated into the network's input, each (*, k), in a list: ["observation"].
         activation: of the hidden layers; smooth ones give smooth policy gradients.
-        input_scale: multiplies the input; a number, or one for each of ``in_keys``. What the tasks observe is of one to
-            ten [m, m/s, rad/s, ten times the quaternion]; entries of the state may be far larger.
+        input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``. What the tasks observe
+            is of one to ten [m, m/s, rad/s, ten times the quaternion]; entries of the state may be far larger.
         action_init: the mean action at the start, (k), strictly between the bounds. By default
             ``env.neutral_action``, averaged over environments, where the environment has one (see
             :mod:`torchrl_quad.data`; a drone's is to hover), and the middle of the range elsewhere.
-        scale_init: standard deviation at the start; training brings it down to 0.01 at least, or to a tenth of this.
-        learn_scale: whether the network returns the standard deviation, too. Otherwise it stays what it is, and
+        scale_init: the standard deviation of the policy's noise at the start, before the tanh. Training brings it down
+            to 0.01 at least, or to a tenth of this.
+        learn_scale: whether this noise changes with the state and in training. Otherwise it stays what it is, and
             neither a gradient through the simulator nor a KL bound takes the exploration away.
-        noise_correlation: of the noise of two steps that follow each other, from 0 to below 1. Correlated noise moves a
-            drone where independent noise averages out; try 0.9 at 50 Hz. Then loc, scale and the log-probability are
-            those of the action given the noise of the step before, which is written to ``noise_before``; ``noise`` is
-            that of the step itself.
-        return_log_prob: also write the log-probability of the action, which an entropy bonus and PPO need. mu then
+        noise_correlation: of the policy's noise in two steps that follow each other; 0 is white noise. Correlated noise
+            moves a drone where independent noise averages out; try 0.9 at 50 Hz. Then loc, scale and the
+            log-probability are those of the action given the noise of the step before, which is written to
+            ``noise_before``; ``noise`` is that of the step itself.
+        return_log_prob: whether it also writes the log-probability of the action, which an entropy bonus and PPO need.
+            mu then
             stays between -5 and 5: further out rounding of the action decides on the log-probability.
 
     Raises:
-        ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one;
-            ``in_keys`` is empty; a width is not a whole number of at least 1; the number of scales is not that of the
-            entries; the first action is not strictly inside the bounds; ``scale_init`` is below 1e-4 or not finite,
-            or ``noise_correlation`` not from 0 to below 1.
+        ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one; the
+            number of scales is not that of the entries; the first action is not strictly inside the bounds; the network
+            has more than 100 million weights; or an option has the wrong type or is out of its range.
+        TypeError: ``env`` is no environment.
     """
-    spec, first = first_action(env, action_init, scale_init, "make_actor")
+    spec, first = first_action(env, action_init, "make_actor")
     size = spec.shape[-1]
     net = network_of(env, in_keys, 2 * size if learn_scale else size, num_cells, activation, input_scale)
     start_near(net.mlp[-1], first)
@@ -79,15 +101,16 @@ def make_actor(
     return writes_noise(actor) if noise_correlation else actor
 
 
+@checked
 def make_value(
     env: EnvBase,
-    num_cells: Sequence[int] = (64, 64),
+    num_cells: Cells = (64, 64),
     *,
-    in_keys: Sequence[NestedKey] = OBSERVATION,
-    activation: type[nn.Module] = nn.ELU,
-    input_scale: float | Sequence[float] = 1.0,
+    in_keys: Entries = OBSERVATION,
+    activation: Activation = nn.ELU,
+    input_scale: Scale | Sequence[Scale] = 1.0,
 ) -> ValueOperator:
-    """A state value V(s), written to ``state_value``, (*, 1). The arguments are those of :func:`make_actor`.
+    """A state value V(s), written to ``state_value``, (*, 1).
 
     LayerNorm normalises its hidden layers. The policy follows the critic's gradient, which is far off without it.
 
@@ -95,32 +118,55 @@ def make_value(
     turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one. Where there are
     obstacles, ``"obstacle"`` (*, 4) is the distance from the drone's surface to the nearest [m], and the direction away
     from it in the body frame: what a policy has images of, a critic can know.
+
+    Args:
+        env: as for :func:`make_actor`.
+        num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
+        in_keys: the entries that it reads, each (*, k), in a list: ["observation"].
+        activation: of the hidden layers.
+        input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``.
+
+    Raises:
+        ValueError, TypeError: as there.
     """
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
     return Critic(net, in_keys=list(in_keys))
 
 
+@checked
 def make_qvalue(
     env: EnvBase,
-    num_cells: Sequence[int] = (64, 64),
+    num_cells: Cells = (64, 64),
     *,
-    in_keys: Sequence[NestedKey] = OBSERVATION,
-    activation: type[nn.Module] = nn.ELU,
-    input_scale: float | Sequence[float] = 1.0,
-    action_scale: float = 0.3,
+    in_keys: Entries = OBSERVATION,
+    activation: Activation = nn.ELU,
+    input_scale: Scale | Sequence[Scale] = 1.0,
+    action_scale: Scale = 0.3,
 ) -> ValueOperator:
     """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); otherwise as :func:`make_value`.
 
     A policy's action reveals the state. A critic that reads the state off the action gets its gradient in the action
-    wrong. ``action_scale`` multiplies the action at the input, so that the critic relies on the state first.
+    wrong. ``action_scale`` below one makes the critic rely on the state first.
+
+    Args:
+        env: as for :func:`make_actor`.
+        num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
+        in_keys: the entries that it reads, each (*, k), in a list: ["observation"].
+        activation: of the hidden layers.
+        input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``.
+        action_scale: the action is multiplied by this.
+
+    Raises:
+        ValueError, TypeError: as there.
     """
     in_keys = [*in_keys, "action"]
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, action_scale, layer_norm=True)
     return Critic(net, in_keys=in_keys)
 
 
-def first_action(env: EnvBase, action_init: Tensor | None, scale_init: float, name: str) -> tuple[Bounded, Tensor]:
+def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[Bounded, Tensor]:
     """The spec of one action, and what the mean of the first actions is before the tanh, (k); checked for ``name``."""
+    require_env(env)
     spec = env.action_spec_unbatched
     if not isinstance(spec, Bounded):
         raise UserValueError(f"{name} needs an action with bounds, a Bounded spec; got {type(spec).__name__}.")
@@ -135,15 +181,19 @@ def first_action(env: EnvBase, action_init: Tensor | None, scale_init: float, na
     if action_init is None:
         action_init = getattr(_single(env), "neutral_action", middle)
         action_init = action_init.mean(0) if action_init.dim() > middle.dim() else action_init
-    action_init = torch.as_tensor(action_init).to(middle)
-    if action_init.shape != spec.shape or not ((low < action_init) & (action_init < high)).all():
+    try:
+        first = torch.as_tensor(action_init)
+        fits = not first.is_complex() and first.shape == spec.shape
+        fits = fits and bool(((low < first.to(middle)) & (first.to(middle) < high)).all())
+    except (TypeError, ValueError, RuntimeError, OverflowError):  # of what is no tensor, and cannot become one
+        fits = False
+    if not fits:
+        given = action_init.tolist() if isinstance(action_init, Tensor) else action_init
         raise UserValueError(
             f"action_init must be {spec.shape[-1]} numbers strictly between {low.tolist()} and {high.tolist()}, got "
-            f"{action_init.tolist()}."
+            f"{shown(given)}."
         )
-    if not 1e-4 <= scale_init < math.inf:  # TorchRL's mapping to a scale ends there
-        raise UserValueError(f"scale_init must be finite and at least 1e-4, got {scale_init}.")
-    return spec, torch.atanh((action_init - middle) / (0.5 * (high - low)))
+    return spec, torch.atanh((first.to(middle) - middle) / (0.5 * (high - low)))
 
 
 def start_near(layer: nn.Linear, first: Tensor) -> None:
@@ -162,13 +212,7 @@ def with_head(
     in_keys: Sequence[NestedKey],
     return_log_prob: bool,
 ) -> TensorDictModule:
-    """Give the last network of a policy, which reads ``in_keys``, a normal distribution of an action of ``size``.
-
-    Raises:
-        ValueError: the correlation is below 0, or not below 1.
-    """
-    if not 0 <= noise_correlation < 1:
-        raise UserValueError(f"noise_correlation must lie from 0 to below 1, got {noise_correlation}.")
+    """Give the last network of a policy, which reads ``in_keys``, a normal distribution of an action of ``size``."""
     least = min(0.01, 0.1 * scale_init)  # to which training can bring the scale down
     mapping, read = f"biased_softplus_{scale_init}_{least}", list(in_keys)
     max_loc = 5.0 if return_log_prob else math.inf  # as far as TorchRL's TanhNormal goes with tanh_loc=True
@@ -210,22 +254,21 @@ def network_of(
     more: int = 0,
 ) -> Network:
     """A network on entries of an environment; it reads ``more`` numbers first, which are none of these entries."""
-    if isinstance(in_keys, str) or not in_keys:
-        raise UserValueError(f'in_keys must be a list of entries, such as ["observation"]; got {in_keys!r}.')
+    require_env(env)
     specs = [_spec(env, key) for key in in_keys]
     own = len(in_keys) - (action_scale is not None)  # without the action of a critic
-    scales = [input_scale] * own if isinstance(input_scale, numbers.Real) else list(input_scale)
+    scales = list(input_scale) if isinstance(input_scale, Sequence) else [input_scale] * own
     if len(scales) != own:
         raise UserValueError(
             f"input_scale must be a number, or one for each of the {own} in_keys; got {input_scale!r}."
         )
     if action_scale is not None:
         scales.append(action_scale)
-    if isinstance(num_cells, int) or not all(isinstance(n, numbers.Integral) and n >= 1 for n in num_cells):
-        raise UserValueError(f"num_cells must be the widths of the hidden layers, such as (64, 64); got {num_cells!r}.")
+    sizes = [more + sum(spec.shape[-1] for spec in specs), *num_cells, out_features]
+    require_memory([a * b for a, b in itertools.pairwise(sizes)])
     norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": cells} for cells in num_cells]}
     mlp = MLP(
-        in_features=more + sum(spec.shape[-1] for spec in specs),
+        in_features=sizes[0],
         out_features=out_features,
         num_cells=list(num_cells),
         activation_class=activation,
@@ -235,6 +278,19 @@ def network_of(
     dtype = next((spec.dtype for spec in specs if spec.dtype.is_floating_point), None)
     widths = [spec.shape[-1] for spec in specs]
     return Network(mlp.to(dtype), [1.0, *scales] if more else scales, [more, *widths] if more else widths)
+
+
+def require_memory(weights: Sequence[int]) -> None:
+    """Refuse layers with so many weights that they fit into no memory that trains on a horizon, before they are made.
+
+    Raises:
+        ValueError: there are more than 100 million.
+    """
+    if sum(weights) > MOST_WEIGHTS:
+        raise UserValueError(
+            f"A network of this many cells has {sum(weights):,} weights, more than {MOST_WEIGHTS:,}: write smaller "
+            "widths, such as num_cells=[256, 256]."
+        )
 
 
 def _single(env: EnvBase) -> EnvBase:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import numbers
+import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase, TensorDictPrimer
@@ -16,12 +15,17 @@ from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, TanhNor
 from torchrl.modules.models.utils import SquashDims
 from torchrl.modules.tensordict_module.rnn import GRU
 
+from torchrl_quad.data.unwrap import require_env
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead
 from torchrl_quad.modules.networks import (
     OBSERVATION,
+    Activation,
+    Cells,
+    ScaleInit,
     first_action,
     network_of,
+    require_memory,
     sampling,
     start_near,
     with_head,
@@ -36,26 +40,28 @@ from torchrl_quad.modules.plain import (
     is_pointwise,
     samples,
 )
+from torchrl_quad.options import Below1, Entries, Entry, Field, Scale, Width, checked
 
 MEMORY = "recurrent_state"
 NEAREST = 0.3  # [m], of what a policy tells apart
 
 
+@checked
 def make_visual_actor(
     env: EnvBase,
-    num_cells: Sequence[int] = (64,),
+    num_cells: Annotated[Cells, Field(min_length=1)] = (64,),
     *,
-    in_keys: Sequence[NestedKey] = OBSERVATION,
-    image_key: NestedKey = "depth",
-    channels: Sequence[int] = (8, 16),
+    in_keys: Entries = OBSERVATION,
+    image_key: Entry = "depth",
+    channels: Annotated[Sequence[Annotated[int, Field(ge=1, le=4096)]], Field(min_length=1, max_length=8)] = (8, 16),
     recurrent: bool = True,
-    hidden_size: int = 64,
-    activation: type[nn.Module] = nn.ELU,
-    input_scale: float | Sequence[float] = 1.0,
+    hidden_size: Width = 64,
+    activation: Activation = nn.ELU,
+    input_scale: Scale | Sequence[Scale] = 1.0,
     action_init: Tensor | None = None,
-    scale_init: float = 0.1,
+    scale_init: ScaleInit = 0.1,
     learn_scale: bool = True,
-    noise_correlation: float = 0.0,
+    noise_correlation: Below1 = 0.0,
     return_log_prob: bool = False,
 ) -> ProbabilisticActor:
     """A tanh-Gaussian policy of a depth image and vectors, with memory or without.
@@ -74,25 +80,25 @@ def make_visual_actor(
 
     Args:
         env: any TorchRL environment with an image, for the sizes of its entries.
-        num_cells: widths of the layers between the convolutions and the memory, or the head.
-        in_keys: the vectors that it reads beside the image, each (*, k).
+        num_cells: the width of every layer between the convolutions and the memory, or the head, in a list: [64].
+        in_keys: the vectors that it reads beside the image, each (*, k), in a list: ["observation"].
         image_key: the entry of the image, (*, channels, height, width) [m].
-        channels: of each convolution, 3 x 3, which halves height and width.
+        channels: of the convolutions, each 3 x 3, which halve height and width, in a list: [8, 16].
         recurrent: whether it has a memory.
-        hidden_size: numbers in the memory.
+        hidden_size: numbers in that memory.
         activation: of convolutions and hidden layers.
-        input_scale: multiplies the vectors; a number, or one for each of ``in_keys``.
+        input_scale: the vectors are multiplied by this; a number, or one for each of ``in_keys``.
         action_init: as for :func:`~torchrl_quad.make_actor`.
-        scale_init: as there.
-        learn_scale: as there.
-        noise_correlation: as there.
-        return_log_prob: as there.
+        scale_init: the standard deviation of the policy's noise at the start, before the tanh.
+        learn_scale: whether this noise changes with the state and in training.
+        noise_correlation: of the policy's noise in two steps that follow each other; 0 is white noise.
+        return_log_prob: whether it also writes the log-probability of the action.
 
     Raises:
-        ValueError: the environment has no such image, ``num_cells`` or ``channels`` is empty, or a width is not a whole
-            number of at least 1; or as for
-            :func:`~torchrl_quad.make_actor`.
+        ValueError: the environment has no such image; or as for :func:`~torchrl_quad.make_actor`.
+        TypeError: ``env`` is no environment.
     """
+    require_env(env)
     known = dict(env.observation_spec.items(True, True))
     if image_key not in known or known[image_key].ndim != len(env.batch_size) + 3:
         raise UserValueError(
@@ -100,14 +106,10 @@ def make_visual_actor(
             f'none there. Give it a camera, camera={{"width": 16, "height": 12}}, or choose image_key from: '
             f"{', '.join(map(str, known))}."
         )
-    widths = (*channels, hidden_size) if isinstance(channels, Sequence) and channels else (0,)
-    if not all(isinstance(n, numbers.Integral) and n >= 1 for n in widths):
-        raise UserValueError(
-            "channels must be a list of at least one whole number, such as (8, 16), and hidden_size a whole number of "
-            f"at least 1; got {channels!r} and {hidden_size!r}."
-        )
-    spec, first = first_action(env, action_init, scale_init, "make_visual_actor")
+    spec, first = first_action(env, action_init, "make_visual_actor")
     image, size = known[image_key], len(first)
+    convolutions = [9 * a * b for a, b in itertools.pairwise((image.shape[-3], *channels))]
+    require_memory([*convolutions, 3 * hidden_size * (num_cells[-1] + hidden_size) if recurrent else 0])
     height, width = image.shape[-2:]
     for _ in channels:
         height, width = (height + 1) // 2, (width + 1) // 2
@@ -121,15 +123,6 @@ def make_visual_actor(
         activation_class=activation,
         device=env.device,
     ).to(image.dtype)
-    if (
-        not isinstance(num_cells, Sequence)
-        or not num_cells
-        or not all(isinstance(n, numbers.Integral) and n >= 1 for n in num_cells)
-    ):
-        raise UserValueError(
-            "num_cells must name the widths of the layers between the convolutions and the head, at least one, such as "
-            f"(64,); got {num_cells!r}."
-        )
     trunk = network_of(
         env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale, more=channels[-1] * height * width
     )

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import numbers
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
@@ -16,6 +15,7 @@ from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.calls import sample_action
 from torchrl_quad.objectives.critic import PathwiseCriticLoss
 from torchrl_quad.objectives.segments import segments, step_in_segment
+from torchrl_quad.options import Copies, Field
 
 
 class ABPTLoss(PathwiseCriticLoss):
@@ -33,19 +33,19 @@ class ABPTLoss(PathwiseCriticLoss):
     Args:
         actor_network: the policy that flew the rollout.
         qvalue_network: the critic Q(s, a), which writes ``state_action_value`` (see ``set_keys``).
-        num_qvalue_nets: number of critics made from it, each initialised anew.
-        n_step_return: include J_N.
-        zero_step_return: include J_0.
-        simulated_steps: let J_0 fly so many control steps through the simulator before it asks the critic: the return
-            of a segment's start is then sum_(t<k) gamma^t r_t + gamma^k V(s_k), with V(s) = Q(s, a) and a sampled anew.
-            Its gradient in a_0 is the simulator's, where that of Q(s_0, a_0) is the critic's, which may be noise. With
-            an action delay of d steps a_0 moves nothing before step d + 1: take 1 + d or more. A segment that ends
-            sooner ends J_0 there.
-        delay_qvalue: keep target networks, to be updated with :class:`torchrl.objectives.SoftUpdate`.
+        num_qvalue_nets: the critics made from it, each initialised anew, whose smallest value counts.
+        n_step_return: whether J includes J_N, the rewards of the horizon and the value of its end.
+        zero_step_return: whether J includes J_0, the critic's estimate at the start.
+        simulated_steps: control steps that the return of the start flies through the simulator before it asks the
+            critic. The return of a segment's start is then sum_(t<k) gamma^t r_t + gamma^k V(s_k), with V(s) = Q(s, a)
+            and a sampled anew. Its gradient in a_0 is the simulator's, where that of Q(s_0, a_0) is the critic's, which
+            may be noise. With an action delay of d steps a_0 moves nothing before step d + 1: take 1 + d or more. A
+            segment that ends sooner ends J_0 there.
+        delay_qvalue: whether the critics have target networks, updated with :class:`torchrl.objectives.SoftUpdate`.
         **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
 
     Raises:
-        ValueError: both returns are switched off, or there is no critic.
+        ValueError: both returns are switched off, or an option has the wrong type or is out of its range.
     """
 
     @dataclass
@@ -71,22 +71,16 @@ class ABPTLoss(PathwiseCriticLoss):
         actor_network: TensorDictModule,
         qvalue_network: TensorDictModule,
         *,
-        num_qvalue_nets: int = 2,
+        num_qvalue_nets: Copies = 2,
         n_step_return: bool = True,
         zero_step_return: bool = True,
-        simulated_steps: int = 0,
+        simulated_steps: Annotated[int, Field(ge=0, le=100_000)] = 0,
         delay_qvalue: bool = True,
         **kwargs: Any,
     ) -> None:
         if not (n_step_return or zero_step_return):
             raise UserValueError(
                 "ABPTLoss needs n_step_return or zero_step_return: with both off there is no objective."
-            )
-        if not (isinstance(num_qvalue_nets, numbers.Integral) and num_qvalue_nets >= 1):
-            raise UserValueError(f"ABPTLoss needs at least one critic, got num_qvalue_nets={num_qvalue_nets}.")
-        if not (isinstance(simulated_steps, numbers.Integral) and simulated_steps >= 0):
-            raise UserValueError(
-                f"simulated_steps must be a number of control steps, 0 or more; got {simulated_steps}."
             )
         super().__init__(actor_network, **kwargs)
         self.simulated_steps = simulated_steps

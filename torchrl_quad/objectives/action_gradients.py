@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.autograd.graph import GradientEdge
 
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import Unsupported, UserValueError
 from torchrl_quad.objectives.calls import act
 
 
@@ -137,7 +137,7 @@ def _plain(actor: TensorDictModule) -> Any:
     make = getattr(actor, "replayed", None) or getattr(actor, "plain", lambda: None)
     plain = make()
     if not hasattr(plain, "drawn_again"):
-        raise NotImplementedError(
+        raise Unsupported(
             "Gradients of single actions need a policy of make_actor or make_visual_actor, whose noise follows from "
             "its actions, and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed parts, or "
             "leave clip_action_gradient=None with another loss than AHACLoss and HybridLoss."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.action_gradients import median_length
 from torchrl_quad.objectives.shac import SHACLoss
+from torchrl_quad.options import Below1, Copies, Field, Horizon
 
 SMOOTHING = 0.2  # how much of the multiplier is new in each iteration
 
@@ -39,17 +40,20 @@ class AHACLoss(SHACLoss):
         actor_network: the policy that flew the rollout, as :func:`~torchrl_quad.make_actor` builds it.
         value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
         horizon: control steps of the first rollout.
-        min_horizon: the shortest horizon; None means a quarter of the first.
-        max_horizon: the longest horizon; None means twice the first.
-        max_stiffness: the bound.
-        horizon_lr: the horizon changes by at most this share in an iteration.
-        num_value_nets: number of critics made from ``value_network``, each initialised anew.
-        terminal_gradient: as for :class:`SHACLoss`.
-        average_over_horizon: divide the objective by the number of steps of the rollout, as Georgiev et al. do.
+        min_horizon: the shortest horizon; null for a quarter of the first.
+        max_horizon: the longest horizon; null for twice the first.
+        max_stiffness: where the action gradients grow beyond it along a horizon, the horizon gets shorter; 1.5 to 5
+            are usual.
+        horizon_lr: the share by which the horizon may change in an iteration.
+        num_value_nets: the critics made from ``value_network``, each initialised anew, whose smallest value counts.
+        terminal_gradient: whether the terminal value keeps its gradient in the state, as for :class:`SHACLoss`.
+        average_over_horizon: whether the objective is divided by the number of steps of the rollout, as Georgiev et
+            al. do.
         **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
 
     Raises:
-        ValueError: the horizon is not between its bounds, a number is out of its range, or the policy is another one.
+        ValueError: the horizon is not between its bounds, an option has the wrong type or is out of its range, or the
+            policy is another one.
     """
 
     measured_of_actions = ["stiffness"]
@@ -59,26 +63,20 @@ class AHACLoss(SHACLoss):
         actor_network: TensorDictModule,
         value_network: TensorDictModule,
         *,
-        horizon: int = 32,
-        min_horizon: int | None = None,
-        max_horizon: int | None = None,
-        max_stiffness: float = 2.0,
-        horizon_lr: float = 0.1,
-        num_value_nets: int = 2,
+        horizon: Horizon = 32,
+        min_horizon: Horizon | None = None,
+        max_horizon: Horizon | None = None,
+        max_stiffness: Annotated[float, Field(gt=1, le=1e30)] = 2.0,
+        horizon_lr: Below1 = 0.1,
+        num_value_nets: Copies = 2,
         terminal_gradient: bool = True,
         average_over_horizon: bool = False,
         **kwargs: Any,
     ) -> None:
         low = max(horizon // 4, 1) if min_horizon is None else min_horizon
         high = 2 * horizon if max_horizon is None else max_horizon
-        if not 1 <= low <= horizon <= high:
-            raise UserValueError(
-                f"horizon={horizon} must lie between min_horizon={low} and max_horizon={high}, and be at least 1."
-            )
-        if not 1 < max_stiffness < math.inf:
-            raise UserValueError(f"max_stiffness must be finite and above 1, got {max_stiffness}; 1.5 to 5 are usual.")
-        if not 0 <= horizon_lr < 1:
-            raise UserValueError(f"horizon_lr must lie from 0 to below 1, got {horizon_lr}.")
+        if not low <= horizon <= high:
+            raise UserValueError(f"horizon={horizon} must lie between min_horizon={low} and max_horizon={high}.")
         super().__init__(
             actor_network,
             value_network,

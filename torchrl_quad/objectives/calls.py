@@ -10,6 +10,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, stack
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_quad.errors import UserTypeError
+
 
 def sample_action(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> TensorDictBase:
     """Let a policy act anew, with gradients in its parameters and its inputs.
@@ -63,6 +65,12 @@ def predict(
         weights = {name: x.detach() for name, x in weights.items()}
     copies = zip(*(x.unbind(0) for x in weights.values()), strict=True) if params.batch_dims else [weights.values()]
     return stack([plain(dict(zip(weights, own, strict=True)), inputs) for own in copies])
+
+
+def require_function(name: str, value: Any) -> None:
+    """Refuse what is neither None nor can be called."""
+    if not (value is None or callable(value)):
+        raise UserTypeError(f"{name} must be a function, or None; got {type(value).__name__}.")
 
 
 def act(plain: Any, tensordict: TensorDictBase, drawn: Tensor) -> dict[NestedKey, Tensor]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,10 +16,12 @@ from torch.distributions import Normal, kl_divergence
 from torch.distributions.transforms import TanhTransform
 from torchrl.objectives.utils import ValueEstimators
 
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserValueError, WrongState
 from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again, location_gradient
+from torchrl_quad.objectives.calls import require_function
 from torchrl_quad.objectives.segments import discounts, segments
 from torchrl_quad.objectives.shac import SHACLoss
+from torchrl_quad.options import Below1, Field, NonNegative, Positive, Share
 
 
 class HybridLoss(SHACLoss):
@@ -58,17 +61,18 @@ class HybridLoss(SHACLoss):
     Args:
         actor_network: the policy that flew the rollout, as ``make_actor`` builds it.
         value_network: the critic V(s).
-        gradient_lmbda: lambda of the return that p_t differentiates, in (0, 1]. That of the advantage and of the
-            critic's targets is ``make_value_estimator(lmbda=...)``.
-        clip_epsilon: how far the ratio of probabilities may move from 1.
-        entropy_coeff: of the entropy, next to advantages of standard deviation 1; 0 for none.
-        clip_action_gradient: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
-        decay: of the running weight, for each rollout.
+        gradient_lmbda: the lambda of the return that the pathwise gradient differentiates; 0.9 is usual. That of the
+            advantage and of the critic's targets is ``make_value_estimator(lmbda=...)``.
+        clip_epsilon: how far the ratio of probabilities may move from 1; 0.2 is usual.
+        entropy_coeff: the weight of the entropy bonus, next to advantages of standard deviation 1; 0 for none.
+        clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for no
+            bound.
+        decay: the share of the running weight that a rollout leaves as it is.
         average: of a scalar over the processes that train together, if there are several.
-        reduction: "mean", "sum" or "none" over samples.
+        reduction: mean, sum or none, over samples.
 
     Raises:
-        ValueError: an option is out of its range; (in use) as for every pathwise loss.
+        ValueError: an option has the wrong type or is out of its range; (in use) as for every pathwise loss.
         NotImplementedError: (in use) the policy is another one than ``make_actor`` builds.
     """
 
@@ -99,22 +103,15 @@ class HybridLoss(SHACLoss):
         actor_network: TensorDictModule,
         value_network: TensorDictModule,
         *,
-        gradient_lmbda: float = 0.9,
-        clip_epsilon: float = 0.2,
-        entropy_coeff: float = 0.0,
-        clip_action_gradient: float | None = 2.0,
-        decay: float = 0.9,
+        gradient_lmbda: Share = 0.9,
+        clip_epsilon: Annotated[float, Field(gt=0, lt=1)] = 0.2,
+        entropy_coeff: NonNegative = 0.0,
+        clip_action_gradient: Positive | None = 2.0,
+        decay: Below1 = 0.9,
         average: Callable[[Tensor], Tensor] | None = None,
-        reduction: str = "mean",
+        reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
-        if not (isinstance(gradient_lmbda, int | float) and 0 < gradient_lmbda <= 1):
-            raise UserValueError(f"gradient_lmbda must lie in (0, 1], got {gradient_lmbda}; 0.9 is usual.")
-        if not 0 < clip_epsilon < 1:
-            raise UserValueError(f"clip_epsilon must lie between 0 and 1, got {clip_epsilon}; 0.2 is usual.")
-        if not 0 <= entropy_coeff < math.inf:
-            raise UserValueError(f"entropy_coeff must be finite and not negative, got {entropy_coeff}; 0.01 is usual.")
-        if not 0 <= decay < 1:
-            raise UserValueError(f"decay must lie in [0, 1), got {decay}.")
+        require_function("average", average)
         options = {"clip_action_gradient": clip_action_gradient, "reduction": reduction}
         super().__init__(actor_network, value_network, delay_value=False, **options)
         self.gradient_lmbda, self.clip_epsilon, self.entropy_coeff = gradient_lmbda, clip_epsilon, entropy_coeff
@@ -146,7 +143,7 @@ class HybridLoss(SHACLoss):
         """
         self._require_rollout(tensordict)
         if not torch.is_grad_enabled():
-            raise RuntimeError("write_targets differentiates the rollout: call it with gradients enabled.")
+            raise WrongState("write_targets differentiates the rollout: call it with gradients enabled.")
         keys = self.tensor_keys
         grad = self._own_gradient(tensordict)
         data = self.write_value_target(tensordict.detach())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -15,11 +15,15 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import ValueEstimators, default_value_kwargs, dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, WrongState
 from torchrl_quad.objectives.action_gradients import MedianClip, act_again, action_gradient
 from torchrl_quad.objectives.segments import discounts
+from torchrl_quad.options import Entry, Fraction, NonNegative, Positive, Real, checked, require, shown
+
+MOST_WEIGHTS = 100_000_000  # of all copies of a critic; more fit into no memory that trains on a horizon
 
 
+@checked
 class PathwiseLoss(LossModule):
     """Base of the losses that differentiate the return of a rollout through the environment's own dynamics.
 
@@ -31,20 +35,21 @@ class PathwiseLoss(LossModule):
 
     Args:
         actor_network: the policy that flew the rollout.
-        alpha: coefficient of the entropy bonus alpha * mean over the steps of -log pi(a|s): 0 for none, a positive
-            number for a fixed one, "auto" to hold the entropy at ``target_entropy``. Needs the log-probability in the
+        alpha: the coefficient of the entropy bonus: a number, 0 for none, or auto to hold the entropy at its target.
+            The bonus is alpha * mean over the steps of -log pi(a|s). It needs the log-probability in the
             rollout (an actor built with ``return_log_prob=True``), since a tanh-Gaussian has no closed entropy. "auto"
             suits noise that is learned: with a fixed one the entropy may never reach its target, and alpha only grows.
-        target_entropy: with ``alpha="auto"``; "auto" means minus the number of action entries.
-        alpha_init: with ``alpha="auto"``, the coefficient to start from.
-        clip_action_gradient: shorten the gradient in each single action, of one drone in one step, to so many times
-            the running median of their lengths, before the policy learns from it: 1 to 5 keep tumbling drones from
-            outweighing all others. Needs a policy of ``make_actor``. An entropy bonus then counts at fixed states.
-        reduction: "mean" or "sum" over environments (over samples for a critic), or "none".
+        target_entropy: where alpha=auto holds the entropy: a number, or auto for minus the number of action entries.
+        alpha_init: what alpha=auto starts from.
+        clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for no
+            bound. That of each single action, of one drone in one step, is shortened before the policy learns from it:
+            1 to 5 keep tumbling drones from outweighing all others. Needs a policy of ``make_actor``. An entropy bonus
+            then counts at fixed states.
+        reduction: mean or sum over environments (over samples for a critic), or none.
 
     Raises:
-        TypeError: a network is not a TensorDictModule.
-        ValueError: alpha or reduction is not one of the allowed values; (in use) the rollout has no time dimension,
+        TypeError: a network is not a TensorDictModule, or an argument is unknown.
+        ValueError: an option has the wrong type or is out of its range; (in use) the rollout has no time dimension,
             lacks an entry, or is on another device.
         RuntimeError: (in use) the rollout has lost its graph, or lacks the log-probability that the bonus needs.
     """
@@ -81,6 +86,8 @@ class PathwiseLoss(LossModule):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        if "__init__" in vars(cls):
+            checked(cls)
         if "out_keys" not in vars(cls):  # tensordict would take its parent's for those of its objects
             cls.out_keys = list(cls.out_keys if isinstance(cls.out_keys, list) else cls._out_keys)
 
@@ -88,27 +95,13 @@ class PathwiseLoss(LossModule):
         self,
         actor_network: TensorDictModule,
         *,
-        alpha: float | str = 0.0,
-        target_entropy: float | str = "auto",
-        alpha_init: float = 1e-2,
-        clip_action_gradient: float | None = None,
-        reduction: str = "mean",
+        alpha: NonNegative | Literal["auto"] = 0.0,
+        target_entropy: Real | Literal["auto"] = "auto",
+        alpha_init: Positive = 1e-2,
+        clip_action_gradient: Positive | None = None,
+        reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
         super().__init__()
-        if reduction not in ("mean", "sum", "none"):
-            raise UserValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}.")
-        if alpha != "auto" and not (isinstance(alpha, int | float) and 0 <= alpha < math.inf):
-            raise UserValueError(f"alpha must be 'auto' or a finite number that is not negative, got {alpha!r}.")
-        if not 0 < alpha_init < math.inf:
-            raise UserValueError(
-                f"alpha_init must be positive and finite, got {alpha_init}; set alpha to 0 for no entropy bonus."
-            )
-        if target_entropy != "auto" and not (isinstance(target_entropy, int | float) and math.isfinite(target_entropy)):
-            raise UserValueError(f"target_entropy must be 'auto' or a finite number, got {target_entropy!r}.")
-        if clip_action_gradient is not None and not 0 < clip_action_gradient < math.inf:
-            raise UserValueError(
-                f"clip_action_gradient must be None or a positive number of medians, got {clip_action_gradient}."
-            )
         self._in_keys = None
         self.reduction = reduction
         self.convert_to_functional(actor_network, "actor_network")
@@ -126,11 +119,18 @@ class PathwiseLoss(LossModule):
         self.out_keys = [*self.out_keys, *self.measured_of_actions, *of_entropy]
 
     def convert_to_functional(self, module: TensorDictModule, module_name: str, *args: Any, **kwargs: Any) -> None:
-        """As TorchRL's, and refuse anything but a TensorDictModule."""
+        """As TorchRL's, and refuse anything but a TensorDictModule, or so many copies that they fit into no memory."""
         if not isinstance(module, TensorDictModuleBase):
             raise UserTypeError(
                 f"{module_name} must be a TensorDictModule, got {type(module).__name__}. Wrap a plain module: "
                 'TensorDictModule(module, in_keys=["observation"], out_keys=[...]).'
+            )
+        copies = kwargs.get("expand_dim") or 1
+        weights = copies * sum(p.numel() for p in module.parameters() if not torch.nn.parameter.is_lazy(p))
+        if weights > MOST_WEIGHTS:
+            raise UserValueError(
+                f"{copies} copies of this {module_name} have {weights:,} weights, more than {MOST_WEIGHTS:,}. Take "
+                "fewer copies, or a smaller network."
             )
         super().convert_to_functional(module, module_name, *args, **kwargs)
 
@@ -165,11 +165,33 @@ class PathwiseLoss(LossModule):
         types = (x.dtype for x in self.actor_network_params.values(True, True) if x.is_floating_point())
         return next(types, torch.get_default_dtype())
 
-    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> PathwiseLoss:
-        """Choose the return estimator and its parameters, such as ``gamma`` and ``lmbda``.
+    @checked
+    def make_value_estimator(
+        self,
+        value_type: Any = None,
+        *,
+        gamma: Fraction | None = None,
+        lmbda: Fraction | None = None,
+        average_rewards: bool | None = None,
+        differentiable: bool | None = None,
+        vectorized: bool | None = None,
+        device: torch.device | str | None = None,
+        **more: Any,
+    ) -> PathwiseLoss:
+        """Choose the return estimator and its parameters.
 
         TD(lambda) runs in its loop form. The vectorised one is wrong under torch.compile, and slower on many
         environments (torchrl 0.14).
+
+        Args:
+            value_type: one of ``supported_value_estimators``, or an estimator of TorchRL; by default that of the loss.
+            gamma: the discount of future rewards per control step; 0.99 is usual.
+            lmbda: the lambda of the TD(lambda) targets; 0.95 is usual.
+            average_rewards: as for TorchRL's estimator.
+            differentiable: as there.
+            vectorized: as there, of TD(lambda).
+            device: as there.
+            **more: what an estimator of TorchRL takes that is given as a class.
 
         Returns:
             the loss itself.
@@ -177,19 +199,35 @@ class PathwiseLoss(LossModule):
         Raises:
             NotImplementedError: the loss does not support the estimator.
             ValueError: gamma or lmbda is not in [0, 1].
+            TypeError: the estimator takes no such argument, as those of one step and of whole returns take no lambda.
         """
         value_type = self.default_value_estimator if value_type is None else value_type
-        if isinstance(value_type, ValueEstimatorBase | type):
-            return super().make_value_estimator(value_type, **hyperparams)
-        if value_type in (ValueEstimators.TDLambda, "tdlambda"):
-            hyperparams.setdefault("vectorized", False)
+        options = {"gamma": gamma, "lmbda": lmbda, "average_rewards": average_rewards, "device": device}
+        options |= {"differentiable": differentiable, "vectorized": vectorized}
+        given = {name: x for name, x in options.items() if x is not None}
+        is_class = isinstance(value_type, type) and issubclass(value_type, ValueEstimatorBase)
+        if is_class or isinstance(value_type, ValueEstimatorBase):
+            return super().make_value_estimator(value_type, **given, **more)
+        supported = {x.name.lower(): x for x in self.supported_value_estimators}
+        chosen = value_type if isinstance(value_type, ValueEstimators) else supported.get(str(value_type).lower())
+        if chosen not in self.supported_value_estimators:
+            raise Unsupported(
+                f"{shown(value_type)} is not implemented for loss {type(self).__name__}. Choose from: "
+                f"{', '.join(supported)}."
+            )
+        has_lambda = chosen is ValueEstimators.TDLambda
+        if unknown := {*more, *(set() if has_lambda else {"lmbda", "vectorized"} & set(given))}:
+            known = sorted(set(options) - (set() if has_lambda else {"lmbda", "vectorized"}))
+            raise UserTypeError(
+                f"{type(self).__name__} estimates its returns by {chosen.name}, which takes no {min(unknown)!r}. "
+                f"Choose from: {', '.join(known)}."
+            )
+        given = {"vectorized": False} | given if has_lambda else given
         estimator = dispatch_value_estimator(
-            self, value_type, supported=self.supported_value_estimators, value_network=None, **hyperparams
+            self, chosen, supported=self.supported_value_estimators, value_network=None, **given
         )
-        given = {**default_value_kwargs(self.value_type), **hyperparams}
+        given = {**default_value_kwargs(self.value_type), **given}
         for name in {"gamma", "lmbda"} & given.keys():  # TorchRL makes them float32 whatever the rollout is
-            if not 0 <= given[name] <= 1:
-                raise UserValueError(f"{name} must lie between 0 and 1, got {given[name]}.")
             buffer = getattr(estimator, name)
             setattr(estimator, name, torch.as_tensor(given[name], device=buffer.device, dtype=self._precision))
         self._forward_value_estimator_keys()
@@ -202,6 +240,19 @@ class PathwiseLoss(LossModule):
             has_default = f"{kept}lmbda" in state_dict or self.default_value_estimator is ValueEstimators.TD1
             self.make_value_estimator(None if has_default else ValueEstimators.TD0)
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+    def set_keys(self, **keys: NestedKey | None) -> None:
+        """Read entries of a rollout under other names; None means the name that TorchRL uses.
+
+        Raises:
+            ValueError: the loss reads no such entry, or a name is not a string or a tuple of strings.
+        """
+        known = vars(self.tensor_keys)
+        for name, key in keys.items():
+            if name not in known:
+                raise UserValueError(f"{type(self).__name__} reads no {name!r}. Choose from: {', '.join(known)}.")
+            require(name, key, Entry | None)
+        super().set_keys(**keys)
 
     def _forward_value_estimator_keys(self, **_: Any) -> None:
         self._in_keys = None
@@ -293,7 +344,7 @@ class PathwiseLoss(LossModule):
         """Minus the log-probability of each action taken, a sample of the policy's entropy: (*, horizon, 1)."""
         log_prob = tensordict.get(self.tensor_keys.sample_log_prob, None)
         if log_prob is None:
-            raise RuntimeError(
+            raise WrongState(
                 f"The entropy bonus of {type(self).__name__} reads {self.tensor_keys.sample_log_prob!r}, which is "
                 "not in the rollout. Build the actor with return_log_prob=True, or set the loss's alpha to 0. If it "
                 "has another name there, write loss.set_keys(sample_log_prob=...)."
@@ -306,7 +357,13 @@ class PathwiseLoss(LossModule):
         return float(self.target_entropy)
 
     def _require_rollout(self, tensordict: TensorDictBase) -> None:
-        name, shape = type(self).__name__, tuple(tensordict.batch_size)
+        name = type(self).__name__
+        if not isinstance(tensordict, TensorDictBase):
+            raise UserTypeError(
+                f"{name} needs a rollout, the tensordict that differentiable_rollout returns; got "
+                f"{type(tensordict).__name__}."
+            )
+        shape = tuple(tensordict.batch_size)
         names = tensordict.names
         # Only the names of its dimensions distinguish a single flight from a batch of single steps.
         has_time = names[-1] == "time" if "time" in names else len(shape) > 1
@@ -335,7 +392,7 @@ class PathwiseLoss(LossModule):
 
     def _require_graph(self, value: Tensor, key: NestedKey) -> None:
         if torch.is_grad_enabled() and not value.requires_grad:
-            raise RuntimeError(
+            raise WrongState(
                 f"{type(self).__name__} differentiates through the rollout, but {key!r} carries no gradient. "
                 "Collectors, ParallelEnv, replay buffers, .detach() and torch.no_grad() cut it. Use "
                 "differentiable_rollout(env, actor, carry, horizon), or env.rollout(horizon, actor, "

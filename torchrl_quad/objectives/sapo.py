@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.shac import SHACLoss
+from torchrl_quad.options import Copies, Field, Positive
 
 
 class SAPOLoss(SHACLoss):
@@ -24,16 +24,19 @@ class SAPOLoss(SHACLoss):
     Args:
         actor_network: the policy that flew the rollout, with log-probabilities (``return_log_prob=True``).
         value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
-        num_value_nets: number of critics made from it, each initialised anew.
-        alpha: coefficient of the entropy: a positive number, or "auto" to hold the entropy at its target.
-        alpha_init: with ``alpha="auto"``, the coefficient to start from.
-        target_entropy: a negative number; "auto" means minus half the number of action entries.
-        terminal_gradient: as for :class:`SHACLoss`.
-        average_over_horizon: divide the objective by the number of steps of the rollout, as Xing et al. do.
+        num_value_nets: the critics made from it, each initialised anew.
+        alpha: the coefficient of the entropy: a positive number, or auto to hold the entropy at its target; without
+            entropy take SHACLoss.
+        alpha_init: what alpha=auto starts from.
+        target_entropy: where alpha=auto holds the entropy: a negative number, or auto for minus half the number of
+            action entries. The entropy is measured in its size.
+        terminal_gradient: whether the terminal value keeps its gradient in the state, as for :class:`SHACLoss`.
+        average_over_horizon: whether the objective is divided by the number of steps of the rollout, as Xing et al.
+            do.
         **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
 
     Raises:
-        ValueError: alpha is 0, or the target entropy is not negative.
+        ValueError: an option has the wrong type or is out of its range.
     """
 
     def __init__(
@@ -41,21 +44,14 @@ class SAPOLoss(SHACLoss):
         actor_network: TensorDictModule,
         value_network: TensorDictModule,
         *,
-        num_value_nets: int = 2,
-        alpha: float | str = "auto",
-        alpha_init: float = 1.0,
-        target_entropy: float | str = "auto",
+        num_value_nets: Copies = 2,
+        alpha: Positive | Literal["auto"] = "auto",
+        alpha_init: Positive = 1.0,
+        target_entropy: Annotated[float, Field(ge=-1e30, le=-1e-3)] | Literal["auto"] = "auto",
         terminal_gradient: bool = True,
         average_over_horizon: bool = False,
         **kwargs: Any,
     ) -> None:
-        if alpha == 0:
-            raise UserValueError("SAPOLoss needs an alpha above 0, or 'auto': without entropy take SHACLoss.")
-        if target_entropy != "auto" and not (isinstance(target_entropy, int | float) and target_entropy < 0):
-            raise UserValueError(
-                f"target_entropy must be 'auto' or a negative number, in whose size SAPOLoss measures the entropy; got "
-                f"{target_entropy}."
-            )
         super().__init__(
             actor_network,
             value_network,

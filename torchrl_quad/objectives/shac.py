@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numbers
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.critic import PathwiseCriticLoss
+from torchrl_quad.options import Copies
 
 
 class SHACLoss(PathwiseCriticLoss):
@@ -28,15 +28,16 @@ class SHACLoss(PathwiseCriticLoss):
     Args:
         actor_network: the policy that flew the rollout.
         value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
-        terminal_gradient: False cuts the gradient of the terminal value in the state, as the code published with the
-            paper does. The actor then climbs the rewards of the horizon alone, as with BPTT.
-        target_bootstrap: take the terminal value from the target critic, as Xu et al. do. False takes it from the
+        terminal_gradient: whether the terminal value keeps its gradient in the state. False cuts it, as the code
+            published with the paper does. The actor then climbs the rewards of the horizon alone, as with BPTT.
+        target_bootstrap: whether the terminal value is the target critic's, as with Xu et al. False takes it from the
             critic itself; with ``delay_value=False`` the two are one.
-        average_over_horizon: divide the objective by the number of steps of the rollout, as Xu et al. do. The entropy
+        average_over_horizon: whether the objective is divided by the number of steps of the rollout, as Xu et al. do.
+            The entropy
             bonus is a mean over steps either way.
-        num_value_nets: number of critics made from it, each initialised anew, of which the least counts; 1 takes it
-            as it is.
-        delay_value: keep a target network, to be updated with :class:`torchrl.objectives.SoftUpdate`.
+        num_value_nets: the critics made from it, each initialised anew, whose smallest value counts; 1 takes it as it
+            is.
+        delay_value: whether the critic has a target network, to be updated with :class:`torchrl.objectives.SoftUpdate`.
         **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
     """
 
@@ -65,14 +66,10 @@ class SHACLoss(PathwiseCriticLoss):
         terminal_gradient: bool = True,
         target_bootstrap: bool = False,
         average_over_horizon: bool = False,
-        num_value_nets: int = 1,
+        num_value_nets: Copies = 1,
         delay_value: bool = True,
         **kwargs: Any,
     ) -> None:
-        if not (isinstance(num_value_nets, numbers.Integral) and num_value_nets >= 1):
-            raise UserValueError(
-                f"{type(self).__name__} needs at least one critic, got num_value_nets={num_value_nets}."
-            )
         super().__init__(actor_network, **kwargs)
         self.terminal_gradient, self.target_bootstrap = terminal_gradient, target_bootstrap
         self.average_over_horizon = average_over_horizon

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Iterator
 
 import torch
@@ -12,9 +11,12 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.objectives.calls import require_function
+from torchrl_quad.options import NonNegative, Positive, checked
 
 
+@checked
 class TrustRegion:
     """Shortens an update that would move a Gaussian policy beyond a bound on the Kullback-Leibler divergence.
 
@@ -32,7 +34,7 @@ class TrustRegion:
     Args:
         actor: the policy, which writes ``loc`` and ``scale`` as those of :func:`~torchrl_quad.make_actor` do. The bound
             is on these normal distributions, before the tanh.
-        max_kl: the bound, positive; None for no bound, which measures nothing.
+        max_kl: the largest divergence of an update, 0.01 to 0.1 are usual; null for no bound, which measures nothing.
         min_scale: the divergence is that of distributions of at least this standard deviation. A gradient through a
             simulator takes the noise away, and a policy without noise could not move at all within a bound.
         average: of a scalar over the processes that train together, if there are several.
@@ -41,21 +43,25 @@ class TrustRegion:
         metrics: ``kl``, the divergence of the last update before it was shortened; empty without a bound.
 
     Raises:
-        ValueError: a number is out of its range; (in use) the rollout has no ``loc`` and ``scale``.
+        ValueError: an option has the wrong type or is out of its range; (in use) the rollout has no ``loc`` and
+            ``scale``.
+        TypeError: the actor is no such policy.
     """
 
     def __init__(
         self,
         actor: ProbabilisticTensorDictSequential,
-        max_kl: float | None,
+        max_kl: Positive | None,
         *,
-        min_scale: float = 0.1,
+        min_scale: NonNegative = 0.1,
         average: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
-        if max_kl is not None and not 0 < max_kl < math.inf:
-            raise UserValueError(f"max_kl must be None or positive and finite, got {max_kl}; 0.01 to 0.1 are usual.")
-        if not 0 <= min_scale < math.inf:
-            raise UserValueError(f"min_scale must be a finite number that is not negative, got {min_scale}.")
+        if not hasattr(actor, "get_dist_params"):
+            raise UserTypeError(
+                f"actor must be a policy as make_actor builds it, which writes loc and scale; got "
+                f"{type(actor).__name__}."
+            )
+        require_function("average", average)
         self.actor, self.max_kl, self.min_scale, self.average = actor, max_kl, min_scale, average
         self.metrics: dict[str, Tensor] = {}
 
@@ -65,7 +71,7 @@ class TrustRegion:
         if self.max_kl is None:
             yield
             return
-        if "loc" not in rollout or "scale" not in rollout:
+        if not isinstance(rollout, TensorDictBase) or "loc" not in rollout or "scale" not in rollout:
             raise UserValueError("TrustRegion reads loc and scale, which are not in the rollout. Give what was flown.")
         parameters = list(self.actor.parameters())
         before = [x.detach().clone() for x in parameters]

@@ -1,14 +1,17 @@
 """Source distribution and wheel: what is in them, and that they work without the repository."""
 
+import importlib.metadata
 import os
 import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 ROOT = Path(__file__).parent.parent
 
@@ -67,3 +70,21 @@ def test_the_wheel_works_away_from_the_repository(wheel, tmp_path):
     )
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
     subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True)
+
+
+def test_every_python_that_the_package_names_can_have_the_tested_versions():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    prefix = "Programming Language :: Python :: 3."
+    named = [f"3.{x.removeprefix(prefix)}.0" for x in project["classifiers"] if x.startswith(prefix)]
+    assert all(python in SpecifierSet(project["requires-python"]) for python in named)
+    assert f"{sys.version_info.major}.{sys.version_info.minor}.0" in named
+    pins = [line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]
+    for name, version in pins:
+        if name.startswith("backports."):  # what newer Pythons have themselves
+            continue
+        try:
+            package = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:  # of an extra that is not installed
+            continue
+        allowed = SpecifierSet(package.metadata.get("Requires-Python", ""))
+        assert package.version.split("+")[0] != version or all(python in allowed for python in named), name

@@ -2,6 +2,7 @@
 
 import errno
 import sys
+from types import SimpleNamespace
 
 import imageio_ffmpeg
 import pytest
@@ -190,3 +191,21 @@ def test_a_picture_takes_the_place_of_nothing_but_a_picture(capsys, tmp_path):
         f"Warning: {tmp_path}/{name}" for name in ("episode.png", "flight.html")
     ]
     assert kept.read_text() == "kept" and (tmp_path / "flight.html").is_symlink()
+
+
+def test_a_transfer_without_a_film_still_gets_its_page(broken_ffmpeg, monkeypatch, capsys, tmp_path):
+    env = HoveringEnv(num_envs=1)
+    monkeypatch.setattr(drawing, "fly", lambda bundle, name, how, episodes: {"simulator": name})
+    monkeypatch.setattr(drawing, "as_rollout", lambda contract, flight: env.rollout(3))
+    monkeypatch.setattr(drawing, "environment", lambda contract: env)
+    broken_ffmpeg("killed later")
+    (tmp_path / "transfer.mp4").touch()
+    bundle = SimpleNamespace(contract=None)
+    drawing.draw_transfer(bundle, "mujoco", "contract", tmp_path / "transfer")
+    assert {"transfer.gif", "transfer.html"} == {path.name for path in tmp_path.glob("transfer.*")}
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    drawing.draw_transfer(bundle, "mujoco", "contract", tmp_path / "transfer")
+    assert [path.name for path in tmp_path.glob("transfer.*")] == ["transfer.html"]
+    fallback, missing = capsys.readouterr().err.splitlines()
+    assert "transfer.gif takes the place" in fallback
+    assert "transfer.mp4 is missing. Pictures need matplotlib: pip install" in missing

@@ -16,21 +16,23 @@ flown again. Settings:
     pictures=true        film the first drones beside our own simulator, and write a replay; needs torch and an extra
 """
 
+import csv
 import json
+import re
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from torchrl_quad.deploy import Bundle, load_bundle
+from torchrl_quad.deploy.contract import naming, shown
 from torchrl_quad.deploy.judging import PRECISION
 from torchrl_quad.deploy.simulators import make_simulator, simulator_class
 from torchrl_quad.deploy.transfer import MUTANTS, fly
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.files import add_rows, machine, read_rows
+from torchrl_quad.errors import MissingPackage, UserError, UserValueError
+from torchrl_quad.files import add_rows, machine, make_folder, read_rows
 
 SETTINGS = {
     "bundle": (str, None),
@@ -43,19 +45,27 @@ SETTINGS = {
     "folder": (str, None),
     "pictures": (bool, False),
 }
+LEAST = {"late": 0, "episodes": 1}
 KEY = ("bundle", "simulator", "loop", "mutant", "drone", "episodes")  # of a flight; others are its results
 SHOWN = ("task", *KEY[1:], "solved", "crash", "precision", "seconds")
 
 
 def main() -> None:
+    sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be anything
     if {"-h", "--help"} & set(sys.argv):
         print(__doc__)
         raise SystemExit(0)
     cfg = settings(sys.argv[1:])
+    loops = [cfg["loop"]] if cfg["loop"] else simulator_class(cfg["simulator"]).loops
+    if cfg["pictures"]:
+        try:
+            from training.drawing import draw_transfer
+        except ImportError as error:
+            what = 'pictures=true needs torch and the extra render: pip install ".[render]"'
+            raise MissingPackage(f"{what} ({error})") from error
     bundle = load_bundle(cfg["bundle"], on_fault="hover")
     bundle.check()
-    folder = Path(cfg["folder"] or Path(cfg["bundle"]).resolve().parent)
-    loops = [cfg["loop"]] if cfg["loop"] else simulator_class(cfg["simulator"]).loops
+    folder = make_folder(cfg["folder"] or Path(cfg["bundle"]).resolve().parent)
     shows_queue = bundle.contract["action_queue"]["observed"]  # else nobody misses it
     mistakes = [name for name in MUTANTS if shows_queue or name != "queue"]
     for loop in loops:
@@ -63,9 +73,8 @@ def main() -> None:
             measure(bundle, cfg, loop, mutant, folder / "transfer.csv")
     show(folder / "transfer.csv", bundle.contract["digest"][:12])
     if cfg["pictures"]:
-        from training.drawing import draw_transfer
-
-        draw_transfer(bundle, cfg["simulator"], loops[0], folder / f"transfer_{cfg['simulator']}")
+        with naming(bundle.folder):
+            draw_transfer(bundle, cfg["simulator"], loops[0], folder / f"transfer_{cfg['simulator']}")
 
 
 def measure(bundle: Bundle, cfg: dict, loop: str, mutant: str | None, path: Path) -> None:
@@ -73,16 +82,17 @@ def measure(bundle: Bundle, cfg: dict, loop: str, mutant: str | None, path: Path
     contract, about = bundle.contract, {**cfg["scale"], **({"late": cfg["late"]} if cfg["late"] else {})}
     task = contract["task"]["name"]
     starts = len(bundle.starts()["position"])
+    with naming(bundle.folder):
+        version = make_simulator(cfg["simulator"], contract, loop).version
     flown = {
         "bundle": contract["digest"][:12],
-        "simulator": make_simulator(cfg["simulator"], contract, loop).version,
+        "simulator": version,
         "loop": loop,
         "mutant": mutant or "none",
         "drone": json.dumps(about, sort_keys=True) if about else "nominal",
         "episodes": str(min(starts, cfg["episodes"] or starts)),
     }
-    rows = read_rows(path)
-    if any(all(row[name] == flown[name] for name in KEY) for row in rows):
+    if any(all(row[name] == flown[name] for name in KEY) for row in flights(path)):
         return
     begin = time.perf_counter()
     wrong = MUTANTS.get(mutant)
@@ -98,12 +108,37 @@ def measure(bundle: Bundle, cfg: dict, loop: str, mutant: str | None, path: Path
         "faults": sum(flight["faults"].values()),
         "machine": machine(),
     }
-    add_rows(path, [{"task": task, **flown, **result}])
+    row, written = {"task": task, **flown, **result}, False
+    try:
+        add_rows(path, [row])
+        written = True
+    finally:
+        if not written:  # for whatever reason
+            print(f"Flown, and not written to {path}:")
+            table = csv.DictWriter(sys.stdout, row)
+            table.writeheader()
+            table.writerow(row)
+
+
+def flights(path: Path) -> list[dict[str, str]]:
+    """The rows of a table of flights; none where there is no table yet.
+
+    Raises:
+        ValueError: it is another kind of file.
+    """
+    wrong, instead = f"{path} is no table of flights", "Move it away, or choose another folder=..."
+    try:
+        rows = read_rows(path)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UserValueError(f"{wrong}: {error}. {instead}") from error
+    if not all(isinstance(row.get(name), str) for row in rows for name in (*KEY, *SHOWN)):
+        raise UserValueError(f"{wrong}: a row lacks one of {', '.join(KEY)} or its results. {instead}")
+    return rows
 
 
 def show(path: Path, bundle: str) -> None:
     """Print the flights of a bundle as a table."""
-    rows = [dict(zip(SHOWN, SHOWN, strict=True)), *(row for row in read_rows(path) if row["bundle"] == bundle)]
+    rows = [dict(zip(SHOWN, SHOWN, strict=True)), *(row for row in flights(path) if row["bundle"] == bundle)]
     widths = [max(len(row[name]) for row in rows) for name in SHOWN]
     for row in rows:
         print("  ".join(row[name].rjust(width) for name, width in zip(SHOWN, widths, strict=True)))
@@ -111,37 +146,66 @@ def show(path: Path, bundle: str) -> None:
 
 
 def settings(arguments: list[str]) -> dict[str, Any]:
-    """The settings of a command line, ``name=value`` with values in YAML.
+    """The settings of a command line, ``name=value``; null is the default.
 
     Raises:
-        ValueError: one is unknown, missing, or of another type.
+        ValueError: one is unknown, missing, given twice, or of another type.
     """
-    cfg = {name: default for name, (_, default) in SETTINGS.items()}
+    cfg: dict[str, Any] = {}
     for argument in arguments:
         name, equals, value = argument.partition("=")
         if name not in SETTINGS or not equals:
-            raise UserValueError(
-                f"unknown setting {argument!r}. Choose from: {', '.join(f'{x}=...' for x in SETTINGS)}."
-            )
-        cfg[name] = yaml.safe_load(value)
-        if cfg[name] is None:
-            cfg[name] = SETTINGS[name][1]
-        elif type(cfg[name]) is not SETTINGS[name][0]:
-            raise UserValueError(f"{argument}: {name} must be a {SETTINGS[name][0].__name__}.")
+            choices = ", ".join(f"{x}=..." for x in SETTINGS)
+            raise UserValueError(f"unknown setting {shown(argument)}. Choose from: {choices}.")
+        if name in cfg:
+            raise UserValueError(f"{name} is given twice. Give it once.")
+        kind, default = SETTINGS[name]
+        cfg[name] = default if value in ("", "null") else READ[kind](name, value)
+    cfg = {name: default for name, (_, default) in SETTINGS.items()} | cfg
     if cfg["bundle"] is None:
         raise UserValueError("bundle is missing: write bundle=FOLDER, of a policy that recipes/export.py has written.")
-    if cfg["late"] < 0 or (cfg["episodes"] is not None and cfg["episodes"] < 1):
-        raise UserValueError(
-            f"late must be at least 0, and episodes at least 1; got {cfg['late']} and {cfg['episodes']}."
-        )
     return cfg
+
+
+def as_bool(name: str, value: str) -> bool:
+    if value.lower() not in ("true", "false"):
+        raise UserValueError(f"{name} must be true or false, got {shown(value)}.")
+    return value.lower() == "true"
+
+
+def as_int(name: str, value: str) -> int:
+    if not re.fullmatch("[+-]?[0-9]{1,18}", value) or int(value) < LEAST[name]:
+        raise UserValueError(f"{name} must be a whole number, at least {LEAST[name]}, got {shown(value)}.")
+    return int(value)
+
+
+def as_factors(name: str, value: str) -> dict[str, float]:
+    """A mapping such as {mass: 1.2, inertia: 1.5}, of words to numbers."""
+    factors: dict[str, float] = {}
+    mapping = value.strip()
+    wrong = UserValueError(f"{name} must look like {{mass: 1.2, inertia: 1.5}}, got {shown(value)}.")
+    if mapping[:1] != "{" or mapping[1:][-1:] != "}":
+        raise wrong
+    for pair in filter(str.strip, mapping[1:-1].split(",")):
+        field, _, factor = (x.strip().strip("'\"") for x in pair.partition(":"))
+        try:
+            number = float(factor)
+        except ValueError:
+            raise wrong from None
+        if field in factors:
+            raise wrong
+        factors[field] = number
+    return factors
+
+
+READ = {str: lambda _, value: value, bool: as_bool, int: as_int, dict: as_factors}
 
 
 if __name__ == "__main__":
     try:
         main()
-    except (ValueError, OSError, ImportError) as error:
-        print(f"Error: {error}", file=sys.stderr)
+    except (UserError, OSError) as error:
+        print("Error:", " ".join(str(error).split()), file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         print("Stopped. What is finished is kept.", file=sys.stderr)

@@ -45,7 +45,7 @@ LIBRARIES = {
     "modules": TORCHRL,
     "objectives": TORCHRL,
     "data": TORCHRL,
-    "deploy": TORCHRL | {"numpy", "onnx", "onnxruntime", "mujoco", "rotorpy", "crazyflow", "jax"},
+    "deploy": TORCHRL | {"jsonschema", "numpy", "onnx", "onnxruntime", "mujoco", "rotorpy", "crazyflow", "jax"},
     "errors": set(),
     "options": {"numpy", "pydantic"},
     "files": {"filelock"},

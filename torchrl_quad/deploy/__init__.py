@@ -1,6 +1,6 @@
 """From a trained policy to a drone: export it as a folder, fly the folder without torch, and translate conventions.
 
-Flying needs numpy and onnxruntime alone, :mod:`~torchrl_quad.deploy.frames` numpy; nothing here imports torch until
+Flying needs numpy, onnxruntime and jsonschema, :mod:`~torchrl_quad.deploy.frames` numpy; nothing here imports torch until
 :func:`~torchrl_quad.deploy.export_policy` is asked for.
 """
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from torchrl_quad.deploy import frames
 from torchrl_quad.deploy.bundle import Bundle, load_bundle
 from torchrl_quad.deploy.contract import (
+    BrokenPolicy,
     Fault,
     MissingQuantity,
     NegativeDepth,
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from torchrl_quad.deploy.export import export_policy
 
 __all__ = [
+    "BrokenPolicy",
     "Bundle",
     "Fault",
     "MissingQuantity",

@@ -183,7 +183,8 @@ class Bundle:
         options.log_severity_level = 4
         path = self.folder / "policy.onnx"
         try:
-            session = onnxruntime.InferenceSession(policy, options, providers=["CPUExecutionProvider"])
+            own = {"providers": ["CPUExecutionProvider"], "enable_fallback": 0}  # which prints
+            session = onnxruntime.InferenceSession(policy, options, **own)
         except Exception as error:  # onnxruntime has a dozen kinds, with nothing else in common
             why = contracts.one_line(error)
             raise TamperedBundle(f"{path}: onnxruntime cannot read it: {why}. {contracts.AGAIN}") from error

@@ -153,7 +153,10 @@ def read(folder: Path) -> Content:
     """
     path = folder / "contract.json"
     if not path.is_file():
-        raise FileNotFoundError(f"No bundle at {folder}: it has no contract.json. Export one: python recipes/export.py")
+        raise FileNotFoundError(
+            f"No bundle at {folder}: it has no contract.json. Export one: "
+            "python recipes/export.py checkpoint=.../checkpoint.pt"
+        )
     contract = _parsed(path)
     if type(contract["version"]) is not int or contract["version"] != VERSION:
         raise UnknownContract(
@@ -303,7 +306,6 @@ _BOUNDS = {"exclusiveMinimum": "above", "minimum": "at least", "maximum": "at mo
 _MUST = {
     **_BOUNDS,
     "type": "of type",
-    "const": "be",
     "enum": "one of",
     "minItems": "of a length of at least",
     "maxItems": "of a length of at most",
@@ -366,7 +368,8 @@ def _misfits(value: Any, part: str | None = None, *at: str) -> Iterator[str]:
             yield f"{place} has {shown(next(name for name in error.instance if name not in known))}, which is unknown"
         else:
             wanted = ", ".join(map(str, wanted)) if isinstance(wanted, list) else wanted
-            yield f"{place} is {shown(error.instance)}, and must be {_MUST.get(rule, rule)} {wanted}"
+            must = f"{_MUST[rule]} {wanted}" if rule in _MUST else wanted  # the others are constants
+            yield f"{place} is {shown(error.instance)}, and must be {must}"
 
 
 def _contradictions(contract: Mapping[str, Any]) -> Iterator[str]:

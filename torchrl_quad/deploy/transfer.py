@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,15 +19,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_quad.deploy.bundle import QUANTITIES, Bundle, load_bundle
+from torchrl_quad.deploy.bundle import Bundle, load_bundle
+from torchrl_quad.deploy.contract import QUANTITIES, drone_problem, naming, shown
 from torchrl_quad.deploy.judging import endings, judge
 from torchrl_quad.deploy.simulators import make_simulator
 from torchrl_quad.deploy.tasks import PROGRESS, progress_of
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 Array = NDArray[np.float64]
 # Fields of the rate loop, which does not know the true drone.
 OF_THE_LOOP = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
+MOST_LATE, MOST_SCALE = 1000, 1000.0
+MOST_STATES = 10_000_000  # of a flight, which take 2 GB
 
 
 @dataclass(frozen=True)
@@ -85,12 +89,27 @@ def fly(
         name and version; ``faults``, the bundle's refusals by name.
 
     Raises:
-        ValueError: the policy sees, or flies through obstacles, which no simulator here has; or an argument is unknown.
+        ValueError: the policy sees, or flies through obstacles, which no simulator here has; or an argument is unknown
+            or out of its range.
     """
     bundle = folder if isinstance(folder, Bundle) else load_bundle(folder, on_fault="hover")
-    contract, mutant = other_drone(bundle.contract, scale or {}), mutant or Mutant("none")
+    with naming(bundle.folder), np.errstate(all="ignore"):  # what a simulator cannot fly becomes NaN, and a crash
+        return _fly(bundle, simulator, loop, mutant or Mutant("none"), scale or {}, late, episodes)
+
+
+def _fly(
+    bundle: Bundle, simulator: str, loop: str, mutant: Mutant, scale: Any, late: Any, episodes: Any
+) -> dict[str, Any]:
+    for name, value, least, most in (("late", late, 0, MOST_LATE), ("episodes", episodes, 1, math.inf)):
+        if not (isinstance(value, int) and type(value) is not bool and least <= value <= most) and value is not None:
+            raise UserValueError(f"{name} must be a whole number from {least} to {most:g}, got {shown(value)}.")
+    if not isinstance(mutant, Mutant):
+        raise UserTypeError(f"mutant must be one of MUTANTS.values(), got {shown(mutant)}.")
+    contract = other_drone(bundle.contract, scale)
     starts = {name: x[:episodes] for name, x in bundle.starts().items()}
     n, steps = len(starts["position"]), contract["task"]["max_episode_steps"]
+    if n * steps > MOST_STATES:
+        raise UserValueError(f"{n} episodes of {steps} control steps do not fit into memory: give fewer, episodes=...")
     world = make_simulator(simulator, contract, loop, mutant.motors)
     world.reset({name: starts[name] for name in QUANTITIES})
     pilots = [_pilot(bundle, {k: x[i] for k, x in starts.items()}) for i in range(n)]
@@ -130,15 +149,22 @@ def other_drone(contract: Mapping[str, Any], scale: Mapping[str, float]) -> dict
     """The contract with another drone in its ``plant``: fields times a factor.
 
     Raises:
-        ValueError: a field is unknown, or belongs to the rate loop.
+        ValueError: a field is unknown, or belongs to the rate loop, or its factor makes no drone.
     """
     drone, plant = contract["drone"] | contract["plant"], dict(contract["plant"])
+    if not isinstance(scale, Mapping):
+        raise UserTypeError(f"scale must be a mapping of fields of the drone to factors, got {shown(scale)}.")
     fields = [name for name in drone if name not in OF_THE_LOOP]
     for name, factor in scale.items():
         if name not in fields:
-            raise UserValueError(f"scale: the drone has no {name!r} to scale. Choose from: {', '.join(fields)}.")
+            raise UserValueError(f"scale: the drone has no {shown(name)} to scale. Choose from: {', '.join(fields)}.")
+        if type(factor) not in (int, float) or not 0.0 <= factor <= MOST_SCALE:
+            raise UserValueError(f"scale: {name} must be a number from 0 to {MOST_SCALE:g}, got {shown(factor)}.")
         plant[name] = (factor * np.array(drone[name], float)).tolist()
-    return {**contract, "plant": plant}
+    scaled = {**contract, "plant": plant}
+    if scale and (problem := drone_problem(scaled)):
+        raise UserValueError(f"scale: {problem}. Choose other factors.")
+    return scaled
 
 
 def _hover(contract: dict[str, Any]) -> Array:

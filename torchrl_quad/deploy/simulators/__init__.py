@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.deploy.contract import shown
 from torchrl_quad.errors import MissingPackage, UserValueError
 
 Array = NDArray[np.float64]
@@ -52,8 +53,8 @@ def simulator_class(name: str) -> type[Simulator]:
         ValueError: it is unknown.
         ImportError: it is not installed.
     """
-    if name not in SIMULATORS:
-        raise UserValueError(f"Unknown simulator {name!r}. Choose from: {', '.join(SIMULATORS)}.")
+    if not isinstance(name, str) or name not in SIMULATORS:
+        raise UserValueError(f"Unknown simulator {shown(name)}. Choose from: {', '.join(SIMULATORS)}.")
     module, cls, package = SIMULATORS[name]
     try:
         return getattr(importlib.import_module(f"{__name__}.{module}"), cls)
@@ -73,7 +74,7 @@ def make_simulator(
     require_open_air(contract)
     kind = simulator_class(name)
     if loop not in kind.loops:
-        raise UserValueError(f"{name} has no rate loop {loop!r}. Choose from: {', '.join(kind.loops)}.")
+        raise UserValueError(f"{name} has no rate loop {shown(loop)}. Choose from: {', '.join(kind.loops)}.")
     return kind(contract, loop, motors)
 
 

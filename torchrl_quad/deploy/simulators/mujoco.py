@@ -10,7 +10,9 @@ import numpy as np
 from mujoco import rollout
 from numpy.typing import NDArray
 
+from torchrl_quad.deploy.contract import one_line
 from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone
+from torchrl_quad.errors import UserValueError
 
 RATE = 1000.0  # [Hz], of the physics and of the rate loop
 FRONT_TO_BACK = ("front_left", "back_left", "back_right", "front_right")
@@ -79,7 +81,10 @@ class MuJoCo:
         nominal = Drone(contract["drone"])
         self.drone, self.hover_speed = Drone(contract["drone"] | contract["plant"]), nominal.hover_speed
         self.loop, self.motors = LOOPS[loop](nominal, timestep), list(motors)
-        self.model = mujoco.MjModel.from_xml_string(model(self.drone, timestep))
+        try:
+            self.model = mujoco.MjModel.from_xml_string(model(self.drone, timestep))
+        except ValueError as error:  # of its compiler, which asks more of a body than we do
+            raise UserValueError(f"MuJoCo does not fly this drone: {one_line(error)}.") from error
         self.data = mujoco.MjData(self.model)
         self.rollout = rollout.Rollout(nthread=0)
         self.inputs = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED)

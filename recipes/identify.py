@@ -18,15 +18,15 @@ def main(cfg: DictConfig) -> None:
     logs = [read_log(path) for path in cfg.logs]
     for log in logs:
         print(log)
-    known = dict(cfg.known or {}) | ({} if cfg.mass is None else {"mass": cfg.mass})
+    settings = OmegaConf.to_container(cfg)
+    known = dict(settings["known"] or {}) | ({} if cfg.mass is None else {"mass": cfg.mass})
     folder = Path(cfg.folder)
     folder.mkdir(parents=True, exist_ok=True)
-    drone = OmegaConf.to_container(cfg.drone) if OmegaConf.is_config(cfg.drone) else cfg.drone
     result = identify(
         logs,
-        drone,
+        settings["drone"],
         known,
-        cfg.fields,
+        settings["fields"],
         past=cfg.past,
         horizon=cfg.horizon,
         iterations=cfg.iterations,

@@ -209,15 +209,13 @@ def test_bad_input_of_a_fit_is_refused_by_name(real, tmp_path):
         prediction_error(short, "crazyflie")
     with pytest.raises(TooLittleFlight, match="too few"):
         identify(dataclasses.replace(real, segments=((300, 600),)))
-    with pytest.raises(ValueError, match=r"horizons and every must be positive \[s\]"):
-        prediction_error(real, "crazyflie", (-0.1,))
     with pytest.raises(ValueError, match="motor_command: missing key 'nominal_voltage'"):
         load_drone({**_plain("visfly"), "motor_command": {"speed_per_volt": 500.0}})
     with pytest.raises(ValueError, match="motor_command: unknown key 'gain'. Allowed: speed_per_volt, nominal_voltage"):
         load_drone({**_plain("visfly"), "motor_command": {"gain": 1.0}})
     with pytest.raises(ValueError, match="motor_command must be a mapping of speed_per_volt, .*; got 500.0"):
         load_drone({**_plain("visfly"), "motor_command": 500.0})
-    with pytest.raises(ValueError, match="speed_per_volt must be between"):
+    with pytest.raises(ValueError, match="speed_per_volt must be"):
         MotorCommand(-1.0, 3.7)
     broken = tmp_path / "checkpoint.json"
     broken.write_text("{")

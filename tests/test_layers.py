@@ -52,7 +52,7 @@ LIBRARIES = {
     "diagnostics": TORCHRL,
     "gym": {"gymnasium", "numpy", "torch"},
     "adapters": TORCHRL | {"gymnasium", "numpy", "rsl_rl", "skrl", "stable_baselines3"},
-    "identification": {"torch", "numpy", "yaml", "pyulog", "rosbags"},
+    "identification": {"torch", "numpy", "yaml", "pydantic", "rosbags", "lz4", "backports", "compression"},
 }
 
 

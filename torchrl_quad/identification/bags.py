@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping
-from operator import attrgetter
+from array import array
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
 from torchrl_quad.identification.layouts import BY_IMU, ROS, Columns, Layout, choose
+from torchrl_quad.identification.ros_files import MAGIC, BagFile, Connection
+from torchrl_quad.identification.ros_messages import STAMP, Damaged, Decoder
 from torchrl_quad.identification.streams import Stream
+
+__all__ = ["MAGIC", "read_bag"]
 
 _AXES = ("x", "y", "z")
 # What the messages of a type hold. Poses first: whoever flies in motion capture has them, too, as odometry.
@@ -53,25 +55,44 @@ def read_bag(path: Path, columns: str | Layout | Mapping[str, object] | None) ->
         MissingColumns: it lacks a topic or field that was asked for, or several topics could be meant.
     """
     try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
+        import rosbags.typesys  # noqa: F401
     except ModuleNotFoundError as error:
         raise UnreadableLog("A ROS bag needs rosbags. Write: pip install '.[logs]' in a clone.") from error
+    bag = BagFile(path)
+    connections, begin = _connections(bag)
+    topics = {topic: connection.kind for topic, connection in connections.items()}
+    layout = _layout(topics, columns, path.name)
+    asked: dict[str, list[str]] = {}
+    for column in sorted({column for choices in layout.columns.values() for c in choices for column in c.names}):
+        asked.setdefault(column.split(".")[0], []).append(column)
+    missing = sorted(asked.keys() - topics.keys())
+    if missing:
+        raise MissingColumns(f"{path.name} has no topic {', '.join(missing)}. {_there(topics)}")
+    notes: list[str] = []
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            topics = {topic: info.msgtype or "" for topic, info in reader.topics.items() if info.msgcount}
-            layout = _layout(topics, columns, path.name)
-            asked = {column for choices in layout.columns.values() for c in choices for column in c.names}
-            missing = sorted({column.split(".")[0] for column in asked} - topics.keys())
-            if missing:
-                raise MissingColumns(f"{path.name} has no topic {', '.join(missing)}. {_there(topics)}")
-            notes: list[str] = []
-            streams = [_stream(reader, topic, asked, notes) for topic in {column.split(".")[0] for column in asked}]
-    except (MissingColumns, UnreadableLog):
-        raise
-    except Exception as error:  # rosbags raises whatever its parsers meet in a broken file
+        streams = _streams(bag, {topic: connections[topic] for topic in asked}, asked, begin, notes)
+    except Damaged as error:
         raise UnreadableLog(f"{path.name} is no readable ROS bag: {error}. Record or copy it again.") from error
+    if bag.unread:
+        notes.append(f"the last {bag.unread} bytes of the bag were not read: it is cut off, or damaged")
     return streams, layout, notes
+
+
+def _connections(bag: BagFile) -> tuple[dict[str, Connection], int]:
+    """The topics that have messages, and when the first of all messages was received [ns]."""
+    found: dict[str, Connection] = {}
+    begin: int | None = None
+    for connection, received, _ in bag.messages():
+        other = found.setdefault(connection.topic, connection)
+        if other.kind != connection.kind:
+            raise UnreadableLog(
+                f"{bag.name}: {connection.topic} has messages of two kinds, {other.kind} and {connection.kind}. Filter "
+                "one of them out."
+            )
+        begin = received if begin is None else min(begin, received)
+    if begin is None:
+        raise UnreadableLog(f"{bag.name} is no readable ROS bag: it holds no messages. Record or copy it again.")
+    return found, begin
 
 
 def _layout(topics: Mapping[str, str], columns: str | Layout | Mapping[str, object] | None, name: str) -> Layout:
@@ -114,36 +135,36 @@ def _columns(topic: str, message: str, quantity: str) -> list[str]:
     return [f"{topic}.{stem}{part if part.startswith('[') else f'.{part}'}" for part in parts] or [f"{topic}.{stem}"]
 
 
-def _stream(reader: Any, topic: str, asked: set[str], notes: list[str]) -> Stream:
-    names = sorted(column for column in asked if column.split(".")[0] == topic)
-    getters = [_getter(name.split(".", 1)[1] if "." in name else "") for name in names]
-    begin = reader.start_time  # whole nanoseconds: a float of seconds since 1970 keeps only a fraction of them
-    times, rows = [], []
-    for connection, received, raw in reader.messages([c for c in reader.connections if c.topic == topic]):
-        message = reader.deserialize(raw, connection.msgtype)
-        stamp = getattr(getattr(message, "header", None), "stamp", None)
-        stamped = stamp is not None and stamp.sec > 0
-        times.append(((stamp.sec * 10**9 + stamp.nanosec if stamped else received) - begin) * 1e-9)
-        try:
-            rows.append([get(message) for get in getters])
-        except (AttributeError, IndexError) as error:
-            fields = [f for f in dir(message) if not f.startswith("_")]
+def _streams(
+    bag: BagFile, connections: Mapping[str, Connection], asked: Mapping[str, list[str]], begin: int, notes: list[str]
+) -> list[Stream]:
+    parts = {topic: [name.partition(".")[2] for name in names] for topic, names in asked.items()}
+    decoders = {topic: Decoder(connections[topic], parts[topic]) for topic in asked}
+    times: dict[str, array] = {
+        topic: array("d") for topic in asked
+    }  # since the bag began: a float of seconds since 1970
+    rows: dict[str, array] = {topic: array("d") for topic in asked}  # keeps only a fraction of the nanoseconds
+    for connection, received, raw in bag.messages():
+        topic = connection.topic
+        if topic not in asked:
+            continue
+        found = decoders[topic].read(raw)
+        lacking = [part for part in parts[topic] if part not in found]
+        if lacking:
             raise MissingColumns(
-                f"{topic} lacks a field of {', '.join(names)}: {error}. Its messages have: {', '.join(fields)}."
-            ) from error
-        if len(times) == 1 and not stamped:
+                f"{topic} lacks a field of {', '.join(asked[topic])}: {', '.join(lacking)} is no number in it. Its "
+                f"messages have: {', '.join(decoders[topic].fields)}."
+            )
+        seconds, rest = (int(found.get(part, 0)) for part in STAMP)
+        if not times[topic] and seconds <= 0:
             notes.append(f"messages of {topic} carry no stamp: their times are when the bag received them")
-    table = np.array(rows, float).reshape(len(times), len(names))
-    return Stream(topic, np.array(times), dict(zip(names, table.T, strict=True)))
-
-
-def _getter(path: str) -> Callable[[Any], float]:
-    """What reads ``field.part[0]`` from a message."""
-    found = re.fullmatch(r"(.+?)\[(\d+)\]", path)
-    if found is None:
-        return attrgetter(path)
-    get, index = attrgetter(found[1]), int(found[2])
-    return lambda message: get(message)[index]
+        times[topic].append(((seconds * 10**9 + rest if seconds > 0 else received) - begin) * 1e-9)
+        rows[topic].extend([found[part] for part in parts[topic]])
+    streams = []
+    for topic, names in asked.items():
+        table = np.frombuffer(rows[topic]).reshape(-1, len(names))
+        streams.append(Stream(topic, np.frombuffer(times[topic]), dict(zip(names, table.T, strict=True))))
+    return streams
 
 
 def _there(topics: Mapping[str, str]) -> str:

@@ -5,36 +5,41 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field
 
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
+from torchrl_quad.dynamics.presets import is_number
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.identification.errors import TooLittleFlight
 from torchrl_quad.identification.fitting import MAX_ITERATIONS
-from torchrl_quad.identification.log import FlightLog
+from torchrl_quad.identification.log import FlightLog, as_logs
 from torchrl_quad.identification.parameters import FIELDS, Model, unknowns_of
 from torchrl_quad.identification.prediction import PAST, as_params, carrying_speed
 from torchrl_quad.identification.result import IdentificationResult
 from torchrl_quad.identification.stages import Checkpoint, Fit, fingerprint, held_out
 from torchrl_quad.identification.windows import cut
+from torchrl_quad.options import Seed, checked
 
 _BODY_STEP = 0.02  # [s]
 _MOST_WINDOWS = 360  # more would cost more and tell little more, since neighbours overlap
 
 
+@checked
 def identify(
     log: FlightLog | Sequence[FlightLog],
     drone: str | Path | Mapping | QuadrotorParams = "crazyflie",
     known: Mapping[str, Any] | None = None,
-    fields: Sequence[str] | None = None,
+    fields: str | Sequence[str] | None = None,
     *,
-    past: float = PAST,
-    horizon: float = 0.5,
-    iterations: int = MAX_ITERATIONS,
-    draws: int = 200,
-    seed: int = 0,
+    past: Annotated[float, Field(ge=0, le=60)] = PAST,
+    horizon: Annotated[float, Field(ge=0.1, le=60)] = 0.5,
+    iterations: Annotated[int, Field(ge=1, le=100_000)] = MAX_ITERATIONS,
+    draws: Annotated[int, Field(ge=0, le=100_000)] = 200,
+    seed: Seed = 0,
     progress: bool = False,
     checkpoint: str | Path | None = None,
 ) -> IdentificationResult:
@@ -57,7 +62,7 @@ def identify(
         horizon: length of a window [s].
         iterations: at most, of each stage: one follows for every unknown that is dropped, and one for rotors with two
             time constants.
-        draws: of the bootstrap over windows.
+        draws: of the bootstrap over windows; 0 for none, else two or more.
         seed: of these draws; the rest is deterministic.
         progress: print a line for each step.
         checkpoint: a file that each step is written to, and from which a fit of the same flights and settings goes on.
@@ -68,13 +73,13 @@ def identify(
         TooLittleFlight: there are too few windows for the unknowns.
         ValueError: the drone is wrong, or a known value.
     """
-    logs = [log] if isinstance(log, FlightLog) else list(log)
-    if not logs:
-        raise TooLittleFlight("identify needs at least one flight: read_log(path) gives it.")
+    logs = as_logs(log, "identify")
+    if draws == 1:
+        raise UserValueError("draws must be 0, for no bootstrap, or at least 2: one draw has no spread.")
     known = dict(known or {})
     delay = known.pop("command_delay", None)
     prior = as_params(drone)
-    prior = prior.replace(**known) if known else prior
+    prior = as_params(prior.replace(**known)) if known else prior
     prior, motors = _with_motors(prior, logs, delay)
     wanted = [x for x in unknowns_of(fields) if x != "stream"]
     for name in (*known, *(["command_delay"] if delay is not None else [])):
@@ -119,5 +124,5 @@ def _with_motors(
         nominal = float(np.mean(volts)) if volts else 1.0
         motors = MotorCommand(float(np.mean([carrying_speed(prior, x, nominal) for x in logs])), nominal)
     if delay is not None:
-        motors = dataclasses.replace(motors, delay=float(delay))
+        motors = dataclasses.replace(motors, delay=float(delay) if is_number(delay) else delay)
     return dataclasses.replace(prior, motor_command=motors), motors

@@ -20,7 +20,7 @@ from torchrl_quad.identification.checks import (
     check_specific_force,
     check_velocity,
 )
-from torchrl_quad.identification.errors import GapsTooLarge, LogError, NoFlight, WrongUnit
+from torchrl_quad.identification.errors import GapsTooLarge, LogError, NoFlight, TooLittleFlight, TooShort, WrongUnit
 from torchrl_quad.identification.layouts import SIZES, Columns, Layout, gather
 from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
 from torchrl_quad.identification.sources import read_streams
@@ -30,6 +30,7 @@ from torchrl_quad.options import NonNegative, checked, shown
 LEAST_STEP, MAX_STEPS = 1e-3, 1_000_000  # [s] of a log, and how many: 17 minutes at 1 kHz, half a gigabyte
 
 
+@checked
 @dataclass(frozen=True)
 class FlightLog:
     """A flight as :func:`read_log` gives it: world z up, body FLU, quaternions (w, x, y, z) from body to world.
@@ -66,8 +67,10 @@ class FlightLog:
                     f"FlightLog: {field} must be a float array {('T', *shape)} of finite numbers, T of them at least "
                     f"two; got {shown(value)}."
                 )
-        if not (np.abs(np.diff(self.time) - self.dt) < 1e-3 * self.dt).all():
-            raise UserValueError(f"FlightLog: time must rise in uniform steps [s], got {shown(self.time)}.")
+        if not (self.dt < 0.5 and (np.abs(np.diff(self.time) - self.dt) < 1e-3 * self.dt).all()):
+            raise UserValueError(f"FlightLog: time must rise in uniform steps below 0.5 s, got {shown(self.time)}.")
+        if not (self.setpoint is None or isinstance(self.setpoint, Mapping)):
+            raise UserTypeError(f"FlightLog: setpoint must be arrays by name, or None; got {shown(self.setpoint)}.")
         ends = [end for piece in self.segments for end in piece]
         if ends != sorted(ends) or not all(0 <= end <= length[0] for end in ends):
             raise UserValueError(
@@ -130,20 +133,24 @@ def read_log(
     """
     if not (convention is None or isinstance(convention, Convention)):
         raise UserTypeError(f"convention must be one of torchrl_quad.deploy.frames, or None; got {shown(convention)}.")
-    known = {*SIZES, "setpoint"} - {"euler", "velocity_body"}
-    for field in onboard or ():
-        if field not in known:
-            raise UserValueError(f"onboard: unknown field {shown(field)}. Choose from: {', '.join(sorted(known))}.")
     path = Path(path)
     try:
         streams, layout, notes = read_streams(path, columns)
         layout = layout if convention is None else replace(layout, convention=convention)
         fields = layout.onboard if onboard is None else tuple(onboard)
+        _check_onboard(fields)
         return _flight(path, streams, layout, notes, fields, dt, clearance, max_gap, min_duration)
     except LogError as error:
         if path.name in str(error):
             raise
         raise type(error)(f"{path.name}: {error}") from error
+
+
+def _check_onboard(fields: Sequence[str]) -> None:
+    known = sorted({*SIZES, "setpoint"} - {"euler", "velocity_body"})
+    for field in fields:
+        if field not in known:
+            raise UserValueError(f"onboard: unknown field {shown(field)}. Choose from: {', '.join(known)}.")
 
 
 def _flight(
@@ -226,6 +233,25 @@ def _signals(layout: Layout, streams: Sequence, name: str, notes: list[str]) -> 
     note = check_motors(signals["motor_command"])
     notes += [note] if note else []
     return signals
+
+
+def as_logs(log: FlightLog | Sequence[FlightLog], whose: str) -> list[FlightLog]:
+    """One flight or several, as a list.
+
+    Raises:
+        UserTypeError: it is anything else.
+    """
+    logs = [log] if isinstance(log, FlightLog) else list(log) if isinstance(log, Sequence) else [log]
+    for one in logs:
+        if not isinstance(one, FlightLog):
+            raise UserTypeError(
+                f"{whose}: log must be a flight as read_log(path) gives it, or a list of them; got {shown(one)}."
+            )
+        if not one.segments:
+            raise TooShort(f"{whose}: {one.name} has no piece in flight.")
+    if not logs:
+        raise TooLittleFlight(f"{whose} needs at least one flight: read_log(path) gives it.")
+    return logs
 
 
 def _refuse_length(name: str, main: Sequence[Signal], span: float, step: float) -> None:

@@ -14,6 +14,7 @@ from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
 from torchrl_quad.dynamics.parameters import RawParams
 from torchrl_quad.identification.errors import UnknownField
 from torchrl_quad.identification.windows import MAX_DELAY, Plant
+from torchrl_quad.options import shown
 
 #: What ``fields`` of :func:`~torchrl_quad.identification.identify` may name, and the unknowns that each stands for.
 FIELDS: dict[str, tuple[str, ...]] = {
@@ -238,10 +239,13 @@ def unknowns_of(fields: Sequence[str] | None) -> list[str]:
     """
     if isinstance(fields, str):
         fields = [fields]
-    for name in fields or ():
+    fields = list(FIELDS) if fields is None else list(dict.fromkeys(fields))
+    if not fields:
+        raise UnknownField(f"identify: fields names none. Choose from: {', '.join(FIELDS)}; None is everything.")
+    for name in fields:
         if name not in FIELDS:
             raise UnknownField(
-                f"identify cannot fit {name!r}. Choose from: {', '.join(FIELDS)}. Geometry, gravity and the mass are "
-                'taken as known: known={"mass": 0.03}, or in the drone.'
+                f"identify cannot fit {shown(name)}. Choose from: {', '.join(FIELDS)}. Geometry, gravity and the mass "
+                'are taken as known: known={"mass": 0.03}, or in the drone.'
             )
-    return [unknown for name in (fields or FIELDS) for unknown in FIELDS[name]]
+    return [unknown for name in fields for unknown in FIELDS[name]]

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from torchrl_quad.dynamics import QuadrotorParams, load_drone, quaternion
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.identification.log import FlightLog
+from torchrl_quad.identification.errors import NoFlight
+from torchrl_quad.identification.log import FlightLog, as_logs
 from torchrl_quad.identification.windows import Plant, Trajectory, Windows, cut, rotation_vector, stream_delay
+from torchrl_quad.options import checked
 
 #: What is predicted, and the unit of its error.
 ERRORS = {"position": "m", "velocity": "m/s", "attitude": "rad", "body_rate": "rad/s"}
@@ -22,13 +25,14 @@ CONSTANT_VELOCITY = "constant_velocity"
 PAST = 0.5  # [s] before a prediction, from which its constant disturbance follows
 
 
+@checked
 def prediction_error(
     log: FlightLog | Sequence[FlightLog],
     drone: str | Path | Mapping | QuadrotorParams | Any,
-    horizons: Sequence[float] = (0.1, 0.25, 0.5),
+    horizons: Annotated[Sequence[Annotated[float, Field(ge=0.01, le=60)]], Field(min_length=1)] = (0.1, 0.25, 0.5),
     *,
-    past: float = PAST,
-    every: float = 0.1,
+    past: Annotated[float, Field(ge=0, le=60)] = PAST,
+    every: Annotated[float, Field(gt=0, le=3600)] = 0.1,
 ) -> dict[str, dict[float, float]]:
     """The error of open-loop predictions: ``errors["position"][0.5]`` [m], after half a second.
 
@@ -58,13 +62,7 @@ def prediction_error(
         ValueError: a horizon is not positive, or the drone is wrong.
         TooShort: no piece of the flight is long enough.
     """
-    logs = [log] if isinstance(log, FlightLog) else list(log)
-    horizons = [float(h) for h in horizons]
-    if not horizons or not all(math.isfinite(h) and h > 0 for h in horizons) or not past >= 0 or not every > 0:
-        raise UserValueError(
-            f"prediction_error: horizons and every must be positive [s], and past zero or positive; got {horizons}, "
-            f"{every!r} and {past!r}."
-        )
+    logs, horizons = as_logs(log, "prediction_error"), [float(h) for h in horizons]
     windows, flown, seen = predict(logs, drone, max(horizons), past, every)
     steps = torch.tensor([max(1, round(h / windows.dt)) for h in horizons])
     errors = differences(Trajectory(*(x[:, steps] for x in flown)), Trajectory(*(x[:, steps] for x in seen)))
@@ -106,7 +104,10 @@ def as_params(drone: Any) -> QuadrotorParams:
     """A drone in float64: from a name, a path, a mapping, parameters, or the result of a fit."""
     drone = getattr(drone, "drone", drone)
     if not isinstance(drone, QuadrotorParams):
-        return load_drone(drone, torch.float64)
+        drone = load_drone(drone, torch.float64)
+    for name, value in drone.fields().items():
+        if value.dim() != drone.dim(name):
+            raise UserValueError(f"A flight is of one drone, and {name} has shape {tuple(value.shape)}, of several.")
     return drone.detach().to(dtype=torch.float64, device="cpu")
 
 
@@ -118,6 +119,8 @@ def carrying_speed(params: QuadrotorParams, log: FlightLog, nominal_voltage: flo
     seen = quaternion.rotate_inverse(torch.from_numpy(log.quaternion), torch.from_numpy(force))
     needed = float(params.mass) * float(torch.cat([seen[a:b, 2] for a, b in log.segments]).mean())
     k2, k1, k0 = params.thrust_map.tolist()
+    if not volts.any():
+        raise NoFlight(f"{log.name}: its motor commands are zero in flight. Name the right columns when it is read.")
     square, line, rest = k2 * np.square(volts).sum(1).mean(), k1 * volts.sum(1).mean(), 4.0 * k0 - needed
     return float((-line + math.sqrt(max(line * line - 4.0 * square * rest, 0.0))) / (2.0 * square))
 

@@ -15,6 +15,7 @@ from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.dynamics.parameters import LIMITS
 from torchrl_quad.files import replacing
 from torchrl_quad.identification.log import FlightLog
+from torchrl_quad.options import checked
 
 # Which intervals a field of the drone is randomised by.
 _RANDOMISED = {
@@ -109,6 +110,7 @@ class IdentificationResult:
         names = [f.name for f in dataclasses.fields(self) if f.name not in ("drone", "prior", "flights")]
         return {name: _plain(getattr(self, name)) for name in names}
 
+    @checked
     def save(self, folder: str | Path, pictures: bool = True) -> Path:
         """Write ``drone.yaml``, ``randomization.yaml``, ``report.json`` and pictures; each is complete or not there.
 

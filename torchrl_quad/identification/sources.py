@@ -7,7 +7,6 @@ import collections
 import gzip
 import itertools
 import os
-import stat
 import zlib
 from array import array
 from collections.abc import Callable, Iterator, Mapping
@@ -17,15 +16,14 @@ from typing import BinaryIO
 
 import numpy as np
 
-from torchrl_quad.identification.bags import read_bag
+from torchrl_quad.identification.bags import MAGIC, read_bag
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
 from torchrl_quad.identification.layouts import LAYOUTS, Layout, choose, match
-from torchrl_quad.identification.streams import Stream
+from torchrl_quad.identification.streams import Stream, open_plain
 from torchrl_quad.identification.ulog import read_ulog
 from torchrl_quad.identification.usd import read_usd
 
 Asked = str | Layout | Mapping[str, object] | None
-BAG = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3")
 # Of a file, which may be packed, and of what it unpacks to. All is read in time and memory proportional to its size.
 MAX_BYTES, MAX_UNPACKED = 2 * 10**9, 500 * 10**6
 MAX_LINE, MAX_COLUMNS, MAX_ROWS = 4 * 10**6, 100_000, 5 * 10**6  # of a CSV file: bytes, names, samples
@@ -46,7 +44,7 @@ def read_streams(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list
         return read_bag(path, columns)
     with open_plain(path) as file:
         start = file.peek(16)[:16]
-        if start.startswith(BAG):
+        if start.startswith(MAGIC):
             return read_bag(path, columns)
         size = os.fstat(file.fileno()).st_size
         if size > MAX_BYTES:
@@ -58,21 +56,6 @@ def read_streams(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list
                 return _read(unpacked, path.name, columns, MAX_UNPACKED)
         except (gzip.BadGzipFile, EOFError, zlib.error) as error:
             raise UnreadableLog(f"{path.name} is a broken gz file: {error}. Copy it again.") from error
-
-
-def open_plain(path: Path) -> BinaryIO:
-    """A plain file, open for reading.
-
-    Raises:
-        UnreadableLog: it is a pipe, a socket or a device, which is not opened: to read one may never end.
-    """
-    if stat.S_ISREG(path.stat().st_mode):
-        flags = getattr(os, "O_NONBLOCK", 0)  # if it is replaced by a pipe just now, opening does not wait
-        file = open(path, "rb", opener=lambda name, given: os.open(name, given | flags))  # noqa: SIM115
-        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            return file
-        file.close()
-    raise UnreadableLog(f"{path.name} is no plain file, but a pipe, a socket or a device. Give the path of a log.")
 
 
 def _read(file: BinaryIO, name: str, columns: Asked, most: int) -> tuple[list[Stream], Layout, list[str]]:

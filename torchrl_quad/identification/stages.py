@@ -23,7 +23,9 @@ from torchrl_quad.identification.parameters import FIELDS, UNKNOWNS, Model, repo
 from torchrl_quad.identification.prediction import CONSTANT_VELOCITY, ERRORS, differences, predict
 from torchrl_quad.identification.result import IdentificationResult
 from torchrl_quad.identification.windows import Trajectory, Windows, stream_delay
+from torchrl_quad.options import shown
 
+MAX_BYTES = 10**7  # of a checkpoint, which has some numbers for each unknown
 HORIZONS = (0.1, 0.25, 0.5)
 _BLOCK = 2.0  # [s] of flight that are held out together
 _EVERY_BLOCK = 5  # of which the last is held out
@@ -211,10 +213,17 @@ class Checkpoint:
     def resume(self, stage: str, free: tuple[str, ...], x: Tensor, streams: Tensor, begun: int = 0) -> State:
         """The last step of a stage, or its start."""
         found = self._read().get(stage)
-        if found is None or tuple(found["free"]) != free:
-            return State(free, x, streams, iteration=begun)
-        tensors = {name: torch.tensor(found[name], dtype=torch.float64) for name in ("x", "streams")}
-        return State(**{**found, **tensors, "free": free})
+        try:
+            if found is None or tuple(found["free"]) != free:
+                return State(free, x, streams, iteration=begun)
+            tensors = {name: torch.tensor(found[name], dtype=torch.float64) for name in ("x", "streams")}
+            if any(tensors[name].shape != own.shape for name, own in (("x", x), ("streams", streams))):
+                raise ValueError("another number of unknowns")
+            if not all(tensor.isfinite().all() for tensor in tensors.values()):
+                raise ValueError("an unknown is not finite")
+            return State(**{**found, **tensors, "free": free})
+        except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
+            raise self._broken(error) from error
 
     def write(self, stage: str, state: State) -> None:
         """Keep a step."""
@@ -228,13 +237,16 @@ class Checkpoint:
     def _read(self) -> dict[str, Any]:
         if self.path is None or not Path(self.path).is_file():
             return {}
+        if Path(self.path).stat().st_size > MAX_BYTES:
+            raise self._broken(f"it has more than {MAX_BYTES:,} bytes")
         try:
             content = json.loads(Path(self.path).read_text())
-            return content["stages"] if content["fingerprint"] == self.fingerprint else {}
-        except (ValueError, KeyError, TypeError) as error:
-            raise UserValueError(
-                f"{self.path} is no checkpoint of a fit: {error!r}. Delete it, to start anew."
-            ) from error
+            return dict(content["stages"]) if content["fingerprint"] == self.fingerprint else {}
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise self._broken(error) from error
+
+    def _broken(self, error: object) -> UserValueError:
+        return UserValueError(f"{self.path} is no checkpoint of a fit: {shown(error)}. Delete it, to start anew.")
 
 
 def held_out(windows: Windows) -> Tensor:

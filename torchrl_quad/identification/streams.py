@@ -2,16 +2,35 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_quad.identification.errors import ClockJumpsBack, NotFiniteLog
+from torchrl_quad.identification.errors import ClockJumpsBack, NotFiniteLog, UnreadableLog
 
 Array = NDArray[np.float64]
 LARGEST = 1e9  # of a quantity, in SI units; only damage makes larger ones
+
+
+def open_plain(path: Path) -> BinaryIO:
+    """A plain file, open for reading.
+
+    Raises:
+        UnreadableLog: it is a pipe, a socket or a device, which is not opened: to read one may never end.
+    """
+    if stat.S_ISREG(path.stat().st_mode):
+        flags = getattr(os, "O_NONBLOCK", 0)  # if it is replaced by a pipe just now, opening does not wait
+        file = open(path, "rb", opener=lambda name, given: os.open(name, given | flags))  # noqa: SIM115
+        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            return file
+        file.close()
+    raise UnreadableLog(f"{path.name} is no plain file, but a pipe, a socket or a device. Give the path of a log.")
 
 
 @dataclass(frozen=True)

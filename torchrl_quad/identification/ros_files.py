@@ -1,0 +1,283 @@
+"""What ROS bags hold, read from the first byte to the last: ROS 1 bags, MCAP and SQLite files, and ROS 2 folders.
+
+Their indices are not used: they may be missing, broken, or name a message a million times. Chunks are unpacked one at a
+time, and never to more than ``MAX_CHUNK``.
+"""
+
+from __future__ import annotations
+
+import bz2
+import io
+import itertools
+import os
+import sqlite3
+import struct
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any, BinaryIO
+
+from torchrl_quad.dynamics import presets
+from torchrl_quad.identification.errors import UnreadableLog
+from torchrl_quad.identification.streams import open_plain
+from torchrl_quad.options import shown
+
+MAX_CHUNK, MAX_RATIO = 256 * 10**6, 100  # [bytes] of what a chunk unpacks to; of all of them to the file
+MAX_FILE = 2 * 10**9  # [bytes] of what a file that is packed as a whole unpacks to
+MAX_MESSAGES = 20 * 10**6
+SQLITE = b"SQLite format 3\0"
+MAGIC = (b"#ROSBAG V", b"\x89MCAP0\r\n", SQLITE)
+
+
+# What the readers of records, numbers, texts, chunks and tables say of damaged ones.
+_BROKEN = (struct.error, KeyError, UnicodeDecodeError, OSError, EOFError, RuntimeError, sqlite3.Error)
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A topic of a file."""
+
+    topic: str
+    kind: str  # of its messages, "pkg/msg/Type"
+    definition: str  # of that kind; empty where the file has none
+    language: str  # of the definition: "msg" or "idl"
+    is_cdr: bool  # else ROS 1
+
+
+Message = tuple[Connection, int, bytes]  # when it was received [ns], and its bytes
+
+
+class BagFile:
+    """The messages of a bag."""
+
+    def __init__(self, path: Path) -> None:
+        self.name, self.packed, self.unread = path.name, "", 0
+        self.paths = [path]
+        if path.is_dir():
+            self.paths = self._from_metadata(path)
+
+    def messages(self) -> Iterator[Message]:
+        """Every message, in the order of the files.
+
+        Raises:
+            UnreadableLog: a file is damaged, or beyond a limit.
+        """
+        self.unread = 0
+        messages = itertools.chain.from_iterable(
+            map(self._read_packed if self.packed == "file" else self._read, self.paths)
+        )
+        for k in itertools.count():
+            try:
+                message = next(messages, None)
+            except _BROKEN as error:
+                said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+                raise UnreadableLog(f"{self.name} is no readable ROS bag ({said}). Record or copy it again.") from error
+            if message is None:
+                return
+            if k == MAX_MESSAGES:
+                raise UnreadableLog(f"{self.name} has more than {MAX_MESSAGES:,} messages; that is the most. Split it.")
+            yield message
+
+    def _from_metadata(self, folder: Path) -> list[Path]:
+        with open_plain(folder / "metadata.yaml") as file:
+            about = presets.parse(file.read(presets.MAX_BYTES + 1), f"{self.name}/metadata.yaml")
+        about = about.get("rosbag2_bagfile_information") if isinstance(about, dict) else None
+        names = about.get("relative_file_paths") if isinstance(about, dict) else None
+        if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
+            raise UnreadableLog(
+                f"{self.name}/metadata.yaml names no relative_file_paths. Give the path of an .mcap or .db3 file in it."
+            )
+        mode = str(about.get("compression_mode") or "").lower()
+        self.packed = mode if mode in ("file", "message") else ""
+        return [folder / PurePath(name).name for name in names]
+
+    def _open(self, path: Path) -> BinaryIO:
+        if not path.exists():
+            raise UnreadableLog(f"{self.name} lacks the file {path.name}, which its metadata.yaml names.")
+        return open_plain(path)
+
+    def _read_packed(self, path: Path) -> Iterator[Message]:
+        with tempfile.TemporaryDirectory() as folder:
+            whole, written, zstd = Path(folder) / path.stem, 0, _zstd()
+            try:
+                with self._open(path) as packed, zstd.open(packed, "rb") as file, open(whole, "wb") as out:
+                    while written <= MAX_FILE and (part := file.read(1 << 20)):
+                        written += out.write(part)
+            except zstd.ZstdError as error:
+                raise UnreadableLog(f"{path.name} is a broken zstd file: {error}. Copy it again.") from error
+            if written > MAX_FILE:
+                raise UnreadableLog(f"{path.name} unpacks to more than {MAX_FILE:,} bytes; that is the most.")
+            yield from self._read(whole)
+
+    def _read(self, path: Path) -> Iterator[Message]:
+        with self._open(path) as file:
+            start = file.peek(16)[:16]  # type: ignore[attr-defined]
+            size = os.fstat(file.fileno()).st_size
+            if start.startswith(SQLITE):
+                yield from self._unpacked(self._sqlite(path))
+            elif start.startswith(b"#ROSBAG V2.0\n"):
+                file.seek(13)
+                yield from self._bag(file, size, {}, [MAX_RATIO * size + MAX_CHUNK])
+            elif start.startswith(MAGIC[1]):
+                file.seek(len(MAGIC[1]))
+                yield from self._unpacked(self._mcap(file, size, {}, {}, [MAX_RATIO * size + MAX_CHUNK]))
+            else:
+                raise UnreadableLog(f"{path.name} is no ROS 1 bag of version 2.0, and no MCAP or SQLite file.")
+
+    def _unpacked(self, messages: Iterator[Message]) -> Iterator[Message]:
+        for connection, time, raw in messages:
+            yield (
+                connection,
+                time,
+                self._unpack("zstd", raw, MAX_CHUNK, [MAX_CHUNK]) if self.packed == "message" else raw,
+            )
+
+    def _bag(self, file: BinaryIO, end: int, known: dict[int, Connection], left: list[int]) -> Iterator[Message]:
+        """The records of a ROS 1 bag, or of a chunk in it: header and data, each after its size (32 bits)."""
+        at = file.tell()
+        while at + 8 <= end:
+            (size,) = struct.unpack("<I", file.read(4))
+            if at + 8 + size > end:
+                break
+            header = self._fields(file.read(size))
+            (size,) = struct.unpack("<I", file.read(4))
+            at = file.tell() + size
+            if at > end:
+                at -= size
+                break
+            op = header[b"op"]
+            if op == b"\x07":  # a connection
+                (number,) = struct.unpack("<I", header[b"conn"])
+                about = self._fields(file.read(size))
+                topic, kind, text = header[b"topic"], about[b"type"], about[b"message_definition"]
+                package, _, name = kind.decode().rpartition("/")
+                kind = f"{package.removesuffix('/msg')}/msg/{name}"
+                known.setdefault(number, Connection(topic.decode(), kind, text.decode(errors="replace"), "msg", False))
+            elif op == b"\x02":  # a message
+                (number,), (seconds, rest) = struct.unpack("<I", header[b"conn"]), struct.unpack("<II", header[b"time"])
+                if number in known:
+                    yield known[number], seconds * 10**9 + rest, file.read(size)
+            elif op == b"\x05":  # a chunk
+                (unpacked,) = struct.unpack("<I", header[b"size"])
+                chunk = self._unpack(header[b"compression"].decode(), file.read(size), unpacked, left)
+                yield from self._bag(io.BytesIO(chunk), len(chunk), known, [])
+            file.seek(at)
+        self.unread += end - at
+
+    def _fields(self, data: bytes) -> dict[bytes, bytes]:
+        found, at = {}, 0
+        while at < len(data):
+            (size,) = struct.unpack_from("<I", data, at)
+            name, _, found_value = data[at + 4 : at + 4 + size].partition(b"=")
+            found[name], at = found_value, at + 4 + size
+        return found
+
+    def _mcap(
+        self, file: BinaryIO, end: int, schemas: dict[int, tuple], known: dict[int, Connection], left: list[int]
+    ) -> Iterator[Message]:
+        """The records of an MCAP file, or of a chunk in it: a byte that says of what kind, and the size (64 bits)."""
+        at = file.tell()
+        while at + 9 <= end:
+            op, size = struct.unpack("<BQ", file.read(9))
+            if at + 9 + size > end:
+                break
+            at += 9 + size
+            if op == 0x0F:  # the end of the data: what follows repeats it
+                return
+            if op == 0x05 and size >= 22:  # a message
+                number, _, time, _ = struct.unpack("<HIQQ", file.read(22))
+                if number in known:
+                    yield known[number], time, file.read(size - 22)
+            elif op == 0x03:  # a schema
+                body = io.BytesIO(file.read(size))
+                (number,) = struct.unpack("<H", body.read(2))
+                schemas[number] = (_sized(body).decode(), _sized(body).decode(), _sized(body).decode(errors="replace"))
+            elif op == 0x04:  # a channel
+                body = io.BytesIO(file.read(size))
+                number, schema = struct.unpack("<HH", body.read(4))
+                topic, encoding = _sized(body).decode(), _sized(body).decode()
+                kind, language, text = schemas.get(schema, ("unknown", "", ""))
+                if encoding == "cdr":
+                    known.setdefault(number, Connection(topic, kind, text, language.removeprefix("ros2")[-3:], True))
+            elif op == 0x06:  # a chunk
+                head = io.BytesIO(file.read(28))
+                _, _, unpacked, _ = struct.unpack("<QQQI", head.read(28))
+                compression = _sized(file).decode()
+                (packed,) = struct.unpack("<Q", file.read(8))
+                chunk = self._unpack(compression, file.read(min(packed, at - file.tell())), unpacked, left)
+                yield from self._mcap(io.BytesIO(chunk), len(chunk), schemas, known, [])
+            elif not 0 < op < 0x10 and op < 0x80:
+                raise UnreadableLog(f"{self.name} is no readable ROS bag: it has a record of the kind {op}.")
+            file.seek(at)
+        self.unread += end - at
+
+    def _unpack(self, compression: str, data: bytes, size: int, left: list[int]) -> bytes:
+        """A chunk of so many bytes; ``left`` is what all chunks of the file may have, still."""
+        if not left:
+            raise UnreadableLog(f"{self.name} is no readable ROS bag: it has a chunk within a chunk.")
+        size = max(size, len(data)) if compression in ("", "none") else size
+        left[0] -= size
+        if size > MAX_CHUNK or left[0] < 0:
+            raise UnreadableLog(
+                f"{self.name} has a chunk that unpacks to {size:,} bytes; the most is {MAX_CHUNK:,}, and {MAX_RATIO} "
+                "times the file for all of them. Record it with smaller chunks."
+            )
+        if compression in ("", "none"):
+            return data
+        if compression == "bz2":
+            unpacker: Any = bz2.BZ2Decompressor()
+        elif compression == "lz4":
+            from lz4.frame import LZ4FrameDecompressor as unpacker_class
+
+            unpacker = unpacker_class()
+        elif compression == "zstd":
+            unpacker = _zstd().ZstdDecompressor()
+        else:
+            raise UnreadableLog(f"{self.name} has a chunk of unknown compression, {shown(compression)}. Use zstd.")
+        try:
+            return unpacker.decompress(data, size)
+        except Exception as error:  # each raises an error of its own
+            raise UnreadableLog(f"{self.name} has a broken chunk: {error}. Record or copy it again.") from error
+
+    def _sqlite(self, path: Path) -> Iterator[Message]:
+        """The rows of the tables messages and topics, which must be plain: a view could go on for ever."""
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as base:
+            base.text_factory = lambda text: text.decode(errors="replace")
+            base.execute("PRAGMA trusted_schema=OFF")
+            tables = dict(base.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchmany(1000))
+            for table in {"messages", "topics"} | ({"message_definitions"} & tables.keys()):
+                columns = base.execute(f"SELECT hidden FROM pragma_table_xinfo('{table}')").fetchall()
+                if not str(tables.get(table)).upper().startswith("CREATE TABLE") or any(
+                    hidden for (hidden,) in columns
+                ):
+                    raise UnreadableLog(f"{self.name} is no ROS bag: it has no plain table of {table}.")
+            definitions: dict[Any, tuple[str, str]] = {}
+            if "message_definitions" in tables:
+                rows = base.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
+                definitions = {kind: (str(text), str(language)[-3:]) for kind, language, text in rows.fetchmany(10_000)}
+            rows = base.execute("SELECT id, name, type FROM topics WHERE serialization_format = 'cdr'")
+            known = {
+                number: Connection(str(topic), str(kind), *definitions.get(kind, ("", "msg")), True)
+                for number, topic, kind in rows.fetchmany(10_000)
+            }
+            for k, row in enumerate(base.execute("SELECT topic_id, timestamp, data FROM messages")):
+                number, time, raw = row
+                if number in known and isinstance(time, int) and isinstance(raw, bytes):
+                    yield known[number], time, raw
+                if k > MAX_MESSAGES:  # of which a broken tree may have more than the file has bytes
+                    raise UnreadableLog(f"{self.name} has more than {MAX_MESSAGES:,} messages; that is the most.")
+
+
+def _sized(file: BinaryIO) -> bytes:
+    (size,) = struct.unpack("<I", file.read(4))
+    return file.read(min(size, MAX_CHUNK))
+
+
+def _zstd() -> Any:
+    try:
+        from compression import zstd  # of Python 3.14
+    except ModuleNotFoundError:
+        from backports import zstd
+    return zstd

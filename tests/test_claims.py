@@ -20,7 +20,8 @@ import results
 import running
 import shipped
 from claims import Claim, try_claim
-from evidence import Part, Results, bootstrap, gap, mean, probability, roughness
+from comparison import interval, is_level
+from evidence import Part, Results, Starts, bootstrap, gap, judged, mean, probability, roughness, shares
 
 from torchrl_quad.files import read_rows, write_rows
 
@@ -45,6 +46,31 @@ def test_the_statistics_are_those_worked_by_hand():
     assert roughness(np.array([0.0, 2.0, 1.0, 4.0, 3.0])) == pytest.approx(2 / 4)
     least, most = bootstrap("mean", mean, np.random.default_rng(1).normal(3.0, 1.0, 100)).interval()
     assert least == pytest.approx(2.8, abs=0.15) and most == pytest.approx(3.2, abs=0.15)
+
+
+def test_an_interval_draws_starts_too_and_what_they_shift_alike_is_no_difference_between_methods(tmp_path):
+    off = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    flown = {"abpt": 50.0 + off, "shac": 60.0 + off, "bptt": 55.0 + off[::-1]}
+    about = {"task": "landing", "seed": 0, "starts": 256}
+    rows = [{**about, "algorithm": name, "return": x} for name, of in flown.items() for x in of]
+    write_rows(tmp_path / "starts.csv", rows)
+    seeds, wide = np.full(5, 10.0), math.sqrt(5 / 4) * off[[0, -1]]  # five sets underestimate how far sets differ
+
+    def from_starts(values, method, **options):
+        return judged(values, Starts(tmp_path).shift("landing", method, "return", **options))
+
+    assert interval(seeds) == (10.0, 10.0)
+    assert interval(from_starts(seeds, "abpt")) == pytest.approx(tuple(10.0 + wide))
+    assert interval(from_starts(seeds, "abpt", starts=64)) == pytest.approx(tuple(10.0 + 2.0 * wide))
+    assert interval(from_starts(seeds, "ppo")) == pytest.approx(
+        tuple(10.0 + wide)
+    )  # not flown: as any of those that were
+    best = from_starts(seeds + 0.5, "shac")
+    assert not is_level(from_starts(seeds, "abpt"), best) and is_level(from_starts(seeds, "bptt"), best)
+    assert Starts(tmp_path).shift("racing", "abpt", "return") is None
+    assert Starts(tmp_path).shift("landing", "abpt", "gates_passed") is None
+    low, high = bootstrap("", mean, judged(np.full(5, 0.5), shares(np.full(5, 0.5), 64))).interval()
+    assert high - 0.5 == pytest.approx(1.96 * 0.5 / 8, rel=0.1) and 0.5 - low == pytest.approx(high - 0.5, rel=0.1)
 
 
 def part(least, most, **bounds):

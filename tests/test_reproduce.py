@@ -29,6 +29,7 @@ import running
 import shipped
 import starts
 import tables
+from evidence import Starts
 from matrix import Job
 
 from torchrl_quad.files import read_rows, write_rows
@@ -310,7 +311,7 @@ def test_a_policy_is_flown_from_every_set_of_starts_once(run_here, monkeypatch, 
     run_main(monkeypatch, starts, *wanted, "--quick")
 
 
-def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom():
+def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom(tmp_path):
     assert comparison.interquartile_mean([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 100.0]) == 3.5
     ours, theirs = [3.0, 1.0, 2.0], [2.0, 0.0, 2.0, 1.0]
     expected = mannwhitneyu(ours, theirs).statistic / 12
@@ -331,10 +332,12 @@ def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom():
         for method, seeds in flown.items()
         for x in seeds
     ]
-    made = [comparison.choice_table, comparison.reached_table, comparison.improvement_table, comparison.speed_table]
-    choice, table, beaten, speed = (make(rows, shipped.METHODS, shipped.TASKS) for make in made)
+    of = shipped.METHODS, shipped.TASKS
+    none = Starts(tmp_path)
+    choice, table = (make(rows, *of, none) for make in (comparison.choice_table, comparison.reached_table))
+    beaten, speed = (make(rows, *of) for make in (comparison.improvement_table, comparison.speed_table))
     assert "| hovering | SHAC: 9.1, 99.0%, 5 s, 3 seeds | PPO: 9.6, 100.0%, 40 s, 3 seeds |  |" in choice
-    level = comparison.choice_table([x for x in rows if x["algorithm"] != "ppo"], shipped.METHODS, shipped.TASKS)
+    level = comparison.choice_table([x for x in rows if x["algorithm"] != "ppo"], *of, none)
     assert "| BPTT: 9.1, 98.0%, 3 s, 3 seeds | SHAC |" in level
     assert '| hovering | "a box" | 333 | 200 | 1000 |  |  |  | 25 |' in speed
     assert "| hovering | ABPT | 2 | 99 | 75.0% (50.0%) |  | 1.0 | 1 |" in table

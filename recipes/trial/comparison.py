@@ -2,7 +2,8 @@
 
 shipped.py calls this after its flights. It flies nothing by itself. The conventions are those of Agarwal et al. 2021,
 "Deep reinforcement learning at the edge of the statistical precipice": interquartile means, percentile intervals of the
-bootstrap over seeds, and the probability that one method improves on another.
+bootstrap, and the probability that one method improves on another. The bootstrap draws seeds and a set of starts
+(evidence.py), but for the curves and for tasks that starts.py has not flown, where it draws seeds alone.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from evidence import bootstrap, probability
+from evidence import Starts, bootstrap, judged, probability
 from numpy.typing import ArrayLike, NDArray
 from results import COLORS
 from scipy.stats import trim_mean
@@ -36,13 +37,24 @@ def interquartile_mean(values: ArrayLike) -> NDArray[np.float64]:
 
 
 def interval(values: Sequence[float]) -> tuple[float, float]:
-    """The 95 % interval of the interquartile mean, by the bootstrap over seeds."""
-    return bootstrap("", interquartile_mean, np.asarray(values)).interval()
+    """The 95 % interval of the interquartile mean, by the bootstrap over seeds and, of what is ``judged``, starts."""
+    return bootstrap("", interquartile_mean, np.asanyarray(values)).interval()
+
+
+def is_level(one: np.ndarray, best: np.ndarray) -> bool:
+    """Whether the 95 % interval of the difference of two interquartile means, from the same starts, reaches zero."""
+    gap = bootstrap("", lambda a, b: interquartile_mean(a) - interquartile_mean(b), one, best)
+    return not gap.interval()[1] < 0.0
 
 
 def column(rows: Sequence[Row], name: str) -> list[float]:
     """Read a column, as numbers; what was not measured is left out."""
     return [float(row[name]) for row in rows if row.get(name)]
+
+
+def returns_of(rows: Sequence[Row], starts: Starts) -> np.ndarray:
+    """The returns of a method's seeds on a task, with what another set of starts would change."""
+    return judged(np.array(column(rows, "return")), starts.shift(rows[0]["task"], rows[0]["algorithm"], "return"))
 
 
 def grouped(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
@@ -53,7 +65,7 @@ def grouped(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
     return groups
 
 
-def reached_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping[str, Shown]) -> str:
+def reached_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping[str, Shown], starts: Starts) -> str:
     """Show what every method reaches on every task, and what it takes."""
     groups, lines = grouped(rows), []
     for task, (name, factor, digits, unit) in shown.items():
@@ -61,7 +73,7 @@ def reached_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mappin
             own = groups.get((task, method))
             if not own:
                 continue
-            returns, solved, metric = (column(own, x) for x in ("return", "solved", name))
+            returns, solved, metric = returns_of(own, starts), *(column(own, x) for x in ("solved", name))
             mean = f"{interquartile_mean(returns):.4g}"
             if len(returns) >= ENOUGH:
                 mean += " ({:.4g} to {:.4g})".format(*interval(returns))
@@ -73,11 +85,11 @@ def reached_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mappin
     return table(head, lines)
 
 
-def choice_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping[str, Shown]) -> str:
+def choice_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping[str, Shown], starts: Starts) -> str:
     """Show for each task the quickest method that works with every seed, and the one of the highest return.
 
-    They are chosen among the methods that have flown with the most seeds. Those whose interval reaches that of the
-    highest return are level with it.
+    They are chosen among the methods that have flown with the most seeds. Those that :func:`is_level` finds are level
+    with the highest return.
     """
     groups, lines = grouped(rows), []
     for task in shown:
@@ -93,8 +105,8 @@ def choice_table(rows: Sequence[Row], methods: Mapping[str, str], shown: Mapping
         most = max(tried, key=returns.get)
         few = {x: f", {len(own)} seed{'s' * (len(own) > 1)}" if len(own) < WANTED else "" for x, own in flown.items()}
         said = {x: f"{methods[x]}: {returns[x]:.4g}, {worst[x]:.1%}, {seconds_of[x]:.0f} s{few[x]}" for x in flown}
-        ranges = {x: interval(column(flown[x], "return")) for x in tried if seeds >= ENOUGH}
-        level = [methods[x] for x in ranges if x != most and ranges[x][1] >= ranges[most][0]]
+        reached = {x: returns_of(flown[x], starts) for x in tried if seeds >= ENOUGH}
+        level = [methods[x] for x in reached if x != most and is_level(reached[x], reached[most])]
         cells = [said.get(x, "none") for x in (quick, most)]
         lines.append([LABELS.get(task, task), *cells, ", ".join(level)])
     return table(["task", "quickest that works with every seed", "highest return", "level with it"], lines)

@@ -30,6 +30,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from comparison import column, reached_table
+from evidence import Starts
 from omegaconf import DictConfig
 from results import fill
 from running import DATA, composed, page  # whose import makes the recipes' code known
@@ -309,7 +310,7 @@ def blocks(data: Path) -> dict[str, str]:
                 )
         made[environment] = table(["loss", "before", "after", "each seed", "seconds"], lines)
     shown = dict.fromkeys(("six_gates", "six_gates_back"), TASKS["racing"])
-    return made | {"tracks": reached_table(tracks, METHODS, shown)}
+    return made | {"tracks": reached_table(tracks, METHODS, shown, Starts(data))}
 
 
 def main() -> None:

@@ -6,7 +6,10 @@ Three statistics carry most claims:
 - gap(a, b): (mean a - mean b) / max(|mean a|, |mean b|); compared with a share.
 - the end of a curve: the mean of its last tenth of evaluations. A run that diverged ends where it began.
 
-Each is a ``Part`` with a bootstrap over seeds.
+Each is a ``Part`` with a bootstrap over seeds and over sets of starts. All runs are judged from the same starts, so
+seeds alone cannot tell what other starts would give. starts.py has flown policies from many sets. A draw of the
+bootstrap takes one set for all methods, and shifts each by as much as its policy returned more from that set than from
+all of them. What two methods have in common of this leaves their difference alone.
 """
 
 from __future__ import annotations
@@ -22,7 +25,54 @@ from matrix import SEEDS, TASKS
 from torchrl_quad.files import read_rows
 
 RESAMPLES = 4_000
+STARTS = {"hovering": 64, "tracking": 64, "landing": 64, "racing": 128}  # of an evaluation along a curve
+PPO_STARTS = 256  # of PPO's, which trains more drones
+Shift = Callable[[np.random.Generator, np.ndarray], np.ndarray]  # from drawn sets (n) to what they add to a mean (n)
 LEVEL = {"hovering": 0.98, "tracking": 0.98, "landing": 0.9, "racing": 0.9}
+
+
+class Judged(np.ndarray):
+    """What the seeds of a method reach from one set of starts, and how far another set would shift their mean."""
+
+    shift: Shift | None = None
+
+
+def judged(values: np.ndarray, shift: Shift | None) -> np.ndarray:
+    """Note on values over seeds how far another set of starts would shift them."""
+    values = np.asarray(values, dtype=float).view(Judged)
+    values.shift = shift
+    return values
+
+
+class Starts:
+    """How far the mean of a method depends on the set of starts from which it is judged: the rows of starts.csv."""
+
+    def __init__(self, data: Path) -> None:
+        self.rows = read_rows(data / "starts.csv")
+
+    def shift(self, task: str, algorithm: str, name: str, starts: int = 256) -> Shift | None:
+        """How far each set of so many starts shifts a column: that of a policy of the method, drawn from those flown.
+
+        Where none of the method was flown it is that of any other; None where nobody has flown the task from several
+        sets, or the column was not measured.
+        """
+        rows = [row for row in self.rows if row["task"] == task and row.get(name)]
+        rows = [row for row in rows if row["algorithm"] == algorithm] or rows
+        runs: dict[tuple[str, str], list[float]] = {}
+        for row in rows:
+            runs.setdefault((row["algorithm"], row["seed"]), []).append(float(row[name]))
+        if not runs:
+            return None
+        off = np.array([np.array(x) - np.mean(x) for x in runs.values()])  # (policies, sets)
+        policies, count = off.shape
+        off *= math.sqrt(count / (count - 1) * int(rows[0]["starts"]) / starts)
+        return lambda rng, sets: off[rng.integers(policies, size=len(sets)), sets % count]
+
+
+def shares(values: np.ndarray, starts: int) -> Shift:
+    """How far another set of starts shifts a share of solved episodes: as much as independent episodes would."""
+    share = np.clip(np.mean(values), 0.0, 1.0)
+    return lambda rng, sets: math.sqrt(share * (1.0 - share) / starts) * rng.standard_normal(len(sets))
 
 
 class NotRunError(Exception):
@@ -69,6 +119,7 @@ class Results:
                 self.curves.setdefault((task, row["variant"]), {}).setdefault(int(row["seed"]), []).append(row)
         self.all_finals = read_rows(data / "final.csv")
         self.finals = [row for row in self.all_finals if not row["lr"]]
+        self.starts = Starts(data)
         self.used: set[tuple[str, str]] = set()  # by the claim on trial
 
     def column(self, task: str, variant: str, name: str) -> list[np.ndarray]:
@@ -84,7 +135,15 @@ class Results:
         """Read the ends of the curves (seeds)."""
         curves = self.column(task, variant, name)
         began = min((x[0] for x in curves if np.isfinite(x[0])), default=math.nan)
-        return np.array([x[-max(len(x) // 10, 1) :].mean() if np.isfinite(x[-1]) else began for x in curves])
+        ends = np.array([x[-max(len(x) // 10, 1) :].mean() if np.isfinite(x[-1]) else began for x in curves])
+        method, starts = variant.split("-")[0], PPO_STARTS if variant.startswith("ppo") else STARTS[task]
+        if name == "solved":
+            return judged(ends, shares(ends, starts))
+        reward = "_position" if task == "racing" and not variant.endswith("-velocity") else ""
+        shift = self.starts.shift(task + reward, method, name, starts)
+        if shift is not None and method == "ppo":  # more drones, and so a set of its own
+            return judged(ends, lambda rng, sets: shift(rng, rng.permutation(sets)))
+        return judged(ends, shift)
 
     def final(self, task: str, variant: str, name: str) -> np.ndarray:
         """Read what the best policies reached in the final evaluation, for the seeds that have one."""
@@ -126,12 +185,18 @@ def bootstrap(
 ) -> Part:
     """Compute a statistic of samples over seeds, and its bootstrap, which draws each sample by itself.
 
-    The statistic takes samples (*, seeds) and gives numbers (*).
+    The statistic takes samples (*, seeds) and gives numbers (*). A draw takes one set of starts for all
+    samples that are ``judged``.
     """
     rng = np.random.default_rng(0)
+    drawn = [rng.choice(np.asarray(x), (RESAMPLES, len(x))) for x in samples]
+    sets = rng.integers(0, 2**32, RESAMPLES)
+    for x, values in zip(samples, drawn, strict=True):
+        if getattr(x, "shift", None) is not None:
+            values += x.shift(rng, sets)[:, None]
     with np.errstate(all="ignore"):
-        draws = statistic(*(rng.choice(x, (RESAMPLES, len(x))) for x in samples))
-        return Part(what, float(statistic(*samples)), np.sort(draws), low, high)
+        draws = statistic(*drawn)
+        return Part(what, float(statistic(*map(np.asarray, samples))), np.sort(draws), low, high)
 
 
 def mean(x: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from comparison import LABELS, WANTED, choice_table, draw, improvement_table, reached_table, speed_table
+from evidence import Starts
 from matrix import EVALUATIONS
 from reproduce import CURVE, OWN, known_task
 from results import fill
@@ -118,8 +119,9 @@ def blocks(data: Path) -> dict[str, str]:
         own = [[x for x in runs if (x["task"], x["algorithm"]) == (task, method)] for task in shown]
         if any(own):
             lines.append([label, *(cell(group, *how) for group, how in zip(own, shown.values(), strict=True))])
-    compared = {"choice": choice_table, "reached": reached_table, "improvement": improvement_table}
-    made = {name: make(runs, METHODS, shown) for name, make in compared.items()}
+    made = {"improvement": improvement_table(runs, METHODS, shown)}
+    compared = {"choice": choice_table, "reached": reached_table}
+    made |= {name: make(runs, METHODS, shown, Starts(data)) for name, make in compared.items()}
     made["speed"] = speed_table([*runs, *read_rows(data / "rates.csv")], METHODS, shown)
     return {"summary": table(["", *(LABELS.get(task, task) for task in shown)], lines)} | made
 

@@ -45,6 +45,7 @@ Size = Annotated[int, Field(ge=1, le=10_000_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Below1 = Annotated[float, Field(allow_inf_nan=False, ge=0, lt=1)]
 Scale = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e6)]
+Coefficient = Annotated[float, Field(allow_inf_nan=False, ge=0, le=1e6)]
 Horizon = Annotated[int, Field(ge=1, le=100_000)]
 Width = Annotated[int, Field(ge=1, le=65_536)]
 Copies = Annotated[int, Field(ge=1, le=64)]
@@ -237,7 +238,7 @@ def shown(value: Any) -> str:
 def _checked(name: str, value: Any, adapter: TypeAdapter[Any], description: str) -> Any:
     plain = _without_numpy(value)
     try:
-        adapter.validate_python(plain)
+        valid = adapter.validate_python(plain)
     except ValidationError as refused:
         first, *others = refused.errors()
         if isinstance(error := first.get("ctx", {}).get("error"), Explained):
@@ -246,7 +247,8 @@ def _checked(name: str, value: Any, adapter: TypeAdapter[Any], description: str)
         choices = [must(error) for error in (first, *others) if error["input"] is first["input"]]
         said = f"{name}{place} must {' or '.join(dict.fromkeys(choices))}, got {shown(first['input'])}."
         raise UserValueError(" ".join(filter(None, (said, description)))) from None
-    return plain
+    # What is a number to Python alone, such as a tensor of one element or a Decimal, computes with no other number.
+    return valid if type(valid) is float and not isinstance(plain, int | float) else plain
 
 
 def _without_numpy(value: Any) -> Any:

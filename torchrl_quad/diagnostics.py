@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -17,9 +18,10 @@ from torchrl_quad.data import differentiable_rollout
 from torchrl_quad.data.unwrap import require_env
 from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
 from torchrl_quad.objectives.action_gradients import sources_of_steps
+from torchrl_quad.objectives.calls import require_tensordict
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.objectives.segments import discounts
-from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, checked, require
+from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, checked, require, shown
 
 Inputs = nn.Module | Tensor | Iterable[Tensor]
 
@@ -107,7 +109,7 @@ def audit_reward(
         TypeError: the rollout is no tensordict, or the inputs are no tensors.
         RuntimeError: the rollout has lost its graph.
     """
-    _require_rollout("audit_reward", rollout)
+    require_tensordict("audit_reward", rollout)
     for key in (terms_key, reward_key, done_key):
         if key not in rollout:
             raise UserValueError(
@@ -115,6 +117,11 @@ def audit_reward(
                 "episodes as the rollout does: terms_key, reward_key, done_key."
             )
     reward, entry = rollout.get(reward_key), rollout.get(terms_key)
+    done = rollout.get(done_key)
+    if not (isinstance(reward, Tensor) and reward.numel() and reward.is_floating_point() and reward.ndim > 1):
+        raise UserValueError(f"{reward_key!r} must be floating-point numbers (*, horizon, 1) of at least one step.")
+    if not (isinstance(done, Tensor) and done.dtype == torch.bool and done.shape == reward.shape):
+        raise UserValueError(f"{done_key!r} must be the ends of episodes, bool {tuple(reward.shape)}.")
     if isinstance(entry, Tensor):
         terms = {terms_key if isinstance(terms_key, str) else terms_key[-1]: entry}
     else:
@@ -131,7 +138,7 @@ def audit_reward(
             f"{reward_key!r} does not depend on the inputs. Give the actor that flew this rollout, or tensors "
             "from which its actions were computed."
         )
-    discount = discounts(rollout.get(done_key), torch.as_tensor(gamma, dtype=reward.dtype, device=reward.device))
+    discount = discounts(done, torch.as_tensor(gamma, dtype=reward.dtype, device=reward.device))
     returns = {name: (discount * term).sum((-2, -1)) for name, term in terms.items()}
     sizes = {name: x.detach().abs().mean().item() for name, x in returns.items()}
     norms = {name: _gradient(x.mean(), sources).norm().item() for name, x in returns.items()}
@@ -252,22 +259,16 @@ def gradient_by_horizon(
         TypeError: ``env`` is no environment, the policy not a TensorDictModule, or the loss no pathwise one.
         RuntimeError: the rollout has lost its graph.
     """
-    if not isinstance(horizons, Iterable):
-        raise UserTypeError(f"horizons must be numbers of control steps, such as (8, 32); got {horizons!r}.")
-    horizons = [require("horizons", horizon, Horizon, "They are numbers of control steps.") for horizon in horizons]
+    horizons = _listed(horizons, "horizons must be numbers of control steps, such as (8, 32)")
+    horizons = {
+        require("horizons", horizon, Horizon, "They are numbers of control steps."): None for horizon in horizons
+    }
     require_env(env)
     start = env.reset() if start is None else start
     return {
         horizon: gradient_statistics(loss, differentiable_rollout(env, actor, start, horizon)[0], max_envs=max_envs)
         for horizon in horizons
     }
-
-
-def _require_rollout(name: str, rollout: TensorDictBase) -> None:
-    if not isinstance(rollout, TensorDictBase):
-        raise UserTypeError(
-            f"{name} needs a rollout, the tensordict that differentiable_rollout returns; got {type(rollout).__name__}."
-        )
 
 
 def _require_loss(loss: PathwiseLoss) -> None:
@@ -277,15 +278,22 @@ def _require_loss(loss: PathwiseLoss) -> None:
         )
 
 
+def _listed(values: Iterable[Any], must: str) -> list[Any]:
+    try:
+        return list(values)
+    except (TypeError, RuntimeError):  # numpy, torch and tensordict raise either
+        raise UserTypeError(f"{must}; got {shown(values)}.") from None
+
+
 def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
     """The tensors to differentiate with respect to; of a loss or an actor, the actor's parameters."""
     if isinstance(inputs, nn.Module):
         inputs = [p for p in getattr(inputs, "actor_network_params", inputs).parameters() if p.requires_grad]
     if isinstance(inputs, Tensor) and (steps := sources_of_steps(inputs)) is not None:
         return [steps] if isinstance(steps, Tensor) else steps
-    if not isinstance(inputs, Iterable):
-        raise UserTypeError(f"inputs must be the actor, its loss, or tensors; got {type(inputs).__name__}.")
-    sources = [inputs] if isinstance(inputs, Tensor) else list(inputs)
+    sources = (
+        [inputs] if isinstance(inputs, Tensor) else _listed(inputs, "inputs must be the actor, its loss, or tensors")
+    )
     if not sources or not all(isinstance(x, Tensor) and x.requires_grad for x in sources):
         raise UserValueError(
             "There is nothing to differentiate with respect to: give the actor or its loss with parameters that "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any
 
@@ -61,7 +62,7 @@ class DifferentiableCollector(BaseCollector):
         exploration_type: ExplorationType = ExplorationType.RANDOM,
     ) -> None:
         super().__init__()
-        self.env: EnvBase = env if isinstance(env, EnvBase) or not callable(env) else env()
+        self.env: EnvBase = env if isinstance(env, EnvBase) or not _needs_nothing(env) else env()
         require_env(self.env)
         require_actor(policy, "policy")
         require_exploration(exploration_type)
@@ -144,3 +145,12 @@ class DifferentiableCollector(BaseCollector):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(env={self.env}, horizon={self.horizon}, total_frames={self.total_frames})"
+
+
+def _needs_nothing(function: Any) -> bool:
+    """Whether something can be called without arguments."""
+    try:
+        inspect.signature(function).bind()
+    except (TypeError, ValueError):
+        return False
+    return True

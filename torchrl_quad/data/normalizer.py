@@ -87,7 +87,7 @@ class ObservationNormalizer(ObservationNorm):
             raise UserTypeError(
                 f"The normalizer reads {entry!r} of a rollout, the tensordict that differentiable_rollout returns."
             )
-        written = rollout.get(entry).reshape(-1, self.loc.shape[-1])
+        written = rollout.get(entry).reshape(-1, self.loc.shape[-1]).to(self.loc)
         seen = self.undo(written[written.isfinite().all(-1)])
         if len(seen) == 0:
             return

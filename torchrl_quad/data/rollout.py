@@ -60,6 +60,7 @@ def differentiable_rollout(
     try:
         require_whole_state(env)
         carry = env.reset() if carry is None else carry.copy()
+        _require_start(env, actor, carry)
         if carry.numel() * horizon > 1_000_000:
             _require_memory(carry, horizon)
         with set_exploration_type(exploration_type):
@@ -101,6 +102,23 @@ def differentiable_rollout(
         carry.set(key, torch.where(expand_as_right(done.squeeze(-1), memory), 0.0, memory))
         carry.set("is_init", done.clone())
     return rollout, carry
+
+
+def _require_start(env: EnvBase, actor: TensorDictModuleBase, carry: TensorDictBase) -> None:
+    """Refuse a tensordict of another batch size, device or precision than those of the environment."""
+    if env.batch_locked and carry.batch_size != env.batch_size:
+        raise UserValueError(
+            f"carry has batch size {tuple(carry.batch_size)}, and the environment {tuple(env.batch_size)}. Start from "
+            "the tensordict of its own reset(), or of its last rollout."
+        )
+    for key in actor.in_keys:
+        x, spec = carry.get(key, None), env.observation_spec.get(key, None)
+        if x is None or spec is None or (x.dtype == spec.dtype and (env.device is None or x.device == env.device)):
+            continue
+        raise UserValueError(
+            f"{key!r} of the carry is {x.dtype} on {x.device}, and that of the environment {spec.dtype} on "
+            f"{env.device}. Start from the tensordict of its own reset(), or of its last rollout."
+        )
 
 
 def _require_memory(carry: TensorDictBase, horizon: int) -> None:

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl_quad.data.rollout import require_actor
 from torchrl_quad.data.unwrap import base_env, memory_keys, require_env
 from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
-from torchrl_quad.options import Entries, Fraction, Seed, Size, checked
+from torchrl_quad.options import Device, Entries, Fraction, Seed, Size, checked
 
 Kinds = dict[NestedKey, tuple[torch.Size, torch.dtype]]  # of the entries of one state
 
@@ -53,18 +53,14 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         *,
         state_keys: Entries | None = None,
         actor: TensorDictModuleBase | None = None,
-        device: torch.device | str = "cpu",
+        device: Device = "cpu",
         seed: Seed = 0,
     ) -> None:
         if env is not None:
             require_env(env)
         if actor is not None:
             require_actor(actor, "actor")
-        try:
-            generator = torch.Generator(device=device).manual_seed(seed)
-        except (RuntimeError, TypeError) as error:
-            said = str(error).splitlines()[0]
-            raise UserValueError(f"device must be one that torch has here, such as cpu; it says: {said}") from None
+        generator = torch.Generator(device=device).manual_seed(seed)
         # Of each part of a state, as far as it is known.
         self.kinds: dict[NestedKey, Kinds] = {} if env is None else _kinds_of(env)
         if state_keys is None:
@@ -97,12 +93,14 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
                 "buffer the environment, VisitedStateBuffer(env=env), or the entries of its Markov state, state_keys."
             )
         states = tensordicts.select(*self.state_keys, *self.memory_keys).detach().reshape(-1)
+        if len(states) == 0:
+            return torch.zeros(0, dtype=torch.int64)
         keep = torch.ones(states.shape[0], dtype=torch.bool, device=states.device)
         for value in states.values(include_nested=True, leaves_only=True):
             keep &= value.reshape(states.shape[0], -1).isfinite().all(-1)
         terminated = tensordicts.get("terminated", None)
         if terminated is not None:
-            keep &= ~terminated.reshape(-1)
+            keep &= ~terminated.reshape(-1).bool()
         if not keep.any():
             return torch.zeros(0, dtype=torch.int64)
         self._require_same(states)

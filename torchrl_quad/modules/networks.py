@@ -188,7 +188,8 @@ def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[B
     except (TypeError, ValueError, RuntimeError, OverflowError):  # of what is no tensor, and cannot become one
         fits = False
     if not fits:
-        given = action_init.tolist() if isinstance(action_init, Tensor) else action_init
+        is_tensor = isinstance(action_init, Tensor) and not action_init.is_meta
+        given = action_init.tolist() if is_tensor else action_init
         raise UserValueError(
             f"action_init must be {spec.shape[-1]} numbers strictly between {low.tolist()} and {high.tolist()}, got "
             f"{shown(given)}."

@@ -14,6 +14,7 @@ from torch.func import vjp
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead, tanh_gaussian
 
 
@@ -33,6 +34,7 @@ class Network(nn.Module):
     def forward(self, *inputs: Tensor) -> Any:
         """The head's output for inputs (*, k_i); the head receives (*, out_features), and the further inputs."""
         own = len(self.scales)
+        _require_widths(inputs[:own], self.widths)
         return self.head(self.mlp(_concatenated(inputs[:own], self.scales)), *inputs[own:])
 
 
@@ -59,6 +61,7 @@ class Critic(ValueOperator):
             return None
 
         def predict(params: Mapping[str, Tensor], inputs: Sequence[Tensor]) -> Tensor:
+            _require_widths(inputs, network.widths)
             x = _concatenated(inputs, network.scales)
             for name, layer in layers.items():
                 own = params.get(f"{name}.weight"), params.get(f"{name}.bias")
@@ -290,6 +293,15 @@ def bounds_of(actor: ProbabilisticActor) -> tuple[Tensor | None, Tensor | None]:
 def _first_noise(x: Tensor, is_random: bool | None) -> Tensor:
     """Standard normal numbers into zeros (*, k), or the zeros where nothing is random."""
     return x.normal_() if is_random else x
+
+
+def _require_widths(inputs: Sequence[Tensor], widths: Sequence[int]) -> None:
+    found = tuple(x.shape[-1] for x in inputs)
+    if found != tuple(widths):
+        raise UserValueError(
+            f"This network was built for entries of {', '.join(map(str, widths))} numbers, and reads some of "
+            f"{', '.join(map(str, found))}: those of another environment, or of other options. Build one for this."
+        )
 
 
 def _concatenated(inputs: Sequence[Tensor], scales: Sequence[float]) -> Tensor:

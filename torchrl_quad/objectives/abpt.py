@@ -148,6 +148,14 @@ class ABPTLoss(PathwiseCriticLoss):
         is_first = index < self.simulated_steps
         return is_first, is_first & (end | (index == self.simulated_steps - 1))
 
+    def _require_rollout(self, tensordict: TensorDictBase) -> None:
+        actor, key = self.actor_network, self.tensor_keys.action
+        if key not in actor.out_keys:
+            raise UserValueError(
+                f"ABPTLoss samples {key!r} of its actor_network, which writes {', '.join(map(str, actor.out_keys))}."
+            )
+        super()._require_rollout(tensordict)
+
     def _beside_actions(self, tensordict: TensorDictBase) -> Tensor | float:
         fixed, parts = tensordict.detach(), []
         if self.n_step_return:

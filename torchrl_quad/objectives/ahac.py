@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.action_gradients import median_length
+from torchrl_quad.objectives.calls import refuse_fixed
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Copies, Field, Horizon
 
@@ -77,6 +78,7 @@ class AHACLoss(SHACLoss):
         high = 2 * horizon if max_horizon is None else max_horizon
         if not low <= horizon <= high:
             raise UserValueError(f"horizon={horizon} must lie between min_horizon={low} and max_horizon={high}.")
+        refuse_fixed(self, kwargs, ("target_bootstrap", "delay_value"))
         super().__init__(
             actor_network,
             value_network,

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from tensordict import TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, stack
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad.errors import UserTypeError
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 
 def sample_action(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> TensorDictBase:
@@ -29,6 +31,7 @@ def sample_action(actor: TensorDictModule, params: TensorDictParams, tensordict:
         plain = actor.plain() if hasattr(actor, "plain") else None
         if plain is None:
             return actor(tensordict)
+        _require_precision(actor, plain.in_keys, [tensordict[key] for key in plain.in_keys], params)
         written = act(plain, tensordict, plain.drawn(1, tensordict.numel(), {})[0])
     return tensordict.update(written)
 
@@ -58,6 +61,7 @@ def predict(
                 predictions.append(critic(inputs.copy()).get(key))
         return stack(predictions)
     inputs = [tensordict[name] for name in critic.in_keys]
+    _require_precision(critic, critic.in_keys, inputs, params)
     weights = {".".join(name): x for name, x in params.items(True, True)}
     if learning:
         inputs = [x.detach() for x in inputs]
@@ -65,6 +69,55 @@ def predict(
         weights = {name: x.detach() for name, x in weights.items()}
     copies = zip(*(x.unbind(0) for x in weights.values()), strict=True) if params.batch_dims else [weights.values()]
     return stack([plain(dict(zip(weights, own, strict=True)), inputs) for own in copies])
+
+
+def _require_precision(
+    network: TensorDictModule, keys: Sequence[NestedKey], inputs: Sequence[Tensor], params: TensorDictParams
+) -> None:
+    """Refuse what a network reads in another precision than its own."""
+    own = next(x.dtype for x in params.values(True, True) if x.is_floating_point())
+    for key, x in zip(keys, inputs, strict=True):
+        if x.is_floating_point() and x.dtype != own:
+            raise UserValueError(
+                f"{type(network).__name__} computes in {own}, and {key!r} is {x.dtype}. Build both with the same "
+                "dtype, or convert the rollout."
+            )
+
+
+def takes_rollout(forward: Callable[..., Any]) -> Callable[..., Any]:
+    """As tensordict's ``dispatch``, for a method of a rollout or of its entries, and refuse anything else."""
+    dispatched = dispatch(forward)
+
+    @functools.wraps(dispatched)
+    def method(self: Any, *args: Any, **kwargs: Any) -> Any:
+        for x in (*args, *kwargs.values()):
+            if not isinstance(x, TensorDictBase | Tensor):
+                require_tensordict(type(self).__name__, x)
+        return dispatched(self, *args, **kwargs)
+
+    return method
+
+
+def require_tensordict(name: str, rollout: Any) -> None:
+    """Refuse what is no tensordict.
+
+    Raises:
+        TypeError: it is none.
+    """
+    if not isinstance(rollout, TensorDictBase):
+        raise UserTypeError(
+            f"{name} needs a rollout, the tensordict that differentiable_rollout returns; got {type(rollout).__name__}."
+        )
+
+
+def refuse_fixed(loss: Any, given: Sequence[str], fixed: Sequence[str]) -> None:
+    """Refuse options of its base that a loss sets itself.
+
+    Raises:
+        TypeError: one of them is given.
+    """
+    for name in sorted(set(given) & set(fixed)):
+        raise UserTypeError(f"{type(loss).__name__} sets {name} itself: leave it out, or take SHACLoss.")
 
 
 def require_function(name: str, value: Any) -> None:

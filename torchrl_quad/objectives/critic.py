@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.objectives.calls import predict
+from torchrl_quad.objectives.calls import predict, require_tensordict, takes_rollout
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.objectives.segments import segments
 
@@ -40,7 +39,7 @@ class PathwiseCriticLoss(PathwiseLoss):
     value_part = "terminal_value"
     target_bootstrap = False  # whether the terminal value comes from the target network
 
-    @dispatch
+    @takes_rollout
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The losses of actor and critic and their metadata, the ``out_keys``, of a rollout that carries its graph."""
         loss_actor, metadata = self.loss_actor(tensordict)
@@ -103,7 +102,11 @@ class PathwiseCriticLoss(PathwiseLoss):
         return self._critics(tensordict, target=target).amin(0)
 
     def _critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        require_tensordict(type(self).__name__, tensordict)
         key = self.tensor_keys.value_target
+        missing = [name for name in getattr(self, self.critic_name).in_keys if name not in tensordict]
+        if missing:
+            raise UserValueError(f"{self.critic_name} reads {missing[0]!r}, which these samples lack.")
         target = tensordict.get(key, None)
         if target is None:
             target = self.write_value_target(tensordict.copy()).get(key)

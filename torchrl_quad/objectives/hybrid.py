@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, dispatch
+from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
@@ -18,10 +18,10 @@ from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_quad.errors import UserValueError, WrongState
 from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again, location_gradient
-from torchrl_quad.objectives.calls import require_function
+from torchrl_quad.objectives.calls import require_function, require_tensordict, takes_rollout
 from torchrl_quad.objectives.segments import discounts, segments
 from torchrl_quad.objectives.shac import SHACLoss
-from torchrl_quad.options import Below1, Field, NonNegative, Positive, Share
+from torchrl_quad.options import Below1, Coefficient, Field, Positive, Share
 
 
 class HybridLoss(SHACLoss):
@@ -105,7 +105,7 @@ class HybridLoss(SHACLoss):
         *,
         gradient_lmbda: Share = 0.9,
         clip_epsilon: Annotated[float, Field(gt=0, lt=1)] = 0.2,
-        entropy_coeff: NonNegative = 0.0,
+        entropy_coeff: Coefficient = 0.0,
         clip_action_gradient: Positive | None = 2.0,
         decay: Below1 = 0.9,
         average: Callable[[Tensor], Tensor] | None = None,
@@ -125,7 +125,7 @@ class HybridLoss(SHACLoss):
         noise = set(self.actor_network.out_keys) & {"noise", "noise_before"}
         return {*super()._network_in_keys(), "loc", "scale", *noise}
 
-    @dispatch
+    @takes_rollout
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The losses and their metadata, the ``out_keys``.
 
@@ -182,6 +182,7 @@ class HybridLoss(SHACLoss):
         return self._reduce_loss(-objective), metadata
 
     def _with_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
+        require_tensordict(type(self).__name__, tensordict)
         keys = self.tensor_keys
         lost = [key for key in (keys.advantage, keys.location_gradient, keys.latent) if key not in tensordict]
         if lost and not {keys.location_gradient, keys.latent} <= set(lost):  # an advantage alone is somebody else's

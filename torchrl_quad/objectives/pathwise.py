@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, composite_lp_aggregate, dispatch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, composite_lp_aggregate
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -17,8 +17,9 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, WrongState
 from torchrl_quad.objectives.action_gradients import MedianClip, act_again, action_gradient
+from torchrl_quad.objectives.calls import require_tensordict, takes_rollout
 from torchrl_quad.objectives.segments import discounts
-from torchrl_quad.options import Entry, Fraction, NonNegative, Positive, Real, checked, require, shown
+from torchrl_quad.options import Coefficient, Device, Entry, Fraction, Positive, Scale, checked, real, require, shown
 
 MOST_WEIGHTS = 100_000_000  # of all copies of a critic; more fit into no memory that trains on a horizon
 
@@ -95,9 +96,9 @@ class PathwiseLoss(LossModule):
         self,
         actor_network: TensorDictModule,
         *,
-        alpha: NonNegative | Literal["auto"] = 0.0,
-        target_entropy: Real | Literal["auto"] = "auto",
-        alpha_init: Positive = 1e-2,
+        alpha: Coefficient | Literal["auto"] = 0.0,
+        target_entropy: real(-1e6, 1e6) | Literal["auto"] = "auto",
+        alpha_init: Scale = 1e-2,
         clip_action_gradient: Positive | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
@@ -175,7 +176,7 @@ class PathwiseLoss(LossModule):
         average_rewards: bool | None = None,
         differentiable: bool | None = None,
         vectorized: bool | None = None,
-        device: torch.device | str | None = None,
+        device: Device | None = None,
         **more: Any,
     ) -> PathwiseLoss:
         """Choose the return estimator and its parameters.
@@ -209,8 +210,8 @@ class PathwiseLoss(LossModule):
         if is_class or isinstance(value_type, ValueEstimatorBase):
             return super().make_value_estimator(value_type, **given, **more)
         supported = {x.name.lower(): x for x in self.supported_value_estimators}
-        chosen = value_type if isinstance(value_type, ValueEstimators) else supported.get(str(value_type).lower())
-        if chosen not in self.supported_value_estimators:
+        chosen = supported.get(value_type.lower()) if isinstance(value_type, str) else value_type
+        if not isinstance(chosen, ValueEstimators) or chosen not in self.supported_value_estimators:
             raise Unsupported(
                 f"{shown(value_type)} is not implemented for loss {type(self).__name__}. Choose from: "
                 f"{', '.join(supported)}."
@@ -251,7 +252,7 @@ class PathwiseLoss(LossModule):
         for name, key in keys.items():
             if name not in known:
                 raise UserValueError(f"{type(self).__name__} reads no {name!r}. Choose from: {', '.join(known)}.")
-            require(name, key, Entry | None)
+            keys[name] = require(name, key, Entry | None)
         super().set_keys(**keys)
 
     def _forward_value_estimator_keys(self, **_: Any) -> None:
@@ -265,7 +266,7 @@ class PathwiseLoss(LossModule):
 
     # -- the loss ------------------------------------------------------------------------------------------------------
 
-    @dispatch
+    @takes_rollout
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss and its metadata, the ``out_keys``, of a rollout that carries its graph."""
         loss, metadata = self.loss_actor(tensordict)
@@ -358,11 +359,7 @@ class PathwiseLoss(LossModule):
 
     def _require_rollout(self, tensordict: TensorDictBase) -> None:
         name = type(self).__name__
-        if not isinstance(tensordict, TensorDictBase):
-            raise UserTypeError(
-                f"{name} needs a rollout, the tensordict that differentiable_rollout returns; got "
-                f"{type(tensordict).__name__}."
-            )
+        require_tensordict(name, tensordict)
         shape = tuple(tensordict.batch_size)
         names = tensordict.names
         # Only the names of its dimensions distinguish a single flight from a batch of single steps.
@@ -383,9 +380,14 @@ class PathwiseLoss(LossModule):
                 f"{name} reads {missing[0]!r}, which is not in the rollout. If it has another name there, write "
                 f"loss.set_keys(...), which takes {', '.join(vars(self.tensor_keys))}."
             )
-        for key in (("next", getattr(self.tensor_keys, x)) for x in ("reward", "done", "terminated")):
-            if (got := tuple(tensordict.get(key).shape)) != (*shape, 1):
+        for what in ("reward", "done", "terminated"):
+            key = ("next", getattr(self.tensor_keys, what))
+            entry = tensordict.get(key)
+            if (got := tuple(entry.shape)) != (*shape, 1):
                 raise UserValueError(f"{name} needs {key!r} of shape {(*shape, 1)} in this rollout; got {got}.")
+            if not (entry.is_floating_point() if what == "reward" else entry.dtype == torch.bool):
+                kind = "floating-point numbers" if what == "reward" else "bool"
+                raise UserValueError(f"{name} needs {key!r} as {kind}; got {entry.dtype}.")
         device, own = tensordict.get(("next", self.tensor_keys.reward)).device, self._default_device
         if own not in (None, device):
             raise UserValueError(f"{name} is on {own}, and the rollout on {device}: loss.to({str(device)!r}) moves it.")

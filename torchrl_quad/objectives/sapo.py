@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
+from torchrl_quad.objectives.calls import refuse_fixed
 from torchrl_quad.objectives.shac import SHACLoss
-from torchrl_quad.options import Copies, Field, Positive
+from torchrl_quad.options import Copies, Scale, real
 
 
 class SAPOLoss(SHACLoss):
@@ -45,13 +46,14 @@ class SAPOLoss(SHACLoss):
         value_network: TensorDictModule,
         *,
         num_value_nets: Copies = 2,
-        alpha: Positive | Literal["auto"] = "auto",
-        alpha_init: Positive = 1.0,
-        target_entropy: Annotated[float, Field(ge=-1e30, le=-1e-3)] | Literal["auto"] = "auto",
+        alpha: Scale | Literal["auto"] = "auto",
+        alpha_init: Scale = 1.0,
+        target_entropy: real(-1e6, -1e-3) | Literal["auto"] = "auto",
         terminal_gradient: bool = True,
         average_over_horizon: bool = False,
         **kwargs: Any,
     ) -> None:
+        refuse_fixed(self, kwargs, ("target_bootstrap", "delay_value"))
         super().__init__(
             actor_network,
             value_network,

@@ -25,7 +25,7 @@ from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
 
 # An episode ends before an entry of the state exceeds this, where a task does not know better.
 _LIMIT = 1e6
-_NO_LIMIT = 2**31  # control steps: gymnasium.make has a time limit of its own
+_NO_LIMIT = 10_000_000  # control steps, as many as a task takes: gymnasium.make has a time limit of its own
 _INFO = "success", "crash", "reward_terms", "metrics"
 
 
@@ -227,7 +227,7 @@ class GymEnv(gymnasium.Env):
     To train, fly a batch, ``gymnasium.make_vec``: it makes hundreds of times as many steps per second.
 
     The time limit is gymnasium's: ``gymnasium.make`` adds that of the task, or its own ``max_episode_steps``. Built
-    without it, ``GymEnv("hovering")`` flies until ``max_episode_steps``, if given.
+    without it, ``GymEnv("hovering")`` flies until ``max_episode_steps``, by default ten million.
 
     Args:
         task: "forest", "hovering", "landing", "racing" or "tracking".

@@ -22,6 +22,7 @@ from gymnasium.vector.utils import batch_space
 
 from torchrl_quad.envs import make_env
 from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
+from torchrl_quad.options import shown
 
 # An episode ends before an entry of the state exceeds this, where a task does not know better.
 _LIMIT = 1e6
@@ -87,10 +88,10 @@ class GymVectorEnv(VectorEnv):
     ) -> None:
         modes = [mode.value for mode in AutoresetMode]
         if not isinstance(autoreset_mode, str | AutoresetMode) or autoreset_mode not in (*modes, *AutoresetMode):
-            raise UserValueError(f"Unknown autoreset_mode {autoreset_mode!r}. Choose from: {', '.join(modes)}.")
+            raise UserValueError(f"Unknown autoreset_mode {shown(autoreset_mode)}. Choose from: {', '.join(modes)}.")
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode == "rgb_array"):
             raise UserValueError(
-                f'Unknown render_mode {render_mode!r}. Choose "rgb_array", for pictures as arrays, or leave it out.'
+                f'Unknown render_mode {shown(render_mode)}. Choose "rgb_array", pictures as arrays, or leave it out.'
             )
         self.render_mode = render_mode
         if kwargs.get("max_episode_steps", 0) is None:  # as the task has it
@@ -98,7 +99,8 @@ class GymVectorEnv(VectorEnv):
         self.torchrl_env = make_env(task, num_envs=num_envs, **kwargs)
         if "seed" not in kwargs:
             self.torchrl_env.set_seed(None)
-        self.num_envs, self.autoreset_mode = num_envs, AutoresetMode(autoreset_mode)
+        num_envs = self.num_envs = self.torchrl_env.num_envs
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         fps = round(1 / self.torchrl_env.control_dt)
         self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
         self._bounds = _bounds(self.torchrl_env)

@@ -16,7 +16,7 @@ from training.launch import recipe
 @recipe("evaluate")
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
-    trained, actor, normalizer = load_policy(Path(cfg.checkpoint), cfg.device)
+    trained, actor, normalizer = load_policy(Path(cfg.checkpoint), cfg.device, cfg.own_task)
     summary, flight = final_evaluation(trained, actor, normalizer, cfg.episodes, cfg.seed)
     folder, env = Path(cfg.checkpoint).parent, build_env(trained, 1, 0)
     write_summary(folder / "evaluation.json", summary)

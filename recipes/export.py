@@ -21,7 +21,7 @@ from torchrl_quad.deploy.export import STARTS
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     checkpoint = Path(cfg.checkpoint)
-    trained, actor, normalizer = load_policy(checkpoint)
+    trained, actor, normalizer = load_policy(checkpoint, task=cfg.own_task)
     env = build_env(trained, cfg.episodes, STARTS)
     if normalizer is not None:
         env.transform.load_state_dict(normalizer)

@@ -2,10 +2,12 @@
 
 import errno
 import random
+import re
 from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from omegaconf import OmegaConf
 from small_runs import SMALL, poison, rows, stop_at_save
 from training import checkpoints, evaluation
@@ -16,7 +18,9 @@ from training.checkpoints import previous, read_checkpoint, write_checkpoint
 @pytest.fixture(scope="module")
 def content():
     torch.manual_seed(0)
-    return {"config": "task: hovering", "best": {"actor": {"weight": torch.randn(40, 40)}}, "version": "0.1"}
+    whole = {name: kind() for name, kind in checkpoints.CONTENT.items() if isinstance(kind, type)}
+    best = {"actor": {"weight": torch.randn(40, 40)}}
+    return {**whole, "config": "task: hovering", "best": best, "logger": None, "version": "0.1"}
 
 
 def test_no_flipped_bit_of_a_checkpoint_goes_unnoticed(content, tmp_path):
@@ -68,7 +72,7 @@ def test_a_file_that_is_no_checkpoint_of_this_version_is_named_with_the_reason(c
     torch.save({"weights": torch.zeros(1)}, path)
     fails(ValueError, "bad.pt is not a checkpoint of these recipes. Give the path of a checkpoint.pt.")
     torch.save({"config": "", "steps": 1}, path)
-    fails(ValueError, "bad.pt has checkpoint format 0, this version reads format 3. It was written by .* or before")
+    fails(ValueError, "bad.pt has checkpoint format 0, this version reads format 4. It was written by .* or before")
     torch.save({**content, "format": 2}, path)  # the layout before this one, which had no checksum
     fails(ValueError, "has checkpoint format 2, .* written by torchrl_quad 0.1 at revision .*: use that version")
     assert "bad.pt has checkpoint format 2" in refused("evaluate", f"checkpoint={path}")
@@ -118,6 +122,90 @@ def test_a_checkpoint_without_an_evaluated_policy_is_no_policy(refused, no_pictu
     refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "max_skipped=0")
     with pytest.raises(ValueError, match="failure.pt holds no policy: the run stopped before its first evaluation"):
         evaluation.load_policy(tmp_path / "failure.pt")
+
+
+EVIL = {  # what somebody else may have written into the configuration of a checkpoint
+    "task: evilmod.Evil": "names the task 'evilmod.Evil', which has no registered name. Code that",
+    "task: 5": "is no mapping with a task",
+    "task: &a hovering\ntags: [*a, *a]": "uses the alias",
+    "task: ${oc.env:HOME}": "refers to other values by",
+    "env: {control_dt: 1e400}": "env.control_dt",
+    "env: {evil: 1}": "unexpected keyword argument 'evil'",
+    "env: 5": "env=5: it must be a section",
+    "actor: {num_cells: [64]}": "actor.activation is missing",
+    "actor: null": "actor=null: it must be a section",
+    "num_envs: abc": "num_envs=abc: it must be a whole number",
+    "normalize: 3": "normalize=3: it must be true or false",
+    "loss: [1]": "loss=[1]: it must be a section",
+    "algorithm: [1]": "algorithm=[1]: it must be a name",
+    "[": "not a YAML file",
+    "": "is no mapping with a task",
+}
+
+
+def write_own(path, content, **changes):
+    write_checkpoint(path, {**{k: v for k, v in content.items() if k != "format"}, **changes})
+
+
+def test_a_configuration_from_somebody_else_runs_no_code_and_passes_the_schema_or_is_refused(
+    train, refused, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "evilmod.py").write_text("open('ran', 'w')")
+    saved, path = train("bptt", tmp_path / "run"), tmp_path / "run/checkpoint.pt"
+    for text, message in EVIL.items():
+        values = yaml.safe_load(saved["config"])
+        try:
+            values |= yaml.safe_load(text) or {}
+        except (yaml.YAMLError, TypeError):
+            values = None
+        is_whole = values is None or "${" in text or "&" in text or not text
+        write_own(path, saved, config=text if is_whole else yaml.safe_dump(values))
+        for recipe, *words in (["evaluate", f"checkpoint={path}"], ["bptt", f"resume={path}", "total_steps=240"]):
+            said = refused(recipe, *words)
+            assert f"{path}: the configuration in it" in said and message in said, (text, said)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_content_that_does_not_fit_its_configuration_is_refused_in_one_line(train, refused, tmp_path):
+    saved, path = train("abpt", tmp_path), tmp_path / "checkpoint.pt"
+    best, own = saved["best"], saved["processes"][0]
+    weights = {name: x[:1] for name, x in best["actor"].items()}
+    for change in (
+        {"best": {}},
+        {"best": {**best, "actor": 5}},
+        {"best": {**best, "actor": {}}},
+        {"best": {**best, "actor": weights}},
+        {"config": saved["config"].replace("normalize: false", "normalize: true")},
+    ):
+        write_own(path, saved, **change)
+        assert re.search(
+            f"{path}(: the policy in it does not fit| holds no policy)", refused("evaluate", f"checkpoint={path}")
+        )
+    damaged = [
+        {"processes": [{}]},
+        {"processes": [5]},
+        {"stateful": []},
+        {"stateful": [5] * len(saved["stateful"])},
+        {"stateful": saved["stateful"][::-1]},
+        {"rows": [5]},
+        {"rows": [{"a": "b"}]},
+        {"seconds": ("a", 1.0)},
+        {"best": {}},
+        *(
+            {"processes": [{**own, name: value}]}
+            for name in own
+            for value in (5, {})
+            if name not in ("clip", "parameters")
+        ),
+    ]
+    for change in damaged:
+        write_own(path, saved, **change)
+        said = refused("abpt", f"resume={path}", "total_steps=240")
+        assert f"{path}" in said and "Traceback" not in said, change
+    for name in checkpoints.CONTENT:
+        write_own(path, saved, **{name: 0.5})
+        assert f"{path} lacks {name}, or has it in another type" in refused("evaluate", f"checkpoint={path}")
 
 
 def test_the_average_of_the_policy_spans_a_share_of_the_iterations_and_is_what_a_run_keeps(train, tmp_path):

@@ -132,7 +132,7 @@ def test_what_environment_and_loss_refuse_ends_in_one_line_and_leaves_no_folder(
     monkeypatch.chdir(tmp_path)
     assert refused("bptt", *SMALL, "env.drone=hawk").startswith("Error: Unknown drone 'hawk'. Choose from: crazyflie")
     assert not list(tmp_path.glob("outputs/hovering/bptt/seed0/*"))
-    assert "Unknown curve 'oval'" in refused("bptt", *SMALL, "task=tracking", "env.curve=oval")
+    assert "env.curve=oval: it must be one of slow_circle" in refused("bptt", *SMALL, "task=tracking", "env.curve=oval")
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(BaseException, match="Unknown drone 'hawk'") as error:
         launch("bptt", *SMALL, "env.drone=hawk")

@@ -118,13 +118,20 @@ def test_the_settings_of_a_task_come_from_its_signature_and_are_checked_by_it(wo
         check(composed("bptt", *task, words))
 
 
-def test_a_task_of_your_own_trains_resumes_and_is_evaluated_as_those_that_ship(train, launch, tmp_path):
+def test_a_task_of_your_own_trains_resumes_and_is_evaluated_as_those_that_ship(train, launch, refused, tmp_path):
     task = "task._target_=own_task.CornerEnv"
     train("abpt", tmp_path, task, "env.reach=0.1")
     saved = train("abpt", tmp_path, task, "resume=auto", "total_steps=240")
     assert saved["iteration"] == 10 and "task: own_task.CornerEnv" in saved["config"]
     assert float(rows(tmp_path)[-1]["eval/corner_error"]) > 0
-    printed = launch("evaluate", f"checkpoint={tmp_path}/checkpoint.pt")
+    for recipe, *words in (
+        ["evaluate", f"checkpoint={tmp_path}/checkpoint.pt"],
+        ["abpt", f"resume={tmp_path}/checkpoint.pt"],
+    ):
+        setting = "own_task" if recipe == "evaluate" else "task"
+        said = refused(recipe, *words)
+        assert said.endswith(f"Code that a file names is not run: if you trust it, write {setting}=own_task.CornerEnv.")
+    printed = launch("evaluate", f"checkpoint={tmp_path}/checkpoint.pt", "own_task=own_task.CornerEnv")
     assert "abpt on own_task.CornerEnv" in printed and "distance to the corner" in printed
     summary = json.loads((tmp_path / "evaluation.json").read_text())
     assert summary["corner_error"] == json.loads((tmp_path / "summary.json").read_text())["corner_error"]

@@ -119,13 +119,19 @@ def test_what_the_command_line_says_must_agree_with_the_checkpoint(train, refuse
     assert f"{tmp_path} holds another run. Go on with it, resume={tmp_path}/checkpoint.pt, or choose another" in said
     said = refused("bptt", *small, "resume=auto", "env.drone=small_racer")
     assert "env.drone=small_racer contradicts the checkpoint" in said and "trained with env.drone=visfly" in said
+    said = refused("bptt", *small, "resume=auto", "tuned=bptt_racing")
+    assert " contradicts the checkpoint" in said and "num_envs=" in said
+    said = refused("bptt", *small, "resume=auto", "algorithm=shac")
+    assert "algorithm=shac: this recipe is bptt" in said
     said = refused("shac", *small, "resume=auto")
     assert "algorithm=shac contradicts the checkpoint" in said and "trained with algorithm=bptt" in said
 
 
-def test_a_run_that_is_resumed_by_path_goes_on_in_the_folder_of_its_checkpoint(train, launch, tmp_path):
+def test_a_run_that_is_resumed_by_path_goes_on_in_the_folder_of_its_checkpoint(train, launch, refused, tmp_path):
     train("bptt", tmp_path / "first")
     path = tmp_path / "first/checkpoint.pt"
-    launch("bptt", f"resume={path}", "total_steps=240", f"hydra.run.dir={tmp_path}/elsewhere")
+    said = refused("bptt", f"resume={path}", "total_steps=240", f"hydra.run.dir={tmp_path}/elsewhere")
+    assert f"hydra.run.dir={tmp_path}/elsewhere has no effect: resume={path} goes on in the folder of that" in said
+    launch("bptt", f"resume={path}", "total_steps=240")
     assert read_checkpoint(path)["iteration"] == 10
     assert not (tmp_path / "elsewhere").exists()

@@ -24,5 +24,9 @@ class Unsupported(UserValueError, NotImplementedError):
     """Something is valid elsewhere, and not offered here."""
 
 
+class Diverged(UserError, FloatingPointError):
+    """A run was given up, since too much of it was not finite."""
+
+
 class MissingPackage(UserError, ImportError):
     """An optional package is not installed."""

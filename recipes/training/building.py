@@ -53,8 +53,7 @@ def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModuleBase:
     It sees where the environment has a camera, unless the configuration blinds it.
     """
     log_prob = "entropy_bonus" in cfg.loss or cfg.loss.get("alpha", 0) != 0  # of PPO, or of an entropy bonus
-    noise = {name: cfg.actor[name] for name in ("scale_init", "noise_correlation")}
-    noise["learn_scale"] = cfg.actor.get("learn_scale", True)  # checkpoints from before do not say
+    noise = {name: cfg.actor[name] for name in ("scale_init", "noise_correlation", "learn_scale")}
     if not sees(cfg, env):
         return make_actor(env, **network(cfg, "actor"), **noise, return_log_prob=log_prob)
     sight = {name: cfg.actor[name] for name in ("recurrent", "hidden_size")} | {"channels": list(cfg.actor.channels)}
@@ -62,8 +61,8 @@ def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModuleBase:
 
 
 def sees(cfg: DictConfig, env: EnvBase) -> bool:
-    """Whether the policy of a configuration reads the images of a camera; checkpoints from before do not say."""
-    return bool(cfg.actor.get("vision", False)) and "depth" in env.observation_spec
+    """Whether the policy of a configuration reads the images of a camera."""
+    return cfg.actor.vision and "depth" in env.observation_spec
 
 
 def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str, Any]:
@@ -160,7 +159,7 @@ def average_policy(cfg: DictConfig, actor: TensorDictModuleBase) -> AveragedMode
     It spans about the share ``actor.average`` of the iterations so far, so it lengthens with the run and forgets the
     start (the power function average of Karras et al. 2024, arXiv:2312.02696).
     """
-    share = cfg.actor.get("average")  # checkpoints from before have none
+    share = cfg.actor.average
     if share is None:
         return None
 

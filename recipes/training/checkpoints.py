@@ -8,18 +8,28 @@ import io
 import os
 import shutil
 import subprocess
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.dynamics import presets
+from torchrl_quad.envs import available_tasks
+from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import replacing
+from training.own import CONFIG
+from training.schema import check
 
-FORMAT = 3  # of the content; raise it when older files can no longer be read
+FORMAT = 4  # of the content; raise it when older files can no longer be read
 MARK = b"\ntorchrl_quad checkpoint, sha256 "  # then 64 digits: the checksum of all bytes before the mark
+CONTENT = {  # and its types
+    **{"version": str, "revision": str, "config": str, "best": dict, "logger": (dict, type(None)), "seconds": tuple},
+    **{"iteration": int, "steps": int, "skipped": int, "rows": list, "stateful": list, "processes": list},
+}
 FREE_ON_RESUME = ("resume", "total_steps", "threads", "compile", "max_skipped", "diagnostics", "eval", "logger")
 
 
@@ -41,6 +51,7 @@ def write_checkpoint(path: Path, content: dict[str, Any], keep: Path | None = No
         temporary.write_bytes(payload + MARK + hashlib.sha256(payload).hexdigest().encode())
         if keep is not None and keep != previous(path) and keep.exists():
             with replacing(previous(path)) as copy:
+                copy.unlink()
                 try:
                     os.link(keep, copy)
                 except OSError:  # a file system without hard links
@@ -52,7 +63,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is damaged, cut off, foreign, or of another version.
+        UserValueError: the file is damaged, cut off, foreign, or of another version, or its entries are of other types.
     """
     path = Path(path)
     if not path.is_file():
@@ -79,6 +90,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         )
     if not mark:
         raise UserValueError(f"{path} is damaged: its checksum is missing. {_way_out(path)}")
+    wrong = [name for name, kind in CONTENT.items() if not isinstance(content.get(name), kind)]
+    if wrong:
+        raise UserValueError(f"{path} lacks {', '.join(wrong)}, or has it in another type. {_way_out(path)}")
     return content
 
 
@@ -107,20 +121,83 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
         )
     if cfg.resume is None:
         return
-    saved = OmegaConf.create(read_checkpoint(Path(cfg.resume))["config"])
-    for key in ("algorithm", *(override.split("=")[0].lstrip("+~") for override in HydraConfig.get().overrides.task)):
-        asked, was = OmegaConf.select(cfg, key), OmegaConf.select(saved, key)
-        if asked != was and key.split(".")[0] not in FREE_ON_RESUME:
+    overrides = [override.partition("=") for override in HydraConfig.get().overrides.task]
+    asked = {name.lstrip("+~"): OmegaConf.select(cfg, name.lstrip("+~")) for name, _, _ in overrides}
+    path = Path(cfg.resume)
+    saved = saved_config(path, read_checkpoint(path), cfg.task if "task" in asked else None)
+    for name, _, value in overrides:
+        if name.lstrip("+") == "tuned" and value != "null":
+            asked |= _leaves(OmegaConf.load(CONFIG / f"tuned/{value}.yaml"))
+    for key, value in ({"algorithm": cfg.algorithm} | asked).items():
+        was = OmegaConf.select(saved, key)
+        if value != was and key.split(".")[0] not in FREE_ON_RESUME:
             raise UserValueError(
-                f"{key}={asked} contradicts the checkpoint {cfg.resume}, which was trained with {key}={was}. Leave it "
+                f"{key}={value} contradicts the checkpoint {cfg.resume}, which was trained with {key}={was}. Leave it "
                 f"out to go on, or start a new run without resume. These may change: {', '.join(FREE_ON_RESUME)}."
             )
-        if asked != was:
-            OmegaConf.update(saved, key, asked)
+        if value != was:
+            OmegaConf.update(saved, key, value)
     saved.resume = cfg.resume
     with open_dict(cfg):
         cfg.clear()
         cfg.update(saved)
+
+
+def saved_config(path: Path, content: Mapping[str, Any], task: str | None, setting: str = "task") -> DictConfig:
+    """The configuration in a checkpoint, which has passed the schema like a command line.
+
+    Nothing that it names is imported: a task that has no registered name is taken if the command line names it, too, by
+    ``setting``.
+
+    Raises:
+        UserValueError: it would not pass as a command line, or its task is not named.
+    """
+    source = f"{path}: the configuration in it"
+    text = content["config"]
+    values = presets.parse(text.encode(), source) if isinstance(text, str) else text
+    if not isinstance(values, Mapping) or not isinstance(values.get("task"), str):
+        raise UserValueError(f"{source} is no mapping with a task. Give the path of a checkpoint.pt.")
+    if "${" in text:
+        raise UserValueError(f"{source} refers to other values by ${{...}}, which no run writes. It is not read.")
+    if values["task"] not in (*available_tasks(), task):
+        raise UserValueError(
+            f"{source} names the task {values['task']!r}, which has no registered name. Code that a file names is not "
+            f"run: if you trust it, write {setting}={values['task']}."
+        )
+    if task not in (None, values["task"]):
+        raise UserValueError(f"{setting}={task} contradicts {path}, which was trained with task={values['task']}.")
+    try:
+        cfg = OmegaConf.create(values)
+        check(cfg)
+    except UserError as error:
+        raise UserValueError(f"{source}: {error}") from error
+    except OmegaConfBaseException as error:
+        raise UserValueError(f"{source}: {str(error).splitlines()[0]}") from error
+    return cfg
+
+
+@contextlib.contextmanager
+def fits(path: Path, what: str) -> Iterator[None]:
+    """Say of which file the content does not fit what is built from its configuration.
+
+    Raises:
+        UserValueError: it does not.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        said = (str(error) or repr(error)).split("\n\t")[-1].splitlines()[0]
+        raise UserValueError(f"{path}: {what} in it does not fit its configuration: {said} {_way_out(path)}") from error
+
+
+def _leaves(node: DictConfig, section: str = "") -> dict[str, Any]:
+    """The settings of a YAML file by their whole names."""
+    found = {}
+    for name in node:
+        value = OmegaConf.select(node, name)
+        inner = _leaves(value, f"{section}{name}.") if OmegaConf.is_dict(value) else {f"{section}{name}": value}
+        found |= {} if name == "defaults" else inner
+    return found
 
 
 def revision() -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -23,7 +23,7 @@ from torchrl_quad.envs.scenery import EPISODE_METRICS, describe_metric
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import replacing
 from training.building import build_env, make_policy
-from training.checkpoints import read_checkpoint
+from training.checkpoints import fits, read_checkpoint, saved_config
 
 
 def evaluate(
@@ -93,18 +93,22 @@ def best_policy(
     Raises:
         ValueError: there is none.
     """
-    if "actor" not in best:
+    if not isinstance(best.get("actor"), Mapping):
         raise UserValueError(
             f"{source} holds no policy: the run stopped before its first evaluation, or no return was finite. Train "
             "longer, or with a lower learning rate."
         )
-    actor = make_policy(cfg, build_env(cfg, 1, 0))
-    actor.load_state_dict(best["actor"])
-    return actor, best.get("normalizer")
+    env = build_env(cfg, 1, 0)
+    actor, normalizer = make_policy(cfg, env), best.get("normalizer")
+    with fits(source, "the policy"):
+        actor.load_state_dict(best["actor"])
+        if cfg.normalize:
+            env.transform.load_state_dict(normalizer)
+    return actor, normalizer if cfg.normalize else None
 
 
 def load_policy(
-    checkpoint: Path, device: str = "cpu"
+    checkpoint: Path, device: str = "cpu", task: str | None = None
 ) -> tuple[DictConfig, TensorDictModuleBase, dict[str, Tensor] | None]:
     """Read the configuration, the best policy, and the state of its normaliser if it has one, from a checkpoint.
 
@@ -113,7 +117,7 @@ def load_policy(
         ValueError: the file is not a checkpoint that these recipes can read, or holds no policy.
     """
     saved = read_checkpoint(checkpoint)
-    cfg = OmegaConf.create(saved["config"])
+    cfg = saved_config(checkpoint, saved, task, "own_task")
     cfg.device = device
     return cfg, *best_policy(cfg, saved["best"], checkpoint)
 

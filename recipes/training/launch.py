@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import joblib
+import omegaconf
+import torch
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
@@ -23,18 +26,20 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchrl_quad
 from torchrl_quad.dynamics import presets
-from torchrl_quad.envs import task_class
+from torchrl_quad.envs import available_tasks, task_class
+from torchrl_quad.errors import UserError, UserValueError
 from training.arguments import hydra_argument
 from training.checkpoints import take_over
 from training.folders import own_folder
-from training.own import offer_tasks, own_recipe
+from training.own import OWN, offer_tasks, own_recipe
 from training.processes import from_the_first, joined, rank
 from training.schema import check
 
 RECIPES = Path(__file__).parents[1]
-OURS = (str(RECIPES), str(Path(torchrl_quad.__file__).parent))
+MAX_DEPTH = 20  # of lists and mappings within each other, as in a YAML file
 FOLDER_SETTINGS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
-EXPECTED = (ValueError, TypeError, OSError, ImportError, FloatingPointError, OmegaConfBaseException)
+NO_MEMORY = "the memory is full. Lower num_envs, horizon, batch_size, or the size of the networks."
+THEIRS = tuple(str(Path(module.__file__).parent) for module in (hydra, omegaconf, joblib))
 
 
 class Refused(BaseException):
@@ -55,7 +60,7 @@ class CheckBeforeFolder(Callback):
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Refuse what the schema refuses."""
         with _explained():
-            check(config)
+            _check(config, config.hydra)
 
 
 def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
@@ -71,20 +76,25 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
 
     name = own_recipe(config, settings) if settings else config
     registered: dict[str, type] = {}  # travels along with the job into the processes of a sweep
+    flies = []  # once main has been called
 
     def decorate(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         @hydra.main(config_path=str(RECIPES / "config"), config_name=name, version_base=None)
         @functools.wraps(main)
         def job(cfg: DictConfig) -> None:
             torchrl_quad.envs.TASKS.update(registered)  # of this process, whatever has been copied into it
+            if settings:
+                OWN[name] = config, settings
             try:
                 with _explained():
-                    check(cfg)
+                    _check(cfg, HydraConfig.get())
                     if "algorithm" not in cfg:
+                        flies.append(name)
                         main(cfg)
                         return
-                    with joined(cfg), _run_folder(cfg.resume) as folder, _resumable(folder):
+                    with joined(cfg), _run_folder(cfg.resume) as folder, _resumable(folder, cfg.task):
                         take_over(cfg, folder)
+                        flies.append(name)
                         main(cfg)
             except Refused as error:
                 if HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -104,11 +114,17 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
                     for path in sorted((RECIPES / "config").rglob("*.yaml")):
                         presets.parse(path.read_bytes(), str(path))
                     sys.argv[1:] = offer_tasks(sys.argv[1:])
+                    for argument in sys.argv[1:]:
+                        _require_flat(argument)
                 job()
-            except (Refused, RefusedInSweep, HydraException, RecursionError, yaml.YAMLError) as error:
+            except (Refused, RefusedInSweep) as error:
                 _end(error, 2, full)
             except KeyboardInterrupt as error:
                 _end(error if str(error) else Stopped("Stopped. What is finished is kept."), 130, full)
+            except Exception as error:
+                if flies or not _is_of_the_command_line(error):
+                    raise
+                _end(error, 2, full)
             finally:
                 os.environ["HYDRA_FULL_ERROR"] = str(int(full))
 
@@ -129,23 +145,58 @@ def _end(error: BaseException, status: int, full: bool) -> None:
             task_class(error.missing_cfg_file.removeprefix("task/"))
         except ValueError as unknown:
             said = [str(unknown)]
-    if isinstance(error, RecursionError):
-        said = ["the command line nests too many lists or mappings: give the path of a YAML file instead."]
     message = " ".join(line.strip() for line in said if line.strip())
     print(message if status == 130 else f"Error: {message}", file=sys.stderr)
     raise SystemExit(status) from None
 
 
+def _check(cfg: DictConfig, hydra_config: DictConfig) -> None:
+    """Check a configuration, and that the command line takes effect."""
+    name, overrides = hydra_config.job.config_name, hydra_config.overrides
+    if cfg.get("algorithm", name) != name:
+        raise UserValueError(
+            f"algorithm={cfg.algorithm}: this recipe is {name}, whatever it is called. Run the recipe of that name."
+        )
+    check(cfg, overrides.task)
+    if cfg.get("resume") not in (None, "auto") and hydra_config.mode != RunMode.MULTIRUN:
+        asked = Path(hydra_config.run.dir)
+        if asked.resolve() != Path(cfg.resume).resolve().parent:
+            raise UserValueError(
+                f"hydra.run.dir={asked} has no effect: resume={cfg.resume} goes on in the folder of that checkpoint. "
+                "Leave it out."
+            )
+
+
+def _require_flat(argument: str) -> None:
+    depth = 0
+    for letter in argument:
+        depth += (letter in "[{(") - (letter in ")}]")
+        if depth > MAX_DEPTH:
+            raise UserValueError(
+                f"{argument[:40]}... nests more than {MAX_DEPTH} lists or mappings. Give the path of a YAML file."
+            )
+
+
+def _is_of_the_command_line(error: Exception) -> bool:
+    """Whether hydra, or the system, refuses what the user has written: with no mistake of ours in between."""
+    if isinstance(error, (HydraException, OmegaConfBaseException, OSError, yaml.YAMLError)):
+        return True
+    return traceback.extract_tb(error.__traceback__)[-1].filename.startswith(THEIRS)
+
+
 @contextlib.contextmanager
 def _explained() -> Iterator[None]:
-    """Turn the errors that recipes and library raise themselves into refusals; other errors keep their traceback."""
+    """Turn errors that their message explains into refusals; all others keep their traceback."""
     try:
         yield
-    except EXPECTED as error:
-        where = traceback.extract_tb(error.__traceback__)[-1].filename
-        if where.startswith(OURS) or isinstance(error, (OSError, OmegaConfBaseException)):
-            raise Refused(str(error)) from error
-        raise
+    except (UserError, OSError) as error:
+        raise Refused(str(error)) from error
+    except (MemoryError, torch.OutOfMemoryError) as error:
+        raise Refused(NO_MEMORY) from error
+    except RuntimeError as error:
+        if "can't allocate memory" not in str(error):
+            raise
+        raise Refused(NO_MEMORY) from error
 
 
 @contextlib.contextmanager
@@ -172,10 +223,11 @@ def _run_folder(resume: str | None) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _resumable(folder: Path) -> Iterator[None]:
+def _resumable(folder: Path, task: str) -> Iterator[None]:
     """Say how to go on when the run is stopped, or when the disk is full."""
     checkpoint = folder / "checkpoint.pt"
-    how = f"Go on with: python {sys.argv[0]} resume={checkpoint}"
+    named = "" if task in available_tasks() else f" task={task}"
+    how = f"Go on with: python {sys.argv[0]} resume={checkpoint}{named}"
     try:
         yield
     except KeyboardInterrupt as error:

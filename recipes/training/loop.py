@@ -28,12 +28,12 @@ from torchrl_quad import (
     differentiable_rollout,
     gradient_statistics,
 )
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import Diverged, UserValueError
 from torchrl_quad.files import replacing
 from torchrl_quad.objectives import PathwiseLoss
 from training import drawing
 from training.building import average_policy, iterations, own_seed
-from training.checkpoints import read_checkpoint, revision, write_checkpoint
+from training.checkpoints import fits, read_checkpoint, revision, write_checkpoint
 from training.evaluation import (
     best_policy,
     drawing_from,
@@ -171,7 +171,7 @@ class Run:
         The step is skipped if the loss or its gradient is not finite.
 
         Raises:
-            FloatingPointError: more than ``max_skipped`` steps were skipped; the run is saved as it is.
+            Diverged: more than ``max_skipped`` steps were skipped; the run is saved as it is.
         """
         value, norm = torch.stack(backward(loss, optimizer, max_grad_norm)).tolist()  # waits for a GPU once
         finite = math.isfinite(value) and math.isfinite(norm)
@@ -187,7 +187,7 @@ class Run:
             return
         path = self.folder / "failure.pt"
         self._save(path)
-        raise FloatingPointError(
+        raise Diverged(
             f"{self.skipped} updates were skipped because their loss or gradient was not finite; the limit is "
             f"max_skipped={self.cfg.max_skipped}. The last: {name}, iteration {self.done}, loss {value:g}, gradient "
             f"norm {norm:g}, not finite in {', '.join(broken[:3]) or 'no parameter'}. Networks and the state in which "
@@ -245,8 +245,7 @@ class Run:
             drawing.draw_flight(flight, self.folder / "flight", self.env, title(now))
             self.logs.show_flight(self.steps)
         score = {name: metrics[f"eval/{name}"] for name in ("solved", "return")}
-        # A checkpoint from before knows the return alone.
-        record = self.best.get("solved", -math.inf), self.best["return"]
+        record = self.best["solved"], self.best["return"]
         if math.isfinite(score["return"]) and tuple(score.values()) >= record:
             policy = {"actor": self.flown, **({"normalizer": self.env.transform} if self.cfg.normalize else {})}
             weights = {name: copy.deepcopy(module.state_dict()) for name, module in policy.items()}
@@ -321,7 +320,7 @@ class Run:
         """Take everything from a checkpoint, and return the state of the logger.
 
         Raises:
-            ValueError: it was written by another number of processes.
+            UserValueError: it was written by another number of processes, or does not fit its configuration.
         """
         saved = read_checkpoint(path)
         if len(saved["processes"]) != world_size():
@@ -329,23 +328,24 @@ class Run:
                 f"{path} was written by {len(saved['processes'])} processes, and {world_size()} want to go on. Start "
                 "as many as before: torchrun --nproc-per-node=N."
             )
-        own = saved["processes"][rank()]
-        for x, state in zip(self.stateful, saved["stateful"], strict=True):
-            x.load_state_dict(state)
-        if self.buffer is not None:
-            self.buffer.load_state_dict(own["buffer"])
-        if own.get("clip") is not None:
-            self.loss.clip.load_state_dict(own["clip"])
-        self.carry = TensorDict(own["carry"], self.env.batch_size).to(self.env.device)
-        self.env.set_random_state(own["env"])
-        torch.set_rng_state(own["torch"])
-        if own["cuda"] is not None:
-            torch.cuda.set_rng_state(own["cuda"], self.env.device)
-        self.done, self.skipped = saved["iteration"], saved["skipped"]
-        # Before horizons could change, a checkpoint did not count them.
-        self.steps = saved.get("steps", self.done * self.cfg.horizon * self.drones)
-        self.seconds, self.processor_seconds = saved["seconds"]
-        self.rows, self.best, self.saved = saved["rows"], saved["best"], path
+        with fits(path, "the state of the run"):
+            own = saved["processes"][rank()]
+            for x, state in zip(self.stateful, saved["stateful"], strict=True):
+                x.load_state_dict(state)
+            if self.buffer is not None:
+                self.buffer.load_state_dict(own["buffer"])
+            if own["clip"] is not None:
+                self.loss.clip.load_state_dict(own["clip"])
+            carry = TensorDict(own["carry"], self.env.batch_size).to(self.env.device)
+            self.carry = self.env.reset(carry.exclude("_reset"), set_state=True).update(carry)
+            self.env.set_random_state(own["env"])
+            torch.set_rng_state(own["torch"])
+            if own["cuda"] is not None:
+                torch.cuda.set_rng_state(own["cuda"], self.env.device)
+            self.seconds, self.processor_seconds = map(float, saved["seconds"])
+            self.best = {**saved["best"], **{name: float(saved["best"][name]) for name in ("solved", "return")}}
+            self.rows = [{str(name): value + 0 for name, value in row.items()} for row in saved["rows"]]
+        self.done, self.skipped, self.steps, self.saved = saved["iteration"], saved["skipped"], saved["steps"], path
         before = saved["revision"]
         self.revision = before if self.revision in before else f"{before}, then {self.revision}"
         return saved["logger"]

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import inspect
 import re
-import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import NoneType, UnionType
+from types import NoneType
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -19,6 +18,7 @@ from torchrl_quad.errors import UserValueError
 
 CONFIG = Path(__file__).parents[1] / "config"
 SET_BY_RECIPES = ("num_envs", "device", "seed", "compile")  # settings outside ``env``
+OWN: dict[str, tuple[str, Mapping[str, Any]]] = {}  # recipes of your own: the configuration each is made from, and more
 PLAIN = (bool, int, float, str, NoneType)
 
 
@@ -53,17 +53,6 @@ def defaults(cls: type[QuadrotorEnv]) -> dict[str, Any]:
     return settings
 
 
-def option_types(cls: type[QuadrotorEnv]) -> dict[str, Any]:
-    """The types of a task's own options, as far as its signature says them in plain types."""
-    hints: dict[str, Any] = {}
-    for owner in reversed(cls.__mro__[: cls.__mro__.index(QuadrotorEnv)]):
-        try:
-            hints |= typing.get_type_hints(vars(owner).get("__init__", object))
-        except NameError:  # of a type that only type checkers import
-            continue
-    return {name: hints[name] for name in _options(cls) if _is_plain(hints.get(name))}
-
-
 def own_recipe(config: str, settings: Mapping[str, Any]) -> str:
     """Store the configuration of a recipe of your own: ``config``, and then these settings. Returns its name.
 
@@ -76,6 +65,7 @@ def own_recipe(config: str, settings: Mapping[str, Any]) -> str:
             f"A recipe of your own needs a name of its own: @recipe({config!r}, algorithm='my_{config}', ...); got "
             f"{name!r}."
         )
+    OWN[name] = config, settings
     node = OmegaConf.load(CONFIG / f"{config}.yaml")
     overrides = [str(entry).startswith("{'override ") for entry in node.defaults]
     node.defaults.insert(overrides.index(True), f"{name}_settings")  # after the task and what is tuned
@@ -87,9 +77,3 @@ def own_recipe(config: str, settings: Mapping[str, Any]) -> str:
 def _options(cls: type[QuadrotorEnv]) -> dict[str, inspect.Parameter]:
     parameters = inspect.signature(cls).parameters.items()
     return {name: x for name, x in parameters if name not in (*SET_BY_RECIPES, "dtype", "disturbances")}
-
-
-def _is_plain(kind: Any) -> bool:
-    if typing.get_origin(kind) in (typing.Union, UnionType):
-        return all(_is_plain(part) for part in typing.get_args(kind))
-    return kind in PLAIN or typing.get_origin(kind) is typing.Literal

@@ -1,25 +1,44 @@
 """The schema of the configuration: the type and the range of every setting, checked before a run makes its folder.
 
-A setting is refused with its name, its value, what it must be, and the sentence that describes it here. Settings that
-this schema leaves open (``Any``, and further entries of ``env`` and ``loss``) are checked by the environment and by the
-loss themselves.
+A setting is refused with its name, its value, what it must be, and the sentence that describes it. The settings in
+``env`` and ``loss`` are declared by the signatures of the task and of the loss, all others here. Which of them a recipe
+has, its YAML files say.
 """
 
 from __future__ import annotations
 
+import difflib
 import inspect
 import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
 from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 
+from torchrl_quad import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
 from torchrl_quad.envs import task_class
 from torchrl_quad.envs.checks import refuse_unknown
 from torchrl_quad.errors import UserValueError
-from training.own import SET_BY_RECIPES, option_types
+from torchrl_quad.options import (
+    Below1,
+    Count,
+    Fraction,
+    NonNegative,
+    Positive,
+    Real,
+    Share,
+    Size,
+    declared,
+    must,
+    shown,
+)
+from training.own import CONFIG, OWN, SET_BY_RECIPES
+
+MAX_ROLLOUT = 100_000_000  # control steps of a rollout: with a graph they take more than 50 GB
 
 
 def available_device(name: str) -> str:
@@ -40,13 +59,7 @@ def existing_checkpoint(path: str) -> str:
 
 # -- types -------------------------------------------------------------------------------------------------------------
 
-Real = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[Real, Field(gt=0)]
-Fraction = Annotated[Real, Field(ge=0, le=1)]
-Share = Annotated[Real, Field(gt=0, le=1)]
-Count = Annotated[int, Field(ge=0, le=10**9)]
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
-Size = Annotated[int, Field(ge=1, le=10_000_000)]
 Device = Annotated[str, AfterValidator(available_device)]
 Threads = Annotated[int, Field(ge=1, le=1024)]
 ACTIVATIONS = (
@@ -61,25 +74,6 @@ class Section(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid")
 
 
-class Env(Section):
-    """The arguments of the environment; it checks itself what is not listed here."""
-
-    model_config = ConfigDict(strict=True, extra="allow")
-    dynamics: Literal["quadrotor", "point_mass"]
-    control: Literal["rates", "attitude", "rotor_thrusts", "velocity"] | dict[str, Any] = Field(
-        "rates", description="A mapping sets limits, too: {mode: velocity, max_speed: 5.0}."
-    )
-    dt: Positive = Field(description="The physics step [s].")
-    control_dt: Positive = Field(description="The control step [s], a whole multiple of env.dt.")
-    action_delay: int = Field(ge=0, le=1000, description="Control steps from a command to its effect; 1 is usual.")
-    observation_delay: int = Field(ge=0, le=1000, description="Control steps by which observations lag behind.")
-    max_episode_steps: Size = Field(description="Control steps after which an episode is truncated.")
-    observe_last_action: bool
-    event_discount: Share | None = Field(
-        None, description="The discount per control step by which the time of an event counts; null: no gradient in it."
-    )
-
-
 class Optimised(Section):
     """A network and its optimiser."""
 
@@ -90,8 +84,8 @@ class Optimised(Section):
     input_scale: Positive = Field(description="The observation is multiplied by this.")
     lr: Positive = Field(description="The learning rate at the start; to keep a network as it is, write 1e-12.")
     schedule: Literal["constant", "linear", "exponential", "cosine"]
-    final_lr: Annotated[Real, Field(ge=0)] = Field(description="The learning rate at the end of the run.")
-    betas: list[Annotated[Real, Field(ge=0, lt=1)]] = Field(
+    final_lr: NonNegative = Field(description="The learning rate at the end of the run.")
+    betas: list[Below1] = Field(
         min_length=2, max_length=2, description="The two decay rates of Adam's averages, such as [0.9, 0.999]."
     )
     max_grad_norm: Positive = Field(
@@ -118,7 +112,7 @@ class Actor(Optimised):
     channels: list[Annotated[int, Field(ge=1, le=4096)]] = Field(
         min_length=1, max_length=8, description="Of the convolutions of a policy that sees: [8, 16]."
     )
-    noise_correlation: Annotated[Real, Field(ge=0, lt=1)] = Field(
+    noise_correlation: Below1 = Field(
         description="Of the policy's noise in two steps that follow each other; 0 is white noise."
     )
     max_kl: Positive | None = Field(
@@ -137,47 +131,6 @@ class Critic(Optimised):
     updates: int = Field(None, ge=1, le=100_000, description="Gradient steps of the critic per iteration.")
     batch_size: Size = Field(None, description="Control steps in a minibatch of the critic.")
     tau: Share = Field(None, description="The share of the critic that its target network takes over in each update.")
-
-
-class Loss(Section):
-    """The options of the loss; it checks itself what is not listed here."""
-
-    model_config = ConfigDict(strict=True, extra="allow")
-    alpha: Annotated[Real, Field(ge=0)] | Literal["auto"] = Field(
-        None, description="The coefficient of the entropy bonus: a number, 0 for none, or auto to learn it."
-    )
-    clip_action_gradient: Positive | None = Field(
-        None, description="The longest gradient in one action, in running medians; null for no bound."
-    )
-    terminal_gradient: bool = Field(None)
-    target_bootstrap: bool = Field(None)
-    average_over_horizon: bool = Field(None)
-    alpha_init: Positive = Field(None, description="What alpha=auto starts from.")
-    target_entropy: Annotated[Real, Field(lt=0)] | Literal["auto"] = Field(
-        None, description="Where alpha=auto holds the entropy; auto for minus the size of the action (SAPO: half)."
-    )
-    simulated_steps: int = Field(
-        None, ge=0, le=100_000, description="Control steps that ABPT's return of the start flies before its critic."
-    )
-    min_horizon: Size | None = Field(None, description="The shortest horizon; null for a quarter of horizon.")
-    max_horizon: Size | None = Field(None, description="The longest horizon; null for twice horizon.")
-    max_stiffness: Annotated[Real, Field(gt=1)] = Field(
-        None, description="Where the action gradients grow beyond it along a horizon, the horizon gets shorter."
-    )
-    horizon_lr: Annotated[Real, Field(ge=0, lt=1)] = Field(
-        None, description="The share by which the horizon may change in an iteration."
-    )
-    num_value_nets: int = Field(None, ge=1, le=64, description="Critics of states.")
-    num_qvalue_nets: int = Field(None, ge=1, le=64, description="Critics whose smallest value counts.")
-    gradient_lmbda: Share = Field(
-        None, description="The lambda of the return that the pathwise gradient differentiates; 0.9 is usual."
-    )
-    clip_epsilon: Annotated[Real, Field(gt=0, lt=1)] = Field(
-        None, description="How far the ratio of probabilities may move from 1; 0.2 is usual."
-    )
-    max_importance_ratio: Positive | None = Field(None, description="The largest ratio of probabilities; null for any.")
-    critic_coeff: Positive = Field(None, description="The weight of the critic's loss.")
-    entropy_coeff: Annotated[Real, Field(ge=0)] = Field(None, description="The weight of the entropy bonus.")
 
 
 class Buffer(Section):
@@ -218,12 +171,10 @@ class Training(Section):
     horizon: int = Field(ge=1, le=100_000, description="Control steps in a rollout.")
     total_steps: int = Field(ge=1, le=10**15, description="Control steps of all drones together, in the whole run.")
     compile: bool
-    env: Env
     normalize: bool
     actor: Actor
-    critic: Critic | None = None
-    loss: Loss
-    buffer: Buffer | None = None
+    critic: Critic = Field(None)
+    buffer: Buffer = Field(None)
     restart_fraction: Fraction = Field(None, description="The share of flights that each iteration gives up.")
     epochs: int = Field(None, ge=1, le=10_000, description="Passes over each rollout.")
     batch_size: Size = Field(None, description="Control steps in a minibatch.")
@@ -233,11 +184,21 @@ class Training(Section):
     eval: Evaluation
     logger: Logger
 
+    @model_validator(mode="after")
+    def _fits_into_memory(self) -> Training:
+        if self.num_envs * self.horizon > MAX_ROLLOUT:
+            raise ValueError(f"have num_envs times horizon at most {MAX_ROLLOUT:,}, or no memory holds a rollout")
+        return self
+
+
+OWN_TASK = Field(description="The class of the checkpoint's task, where that has no registered name.")
+
 
 class Flying(Section):
     """The configuration of evaluate.py."""
 
     checkpoint: str
+    own_task: str | None = OWN_TASK
     episodes: Size = Field(description="Fresh episodes to fly, side by side.")
     seed: Seed
     threads: Threads
@@ -248,6 +209,7 @@ class Exporting(Section):
     """The configuration of export.py."""
 
     checkpoint: str
+    own_task: str | None = OWN_TASK
     folder: str | None = Field(description="The folder to write; null: policy, beside the checkpoint.")
     episodes: Size = Field(description="Fresh episodes to fly, side by side.")
     threads: Threads
@@ -262,7 +224,7 @@ class Identifying(Section):
     known: dict[str, Any] | None = Field(description="Fields of the drone that are known by measurement.")
     fields: list[str] | None = Field(description="What to fit; null for everything.")
     folder: str = Field(description="The folder to write.")
-    past: Annotated[Real, Field(ge=0)]
+    past: NonNegative
     horizon: Positive
     iterations: Size
     draws: Count = Field(description="Of the bootstrap over windows; 0 for none.")
@@ -270,43 +232,194 @@ class Identifying(Section):
     threads: Threads
 
 
+# -- what is declared elsewhere ----------------------------------------------------------------------------------------
+
+
+def ppo(
+    *,
+    clip_epsilon: Annotated[Real, Field(gt=0, lt=1)] = 0.2,
+    entropy_bonus: bool = True,
+    entropy_coeff: NonNegative = 0.01,
+    critic_coeff: Positive = 1.0,
+    loss_critic_type: Literal["l1", "l2", "smooth_l1"] = "smooth_l1",
+    normalize_advantage: bool = False,
+    max_importance_ratio: Positive | None = None,
+) -> None:
+    """The options of TorchRL's ClipPPOLoss that the recipe takes.
+
+    Args:
+        clip_epsilon: how far the ratio of probabilities may move from 1; 0.2 is usual.
+        entropy_bonus: whether there is one.
+        entropy_coeff: its weight.
+        critic_coeff: the weight of the critic's loss.
+        loss_critic_type: the distance of values from their targets.
+        normalize_advantage: to zero mean and unit variance in each minibatch.
+        max_importance_ratio: the largest ratio of probabilities; null for any.
+    """
+
+
+LOSSES: dict[str, Callable[..., Any]] = {
+    "abpt": ABPTLoss,
+    "ahac": AHACLoss,
+    "bptt": BPTTLoss,
+    "hybrid": HybridLoss,
+    "ppo": ppo,
+    "sapo": SAPOLoss,
+    "shac": SHACLoss,
+}
+# What a recipe builds its loss with itself.
+SET_BY_LOOPS = {"horizon", "average", "reduction", "delay_value", "delay_qvalue"}
+# Settings that others switch off: where, and why.
+IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
+    ("actor.final_lr", lambda c: c["actor"]["schedule"] == "constant", "actor.schedule=constant"),
+    ("critic.final_lr", lambda c: c["critic"]["schedule"] == "constant", "critic.schedule=constant"),
+    ("actor.schedule actor.final_lr", lambda c: c["algorithm"] == "hybrid", "actor.max_kl sets the rate"),
+    ("actor.input_scale critic.input_scale", lambda c: c["normalize"], "normalize=true"),
+    (
+        "actor.vision actor.recurrent actor.hidden_size actor.channels",
+        lambda c: c["env"].get("camera") is None,
+        "env.camera=null",
+    ),
+    ("actor.recurrent actor.hidden_size actor.channels", lambda c: not c["actor"]["vision"], "actor.vision=false"),
+    ("actor.hidden_size", lambda c: not c["actor"]["recurrent"], "actor.recurrent=false"),
+    ("loss.alpha_init loss.target_entropy", lambda c: c["loss"].get("alpha") != "auto", "loss.alpha is not auto"),
+    ("loss.entropy_coeff", lambda c: c["loss"].get("entropy_bonus") is False, "loss.entropy_bonus=false"),
+    ("env.difficulty", lambda c: c["env"].get("density") is not None, "env.density is set"),
+    ("logger.project logger.group logger.mode", lambda c: c["logger"]["backend"] != "wandb", "it is wandb's"),
+    (
+        "restart_fraction",
+        lambda c: (c.get("buffer") or {}).get("fraction") is not None,
+        "buffer.fraction says where horizons start",
+    ),
+]
+
+
+def settings(algorithm: str) -> dict[str, Any] | None:
+    """What the YAML files of a recipe set, without those for a task; None for a recipe that is not known here."""
+    config, own = OWN.get(algorithm, (algorithm, {}))
+    if not (CONFIG / f"{config}.yaml").is_file() or config not in LOSSES:
+        return None
+    recipe = OmegaConf.load(CONFIG / f"{config}.yaml")
+    shared = [OmegaConf.load(CONFIG / f"{x}.yaml") for x in recipe.pop("defaults") if x in ("common", "critic")]
+    merged = OmegaConf.merge(*shared, recipe, own)
+    known = OmegaConf.to_container(OmegaConf.masked_copy(merged, [name for name in merged if name != "hydra"]))
+    return {"task": None} | known
+
+
 # -- the check ---------------------------------------------------------------------------------------------------------
 
 
-def check(cfg: DictConfig) -> None:
-    """Check a configuration against the schema, and the options of its task against the signature of its class.
+def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
+    """Check a configuration against the schema, and what the command line has changed in it.
 
     Raises:
-        ValueError: the first setting that has the wrong type or is out of its range, and what to write instead.
-        TypeError: the task has no such option.
+        UserValueError: the first setting that is unknown, has the wrong type, is out of its range, or has no effect.
+        UserTypeError: the task has no such option.
     """
     try:
-        settings = OmegaConf.masked_copy(cfg, [name for name in cfg if name != "hydra"])
-        values = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
+        chosen = OmegaConf.masked_copy(cfg, [name for name in cfg if name != "hydra"])
+        values = OmegaConf.to_container(chosen, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
         name = error.full_key or "a setting"
         raise UserValueError(f"{name} is missing: write {name}=... on the command line.") from None
+    except OmegaConfBaseException as error:
+        raise UserValueError(f"{error.full_key or 'the configuration'}: {str(error).splitlines()[0]}") from None
     _refuse_none(values)
     kinds = {"logs": Identifying, "folder": Exporting, "checkpoint": Flying}
-    schema = next((kind for name, kind in kinds.items() if name in values), Training)
-    if isinstance(values.get("task"), str) and isinstance(values.get("env"), dict):
-        schema = _with_options(values["task"], values["env"])
+    schema = next((kind for name, kind in kinds.items() if name in values), None) or schema_of(values)
+    asked = {name.lstrip("+~"): value for name, _, value in (override.partition("=") for override in overrides)}
+    if "algorithm" in values:
+        _refuse_unknown(values, asked)
     try:
         schema.model_validate(values)
     except ValidationError as error:
         raise UserValueError(_sentence(schema, error.errors()[0])) from None
+    if "algorithm" in values:
+        _refuse_idle(values, asked)
 
 
-def _with_options(task: str, env: dict[str, Any]) -> type[Training]:
-    """The schema of a training run on this task."""
-    cls = task_class(task)
-    for name in env:
+def schema_of(values: dict[str, Any]) -> type[Training]:
+    """The schema of a training run: of its recipe, its task and its loss."""
+    for name in ("algorithm", "task"):
+        if not isinstance(values.get(name), str):
+            raise UserValueError(f"{name}={shown(values.get(name))}: it must be a name.")
+    known = settings(values["algorithm"])
+    if known is None:  # of a recipe that is somebody's own, in another program
+        return create_model("Training", __base__=Training, env=(_environment(values), ...), loss=(dict[str, Any], ...))
+    _require_all(values, known)
+    sections = {"env": _environment(values), "loss": _loss(values["algorithm"], values["loss"])}
+    return create_model("Training", __base__=Training, **{name: (kind, ...) for name, kind in sections.items()})
+
+
+def _require_all(values: Mapping[str, Any], known: Mapping[str, Any], section: str = "") -> None:
+    """Refuse to go without settings that the files of the recipe have, and the command line has deleted."""
+    for name in known:
+        if name not in values:
+            raise UserValueError(f"{section}{name} is missing: do not delete it. Set it to another value instead.")
+        if name not in ("env", "loss") and isinstance(known[name], Mapping) and isinstance(values[name], Mapping):
+            _require_all(values[name], known[name], f"{section}{name}.")
+
+
+def _environment(values: dict[str, Any]) -> Any:
+    """The schema of the section env, from the signature of the task."""
+    cls, env = task_class(values["task"]), values.get("env")
+    for name in env if isinstance(env, dict) else ():
         if name in SET_BY_RECIPES:
             raise UserValueError(f"env.{name}: recipes set it for all environments. Write {name}=..., without env.")
-    refuse_unknown(cls, sorted(set(env) - set(inspect.signature(cls).parameters)))
-    kinds = {name: (Real if kind is float else kind, None) for name, kind in option_types(cls).items()}
-    kinds = {name: kind for name, kind in kinds.items() if name not in Env.model_fields}
-    return create_model("Training", __base__=Training, env=(create_model("Env", __base__=Env, **kinds), ...))
+    if isinstance(env, dict):
+        refuse_unknown(cls, sorted(set(env) - set(inspect.signature(cls).parameters)))
+    return _section("Env", declared(cls), inspect.signature(cls).parameters)
+
+
+def _loss(algorithm: str, values: Any) -> Any:
+    """The schema of the section loss, from the signature of the loss, and from what a recipe of one's own adds."""
+    config, own = OWN.get(algorithm, (algorithm, {}))
+    options = {name: kind for name, kind in declared(LOSSES[config]).items() if name not in SET_BY_LOOPS}
+    added = {name: (type(x) if isinstance(x, bool | str) else Any, "") for name, x in (own.get("loss") or {}).items()}
+    options = {**added, **options}
+    for name in values if isinstance(values, dict) else ():
+        if name not in options:
+            raise UserValueError(
+                f"loss.{name} is unknown, or set by the recipe. Choose from: {', '.join(sorted(options))}."
+            )
+    return _section("Loss", options, options)
+
+
+def _section(name: str, kinds: Mapping[str, tuple[Any, str]], names: Iterable[str]) -> Any:
+    """A section with these options, all of which may be left out; what has no declared type its owner checks."""
+    fields = {}
+    for option in names:
+        kind, described = kinds.get(option, (Any, ""))
+        fields[option] = (kind, Field(None, description=re.sub(r"\bNone\b", "null", described) or None))
+    return create_model(name, __base__=Section, **fields)
+
+
+def _refuse_unknown(values: dict[str, Any], asked: Mapping[str, str]) -> None:
+    """Refuse settings on the command line that the recipe has not, and a file in tuned/ that is not there."""
+    known = OmegaConf.create(settings(values["algorithm"]) or values)
+    for name in asked:
+        section, *inner = name.split(".")
+        is_known = section in ("env", "loss", "tuned") or "/" in name or OmegaConf.select(known, name, default="") != ""
+        if not is_known:
+            among = known.get(section, {}) if inner else known
+            close = difflib.get_close_matches(name.split(".")[-1], map(str, among), 1)
+            hint = f"Did you mean {'.'.join([section, *close] if inner else close)}?" if close else "Leave it out."
+            raise UserValueError(f"{name} is unknown: this recipe has no such setting. {hint}")
+    tuned = asked.get("tuned", "null")
+    known = sorted(path.stem for path in (CONFIG / "tuned").glob("*.yaml"))
+    if tuned not in ("null", *known):
+        close = difflib.get_close_matches(tuned, known, 1) or known
+        raise UserValueError(
+            f"tuned={tuned}: there is no such file in recipes/config/tuned. Choose from: {', '.join(close)}."
+        )
+
+
+def _refuse_idle(values: dict[str, Any], asked: Mapping[str, str]) -> None:
+    """Refuse what the command line sets and another setting switches off."""
+    for names, is_idle, why in IDLE:
+        for name in set(names.split()) & asked.keys():
+            if is_idle(values):
+                raise UserValueError(f"{name}={asked[name]} has no effect: {why}. Leave it out, or change that.")
 
 
 def _refuse_none(values: Any, name: str = "") -> None:
@@ -316,16 +429,6 @@ def _refuse_none(values: Any, name: str = "") -> None:
             _refuse_none(value, f"{name}.{key}" if name else str(key))
     elif values in ("None", "none"):
         raise UserValueError(f"{name}={values}: it is the word {values!r} to YAML. For no value write {name}=null.")
-
-
-_TYPES = {  # pydantic's kinds of error in plain words
-    "int_type": "be a whole number",
-    "float_type": "be a number",
-    "bool_type": "be true or false",
-    "string_type": "be a string",
-    "list_type": "be a list",
-    "model_type": "be a section with settings of its own",
-}
 
 
 def _sentence(schema: type[BaseModel], error: Any) -> str:
@@ -340,12 +443,13 @@ def _sentence(schema: type[BaseModel], error: Any) -> str:
             kinds = [] if field is None else [field.annotation, *getattr(field.annotation, "__args__", ())]
             schema = next((x for x in kinds if isinstance(x, type) and issubclass(x, BaseModel)), None)
     if error["type"] == "extra_forbidden":
-        return f"{name} is unknown: recipes/training/schema.py has no such setting. Look for a misspelling."
-    said = error["msg"].removeprefix("Value error, ").removeprefix("Input should ").replace(" after validation", "")
-    for long, short in (("greater than or equal to", "at least"), ("less than or equal to", "at most")):
-        said = said.replace(long, short)
-    must = _TYPES.get(error["type"], said.replace("List should have", "have"))
-    if error["type"] == "int_type" and isinstance(value, float) and value.is_integer():
-        must += f", written {int(value)}"
-    shown = "" if isinstance(value, dict) else f"={'null' if value is None else value}"
-    return " ".join(filter(None, (f"{name}{shown}: it must {must}.", field and field.description)))
+        return f"{name} is unknown: there is no such setting. Look for a misspelling."
+    if error["type"] == "missing":
+        return f"{name} is missing: write {name}=... on the command line."
+    text = "" if isinstance(value, dict) else f"={'null' if value is None else _plain(value)}"
+    described = "" if field is None or not field.description else field.description
+    return " ".join(filter(None, (f"{name}{text}: it must {must(error)}.", described)))
+
+
+def _plain(value: Any) -> str:
+    return value[:100] if isinstance(value, str) else shown(value)

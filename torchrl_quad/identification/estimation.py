@@ -14,7 +14,7 @@ from pydantic import Field
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
 from torchrl_quad.dynamics.presets import is_number
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.identification.errors import TooLittleFlight
+from torchrl_quad.identification.errors import TooLittleFlight, UnknownField
 from torchrl_quad.identification.fitting import MAX_ITERATIONS
 from torchrl_quad.identification.log import FlightLog, as_logs
 from torchrl_quad.identification.parameters import FIELDS, Model, unknowns_of
@@ -86,6 +86,8 @@ def identify(
         wanted = [x for x in wanted if x not in FIELDS.get(name, ())]
     lagging = any("angular_velocity" in x.onboard for x in logs)
     moves_streams = lagging and "stream" in unknowns_of(fields)
+    if not wanted and not moves_streams:
+        raise UnknownField("identify: nothing is left to fit, since all of the fields are known. Name more fields.")
     step = min(x.dt * max(1, round(0.01 / x.dt)) for x in logs)
     seconds = sum((b - a) * x.dt for x in logs for a, b in x.segments)
     every = max(0.5 * horizon, seconds / _MOST_WINDOWS)

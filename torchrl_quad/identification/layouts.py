@@ -12,7 +12,7 @@ from torchrl_quad.deploy import frames
 from torchrl_quad.dynamics.presets import as_array
 from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
-from torchrl_quad.identification.streams import Array, Signal, Stream
+from torchrl_quad.identification.streams import LARGEST, Array, Signal, Stream
 from torchrl_quad.options import shown
 
 SIZES = {  # how many columns a quantity has; setpoints may have any number
@@ -61,6 +61,7 @@ class Columns:
             if not fits or (field == "scale" and not numbers.all()):
                 rule = "a number, or one for each column" + (", and none may be zero" if field == "scale" else "")
                 raise UserValueError(f"Columns: {field} of {', '.join(names)} must be {rule}; got {shown(value)}.")
+            object.__setattr__(self, field, tuple(numbers.tolist()) if numbers.ndim else float(numbers))
 
 
 @dataclass(frozen=True)
@@ -222,7 +223,7 @@ def _as_columns(quantity: str, names: object) -> Columns:
 
 
 def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Signal]:
-    """Each quantity of the layout that the streams have, in our units, frames and orders.
+    """Each quantity of the layout that the streams have, in our units, frames and orders; NaN beyond ``LARGEST``.
 
     Raises:
         MissingColumns: the streams lack a quantity that every log needs, or a column of a mapping.
@@ -245,8 +246,11 @@ def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Si
                 f"{name}: the columns of {quantity}, {', '.join(choice.names)}, stand in different streams, whose "
                 "samples have different times. Name columns of one."
             )
-        values = np.stack([np.asarray(stream.columns[column], float) for column in choice.names], -1)
-        values = _translate(quantity, (values - choice.offset) * choice.scale, layout.convention)
+        with np.errstate(over="ignore", invalid="ignore"):  # damage makes NaN and numbers of any size
+            values = np.stack([np.asarray(stream.columns[column], float) for column in choice.names], -1)
+            values = (values - choice.offset) * choice.scale
+        values[~(np.abs(values) < LARGEST)] = np.nan
+        values = _translate(quantity, values, layout.convention)
         found[quantity] = Signal(quantity, choice.names, stream.time, values)
     if "quaternion" in found:
         found.pop("euler", None)

@@ -20,13 +20,22 @@ from torchrl_quad.identification.checks import (
     check_specific_force,
     check_velocity,
 )
-from torchrl_quad.identification.errors import GapsTooLarge, LogError, NoFlight, TooLittleFlight, TooShort, WrongUnit
+from torchrl_quad.identification.errors import (
+    GapsTooLarge,
+    LogError,
+    NoFlight,
+    TooLittleFlight,
+    TooShort,
+    UnreadableLog,
+    WrongUnit,
+)
 from torchrl_quad.identification.layouts import SIZES, Columns, Layout, gather
 from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
 from torchrl_quad.identification.sources import read_streams
 from torchrl_quad.identification.streams import LARGEST, Array, Signal, Stream, clean, covered, frozen, resample
 from torchrl_quad.options import NonNegative, checked, shown
 
+_LONGEST = 3000  # letters of an error: it lists up to 60 columns of a file
 LEAST_STEP, MAX_STEPS = 1e-3, 1_000_000  # [s] of a log, and how many: 17 minutes at 1 kHz, half a gigabyte
 
 
@@ -141,9 +150,9 @@ def read_log(
         _check_onboard(fields)
         return _flight(path, streams, layout, notes, fields, dt, clearance, max_gap, min_duration)
     except LogError as error:
-        if path.name in str(error):
-            raise
-        raise type(error)(f"{path.name}: {error}") from error
+        said = str(error) if path.name in str(error) else f"{path.name}: {error}"
+        said = " ".join("".join(x if x.isprintable() else " " for x in said).split())  # names may hold anything
+        raise type(error)(said if len(said) <= _LONGEST else f"{said[:_LONGEST]} ...") from error
 
 
 def _check_onboard(fields: Sequence[str]) -> None:
@@ -258,10 +267,13 @@ def _refuse_length(name: str, main: Sequence[Signal], span: float, step: float) 
     """Raise the error of a clock that jumps ahead, or of a log that is too long; before it is put on a grid."""
     signal = max(main, key=lambda s: np.diff(s.time).max())
     k = int(np.diff(signal.time).argmax())
+    begin, end = signal.time[k : k + 2]
+    said = f"{name} spans {span:.4g} s, {span / step:.3g} steps of {step:g} s; the most is {MAX_STEPS:,}"
+    if end - begin < 0.1 * span:
+        raise UnreadableLog(f"{said}. Cut it into shorter logs, or give a larger dt.")
     raise GapsTooLarge(
-        f"{name} spans {span:.4g} s, which are {span / step:.3g} steps of {step:g} s; the most is {MAX_STEPS:,}. The "
-        f"clock of {signal} jumps from {signal.time[k]:.6g} to {signal.time[k + 1]:.6g} s at sample {k + 1}. Cut the "
-        "file there and read the parts, or give a larger dt."
+        f"{said}. The clock of {signal} jumps from {begin:.6g} to {end:.6g} s at sample {k + 1}. Cut the file there "
+        "and read the parts."
     )
 
 

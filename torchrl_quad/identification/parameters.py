@@ -95,7 +95,7 @@ class Model:
             "delay": prior.mass.new_tensor(self.motors.delay / UNKNOWNS["delay"].scale),
             "stream": prior.mass.new_zeros(()),
         }
-        return torch.stack([values[name] for name in self.free])
+        return torch.stack([values[name] for name in self.free]) if self.free else prior.mass.new_zeros(0)
 
     def only(self, free: Sequence[str]) -> Model:
         """The same with other unknowns; what is left out keeps its prior."""

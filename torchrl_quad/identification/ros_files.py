@@ -20,6 +20,7 @@ from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 
 from torchrl_quad.dynamics import presets
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.identification.errors import UnreadableLog
 from torchrl_quad.identification.streams import open_plain
 from torchrl_quad.options import shown
@@ -82,7 +83,10 @@ class BagFile:
 
     def _from_metadata(self, folder: Path) -> list[Path]:
         with open_plain(folder / "metadata.yaml") as file:
-            about = presets.parse(file.read(presets.MAX_BYTES + 1), f"{self.name}/metadata.yaml")
+            try:
+                about = presets.parse(file.read(presets.MAX_BYTES + 1), f"{self.name}/metadata.yaml")
+            except UserValueError as error:
+                raise UnreadableLog(str(error)) from error
         about = about.get("rosbag2_bagfile_information") if isinstance(about, dict) else None
         names = about.get("relative_file_paths") if isinstance(about, dict) else None
         if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchrl_quad.identification.ros_files import Connection
+from torchrl_quad.options import shown
 
 MAX_DEFINITION = 100_000  # characters
 _NUMBERS = {
@@ -126,7 +127,7 @@ def definitions_of(connection: Connection) -> Mapping[str, list[tuple[str, tuple
                     text = part.partition("\n")[2] if part.startswith("IDL: ") else part
                     own |= get_types_from_idl(text) if text.strip() else {}
         except Exception as error:  # rosbags raises whatever its parser meets
-            raise Damaged(f"the definition of {connection.kind} is broken: {error}") from error
+            raise Damaged(f"the definition of {connection.kind} is broken: {shown(str(error))}") from error
         found |= {name: fields for name, (_, fields) in own.items()}
     if connection.kind not in found:
         raise Damaged(f"{connection.kind} has no definition")

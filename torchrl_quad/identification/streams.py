@@ -61,14 +61,14 @@ class Signal:
 
 
 def clean(signal: Signal) -> tuple[Signal, str | None]:
-    """Without samples that are not finite, beyond ``LARGEST`` or repeat a time, and what was dropped.
+    """Without samples that are not finite or repeat a time, and what was dropped.
 
     Raises:
         ClockJumpsBack: the clock runs backwards.
         NotFiniteLog: fewer than two samples are finite.
     """
     time, values = signal.time, signal.values
-    finite = (np.abs(values) < LARGEST).all(-1) & (np.abs(time) < 1e15)  # neither holds for NaN
+    finite = np.isfinite(values).all(-1) & (np.abs(time) < 1e15)
     if finite.sum() < 2:  # of tables that join several rates, most rows of the slower ones are empty
         raise NotFiniteLog(
             f"{finite.sum()} of {len(finite)} samples of {signal} are finite: nothing was recorded there. Name other "

@@ -21,7 +21,7 @@ from torchrl_quad.deploy.frames import motor_signal
 from torchrl_quad.identification.errors import UnreadableLog
 from torchrl_quad.identification.streams import Stream
 
-MAX_COLUMNS = 100_000  # of all messages
+MAX_COLUMNS, MAX_MESSAGES = 100_000, 20 * 10**6  # columns of all kinds of messages together
 _MAGIC = b"ULog\x01\x12\x35"
 _SYNC = bytes.fromhex("2f731320250cbb12")
 _KINDS = frozenset(b"BFIMPQARDLCSO")
@@ -68,7 +68,7 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     to its size; what makes no sense is left out, and the notes say so.
 
     Raises:
-        UnreadableLog: no message of the file can be read, or it has too many columns.
+        UnreadableLog: no message of the file can be read, or it has too many of them, or of columns.
     """
     log = _scan(data, name)
     notes = []
@@ -93,7 +93,9 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
             for k in range(4):
                 control = columns.get(f"{stem}.control[{k}]")
                 if control is not None:
-                    columns[f"{stem}.signal[{k}]"] = motor_signal(np.nan_to_num(control.astype(float)), log.curve)
+                    with np.errstate(invalid="ignore", over="ignore"):  # NaN of some patterns warn
+                        thrust = np.nan_to_num(control.astype(float))
+                        columns[f"{stem}.signal[{k}]"] = motor_signal(thrust, log.curve)
         streams.append(Stream(stem, time * 1e-6, columns))
     if "actuator_motors" not in {stream.name for stream in streams}:
         notes.append("no actuator_motors: motor commands are actuator_outputs, taken as 1000 to 2000 us")
@@ -105,7 +107,9 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
 def _scan(data: bytes, name: str) -> _Log:
     """Every message once, from the first byte to the last."""
     log, at, flying = _Log(), 16, False
-    while True:
+    for count in itertools.count():
+        if count > MAX_MESSAGES:
+            raise UnreadableLog(f"{name} has more than {MAX_MESSAGES:,} messages; that is the most. Log fewer.")
         end = next((end for end in log.ends if end > at), len(data))
         if at + 3 > end:
             if end == len(data):

@@ -8,14 +8,20 @@ id, time (version 1: 32 bits, ms; version 2: 64 bits, us) and values. The last f
 
 from __future__ import annotations
 
+import itertools
 import re
 import struct
 import zlib
+from array import array
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from torchrl_quad.identification.errors import UnreadableLog
 from torchrl_quad.identification.streams import Array, Stream
+from torchrl_quad.options import shown
+
+MAX_COLUMNS, MAX_EVENTS = 100_000, 20 * 10**6  # columns of all kinds of events together
 
 _TICKS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}
 _VARIABLE = re.compile(r"(.+)\(([bBhHiIqQfd?])\)")
@@ -25,7 +31,7 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     """A stream for each kind of event.
 
     Raises:
-        UnreadableLog: the file has another version, or its header is cut off.
+        UnreadableLog: the file has another version or too many variables or events, or its header is cut off.
     """
     notes = []
     body = data[:-4]
@@ -37,7 +43,7 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
         version, kinds = struct.unpack_from("<HH", body, 1)
         if version not in _TICKS:
             raise UnreadableLog(f"{name} is a uSD log of version {version}; 1 and 2 are known. Export it as CSV.")
-        records, names, at = {}, {}, 5
+        records, names, at, columns = {}, {}, 5, 0
         for _ in range(kinds):
             (kind,) = struct.unpack_from("<H", body, at)
             names[kind], at = _text(body, at + 2)
@@ -48,31 +54,39 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
                 variable, at = _text(body, at)
                 found = _VARIABLE.fullmatch(variable)
                 if found is None:
-                    raise UnreadableLog(f"{name} has a variable of unknown type, {variable!r}. Export it as CSV.")
+                    raise UnreadableLog(f"{name} has a variable of unknown type, {shown(variable)}. Export it as CSV.")
+                columns += 1
+                if columns > MAX_COLUMNS:
+                    raise UnreadableLog(f"{name} has more than {MAX_COLUMNS:,} variables; that is the most.")
                 fields.append((found[1], np.dtype(found[2]).newbyteorder("<")))
             records[kind] = np.dtype(fields)
     except (struct.error, ValueError) as error:
         if isinstance(error, UnreadableLog):
             raise
         raise UnreadableLog(f"{name} begins like a uSD log, but its header is cut off. Copy it again.") from error
-    events, left = _events(body, at, records)
+    events, left = _events(body, at, records, name)
     if left:
         notes.append(f"the last {left} bytes of the uSD log were not read: they are no whole events")
     streams = []
     for kind, rows in events.items():
-        columns = {field: rows[field].astype(float) for field in records[kind].names[2:]}
-        if "stateEstimateZ.quat" in columns:
+        with np.errstate(invalid="ignore"):  # NaN of some patterns warn
+            values = {field: rows[field].astype(float) for field in records[kind].names[2:]}
+        if "stateEstimateZ.quat" in values and rows["stateEstimateZ.quat"].dtype.kind in "iu":
             q = decompress_quaternions(rows["stateEstimateZ.quat"])
-            columns |= {f"stateEstimateZ.q{axis}": q[:, k] for k, axis in enumerate("xyzw")}
-        streams.append(Stream(names[kind], rows["tick"] * _TICKS[version][1], columns))
+            values |= {f"stateEstimateZ.q{axis}": q[:, k] for k, axis in enumerate("xyzw")}
+        streams.append(Stream(names[kind], rows["tick"] * _TICKS[version][1], values))
     return streams, notes
 
 
-def _events(body: bytes, at: int, records: dict[int, np.dtype]) -> tuple[dict[int, np.ndarray], int]:
+def _events(body: bytes, at: int, records: dict[int, np.dtype], name: str) -> tuple[dict[int, np.ndarray], int]:
     """The events of each kind, and how many bytes at the end are no event."""
-    starts: dict[int, list[int]] = {kind: [] for kind in records}
+    starts = {kind: array("Q") for kind in records}
     sizes = {kind: record.itemsize for kind, record in records.items()}
-    while at + 2 <= len(body):
+    for count in itertools.count():
+        if count > MAX_EVENTS:
+            raise UnreadableLog(f"{name} has more than {MAX_EVENTS:,} events; that is the most. Log fewer.")
+        if at + 2 > len(body):
+            break
         kind = body[at] | body[at + 1] << 8
         if kind not in sizes or at + sizes[kind] > len(body):
             break
@@ -81,15 +95,17 @@ def _events(body: bytes, at: int, records: dict[int, np.dtype]) -> tuple[dict[in
     data = np.frombuffer(body, np.uint8)
     rows = {}
     for kind, begin in starts.items():
-        picked = data[np.array(begin, int)[:, None] + np.arange(sizes[kind])]
-        rows[kind] = np.ascontiguousarray(picked).view(records[kind])[:, 0] if begin else np.empty(0, records[kind])
+        rows[kind] = np.empty(0, records[kind])
+        if begin:
+            picked = sliding_window_view(data, sizes[kind])[np.frombuffer(begin, np.uint64)]
+            rows[kind] = picked.view(records[kind])[:, 0]
     return rows, len(body) - at
 
 
 def decompress_quaternions(compressed: np.ndarray) -> Array:
     """Quaternions (N, 4), x y z w, of ``stateEstimateZ.quat`` (``quatcompress.h``): the top two bits name the largest
     component, which is positive; the others follow in ten bits each, a sign and a share of sqrt(1/2) of nine bits."""
-    code = np.asarray(compressed).astype(np.uint64)
+    code = np.asarray(compressed).astype(np.uint64) & np.uint64(0xFFFFFFFF)
     largest = (code >> np.uint64(30)).astype(int)
     q = np.zeros((len(code), 4))
     for k in (3, 2, 1, 0):

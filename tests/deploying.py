@@ -37,6 +37,7 @@ TASKS = {  # with all that policies may read, spread over the tasks
     "hovering, without memory": {"camera": {"width": 5, "height": 4, "position": [0.1, 0, 0], "along_ray": True}},
 }
 NORMALIZED = ("tracking", "racing", "forest")
+FLOWN = ("hovering", "tracking", "racing", "landing", "forest")  # of each rule one
 
 
 def build(name, num_envs=16):
@@ -61,6 +62,13 @@ def resting(**changes):
     """A level drone at rest near the target of hovering, as a bundle takes it."""
     still = {"position": [1, 0, 1.4], "quaternion": [1, 0, 0, 0], "velocity": [0, 0, 0], "angular_velocity": [0, 0, 0]}
     return {**still, "age": 0.0, **changes}
+
+
+def seen_by(bundle, **changes):
+    """A state that the policy of a bundle can fly from."""
+    camera = bundle.contract["camera"]
+    images = {"depth": np.full((camera["height"], camera["width"]), 3.0), "depth_age": 0.0} if camera else {}
+    return resting(**images, **changes)
 
 
 @pytest.fixture(scope="session")

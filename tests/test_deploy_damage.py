@@ -12,23 +12,18 @@ import zipfile
 import numpy as np
 import onnx
 import pytest
-from deploying import resting
+from deploying import FLOWN, resting, seen_by
 from onnx import TensorProto, helper
 
 from torchrl_quad.deploy import (
     BrokenPolicy,
-    MissingQuantity,
-    NotFinite,
-    StaleState,
     TamperedBundle,
     UnknownContract,
     contract,
     load_bundle,
 )
 from torchrl_quad.dynamics.parameters import LIMITS
-from torchrl_quad.errors import UserError, UserValueError
-
-FLOWN = ("hovering", "tracking", "racing", "landing", "forest")  # a bundle of each rule
+from torchrl_quad.errors import UserError
 
 
 @pytest.fixture
@@ -54,13 +49,6 @@ def put(about, path, value):
     for key in way:
         about = about[key]
     about[last] = value
-
-
-def seen_by(bundle, **changes):
-    """A state that the policy of a bundle can fly from."""
-    camera = bundle.contract["camera"]
-    images = {"depth": np.full((camera["height"], camera["width"]), 3.0), "depth_age": 0.0} if camera else {}
-    return resting(**images, **changes)
 
 
 def require_sane_flight(bundle):
@@ -368,92 +356,3 @@ def test_a_network_that_leaves_its_limits_or_its_shape_in_flight_is_a_fault(copi
         fit(folder, about)
         with pytest.raises(BrokenPolicy, match=message):
             load_bundle(folder)(resting())
-
-
-# -- steps that fail ---------------------------------------------------------------------------------------------------
-
-
-class Failing:
-    """A session that fails or answers otherwise, once."""
-
-    def __init__(self, session, answer):
-        self.session, self.answer, self.get_inputs = session, answer, session.get_inputs
-
-    def run(self, names, given):
-        found = self.session.run(names, given)
-        answer, self.answer = self.answer, None
-        return found if answer is None else answer(found)
-
-
-def crash(found):
-    raise RuntimeError("[ONNXRuntimeError] : 6 :\n out of everything")
-
-
-class Hostile:
-    def __array__(self, *_, **__):
-        raise ZeroDivisionError
-
-
-FAILURES = {
-    "stale": (StaleState, {"age": 1.0}, None),
-    "missing": (MissingQuantity, {"velocity": None}, None),
-    "NaN": (NotFinite, {"position": [np.nan, 0, 0]}, None),
-    "text": (MissingQuantity, {"position": ["1", "2", "3"]}, None),
-    "truth": (MissingQuantity, {"age": True}, None),
-    "own type": (MissingQuantity, {"position": Hostile()}, None),
-    "onnxruntime": (BrokenPolicy, {}, crash),
-    "interrupt": (KeyboardInterrupt, {}, lambda _: exec("raise KeyboardInterrupt")),
-    "action": (NotFinite, {}, lambda found: [np.full_like(x, np.nan) for x in found]),
-    "last output": (NotFinite, {}, lambda found: [*found[:-1], np.full_like(found[-1], np.inf)]),
-    "beyond": (BrokenPolicy, {}, lambda found: [np.full_like(found[0], 2.0), *found[1:]]),
-    "shape": (BrokenPolicy, {}, lambda found: [found[0][:, :3], *found[1:]]),
-}
-
-
-@pytest.mark.parametrize("failure", FAILURES)
-@pytest.mark.parametrize("task", FLOWN)
-def test_a_step_that_failed_and_is_repeated_equals_one_that_never_failed(export_once, task, failure):
-    kind, changes, answer = FAILURES[failure]
-    failing, untouched = (load_bundle(export_once(task)[2]) for _ in range(2))
-    session, gates = failing._session, failing.contract["task"].get("gates", [[1, 0, 1.4]])
-    for step in range(6):
-        position = np.array(gates[0]) + (step - 2.5, 0, 0)  # through the gate between two of the steps
-        state = seen_by(failing, position=position, angular_velocity=[0, 0.1 * step, 0])
-        before = copy.deepcopy(
-            {**vars(failing), "_session": 0, "faults": 0, "last_fault": 0, "rule": vars(failing.rule)}
-        )
-        failing._session = Failing(session, answer)
-        with pytest.raises(kind):
-            failing({key: x for key, x in (state | changes).items() if x is not None})
-        after = {**vars(failing), "_session": 0, "faults": 0, "last_fault": 0, "rule": vars(failing.rule)}
-        np.testing.assert_equal(after, before)
-        failing._session = session
-        (thrust, rates), (expected, turning) = failing(state), untouched(state)
-        assert thrust == expected and np.array_equal(rates, turning)
-        assert vars(failing.rule).keys() == vars(untouched.rule).keys()
-    np.testing.assert_equal(vars(failing.rule), vars(untouched.rule))
-    np.testing.assert_equal(failing.memory, untouched.memory)
-    if kind is not KeyboardInterrupt:
-        assert failing.faults == {kind.__name__: 6} and str(failing.last_fault).startswith(f"{failing.folder}: ")
-
-
-@pytest.mark.parametrize(
-    ("task", "progress"),
-    [
-        ("hovering", {"target": "here"}),
-        ("hovering", {"target": [10**400, 0, 0]}),
-        ("hovering", {"target": [True, False, True]}),
-        ("tracking", {"phase": "late"}),
-        ("tracking", {"phase": 1e308}),
-        ("racing", {"gate": [0, 1]}),
-        ("racing", {"gate": np.arange(2)}),
-        ("forest", {"target": [1, 2, 3], "speed": np.nan}),
-        ("forest", {"speed": True}),
-    ],
-)
-def test_a_start_that_makes_no_sense_is_refused_and_changes_nothing(export_once, task, progress):
-    bundle = load_bundle(export_once(task)[2])
-    before = copy.deepcopy(vars(bundle.rule))
-    with pytest.raises(UserValueError, match=f"^{bundle.folder}: {list(progress)[-1]} must be"):
-        bundle.reset(**progress)
-    np.testing.assert_equal(vars(bundle.rule), before)

@@ -1,6 +1,6 @@
 """A bundle in flight and its limits: faults have names and are counted, and what cannot be exported is refused."""
 
-import functools
+import copy
 import json
 import math
 import re
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from deploying import build, resting
+from deploying import FLOWN, build, resting, seen_by
 from own_task import CornerEnv
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -20,6 +20,7 @@ from torchrl.envs import PendulumEnv, RewardSum, TransformedEnv
 import torchrl_quad
 from torchrl_quad import HoveringEnv, ObservationNormalizer, RacingEnv, TrackingEnv, make_actor, make_env
 from torchrl_quad.deploy import (
+    BrokenPolicy,
     MissingQuantity,
     NotFinite,
     NotUnitQuaternion,
@@ -31,6 +32,7 @@ from torchrl_quad.deploy import (
 from torchrl_quad.deploy.describe import _harmonics
 from torchrl_quad.deploy.tasks import Course, Curve, Gates
 from torchrl_quad.envs import TASKS
+from torchrl_quad.errors import UserValueError
 
 ROOT = Path(__file__).parent.parent
 
@@ -86,17 +88,6 @@ def test_each_fault_has_a_name_and_changes_nothing_or_hovers_and_is_counted(fold
     assert not untouched.faults and untouched.last_fault is None
     hovering.reset()
     assert hovering.faults  # readable after the flight
-
-
-def test_an_action_that_is_not_finite_is_a_fault(folder, monkeypatch):
-    class Broken:
-        def run(self, *_):
-            return [np.full((1, 4), np.nan, np.float32)]
-
-    bundle = load_bundle(folder)
-    monkeypatch.setattr(bundle, "_session", Broken())
-    with pytest.raises(NotFinite, match="The action is not finite"):
-        bundle(resting())
 
 
 def test_a_bundle_keeps_the_queue_and_starts_anew(folder):
@@ -190,10 +181,9 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
         r"reads \['observation', \('state', 'rotor_speed'\)\]. A drone can give it",
         make_actor(env, in_keys=["observation", ("state", "rotor_speed")]),
     )
-    refuses(
-        r"cannot write LeakyReLU\(negative_slope=0.2\)",
-        make_actor(env, activation=functools.partial(nn.LeakyReLU, 0.2)),
-    )
+    leaky = make_actor(env)
+    leaky[0].module.mlp[1] = nn.LeakyReLU(0.2)
+    refuses(r"cannot write LeakyReLU\(negative_slope=0.2\)", leaky)
     hooked = make_actor(env)
     hooked[0].module.mlp.register_forward_hook(lambda *_: None)
     refuses("exports what make_actor and make_visual_actor build", hooked)
@@ -232,6 +222,95 @@ def test_a_normalizer_is_that_of_the_transforms_or_is_given_beside_a_bare_enviro
     assert marks[0] != marks[1] == marks[2]
 
 
+# -- steps that fail ---------------------------------------------------------------------------------------------------
+
+
+class Failing:
+    """A session that fails or answers otherwise, once."""
+
+    def __init__(self, session, answer):
+        self.session, self.answer, self.get_inputs = session, answer, session.get_inputs
+
+    def run(self, names, given):
+        found = self.session.run(names, given)
+        answer, self.answer = self.answer, None
+        return found if answer is None else answer(found)
+
+
+def crash(found):
+    raise RuntimeError("[ONNXRuntimeError] : 6 :\n out of everything")
+
+
+class Hostile:
+    def __array__(self, *_, **__):
+        raise ZeroDivisionError
+
+
+FAILURES = {
+    "stale": (StaleState, {"age": 1.0}, None),
+    "missing": (MissingQuantity, {"velocity": None}, None),
+    "NaN": (NotFinite, {"position": [np.nan, 0, 0]}, None),
+    "text": (MissingQuantity, {"position": ["1", "2", "3"]}, None),
+    "truth": (MissingQuantity, {"age": True}, None),
+    "own type": (MissingQuantity, {"position": Hostile()}, None),
+    "onnxruntime": (BrokenPolicy, {}, crash),
+    "interrupt": (KeyboardInterrupt, {}, lambda _: exec("raise KeyboardInterrupt")),
+    "action": (NotFinite, {}, lambda found: [np.full_like(x, np.nan) for x in found]),
+    "last output": (NotFinite, {}, lambda found: [*found[:-1], np.full_like(found[-1], np.inf)]),
+    "beyond": (BrokenPolicy, {}, lambda found: [np.full_like(found[0], 2.0), *found[1:]]),
+    "shape": (BrokenPolicy, {}, lambda found: [found[0][:, :3], *found[1:]]),
+}
+
+
+@pytest.mark.parametrize("failure", FAILURES)
+@pytest.mark.parametrize("task", FLOWN)
+def test_a_step_that_failed_and_is_repeated_equals_one_that_never_failed(export_once, task, failure):
+    kind, changes, answer = FAILURES[failure]
+    failing, untouched = (load_bundle(export_once(task)[2]) for _ in range(2))
+    session, gates = failing._session, failing.contract["task"].get("gates", [[1, 0, 1.4]])
+    for step in range(6):
+        position = np.array(gates[0]) + (step - 2.5, 0, 0)  # through the gate between two of the steps
+        state = seen_by(failing, position=position, angular_velocity=[0, 0.1 * step, 0])
+        before = copy.deepcopy(
+            {**vars(failing), "_session": 0, "faults": 0, "last_fault": 0, "rule": vars(failing.rule)}
+        )
+        failing._session = Failing(session, answer)
+        with pytest.raises(kind):
+            failing({key: x for key, x in (state | changes).items() if x is not None})
+        after = {**vars(failing), "_session": 0, "faults": 0, "last_fault": 0, "rule": vars(failing.rule)}
+        np.testing.assert_equal(after, before)
+        failing._session = session
+        (thrust, rates), (expected, turning) = failing(state), untouched(state)
+        assert thrust == expected and np.array_equal(rates, turning)
+        assert vars(failing.rule).keys() == vars(untouched.rule).keys()
+    np.testing.assert_equal(vars(failing.rule), vars(untouched.rule))
+    np.testing.assert_equal(failing.memory, untouched.memory)
+    if kind is not KeyboardInterrupt:
+        assert failing.faults == {kind.__name__: 6} and str(failing.last_fault).startswith(f"{failing.folder}: ")
+
+
+@pytest.mark.parametrize(
+    ("task", "progress"),
+    [
+        ("hovering", {"target": "here"}),
+        ("hovering", {"target": [10**400, 0, 0]}),
+        ("hovering", {"target": [True, False, True]}),
+        ("tracking", {"phase": "late"}),
+        ("tracking", {"phase": 1e308}),
+        ("racing", {"gate": [0, 1]}),
+        ("racing", {"gate": np.arange(2)}),
+        ("forest", {"target": [1, 2, 3], "speed": np.nan}),
+        ("forest", {"speed": True}),
+    ],
+)
+def test_a_start_that_makes_no_sense_is_refused_and_changes_nothing(export_once, task, progress):
+    bundle = load_bundle(export_once(task)[2])
+    before = copy.deepcopy(vars(bundle.rule))
+    with pytest.raises(UserValueError, match=f"^{bundle.folder}: {list(progress)[-1]} must be"):
+        bundle.reset(**progress)
+    np.testing.assert_equal(vars(bundle.rule), before)
+
+
 # -- without torch -----------------------------------------------------------------------------------------------------
 
 BLOCKED = """
@@ -252,7 +331,7 @@ def python(program):
     return done.stdout
 
 
-def test_flying_needs_numpy_and_onnxruntime_alone(folder):
+def test_flying_needs_numpy_onnxruntime_and_jsonschema_alone(folder):
     fly = f"""
 import numpy
 from torchrl_quad.deploy import frames, load_bundle
@@ -262,14 +341,18 @@ assert "torch" not in sys.modules
 """
     assert "array" in python(BLOCKED + fly)
     missing = """
-sys.modules["onnxruntime"] = None
+sys.modules[{!r}] = None
 from torchrl_quad.deploy import load_bundle
+from torchrl_quad.errors import MissingPackage
 try:
     load_bundle({!r})
-except ImportError as error:
+except MissingPackage as error:
     print(error)
 """
-    assert python(BLOCKED + missing.format(str(folder))) == "A bundle flies with onnxruntime: pip install onnxruntime\n"
+    for name, why in {"onnxruntime": "flies", "jsonschema": "is checked"}.items():
+        assert (
+            python(BLOCKED + missing.format(name, str(folder))) == f"A bundle {why} with {name}: pip install {name}\n"
+        )
 
 
 def test_the_package_imports_its_parts_when_they_are_asked_for():

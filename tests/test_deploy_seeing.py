@@ -1,7 +1,6 @@
 """Policies that see and remember, exported: images and their faults, the memory, and what is refused."""
 
 import ctypes
-import functools
 import math
 import re
 
@@ -146,4 +145,6 @@ def test_a_policy_that_sees_otherwise_than_it_was_built_is_refused(tmp_path):
         refuses("exports what make_actor and make_visual_actor build, .* This VisualActor is something", changed)
     velocity = make_visual_actor(forest, in_keys=[("state", "velocity")])
     refuses(r"reads \['depth', \('state', 'velocity'\)\]. A drone can give it", velocity)
-    refuses("cannot write ELU.alpha=0.5", make_visual_actor(forest, activation=functools.partial(nn.ELU, 0.5)))
+    flatter = make_visual_actor(forest)
+    flatter[0][0].module.eyes[1] = nn.ELU(0.5)
+    refuses("cannot write ELU.alpha=0.5", flatter)

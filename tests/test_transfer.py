@@ -3,6 +3,8 @@
 import contextlib
 import copy
 import csv
+import re
+import runpy
 import subprocess
 import sys
 
@@ -259,7 +261,60 @@ def test_the_recipe_films_a_flight_beside_ours(hovering, tmp_path, launch, monke
     assert "from the same starts: MuJoCo" in (tmp_path / "transfer_mujoco.html").read_text()
 
 
-def test_the_recipe_says_what_is_wrong(hovering, refused, monkeypatch):
+def test_what_was_flown_is_printed_where_it_cannot_be_written(hovering, tmp_path, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("torchrl_quad.files.write_rows", full)
+    settings = [f"bundle={hovering}", f"folder={tmp_path}", "loop=contract", "episodes=1"]
+    with pytest.raises(SystemExit) as exit:
+        runpy.run_path(*argv(monkeypatch, *settings), run_name="__main__")
+    printed = capsys.readouterr()
+    assert exit.value.code == 2 and printed.err == "Error: [Errno 28] No space left on device\n"
+    first, *lines = printed.out.splitlines()
+    (row,) = csv.DictReader(lines)
+    assert first == f"Flown, and not written to {tmp_path}/transfer.csv:" and row["solved"] == "1.0000"
+
+
+def test_a_mistake_of_ours_keeps_its_traceback(hovering, tmp_path, monkeypatch):
+    def mistake(*_):
+        raise ValueError("of ours")
+
+    monkeypatch.setattr("torchrl_quad.deploy.transfer.judge", mistake)
+    with pytest.raises(ValueError, match="^of ours$"):
+        runpy.run_path(*argv(monkeypatch, f"bundle={hovering}", f"folder={tmp_path}"), run_name="__main__")
+
+
+def argv(monkeypatch, *settings):
+    monkeypatch.setattr(sys, "argv", ["recipes/transfer.py", *settings])
+    return [str(ROOT / "recipes/transfer.py")]
+
+
+WRONG_SETTINGS = {
+    "episodes=all": "episodes must be a whole number, at least 1, got 'all'",
+    "episodes=true": "episodes must be a whole number",
+    "episodes=0": "episodes must be a whole number, at least 1",
+    "late=-1": "late must be a whole number, at least 0, got '-1'",
+    "late=1e999": "late must be a whole number",
+    f"late={'9' * 5000}": "late must be a whole number",
+    "late=9999 ; loop=pd": "policy: late must be a whole number from 0 to 1000, got 9999",
+    "mutants=maybe": "mutants must be true or false, got 'maybe'",
+    "scale=[": r"scale must look like {mass: 1.2, inertia: 1.5}, got '\['",
+    f"scale={'{a: ' * 5000}": "scale must look like {mass: 1.2, inertia: 1.5}, got",
+    "scale={mass: [1]}": "scale must look like",
+    "scale={mass: 1, mass: 2}": "scale must look like",
+    "scale={mass: 1e999}": "policy: scale: mass must be a number from 0 to 1000, got inf",
+    "scale={mass: nan}": "scale: mass must be a number from 0 to 1000, got nan",
+    "scale={mass: 0}": "policy: scale: plant.mass is 0.0, and must be at least 0.001. Choose other factors",
+    "scale={rate_gain: 2}": "policy: scale: the drone has no 'rate_gain' to scale. Choose from: mass, ",
+    "late=1 ; late=2": "late is given twice",
+    "simulator=torchrl_quad ; loop=pid": "policy: torchrl_quad has no rate loop 'pid'. Choose from: contract",
+    "simulator=torchrl_quad ; mutants=true ; scale={inertia: 9}": "policy: torchrl_quad flies motors as they are",
+    "hello": "unknown setting 'hello'. Choose from: bundle=...",
+}
+
+
+def test_the_recipe_says_in_one_line_what_is_wrong(hovering, refused, monkeypatch, tmp_path):
     bundle = f"bundle={hovering}"
     assert "bundle is missing: write bundle=FOLDER" in refused("transfer")
     assert "No bundle at nowhere" in refused("transfer", "bundle=nowhere")
@@ -268,9 +323,17 @@ def test_the_recipe_says_what_is_wrong(hovering, refused, monkeypatch):
     )
     assert "mujoco has no rate loop 'own'. Choose from: contract, pid, pd." in refused("transfer", bundle, "loop=own")
     assert "unknown setting 'bundel=x'. Choose from: bundle=..." in refused("transfer", "bundel=x")
-    assert "episodes=all: episodes must be a int" in refused("transfer", bundle, "episodes=all")
-    assert "late must be at least 0" in refused("transfer", bundle, "late=-1")
-    assert "scale: the drone has no 'rate_gain' to scale" in refused("transfer", bundle, "scale={rate_gain: 2}")
+    for folder in ("[", "x" * 5000, "a\nb", "/dev/null"):
+        assert refused("transfer", f"bundle={folder}").startswith("Error: ")
+    assert "/dev/null is a device, and no folder" in refused("transfer", bundle, "folder=/dev/null")
+    for wrong, said in WRONG_SETTINGS.items():
+        line = refused("transfer", bundle, f"folder={tmp_path}", *wrong.split(" ; "))
+        assert re.fullmatch(f"Error: .*{said}.*", line), line
+    table = tmp_path / "transfer.csv"
+    for content in (b"a,b\n1,2\n", b"bundle\n\xff\n", b'a\n"' + b"x" * 200_000):
+        table.write_bytes(content)
+        assert "transfer.csv is no table of flights" in refused("transfer", bundle, f"folder={tmp_path}")
+        assert table.read_bytes() == content
     monkeypatch.setitem(sys.modules, "mujoco", None)
     monkeypatch.delitem(sys.modules, "torchrl_quad.deploy.simulators.mujoco", raising=False)
     assert "Flying in mujoco needs mujoco: pip install mujoco" in refused("transfer", bundle)

@@ -1,7 +1,7 @@
 """From a trained policy to a drone: export it as a folder, fly the folder without torch, and translate conventions.
 
-Flying needs numpy, onnxruntime and jsonschema, :mod:`~torchrl_quad.deploy.frames` numpy; nothing here imports torch until
-:func:`~torchrl_quad.deploy.export_policy` is asked for.
+Flying needs numpy, onnxruntime and jsonschema, :mod:`~torchrl_quad.deploy.frames` numpy; nothing here imports torch
+until :func:`~torchrl_quad.deploy.export_policy` is asked for.
 """
 
 from typing import TYPE_CHECKING, Any

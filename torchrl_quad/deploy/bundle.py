@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 from torchrl_quad.deploy import contract as contracts
 from torchrl_quad.deploy.contract import (
     IN_BODY,
-    QUANTITIES,
     BrokenPolicy,
-    Content,
     Fault,
     MissingQuantity,
     NegativeDepth,
@@ -30,6 +28,7 @@ from torchrl_quad.deploy.contract import (
     WrongActions,
     shown,
 )
+from torchrl_quad.deploy.reading import AGAIN, QUANTITIES, Content, read, shapes_of
 from torchrl_quad.deploy.simulators.vehicle import rotate
 from torchrl_quad.deploy.tasks import RULES
 from torchrl_quad.errors import MissingPackage, UserTypeError, UserValueError
@@ -83,7 +82,7 @@ class Bundle:
         self.rule = RULES[contract["task"]["rule"]](contract["task"] | {"control_dt": contract["control_dt"]})
         self._names = [x["name"] for x in contract["inputs"]]
         self._turned = [name for name in self._names if name.endswith(IN_BODY)]
-        self._reads, self._writes = contracts.shapes(contract)
+        self._reads, self._writes = shapes_of(contract)
         self.reset()
         self._session = self._opened(policy)
 
@@ -187,7 +186,7 @@ class Bundle:
             session = onnxruntime.InferenceSession(policy, options, **own)
         except Exception as error:  # onnxruntime has a dozen kinds, with nothing else in common
             why = contracts.one_line(error)
-            raise TamperedBundle(f"{path}: onnxruntime cannot read it: {why}. {contracts.AGAIN}") from error
+            raise TamperedBundle(f"{path}: onnxruntime cannot read it: {why}. {AGAIN}") from error
         for verb, side, shapes in (
             ("reads", session.get_inputs(), self._reads),
             ("writes", session.get_outputs(), self._writes),
@@ -196,7 +195,7 @@ class Bundle:
             wanted = {name: ("tensor(float)", "batch", *shape) for name, shape in shapes.items()}
             if found != wanted:
                 found = contracts.one_line(found)
-                raise TamperedBundle(f"{path} {verb} {found}, and the contract says {wanted}. {contracts.AGAIN}")
+                raise TamperedBundle(f"{path} {verb} {found}, and the contract says {wanted}. {AGAIN}")
         return session
 
     def _run(self, given: dict[str, NDArray[np.float32]]) -> list[NDArray[np.float32]]:
@@ -313,4 +312,4 @@ def load_bundle(folder: str | Path, on_fault: Literal["raise", "hover"] = "raise
     """
     if not isinstance(folder, (str, os.PathLike)):
         raise UserTypeError(f"load_bundle: folder must be the path of a folder, got {shown(folder)}.")
-    return Bundle(Path(folder), contracts.read(Path(folder)), on_fault)
+    return Bundle(Path(folder), read(Path(folder)), on_fault)

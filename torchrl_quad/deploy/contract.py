@@ -5,31 +5,23 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
-import io
 import itertools
 import json
 import math
 import reprlib
-import zipfile
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from torchrl_quad.deploy.network import foreign_parts
-from torchrl_quad.deploy.tasks import PROGRESS, RULES
+from torchrl_quad.deploy.tasks import RULES
 from torchrl_quad.errors import MissingPackage, UserError, UserValueError
 
 VERSION = 3  # of the contract; raise it when a reader of the older one would misunderstand the new one
 FILES = ("README.md", "policy.c", "policy.h", "policy.onnx", "starts.npz", "vectors.npz")  # beside contract.json
-MOST_BYTES = {"contract.json": 2**20}  # of a file; those of policies here take a fiftieth of it
-MOST_BYTES |= dict.fromkeys(FILES, 2**28)
-QUANTITIES = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}  # that each state must have
 IN_BODY = "_in_body"  # ends the names of inputs that are vectors of the world frame, turned to the body frame
-AGAIN = "Export the policy again."
 
 
 class TamperedBundle(UserValueError):
@@ -70,15 +62,6 @@ class NegativeDepth(Fault):
 
 class BrokenPolicy(Fault):
     """The network failed, or answered something else than four numbers from -1 to 1."""
-
-
-class Content(NamedTuple):
-    """What a bundle flies with."""
-
-    contract: dict[str, Any]
-    policy: bytes  #: ONNX
-    vectors: dict[str, NDArray[Any]]
-    starts: dict[str, NDArray[Any]]
 
 
 def schema() -> dict[str, Any]:
@@ -139,165 +122,11 @@ def digest(contract: Mapping[str, Any]) -> str:
     return sha256(json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False).encode())
 
 
-# -- the folder --------------------------------------------------------------------------------------------------------
-
-
-def read(folder: Path) -> Content:
-    """Read a bundle, when every checksum fits and every file holds what the contract says.
-
-    Raises:
-        FileNotFoundError: there is no contract in the folder.
-        UnknownContract: it has another version, does not fit the schema, or contradicts itself.
-        TamperedBundle: a file is not as it was exported, or no contract and no policy at all.
-        ImportError: jsonschema is missing.
-    """
-    path = folder / "contract.json"
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"No bundle at {folder}: it has no contract.json. Export one: "
-            "python recipes/export.py checkpoint=.../checkpoint.pt"
-        )
-    contract = _parsed(path)
-    if type(contract["version"]) is not int or contract["version"] != VERSION:
-        raise UnknownContract(
-            f"{path} has version {shown(contract['version'])}, and this torchrl_quad reads version {VERSION}. It was "
-            f"written by {_writer(contract)}: use that one, or export again."
-        )
-    try:
-        fits = digest(contract) == contract["digest"] and set(contract["sha256"]) == set(FILES)
-    except (ValueError, TypeError, KeyError, RecursionError):
-        fits = False
-    if not fits:
-        raise TamperedBundle(f"{path} was changed after the export: its checksum does not fit. {AGAIN}")
-    check(contract, path)
-    files = {}
-    for name in FILES:
-        files[name] = _content(folder / name)
-        if sha256(files[name]) != contract["sha256"][name]:
-            raise TamperedBundle(f"{folder / name} was changed after the export: its checksum does not fit. {AGAIN}")
-    if problem := foreign_parts(files["policy.onnx"]):
-        raise TamperedBundle(f"{folder / 'policy.onnx'} {problem}. {AGAIN}")
-    reads, writes = shapes(contract)
-    vectors = _arrays(folder / "vectors.npz", files["vectors.npz"], reads | writes, single=True)
-    starts = _starts(folder / "starts.npz", files["starts.npz"], contract)
-    return Content(contract, files["policy.onnx"], vectors, starts)
-
-
-def shapes(contract: Mapping[str, Any]) -> tuple[dict[str, tuple[int, ...]], dict[str, tuple[int, ...]]]:
-    """The shapes of what the network reads, and of what it writes, by name and without the batch."""
-    camera, memory = contract["camera"], contract["memory"]
-    reads: dict[str, tuple[int, ...]] = {"observation": (contract["inputs"][-1]["stop"],)}
-    reads |= {"depth": (1, camera["height"], camera["width"])} if camera else {}
-    reads |= {"memory": (memory,)} if memory else {}
-    return reads, {"action": (4,)} | ({"next_memory": (memory,)} if memory else {})
-
-
-def _content(path: Path) -> bytes:
-    most = MOST_BYTES[path.name]
-    try:
-        if path.exists() and not path.is_file():  # who opens a pipe waits for ever
-            raise TamperedBundle(f"{path} is no plain file. {AGAIN}")
-        with open(path, "rb") as file:
-            size = path.stat().st_size
-            content = file.read(most + 1) if size <= most else b""
-    except OSError as error:
-        raise TamperedBundle(f"{path} cannot be read: {error.strerror}. {AGAIN}") from error
-    if max(size, len(content)) > most:
-        raise TamperedBundle(f"{path} is larger than {most >> 20} MiB, the most that is read. {AGAIN}")
-    return content
-
-
-def _parsed(path: Path) -> dict[str, Any]:
-    """The JSON of a contract, stricter than Python reads it."""
-    try:
-        contract = json.loads(
-            _content(path).decode(),
-            object_pairs_hook=_unique,
-            parse_int=_whole,
-            parse_float=_finite,
-            parse_constant=_finite,
-        )
-    except (ValueError, RecursionError) as error:  # of a parser: all of it is about the file
-        if isinstance(error, UserError):
-            raise
-        why = "it nests too deep" if isinstance(error, RecursionError) else str(error)
-        raise TamperedBundle(f"{path} is no contract of a policy, or is damaged: {one_line(why)}. {AGAIN}") from error
-    if not isinstance(contract, dict) or not {"version", "sha256", "digest"} <= contract.keys():
-        raise TamperedBundle(f"{path} is no contract of a policy, or is damaged: it lacks its version. {AGAIN}")
-    return contract
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError("a key stands twice in one object")
-    return found
-
-
-def _whole(text: str) -> int:
-    if len(text) > 20:
-        raise ValueError("a whole number has more than 20 digits")
-    return int(text)
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{text[:20]} is no finite number")
-    return value
-
-
-def _writer(contract: Mapping[str, Any]) -> str:
+def writer(contract: Mapping[str, Any]) -> str:
+    """The package that wrote a contract, of which nothing is known yet."""
     origin = contract.get("origin")
     package = origin.get("package") if isinstance(origin, dict) else None
     return shown(package).strip("'") if isinstance(package, str) else "an unknown version"
-
-
-# -- its arrays --------------------------------------------------------------------------------------------------------
-
-
-def _arrays(
-    path: Path, content: bytes, expected: Mapping[str, tuple[int, ...]], single: bool
-) -> dict[str, NDArray[Any]]:
-    """The arrays (n, ...) of a file, of these shapes without n, all finite, and if ``single`` of float32."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.infolist())
-            names = sorted(entry.filename for entry in archive.infolist())
-        if not stored or names != sorted(f"{name}.npy" for name in expected):
-            raise ValueError(f"it must hold {', '.join(sorted(expected))} alone, and not compressed")
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in expected}
-    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds for damaged files
-        raise TamperedBundle(f"{path} is damaged: {one_line(error)}. {AGAIN}") from error
-    count = len(arrays[next(iter(arrays))]) if arrays[next(iter(arrays))].ndim else 0
-    for name, shape in expected.items():
-        x = arrays[name]
-        if not count or x.shape != (count, *shape):
-            wanted = ", ".join(map(str, ("n", *shape)))
-            raise TamperedBundle(f"{path}: {name} has shape {x.shape}, and must have ({wanted}), n above 0. {AGAIN}")
-        if not ((x.dtype == np.float32 or (not single and x.dtype.kind in "fiu")) and np.isfinite(x).all()):
-            kind = "finite numbers in float32" if single else "finite numbers"
-            raise TamperedBundle(f"{path}: {name} must hold {kind}. {AGAIN}")
-    return arrays
-
-
-def _starts(path: Path, content: bytes, contract: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    task, limits = contract["task"], contract["limits"]
-    progress = {name: (3,) if name == "target" else (1,) for name in PROGRESS[task["rule"]]}
-    starts = _arrays(path, content, {name: (size,) for name, size in QUANTITIES.items()} | progress, single=False)
-    norm = np.linalg.norm(starts["quaternion"].astype(float), axis=1)
-    fits = {name: np.abs(x) <= limits["max_value"] for name, x in starts.items()}
-    fits["quaternion"] = np.abs(norm - 1.0) <= limits["quaternion_norm_error"]
-    if "gate" in fits:
-        fits["gate"] = np.isin(starts["gate"], np.arange(len(task["gates"])))
-    if "speed" in fits:
-        fits["speed"] &= starts["speed"] > 0
-    for name, fit in fits.items():
-        if not fit.all():
-            value = shown(starts[name][np.flatnonzero(~fit.reshape(len(norm), -1).all(1))[0]].tolist())
-            raise TamperedBundle(f"{path}: no flight starts with the {name} {value}. {AGAIN}")
-    return starts
 
 
 # -- what the contract says --------------------------------------------------------------------------------------------
@@ -325,7 +154,7 @@ def check(contract: Mapping[str, Any], path: Path) -> None:
     problem = next(itertools.chain(_misfits(contract), _contradictions(contract)), None)
     if problem:
         raise UnknownContract(
-            f"{path}: {problem}. This torchrl_quad does not fly that; it was written by {_writer(contract)}: use that "
+            f"{path}: {problem}. This torchrl_quad does not fly that; it was written by {writer(contract)}: use that "
             "one, or export again."
         )
 

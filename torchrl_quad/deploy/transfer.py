@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.bundle import Bundle, load_bundle
-from torchrl_quad.deploy.contract import QUANTITIES, drone_problem, naming, shown
+from torchrl_quad.deploy.contract import drone_problem, naming, shown
 from torchrl_quad.deploy.judging import endings, judge
+from torchrl_quad.deploy.reading import QUANTITIES
 from torchrl_quad.deploy.simulators import make_simulator
 from torchrl_quad.deploy.tasks import PROGRESS, progress_of
 from torchrl_quad.errors import UserTypeError, UserValueError

@@ -12,7 +12,9 @@ import torch
 
 from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.dynamics import MotorCommand
+from torchrl_quad.errors import UserError
 from torchrl_quad.identification import (
+    NoFlight,
     TooLittleFlight,
     TooShort,
     UnknownField,
@@ -199,7 +201,7 @@ def test_predictions_of_a_drone_that_is_right_are_right_and_of_one_that_drifts_a
     assert prediction_error(real, plain, (0.1,))["position"][0.1] < 0.01
 
 
-def test_bad_input_of_a_fit_is_refused_by_name(real, tmp_path):
+def test_bad_input_of_a_fit_is_refused_by_name(real):
     with pytest.raises(UnknownField, match="cannot fit 'mass'. Choose from: thrust_map"):
         identify(real, fields=["mass"])
     with pytest.raises(TooLittleFlight, match="at least one flight"):
@@ -217,10 +219,85 @@ def test_bad_input_of_a_fit_is_refused_by_name(real, tmp_path):
         load_drone({**_plain("visfly"), "motor_command": 500.0})
     with pytest.raises(ValueError, match="speed_per_volt must be"):
         MotorCommand(-1.0, 3.7)
-    broken = tmp_path / "checkpoint.json"
-    broken.write_text("{")
-    with pytest.raises(ValueError, match="is no checkpoint of a fit"):
-        identify(real, fields=["linear_drag"], checkpoint=broken)
+
+
+NUMBERS = (float("nan"), float("inf"), -1, True, "a", 10**400, [0.5], torch.ones(2), None)
+HOSTILE = [
+    *(("identify", name, value) for name in ("past", "horizon", "iterations", "draws", "seed") for value in NUMBERS),
+    *(("identify", name, value) for name, value in (
+        ("horizon", 1e-9), ("horizon", 1e9), ("iterations", 0), ("iterations", 1.5), ("draws", 1), ("fields", []),
+        ("fields", [3]), ("fields", {"inertia": 1}), ("fields", ["mass"]), ("known", 5), ("known", {1: 2}),
+        ("known", {"weight": 1.0}), ("known", {"mass": True}), ("known", {"mass": "1"}),
+        ("known", {"mass": [[1], [2]]}),
+        ("known", {"mass": 10**400}), ("known", {"command_delay": "a"}), ("known", {"command_delay": True}),
+        ("known", {"linear_drag": [0.1, 0.1, 0.1]}), ("drone", 5), ("drone", None), ("drone", {}), ("log", 5),
+        ("log", "a.csv"), ("log", []), ("log", [None]), ("progress", 1), ("checkpoint", 5),
+    )),
+    *(("prediction_error", name, value) for name in ("past", "every") for value in NUMBERS),
+    *(("prediction_error", "horizons", value) for value in (
+        0.1, [], [0.0], [1e-9], [-0.1], ["a"], [True], [10**400], None,
+    )),
+    *(("prediction_error", name, value) for name, value in (("every", 0), ("drone", 5), ("log", None))),
+]  # fmt: skip
+
+
+def test_hostile_arguments_of_fits_and_predictions_are_refused_in_one_line(real):
+    short = dataclasses.replace(real, segments=((300, 700),))
+    usual = {
+        "identify": {"log": short, "fields": ["linear_drag"], "iterations": 1, "draws": 0, "horizon": 0.2, "past": 0.1},
+        "prediction_error": {"log": short, "drone": "crazyflie", "horizons": (0.1,)},
+    }
+    functions = {"identify": identify, "prediction_error": prediction_error}
+    for function, name, value in HOSTILE:
+        with pytest.raises(UserError) as refused:
+            functions[function](**usual[function] | {name: value})
+        assert "\n" not in str(refused.value) and len(str(refused.value)) < 800, (function, name, value)
+
+
+def test_a_flight_of_ones_own_making_must_be_whole(real):
+    changes = {
+        name: (None, 5, "a", np.zeros(3), np.full_like(getattr(real, name), np.nan)) for name in ("position", "time")
+    }
+    changes |= {
+        "segments": (None, 5, ((5, 3),), ((0, 10**9),), ((-1, 5),), (("a", 5),)),
+        "setpoint": (5,),
+        "name": (5,),
+    }
+    changes |= {"quaternion": (real.position,), "onboard": ("gyro",), "time": (real.time[::-1], 100.0 * real.time)}
+    for name, values in changes.items():
+        for value in values:
+            with pytest.raises(UserError, match=name):
+                dataclasses.replace(real, **{name: value})
+    with pytest.raises(TooShort, match="figure8 has no piece in flight"):
+        prediction_error(dataclasses.replace(real, segments=()), "visfly")
+    still = dataclasses.replace(real, motor_command=0.0 * real.motor_command)
+    with pytest.raises(NoFlight, match="its motor commands are zero"):
+        prediction_error(still, dataclasses.replace(load_drone("visfly"), motor_command=None))
+
+
+BROKEN = ("{", "[]", "5", '{"stages": 5}', "[" * 100_000, "\xff", '{"fingerprint": "F", "stages": 5}')
+BROKEN_STAGES = (
+    5,
+    {},
+    {"free": 5},
+    {"free": ["drag_xy", "drag_z"]},
+    {"free": ["drag_xy", "drag_z"], "x": [0], "streams": [0]},
+)
+
+
+def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
+    file, short = tmp_path / "checkpoint.json", dataclasses.replace(real, segments=((300, 700),))
+    options = {"fields": ["linear_drag"], "draws": 0, "iterations": 1, "horizon": 0.2, "past": 0.1, "checkpoint": file}
+    identify(short, **options)
+    whole = json.loads(file.read_text())
+    first = next(iter(whole["stages"]))
+    texts = [text.replace("F", whole["fingerprint"]) for text in BROKEN]
+    for stage in (*BROKEN_STAGES, whole["stages"][first] | {"x": [1e999, 0]}, whole["stages"][first] | {"more": 1}):
+        texts.append(json.dumps({**whole, "stages": {first: stage}}))
+    for text in texts:
+        file.write_text(text, encoding="latin-1")
+        with pytest.raises(UserError, match="checkpoint.json is no checkpoint of a fit: .*Delete it, to start anew"):
+            identify(short, **options)
 
 
 def test_the_recipe_fits_a_real_flight_and_draws_it(launch, refused, tmp_path):

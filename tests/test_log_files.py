@@ -216,8 +216,8 @@ def ros_messages(store, stamped=True):
             yield topic, kind, int((seconds + at) * 1e9), message
 
 
-def write_bag(path, ros2, storage=None, twin=None, **options):
-    """A bag of either version; ``twin`` is a topic that it has twice."""
+def write_bag(path, ros2, storage=None, twin=None, pack=None, **options):
+    """A bag of either version; ``twin`` is a topic that it has twice, and ``pack`` says how it is compressed."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -225,6 +225,8 @@ def write_bag(path, ros2, storage=None, twin=None, **options):
     store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(ACTUATORS, "mav_msgs/msg/Actuators"))
     writer = Writer2(path, version=9, storage_plugin=storage) if ros2 else Writer1(path)
+    if pack:
+        pack(writer)
     with writer:
         connections = {}
         for topic, kind, received, message in ros_messages(store, **options):

@@ -7,6 +7,7 @@ import pytest
 from log_writers import END, G, flight, matrix, ned, write_csv
 
 from torchrl_quad.deploy import frames
+from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.identification import (
     LAYOUTS,
     Columns,
@@ -145,3 +146,46 @@ def test_a_log_in_ned_is_read_by_its_convention(tmp_path):
     log = read_log(path, mapping, convention=replace(frames.px4(), motors=(0, 1, 2, 3)))
     np.testing.assert_allclose(log.position, flight(t)["position"], atol=1e-6)
     np.testing.assert_allclose(log.angular_velocity, flight(t)["angular_velocity"], atol=1e-6)
+
+
+HUGE = 10**400  # more than a float holds
+BAD_ARGUMENTS = [
+    *((name, value) for name in ("dt", "clearance", "max_gap", "min_duration") for value in (
+        np.nan, np.inf, -1, True, "a", HUGE, [1.0], np.array([1.0, 2.0]),
+    )),
+    *(("dt", value) for value in (0, 1e-9, 0.5)),
+    *(("columns", value) for value in (
+        5, True, b"px4", ["x"], {1: "x"}, {"time": 5}, {"position": [1, 2, 3]}, {"velocity": None}, {"euler": {"a": 1}},
+    )),
+    *(("convention", value) for value in ("px4", 5, {})),
+    *(("onboard", value) for value in ("setpoint", 5, ["speed"], [None], {"position": 1})),
+    *(("path", value) for value in (None, 5, b"a.csv", ["a.csv"], "", "a\0b", "a" * 5000, "two\nlines.csv")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value"), BAD_ARGUMENTS, ids=lambda x: x if isinstance(x, str) and len(x) < 9 else "")
+def test_arguments_that_make_no_log_are_refused_by_name(name, value, tmp_path):
+    path = write_csv(tmp_path / "own.csv", own_table(np.arange(0.0, END, 0.01)))
+    arguments = {"path": path, "columns": {"time": "t", **OURS}} | {name: value}
+    with pytest.raises((UserError, OSError)) as refused:
+        read_log(**arguments)
+    assert name in str(refused.value) or name in ("columns", "path")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("value", [0, True, "2", None, np.nan, np.inf, HUGE, (1, 2), [], 1j, [[1.0, 1.0, 1.0]]])
+def test_columns_take_a_scale_and_an_offset_that_are_numbers(value):
+    with pytest.raises(UserValueError, match="Columns: scale of a, b, c must be a number, or one for each column"):
+        Columns(("a", "b", "c"), scale=value)
+    if value != 0:
+        with pytest.raises(UserValueError, match="Columns: offset of a, b, c must be"):
+            Columns(("a", "b", "c"), offset=value)
+
+
+@pytest.mark.parametrize("field", ["columns", "convention", "onboard", "time", "required"])
+def test_layouts_say_which_of_their_fields_is_wrong(field):
+    for value in (5, "x", [3], {"position": ("x",)}):
+        with pytest.raises(UserError, match=f"Layout: {field} must"):
+            replace(LAYOUTS["nanobench"], **{field: value})
+    with pytest.raises(UserValueError, match="names must be the names of columns, got 5"):
+        Columns(5)

@@ -28,7 +28,7 @@ def main(cfg: DictConfig) -> None:
     loss = ABPTLoss(actor, make_qvalue(env, **network(cfg, "critic", env)), **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     target = TargetUpdate(loss, tau=cfg.critic.tau)
-    buffer = VisitedStateBuffer(cfg.buffer.capacity, seed=own_seed(cfg), actor=actor)
+    buffer = VisitedStateBuffer(cfg.buffer.capacity, env, seed=own_seed(cfg), actor=actor)
 
     actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
     critic_parameters = loss.qvalue_network_params.parameters()

@@ -3,12 +3,11 @@
 python recipes/identify.py 'logs=[flight1.csv, flight2.csv]' drone=crazyflie mass=0.027
 """
 
-from pathlib import Path
-
 import torch
 from omegaconf import DictConfig, OmegaConf
 from training.launch import recipe
 
+from torchrl_quad.files import make_folder
 from torchrl_quad.identification import identify, read_log
 
 
@@ -20,8 +19,7 @@ def main(cfg: DictConfig) -> None:
         print(log)
     settings = OmegaConf.to_container(cfg)
     known = dict(settings["known"] or {}) | ({} if cfg.mass is None else {"mass": cfg.mass})
-    folder = Path(cfg.folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = make_folder(cfg.folder)
     result = identify(
         logs,
         settings["drone"],

@@ -90,10 +90,14 @@ def test_what_is_neither_file_nor_folder_is_refused_and_stays(write, make, tmp_p
 
 @pytest.mark.parametrize("make", [fifo, link_to_a_file])
 def test_what_takes_the_place_while_a_file_is_written_stays_too(make, tmp_path):
-    with pytest.raises(FileExistsError), replacing(tmp_path / "place") as temporary:
-        temporary.write_text("ours")
-        make(tmp_path / "place")
-    with pytest.raises(FileExistsError), replacing_folder(tmp_path / "place", lambda _: None):
+    def write():
+        with replacing(tmp_path / "place") as temporary:
+            temporary.write_text("ours")
+            make(tmp_path / "place")
+
+    with pytest.raises(FileExistsError, match="place is a"):
+        write()
+    with pytest.raises(FileExistsError, match="place is a"), replacing_folder(tmp_path / "place", lambda _: None):
         pass
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 

@@ -39,7 +39,7 @@ LIBRARIES = {
     "dynamics": {"torch", "numpy", "yaml"},
     "engine": {"torch", "tensordict"},
     "vision": {"torch"},
-    "envs": TORCHRL | {"numpy"},
+    "envs": TORCHRL | {"numpy", "pydantic"},
     "controllers": TORCHRL,
     "render": TORCHRL | {"matplotlib", "mpl_toolkits", "plotly", "PIL", "imageio_ffmpeg", "numpy"},
     "modules": TORCHRL,

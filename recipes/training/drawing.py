@@ -23,7 +23,7 @@ from torchrl_quad.deploy import Bundle
 from torchrl_quad.deploy.replaying import as_rollout, environment
 from torchrl_quad.deploy.transfer import fly
 from torchrl_quad.errors import UserError
-from torchrl_quad.files import replacing
+from torchrl_quad.files import require_file
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, write_replay
 from torchrl_quad.render.frames import NoFfmpeg, find_ffmpeg
 
@@ -33,8 +33,8 @@ EXPLAINED = (UserError, OSError, ImportError, MemoryError)
 def draw_flight(flight: TensorDictBase, path: Path, env: EnvBase, title: str) -> None:
     """Draw a flight as a picture and as a film: ``path`` with .png and, see :func:`film_of`, .mp4 or .gif."""
     picture = path.with_suffix(".png")
-    with _or_without(picture), replacing(picture) as temporary:
-        plot_flight(flight, temporary, env=env, title=title)
+    with _or_without(picture):
+        plot_flight(flight, picture, env=env, title=title)
     _film(path, flight, env=env, sharp={"fps": 25, "size": 560})
 
 
@@ -50,8 +50,8 @@ def film_of(path: Path) -> Path:
 
 def publish_flight(flight: TensorDictBase, figure: Path, page: Path, env: EnvBase, title: str) -> None:
     """Draw the first episode of a flight as a figure for a paper, and write a page that plays the flight."""
-    with _or_without(figure), replacing(figure) as temporary:
-        plot_episode(flight, temporary, env=env)
+    with _or_without(figure):
+        plot_episode(flight, figure, env=env)
     with _or_without(page):
         write_replay(flight, page, env=env, title=title)
 
@@ -72,8 +72,8 @@ def draw_transfer(bundle: Bundle, simulator: str, loop: str, path: Path, drones:
 
 def draw_learning_curve(metrics: Path, path: Path, env: EnvBase) -> None:
     """Draw the evaluations in a metrics.csv over training time and steps."""
-    with _or_without(path), replacing(path) as temporary:
-        plot_learning_curve(metrics, temporary, metrics=env.metric_info)
+    with _or_without(path):
+        plot_learning_curve(metrics, path, metrics=env.metric_info)
 
 
 def _film(path: Path, flight: TensorDictBase, sharp: dict[str, Any] | None = None, **options: Any) -> None:
@@ -83,14 +83,12 @@ def _film(path: Path, flight: TensorDictBase, sharp: dict[str, Any] | None = Non
     with _or_without(film, mp4, gif):
         try:
             if film == mp4:
-                with replacing(mp4) as temporary:
-                    animate_flight(flight, temporary, **options, **(sharp or {}))
+                animate_flight(flight, mp4, **options, **(sharp or {}))
         except NoFfmpeg as error:  # it works, and has failed all the same
             _warn(f"{gif} takes the place of an MP4. {error}")
             film = gif
         if film == gif:
-            with replacing(gif) as temporary:
-                animate_flight(flight, temporary, **options)
+            animate_flight(flight, gif, **options)
         (mp4 if film == gif else gif).unlink(missing_ok=True)
 
 
@@ -114,6 +112,7 @@ def _log_traceback(path: Path) -> str:
     """Add the traceback of the present error to drawing.log, or print it where that cannot be written; say which."""
     log = path.with_name("drawing.log")
     try:
+        require_file(log)
         with open(log, "a", encoding="utf-8") as file:
             file.write(f"{path.name} is missing.\n{traceback.format_exc()}\n")
     except OSError:

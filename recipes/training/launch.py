@@ -140,6 +140,8 @@ def _end(error: BaseException, status: int, full: bool) -> None:
     said = str(error).splitlines() or [repr(error)]
     if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
         said += str(error.__cause__).splitlines()[:1]
+    if isinstance(error, OSError) and error.filename:
+        said = [f"{error.filename}: {error.strerror}. Choose another hydra.run.dir."]
     if isinstance(error, MissingConfigException) and str(error.missing_cfg_file).startswith("task/"):
         try:
             task_class(error.missing_cfg_file.removeprefix("task/"))

@@ -13,6 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import get_logger
 
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import write_rows
 from training.evaluation import as_json
 
@@ -61,7 +62,7 @@ class Logs:
         }
         if saved:
             wandb["id"] = saved["local"]["id"]
-        self.backend = get_logger(cfg.logger.backend, str(folder), name, wandb_kwargs=wandb)
+        self.backend = _logger(cfg.logger.backend, str(folder), name, wandb_kwargs=wandb)
         if cfg.logger.backend == "wandb":
             self.backend.experiment.define_metric("steps", hidden=True)
             self.backend.experiment.define_metric("*", step_metric="steps")
@@ -126,6 +127,21 @@ class Logs:
 
     def _write(self) -> None:
         write_rows(self.folder / "metrics.csv", self.rows, missing=math.nan)
+
+
+def _logger(backend: str, *arguments: Any, **options: Any) -> Any:
+    """TorchRL's logger.
+
+    Raises:
+        UserValueError: wandb refuses, as where nobody has logged in.
+    """
+    try:
+        return get_logger(backend, *arguments, **options)
+    except Exception as error:
+        if not type(error).__module__.startswith("wandb"):
+            raise
+        said = str(error).splitlines()[0].rstrip(".")
+        raise UserValueError(f"logger.backend=wandb: {said}. Or write logger.mode=offline.") from error
 
 
 def run_name(name: str, overrides: Iterable[str]) -> str:

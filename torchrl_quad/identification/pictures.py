@@ -10,7 +10,7 @@ import numpy as np
 
 from torchrl_quad.identification.log import FlightLog
 from torchrl_quad.identification.prediction import ERRORS, PAST, differences, predict
-from torchrl_quad.render.canvas import BLUE, INK, RED, make_figure
+from torchrl_quad.render.canvas import BLUE, INK, RED, make_figure, save
 
 _ROWS = (("position", "m", 1.0), ("velocity", "m/s", 1.0), ("tilt", "deg", 180.0 / np.pi), ("body_rate", "rad/s", 1.0))
 
@@ -59,7 +59,7 @@ def draw_prediction(
     for ax in axes[-1]:
         ax.set_xlabel("time [s]", fontsize=8)
     axes[0, 1].set_title(f"{log.name}, predictions of {horizon:g} s", fontsize=8, loc="right")
-    figure.savefig(path, dpi=110)
+    save(figure, path, dpi=110)
 
 
 def draw_residuals(
@@ -80,7 +80,7 @@ def draw_residuals(
         ax.set_xlabel("time [s]", fontsize=8)
         ax.grid(alpha=0.3, linewidth=0.5)
         ax.set_ylim(bottom=0.0)
-    figure.savefig(path, dpi=110)
+    save(figure, path, dpi=110)
 
 
 def _component(states: Any, row: str, k: int) -> np.ndarray:

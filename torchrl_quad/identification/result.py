@@ -13,7 +13,7 @@ import yaml
 
 from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.dynamics.parameters import LIMITS
-from torchrl_quad.files import replacing
+from torchrl_quad.files import make_folder, replacing
 from torchrl_quad.identification.log import FlightLog
 from torchrl_quad.options import checked
 
@@ -121,8 +121,7 @@ class IdentificationResult:
             ImportError: matplotlib is not installed.
             OSError: the folder cannot be made or written.
         """
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = make_folder(folder)
         with replacing(folder / "drone.yaml") as path:
             path.write_text(self.as_yaml(), encoding="utf-8")
         with replacing(folder / "randomization.yaml") as path:
@@ -133,10 +132,8 @@ class IdentificationResult:
             from torchrl_quad.identification.pictures import draw_prediction, draw_residuals
 
             span = {"horizon": self.settings["horizon"], "past": self.settings["past"]}
-            with replacing(folder / "prediction.png") as path:
-                draw_prediction(self.flights[0], self.drone, path, prior=self.prior, **span)
-            with replacing(folder / "residuals.png") as path:
-                draw_residuals(self.flights, self.drone, path, **span)
+            draw_prediction(self.flights[0], self.drone, folder / "prediction.png", prior=self.prior, **span)
+            draw_residuals(self.flights, self.drone, folder / "residuals.png", **span)
         return folder
 
 

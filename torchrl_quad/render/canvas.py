@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from torchrl_quad.envs.scenery import Scenery
 from torchrl_quad.errors import MissingPackage
+from torchrl_quad.files import replacing
 
 INK, BLUE, RED = "#222222", "#2f6db5", "#c8452f"
 
@@ -24,6 +26,13 @@ def make_figure(**options: Any) -> Any:
     figure = Figure(**options)
     FigureCanvasAgg(figure)
     return figure
+
+
+def save(figure: Any, path: str | Path, **options: Any) -> None:
+    """Write a figure, complete or not at all; a path without a suffix gets .png."""
+    path = Path(path)
+    with replacing(path if path.suffix else path.with_suffix(".png")) as temporary:
+        figure.savefig(temporary, **options)
 
 
 def bounds(*points: Tensor) -> tuple[Tensor, Tensor]:

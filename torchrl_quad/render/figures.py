@@ -20,6 +20,7 @@ from torchrl_quad.render.canvas import (
     draw_scenery,
     drone_colors,
     make_figure,
+    save,
     set_box,
     set_scale,
 )
@@ -103,7 +104,7 @@ def plot_flight(
         over_time.axhline(success, color=RED, linestyle="--", linewidth=1.0, label=f"success: {near}{success:g}")
         over_time.legend(loc="best", frameon=False)
     figure.suptitle(flight.title if title is None else title, x=0.04, y=0.965, ha="left", fontsize=13)
-    figure.savefig(path, dpi=130)
+    save(figure, path, dpi=130)
 
 
 def plot_episode(
@@ -172,7 +173,7 @@ def plot_episode(
         axes[-1].set(xlabel="time [s]", xlim=(0, times[-1]))
         for axis in axes[1:]:
             axis.yaxis.set_major_locator(MaxNLocator(4))
-        figure.savefig(path)
+        save(figure, path)
 
 
 def _draw_path(space: Any, below: Any, flight: Flight) -> None:

@@ -23,6 +23,7 @@ from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs.scenery import Scenery
 from torchrl_quad.errors import MissingPackage, UserValueError
+from torchrl_quad.files import replacing
 from torchrl_quad.render.canvas import INK, RED, bounds, box, draw_scenery, drone_colors, make_figure, set_box
 from torchrl_quad.render.flights import Flight, state_keys
 from torchrl_quad.render.obstacles import depth_image, with_obstacles
@@ -194,7 +195,8 @@ def animate_flight(
         )
 
     frames = (np.concatenate([frame(i, t) for i in range(len(flights))], 1) for t in instants)
-    write(Path(path), frames, control_dt * np.append(instants, instants[-1] + stride))
+    with replacing(path) as temporary:
+        write(temporary, frames, control_dt * np.append(instants, instants[-1] + stride))
 
 
 def _write_gif(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> None:

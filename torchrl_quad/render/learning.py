@@ -11,7 +11,7 @@ import numpy as np
 
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, describe_metric
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.render.canvas import BLUE, INK, make_figure, set_scale
+from torchrl_quad.render.canvas import BLUE, INK, make_figure, save, set_scale
 
 _PANELS = 4
 
@@ -69,7 +69,7 @@ def plot_learning_curve(
             upper.set_xlabel("control steps", color=INK)
             upper.xaxis.set_major_locator(MaxNLocator(5))
             upper.xaxis.set_major_formatter(EngFormatter(sep=""))
-    figure.savefig(path, dpi=130)
+    save(figure, path, dpi=130)
 
 
 def _knots(seconds: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from torchrl_quad.envs.scenery import Scenery
 from torchrl_quad.envs.scenes import ELSEWHERE
 from torchrl_quad.envs.shapes import Shape
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.render.canvas import INK, RED, make_figure
+from torchrl_quad.render.canvas import INK, RED, make_figure, save
 from torchrl_quad.render.flights import Flight, state_keys
 from torchrl_quad.vision import Primitives
 
@@ -115,7 +115,7 @@ def plot_from_above(
     axes[-1].set_xlabel("x [m]")
     figure.suptitle(flight.title if title is None else title, x=0.02, ha="left", fontsize=12)
     figure.colorbar(line, ax=list(axes), label="speed [m/s]", shrink=0.6, pad=0.01, aspect=30)
-    figure.savefig(path, dpi=130)
+    save(figure, path, dpi=130)
 
 
 def _draw_sections(axis: Any, solids: Primitives, low: float, high: float) -> None:

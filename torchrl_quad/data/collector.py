@@ -148,7 +148,9 @@ class DifferentiableCollector(BaseCollector):
 
 
 def _needs_nothing(function: Any) -> bool:
-    """Whether something can be called without arguments."""
+    """Whether something that is no network can be called without arguments."""
+    if isinstance(function, nn.Module):
+        return False
     try:
         inspect.signature(function).bind()
     except (TypeError, ValueError):

@@ -92,9 +92,9 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
                 f"The visited-state buffer keeps {self.state_keys}, and the rollout lacks {missing[0]!r}. Give the "
                 "buffer the environment, VisitedStateBuffer(env=env), or the entries of its Markov state, state_keys."
             )
-        states = tensordicts.select(*self.state_keys, *self.memory_keys).detach().reshape(-1)
-        if len(states) == 0:
+        if tensordicts.numel() == 0:
             return torch.zeros(0, dtype=torch.int64)
+        states = tensordicts.select(*self.state_keys, *self.memory_keys).detach().reshape(-1)
         keep = torch.ones(states.shape[0], dtype=torch.bool, device=states.device)
         for value in states.values(include_nested=True, leaves_only=True):
             keep &= value.reshape(states.shape[0], -1).isfinite().all(-1)

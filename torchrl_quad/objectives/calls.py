@@ -74,13 +74,13 @@ def predict(
 def _require_precision(
     network: TensorDictModule, keys: Sequence[NestedKey], inputs: Sequence[Tensor], params: TensorDictParams
 ) -> None:
-    """Refuse what a network reads in another precision than its own."""
-    own = next(x.dtype for x in params.values(True, True) if x.is_floating_point())
+    """Refuse what a network reads in another precision or on another device than its own."""
+    own = next(x for x in params.values(True, True) if x.is_floating_point())
     for key, x in zip(keys, inputs, strict=True):
-        if x.is_floating_point() and x.dtype != own:
+        if x.device != own.device or (x.dtype != own.dtype and x.is_floating_point()):
             raise UserValueError(
-                f"{type(network).__name__} computes in {own}, and {key!r} is {x.dtype}. Build both with the same "
-                "dtype, or convert the rollout."
+                f"{type(network).__name__} computes in {own.dtype} on {own.device}, and {key!r} is {x.dtype} on "
+                f"{x.device}. Build both with the same dtype and device, or convert the rollout."
             )
 
 

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from small_runs import assert_equal
+from torch import nn
 from torchrl.checkpoint import Checkpoint
 from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.trainers import DefaultOptimizationStepper, Trainer, UpdateWeights
@@ -123,5 +124,8 @@ def test_wrong_numbers_are_refused_with_what_to_write_instead():
         DifferentiableCollector(env, make_actor(env), frames_per_batch=10)
     with pytest.raises(ValueError, match="restart_fraction must be at most 1, got 2"):
         DifferentiableCollector(env, make_actor(env), frames_per_batch=8, restart_fraction=2)
+    for no_env in (nn.Linear(3, 4), lambda: None, 3):
+        with pytest.raises(TypeError, match="env must be a TorchRL environment, such as make_env.*; got "):
+            DifferentiableCollector(no_env, make_actor(env), frames_per_batch=8)
     with pytest.raises(TypeError, match="goes on for ever, and has no length"):
         len(make())

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from small_runs import assert_equal
 from tensordict.nn import TensorDictModule
 from torchrl.envs import (
     Compose,
@@ -21,6 +22,7 @@ from torchrl_quad import (
     make_actor,
     restart,
 )
+from torchrl_quad.errors import UserValueError
 
 
 @pytest.fixture
@@ -238,6 +240,105 @@ def test_the_buffer_is_saved_and_loaded_with_its_generator(flight, tmp_path, way
     env.set_seed(0)
     b = other.initial_state(env, 0.5)
     assert (a == b).all()
+
+
+@pytest.mark.parametrize("way", ["state_dict", "dumps"])
+def test_what_was_never_written_stays_out_of_files(flight, tmp_path, way):
+    files = []
+    for secret in (1.0, 2.0):  # what memory held before
+        buffer = VisitedStateBuffer(capacity=5000)
+        buffer.extend(flight[2][:, :2])
+        buffer._storage._storage[8:]["state"].apply_(lambda x, secret=secret: x.fill_(secret))
+        folder = tmp_path / str(secret)
+        folder.mkdir()
+        if way == "dumps":
+            buffer.dumps(folder)
+        else:
+            torch.save(buffer.state_dict(), folder / "buffer.pt")
+        files.append((folder / "buffer.pt").read_bytes())
+    assert files[0] == files[1] and len(files[0]) < 20_000
+    assert all(len(x) == 8 for x in buffer.state_dict()["_storage"]["_storage"].values())
+
+
+def test_a_smaller_buffer_is_loaded_with_its_oldest_state_first_to_go(flight):
+    small, same, large = (VisitedStateBuffer(capacity=n) for n in (8, 8, 10))
+    positions = flight[2]["state", "position"].detach().reshape(-1, 3)
+    states = flight[2].reshape(-1)
+    small.extend(states[:8])
+    small.extend(states[8:11])
+    for other in (same, large):
+        other.load_state_dict(small.state_dict())
+        assert len(other) == 8
+    assert (same[:]["state", "position"] == small[:]["state", "position"]).all()
+    assert (large[:]["state", "position"] == positions[3:11]).all()
+    for buffer in (small, same, large):
+        buffer.extend(states[11:14])
+    assert (same[:]["state", "position"] == small[:]["state", "position"]).all()
+    kept = {tuple(x) for x in large[:]["state", "position"].tolist()}
+    assert kept == {tuple(x) for x in positions[4:14].tolist()}
+
+
+def _set(*path):
+    *groups, name, value = path
+
+    def change(state):
+        for group in groups:
+            state = state[group]
+        state[name] = value
+
+    return change
+
+
+ENTRIES, POSITION = ("_storage", "_storage"), "state.position"
+NAN = torch.full((20, 3), float("nan"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda state: state.pop("_writer"), "it lacks the storage, the writer or the random generator"),
+        (lambda state: state["_storage"]["_storage"].pop(POSITION), "other states .*position.* differ in name"),
+        (_set(*ENTRIES, "state.extra", torch.ones(20, 1)), "other states .* 'extra'.* differ in name"),
+        (_set(*ENTRIES, "else", torch.ones(20, 1)), "it lacks or adds .'else'"),
+        (_set(*ENTRIES, POSITION, torch.ones(20, 2)), "other states .*position"),
+        (_set(*ENTRIES, POSITION, torch.ones(20, 3, dtype=torch.float64)), "other states .*position"),
+        (_set(*ENTRIES, POSITION, torch.ones(19, 3)), r"state.position has shape \(19, 3\)"),
+        (_set(*ENTRIES, POSITION, NAN), "state.position is not finite"),
+        (_set(*ENTRIES, POSITION, torch.ones(20, 3, device="meta")), "state.position has shape"),
+        (_set(*ENTRIES[:1], "_storage", [1, 2]), "its storage is no mapping"),
+        (_set("_storage", "_len", 31), "of 30 states: it has 31 states"),
+        (_set("_storage", "_len", True), "its numbers of states are none"),
+        (_set("_writer", "_cursor", 21), "its cursor is 21 and its count 20, with 20 states"),
+        (_set("_writer", "_cursor", -1), "its numbers of states are none"),
+        (_set("_writer", "_write_count", 19), "its count 19"),
+        (_set("_rng", (torch.ones(3), "cpu")), "its random generator is none"),
+        (_set("_rng", (None, "mars")), "its random generator is none"),
+        (_set("_rng", None), "it lacks"),
+    ],
+)
+def test_content_that_does_not_fit_is_refused_and_changes_nothing(flight, change, message):
+    env, _, rollout, _ = flight
+    saved, buffer = (VisitedStateBuffer(30, env) for _ in range(2))
+    saved.extend(rollout)
+    buffer.extend(rollout[:2])
+    content, before = saved.state_dict(), buffer.state_dict()
+    change(content)
+    for target in (buffer, VisitedStateBuffer(30, env)):
+        with pytest.raises(UserValueError, match=message) as refused:
+            target.load_state_dict(content)
+        assert "\n" not in str(refused.value)
+    assert_equal(buffer.state_dict(), before)
+
+
+def test_a_damaged_file_of_a_buffer_is_refused(flight, tmp_path):
+    buffer = VisitedStateBuffer(30)
+    buffer.extend(flight[2])
+    buffer.dumps(tmp_path)
+    intact = (tmp_path / "buffer.pt").read_bytes()
+    for damaged in (b"", b"no file of torch", intact[:100], intact[:-100], intact[200:]):
+        (tmp_path / "buffer.pt").write_bytes(damaged)
+        with pytest.raises(UserValueError, match="buffer.pt is damaged, or no buffer that dumps wrote: "):
+            VisitedStateBuffer(30).loads(tmp_path)
 
 
 def test_a_buffer_keeps_the_markov_state_of_any_environment():

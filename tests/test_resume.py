@@ -25,7 +25,7 @@ SEEING = [  # and remembering: a memory, images on their way, and noise that goe
 @pytest.mark.parametrize(
     ("recipe", "options"),
     [
-        ("abpt", [*EVERYTHING, *ENTROPY, "buffer.capacity=24"]),  # full from the start: what is unused is arbitrary
+        ("abpt", [*EVERYTHING, *ENTROPY]),
         ("hybrid", EVERYTHING),
         ("ppo", EVERYTHING),
         ("ahac", [*EVERYTHING, *ENTROPY]),
@@ -54,6 +54,15 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(recipe, options, train,
     for summary in summaries:
         assert summary.pop("seconds") > 0 and summary.pop("revision")
     assert summaries[0] == summaries[1]
+
+
+def test_equal_runs_have_equal_checkpoints_which_hold_no_memory_that_was_never_written(train, tmp_path):
+    one, other = (train("abpt", tmp_path / name, "total_steps=96", *EVERYTHING, *ENTROPY) for name in ("one", "other"))
+    assert_equal(one, other)
+    storage = one["processes"][0]["buffer"]["_storage"]
+    assert storage["_len"] == 96 and all(len(x) == 96 for x in storage["_storage"].values())
+    sizes = [(tmp_path / name / "checkpoint.pt").stat().st_size for name in ("one", "other")]
+    assert sizes[0] == sizes[1]
 
 
 KILLED = """

@@ -18,7 +18,7 @@ from torch import nn
 from torchrl.envs import PendulumEnv, RewardSum, TransformedEnv
 
 import torchrl_quad
-from torchrl_quad import HoveringEnv, ObservationNormalizer, RacingEnv, TrackingEnv, make_actor, make_env
+from torchrl_quad import HoveringEnv, ObservationNormalizer, RacingEnv, TrackingEnv, load_drone, make_actor, make_env
 from torchrl_quad.deploy import (
     BrokenPolicy,
     MissingQuantity,
@@ -195,6 +195,11 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
     with torch.no_grad():
         broken[0].module.mlp[0].bias[0] = math.nan
     refuses("the weights of the policy, or its normaliser, are not finite", broken)
+    strong = load_drone("visfly").replace(max_thrust_to_weight=30.0)
+    refuses(
+        r"export_policy: output.thrust.range_in_weights\[1\] is 30.0, and must be at most 20. A bundle flies within",
+        env=HoveringEnv(num_envs=2, max_episode_steps=4, drone=strong),
+    )
     other = HoveringEnv(num_envs=2, control="attitude")
     refuses("exports thrust and body rates alone, control=\"rates\"; got 'attitude'", env=other)
     of_an_error = ObservationNormalizer(env, ("metrics", "position_error"))

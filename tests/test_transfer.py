@@ -1,6 +1,5 @@
 """A bundle flies elsewhere as it does in our own simulator, is judged as our evaluation does, and its mutants fail."""
 
-import contextlib
 import copy
 import csv
 import re
@@ -23,6 +22,7 @@ from torchrl_quad.deploy.simulators import make_simulator
 from torchrl_quad.deploy.simulators.vehicle import ContractLoop, Drone
 from torchrl_quad.deploy.transfer import MUTANTS, fly
 from torchrl_quad.dynamics import FlightController
+from torchrl_quad.errors import UserError, UserValueError
 
 NAMES = ("position", "quaternion", "velocity", "angular_velocity")
 STEPS = 110
@@ -198,6 +198,33 @@ def test_gates_and_laps_are_counted_from_the_lines_between_positions():
     assert found["lap_time"] == pytest.approx((7 - 2) * 0.02)
 
 
+def test_a_drone_that_no_simulator_can_fly_is_refused_with_the_name_of_its_bundle(hovering, monkeypatch):
+    bundle = load_bundle(hovering)
+    for changes, simulator, why in (
+        ({"inertia": [1e-3, 1e-3, 3e-3]}, "mujoco", "MuJoCo flies no body with the inertia .*: each of the three"),
+        ({"drag_height": 0.1}, "mujoco", "Other simulators do not fly drones with drag_height"),
+        ({"motor_time_constant": [0.1, 0.2]}, "mujoco", "Other simulators do not fly drones with two motor"),
+    ):
+        monkeypatch.setitem(bundle.contract, "plant", changes)
+        with pytest.raises(UserValueError, match=f"^{hovering}: {why}"):
+            fly(bundle, simulator)
+    monkeypatch.setitem(bundle.contract["simulator"], "dynamics", "balloon")
+    with pytest.raises(
+        UserValueError, match=f"^{hovering}: The simulator lacks the dynamics 'balloon'. Known are quad"
+    ):
+        fly(bundle, "torchrl_quad")
+    for options, why in (
+        ({"late": True}, "late must be a whole number from 0 to 1000, got True"),
+        ({"episodes": 0}, "episodes must be a whole number from 1 to inf, got 0"),
+        ({"scale": [1]}, "scale must be a mapping"),
+        ({"scale": {"mass": "2"}}, "scale: mass must be a number from 0 to 1000, got '2'"),
+        ({"mutant": "yaw"}, "mutant must be one of MUTANTS.values.., got 'yaw'"),
+        ({"loop": ["pid"]}, "mujoco has no rate loop"),
+    ):
+        with pytest.raises(UserError, match=f"^{hovering}: {why}"):
+            fly(bundle, "mujoco", **options)
+
+
 def test_a_state_that_is_not_a_number_is_a_crash(hovering):
     contract = load_bundle(hovering).contract
     crash, done = endings(contract, np.array([[1.0, 0.0, 1.5], [np.nan, 0.0, 1.5]]), np.zeros((2, 3)))
@@ -251,7 +278,6 @@ def test_the_recipe_films_a_flight_beside_ours(hovering, tmp_path, launch, monke
 
     films = []
     monkeypatch.setattr(drawing, "animate_flight", lambda *args, **options: films.append((args, options)))
-    monkeypatch.setattr(drawing, "replacing", contextlib.nullcontext)
     changed = ["scale={mass: 1.1}", "late=1"]
     settings = [f"bundle={hovering}", f"folder={tmp_path}", "episodes=1", "loop=contract", "pictures=true"]
     assert '{"late": 1, "mass": 1.1}' in launch("transfer", *settings, *changed)
@@ -308,6 +334,7 @@ WRONG_SETTINGS = {
     "scale={mass: 0}": "policy: scale: plant.mass is 0.0, and must be at least 0.001. Choose other factors",
     "scale={rate_gain: 2}": "policy: scale: the drone has no 'rate_gain' to scale. Choose from: mass, ",
     "late=1 ; late=2": "late is given twice",
+    "scale={inertia: 1.0, rotor_positions: 0}": "policy: scale: plant.rotor_positions and rotor_spin cannot make",
     "simulator=torchrl_quad ; loop=pid": "policy: torchrl_quad has no rate loop 'pid'. Choose from: contract",
     "simulator=torchrl_quad ; mutants=true ; scale={inertia: 9}": "policy: torchrl_quad flies motors as they are",
     "hello": "unknown setting 'hello'. Choose from: bundle=...",

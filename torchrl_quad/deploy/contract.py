@@ -21,6 +21,7 @@ from torchrl_quad.errors import MissingPackage, UserError, UserValueError
 
 VERSION = 3  # of the contract; raise it when a reader of the older one would misunderstand the new one
 FILES = ("README.md", "policy.c", "policy.h", "policy.onnx", "starts.npz", "vectors.npz")  # beside contract.json
+MOST_PIXELS = 2**18  # of an image; 256 of them are in vectors.npz
 IN_BODY = "_in_body"  # ends the names of inputs that are vectors of the world frame, turned to the body frame
 
 
@@ -144,6 +145,11 @@ _MUST = {
 }
 
 
+def problem(contract: Mapping[str, Any]) -> str | None:
+    """Where a contract does not fit its schema, or contradicts itself, if anywhere."""
+    return next(itertools.chain(_misfits(contract), _contradictions(contract)), None)
+
+
 def check(contract: Mapping[str, Any], path: Path) -> None:
     """Hold a contract against its schema, and what it says against itself, before anything uses it.
 
@@ -151,10 +157,9 @@ def check(contract: Mapping[str, Any], path: Path) -> None:
         UnknownContract: it does not fit.
         ImportError: jsonschema is missing.
     """
-    problem = next(itertools.chain(_misfits(contract), _contradictions(contract)), None)
-    if problem:
+    if said := problem(contract):
         raise UnknownContract(
-            f"{path}: {problem}. This torchrl_quad does not fly that; it was written by {writer(contract)}: use that "
+            f"{path}: {said}. This torchrl_quad does not fly that; it was written by {writer(contract)}: use that "
             "one, or export again."
         )
 
@@ -220,6 +225,8 @@ def _contradictions(contract: Mapping[str, Any]) -> Iterator[str]:
     }
     if camera:
         equal["limits.max_depth_age"] = (limits["max_depth_age"] or 0.0, (camera["rate"] + camera["delay"]) * dt)
+        if camera["width"] * camera["height"] > MOST_PIXELS:
+            yield f"camera has {camera['width']} x {camera['height']} pixels, and may have {MOST_PIXELS}"
         equal["the norm of camera.quaternion"] = (math.hypot(*camera["quaternion"]), 1.0)
     for name, (value, wanted) in equal.items():
         if not math.isclose(value, wanted, rel_tol=1e-3):

@@ -130,6 +130,11 @@ def export_policy(
     files |= write_c(network, contract, {name: x[:: count // self_test] for name, x in vectors.items()})
     contract["sha256"] = {name: contracts.sha256(files[name]) for name in contracts.FILES}
     contract["digest"] = contracts.digest(contract)
+    if problem := contracts.problem(contract):
+        raise UserValueError(
+            f"export_policy: {problem}. A bundle flies within the ranges of docs/deploy_contract.md: change the "
+            "environment, or the drone."
+        )
     files["contract.json"] = (json.dumps(contract, indent=2, allow_nan=False) + "\n").encode()
     with replacing_folder(place, require_bundle) as temporary:
         for name, content in files.items():

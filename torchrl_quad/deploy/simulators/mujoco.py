@@ -10,7 +10,6 @@ import numpy as np
 from mujoco import rollout
 from numpy.typing import NDArray
 
-from torchrl_quad.deploy.contract import one_line
 from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone
 from torchrl_quad.errors import UserValueError
 
@@ -81,10 +80,13 @@ class MuJoCo:
         nominal = Drone(contract["drone"])
         self.drone, self.hover_speed = Drone(contract["drone"] | contract["plant"]), nominal.hover_speed
         self.loop, self.motors = LOOPS[loop](nominal, timestep), list(motors)
-        try:
-            self.model = mujoco.MjModel.from_xml_string(model(self.drone, timestep))
-        except ValueError as error:  # of its compiler, which asks more of a body than we do
-            raise UserValueError(f"MuJoCo does not fly this drone: {one_line(error)}.") from error
+        inertia = self.drone.inertia
+        if 2.0 * inertia.max() > inertia.sum():
+            raise UserValueError(
+                f"MuJoCo flies no body with the inertia {inertia.tolist()}, since there is none: each of the three is "
+                "at most the sum of the other two. Fly it in another simulator."
+            )
+        self.model = mujoco.MjModel.from_xml_string(model(self.drone, timestep))
         self.data = mujoco.MjData(self.model)
         self.rollout = rollout.Rollout(nthread=0)
         self.inputs = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED)

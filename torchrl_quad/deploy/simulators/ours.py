@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 
+from torchrl_quad.deploy.contract import shown
 from torchrl_quad.deploy.simulators.vehicle import Array
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams, load_drone
 from torchrl_quad.errors import UserValueError
@@ -35,6 +36,11 @@ class Ours:
         self.params: QuadrotorParams = (
             load_drone(contract["drone"] | contract["plant"]) if contract["plant"] else nominal
         )
+        if about["dynamics"] not in DYNAMICS:
+            raise UserValueError(
+                f"The simulator lacks the dynamics {shown(about['dynamics'])}. Known are {', '.join(DYNAMICS)}; "
+                "register those of your own first."
+            )
         kind = DYNAMICS[about["dynamics"]]
         self.dynamics = kind(nominal, about["dt"], substeps, about["integrator"], "rates")
         if not contract["plant"]:

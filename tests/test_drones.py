@@ -1,5 +1,6 @@
 """Loading drones: presets, files, mappings, and what is wrong with a bad one."""
 
+import functools
 import itertools
 
 import numpy as np
@@ -109,7 +110,16 @@ def test_gradients_flow_through_replace_to_and_construction():
 
 
 NO_NUMBERS = [True, np.True_, [True, 1.0, 1.0], "1", b"1", "", [], [[1.0], [1.0, 2.0]], 10**400, 10**6000, float("nan")]
-NO_NUMBERS += [{}, object(), 1j, np.array(["1"]), torch.tensor(True), torch.tensor(1j), torch.zeros(0)]
+NO_NUMBERS += [
+    functools.reduce(lambda inner, _: [inner], range(5000), 1.0),
+    {},
+    object(),
+    1j,
+    np.array(["1"]),
+    torch.tensor(True),
+    torch.tensor(1j),
+    torch.zeros(0),
+]
 
 
 @pytest.mark.parametrize("value", NO_NUMBERS, ids=lambda value: shown(value)[:20])
@@ -124,6 +134,10 @@ def test_what_is_no_number_is_refused_in_every_field_however_a_drone_is_made(val
         with pytest.raises(UserValueError, match=f"field '{name}' (is not a number|must be|has shape)") as refused:
             make({name: value})
         assert "\n" not in str(refused.value)
+    motors = {"speed_per_volt": 500.0, "nominal_voltage": 3.7, "speed_at_zero": 0.0, "delay": 0.0}
+    for name in motors:
+        with pytest.raises(UserValueError, match=name):
+            load_drone({**VISFLY, "motor_command": {**motors, name: value}})
 
 
 def test_a_drone_of_a_float64_environment_is_in_its_precision_and_may_lie_at_a_limit():

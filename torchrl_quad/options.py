@@ -236,7 +236,10 @@ def shown(value: Any) -> str:
 
 
 def _checked(name: str, value: Any, adapter: TypeAdapter[Any], description: str) -> Any:
-    plain = _without_numpy(value)
+    try:
+        plain = _without_numpy(value)
+    except RecursionError:
+        raise UserValueError(f"{name} holds lists in more lists than anything needs. Write it flatter.") from None
     try:
         valid = adapter.validate_python(plain)
     except ValidationError as refused:
@@ -254,6 +257,8 @@ def _checked(name: str, value: Any, adapter: TypeAdapter[Any], description: str)
 def _without_numpy(value: Any) -> Any:
     if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.ndim == 0):
         return value.item()
+    if str(getattr(value, "dtype", "")) == "torch.bool":  # which is a float to Python
+        return value.tolist()
     if type(value) in (list, tuple):
         return type(value)(map(_without_numpy, value))
     if type(value) is dict:
@@ -276,7 +281,8 @@ def _misfit(target: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str
 
 def _names(called: Callable[..., Any]) -> list[str]:
     """The names of all arguments; those of a class include what it hands on to its bases."""
-    parameters = (inspect.signature(function).parameters.items() for _, function in _takers(called))
+    whole = [called] if hasattr(called, "__signature__") else [function for _, function in _takers(called)]
+    parameters = (inspect.signature(function).parameters.items() for function in whole)
     variable = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
     return sorted({name for some in parameters for name, x in some if x.kind not in variable} - {"self"})
 

@@ -242,12 +242,20 @@ def test_what_they_cannot_fly_is_refused_and_a_reference_of_ones_own_is_flown():
                 controller(env)
     with pytest.raises(TypeError, match="flies a QuadrotorEnv"):
         MPC(nn.Identity())
-    for wrong in ({"horizon": 0}, {"iterations": 1.5}, {"weights": {"speed": 1.0}}, {"weights": {"action": 0.0}}):
-        with pytest.raises(ValueError, match="MPC: "):
-            MPC(own, reference=lambda state, t: state["target"], **wrong)
-    for wrong in ({"position_gain": 0.0}, {"max_tilt": 1.6}):
-        with pytest.raises(ValueError, match="GeometricController: "):
-            GeometricController(own, reference=lambda state, t: state["target"], **wrong)
+    still = {"reference": lambda state, t: state["target"].unsqueeze(1).expand(-1, len(t), 3)}
+    for controller, wrong, message in (
+        (MPC, {"horizon": 0}, "horizon must be at least 1, got 0. Control steps of a plan"),
+        (MPC, {"iterations": 1.5}, "iterations must be a whole number, got 1.5"),
+        (MPC, {"weights": {"speed": 1.0}}, "weights: unknown weight 'speed'. Choose from: position"),
+        (MPC, {"weights": {"action": 0.0}}, "weights: action must be at least 1e-6"),
+        (GeometricController, {"position_gain": 0.0}, "position_gain must be at least 0.001, got 0.0"),
+        (GeometricController, {"max_tilt": 1.6}, "max_tilt must be at most 1.5, got 1.6"),
+        (MPC, {"reference": 3}, r"reference is a function from the state and times \(T\) .*; got 3"),
+        (MPC, {"reference": lambda state, t: state["target"]}, r"here \(1, 2, 3\), torch.float32; it made \(1, 3\)"),
+        (MPC, {"reference": lambda state, t: state["goal"]}, "given two times it failed: 'goal'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            controller(own, **{**still, **wrong})
     up = GeometricController(own, reference=lambda state, t: state["target"][:, None] + t[:, None] * torch.ones(3))
     assert up(at(own))["action"][0, 0] > own.hover_action[0]
     assert isinstance(up(TensorDict(at(own))), TensorDict)

@@ -158,11 +158,11 @@ def test_limits_can_be_chosen_and_gymnasium_takes_them():
     [
         ("thrust", "Unknown control 'thrust'. Choose from: rates, attitude, rotor_thrusts, velocity; or"),
         ({"max_tilt": 0.5}, r"control=\{'max_tilt': 0.5\} names no mode. Choose from: rates, "),
-        (None, "control=None names no mode"),
+        (None, "control must be a name, such as rates, or a mapping with limits, got None"),
         ({"mode": "attitude", "max_speed": 1.0}, "'attitude' has no limit 'max_speed'. Choose from: max_tilt"),
         ({"mode": "rates", "max_tilt": 1.0}, "'rates' has no limit 'max_tilt'. It has none; those of the drone hold"),
-        ({"mode": "attitude", "max_tilt": 30}, "max_tilt must be an angle in rad between 0 and 1.571, got 30"),
-        ({"mode": "velocity", "max_speed": "5"}, "max_speed must be a speed in m/s between 0 and 100, got '5'"),
+        ({"mode": "attitude", "max_tilt": 30}, "control: max_tilt must be at most 1.5, got 30"),
+        ({"mode": "velocity", "max_speed": "5"}, "control: max_speed must be a number, got '5'"),
     ],
 )
 def test_a_mode_or_a_limit_that_makes_no_sense_is_refused(control, message):

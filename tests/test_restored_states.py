@@ -104,7 +104,7 @@ def test_a_state_of_another_device_or_precision_is_refused_by_a_step_and_convert
     for wrong, message in ((double, "torch.float64 on cpu"), (elsewhere, "torch.float32 on meta")):
         with pytest.raises(ValueError, match=f"state 'position' is {message}, and this environment torch.float32 on"):
             env.step(wrong)
-    with pytest.raises(ValueError, match="on meta, and this environment torch.float32 on cpu. Convert it: env.reset"):
+    with pytest.raises(ValueError, match="on meta, and that of the environment torch.float32 on cpu"):
         differentiable_rollout(env, make_actor(env), td.to("meta"), 2)
     assert env.reset(double, set_state=True)["state", "position"].dtype is torch.float32
 

@@ -91,9 +91,12 @@ def test_a_large_curve_gets_a_box_that_holds_it():
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"curve": "square"}, "Unknown curve 'square'. Choose from: slow_circle, fast_circle, lemniscate"),
+        (
+            {"curve": "square"},
+            "curve must be one of slow_circle, fast_circle, lemniscate, or a function .*, got 'square'",
+        ),
         ({"curve": lambda p: p}, "needs a period in seconds"),
-        ({"curve": "slow_circle", "period": -1.0}, "needs a period in seconds, such as period=10.0; got -1.0"),
+        ({"curve": "slow_circle", "period": -1.0}, "period must be at least 0.1, got -1.0"),
         ({"curve": lambda p: p, "period": 5.0}, r"from shape \(2, 257\) it made \(2, 257\), torch.float32"),
         ({"curve": lambda p: torch.stack((p, p, p), 1), "period": 5.0}, r"it made \(2, 3, 257\)"),
         (
@@ -317,7 +320,7 @@ def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):
     ("track", "message"),
     [
         ("monza", "Unknown track 'monza'. Choose from: six_gates, visfly; or give the path"),
-        ({"gates": [[0, 0, 1]]}, "track: a track needs at least two gates, got 1"),
+        ({"gates": [[0, 0, 1]]}, "track: a track has 2 to 1000 gates, got 1"),
         ({"gate": []}, "unknown key 'gate'. Allowed: gates, starts, gate_radius"),
         ({}, "gates must be a list of points"),
         ({"gates": [[0, 0], [1, 1]]}, "gates must be a list of points"),
@@ -326,10 +329,13 @@ def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):
         ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1]]}, "one start before each gate, got 1 for 2"),
         ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1], [9, 9, 1]]}, r"within 0.2 m of \[9.0, 9.0, 1.0\]"),
         ({"gates": [[0, 0, 0.1], [1, 1, 0.1]]}, "not all inside the box"),
-        ({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": 0}, "gate_radius must be a positive number"),
+        (
+            {"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": 0},
+            "track: gate_radius must be at least 0.01, got 0. Of all gates",
+        ),
         (
             {"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": float("inf")},
-            "gate_radius must be a positive number .m., got inf",
+            "track: gate_radius must be a finite number, got inf",
         ),
     ],
 )
@@ -340,5 +346,5 @@ def test_a_track_that_nobody_can_fly_is_refused(track, message):
 
 @pytest.mark.parametrize("option", ["reward", "gate_bonus"])
 def test_unknown_rewards_are_refused(option):
-    with pytest.raises(ValueError, match=f"Unknown {option} 'fast'. Choose from"):
+    with pytest.raises(ValueError, match=f"{option} must be .* or .*, got 'fast'"):
         RacingEnv(num_envs=1, **{option: "fast"})

@@ -194,15 +194,15 @@ def test_a_way_is_found_through_a_gap_and_none_through_a_wall():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"width": 0}, "camera: width must be a whole number of pixels: an image needs at least one"),
-        ({"field_of_view": math.radians(171)}, "below 170 degrees, 2.967"),
-        ({"field_of_view": 90}, "In degrees? 90 degrees are 1.571"),
+        ({"width": 0}, "width must be at least 1, got 0. Pixels of a row"),
+        ({"field_of_view": math.radians(171)}, "field_of_view must be at most 2.967, got 2.98"),
+        ({"field_of_view": 90}, "got 90. The horizontal .*; 90 degrees are 1.571 rad"),
         ({"width": 10, "height": 300, "field_of_view": 1.0}, "10 square pixels see 173"),
-        ({"rate": 0}, "rate must be a whole number of control steps, from 1"),
-        ({"dropout": 1.0}, "dropout must be a probability"),
+        ({"rate": 0}, "rate must be at least 1, got 0. Control steps from"),
+        ({"dropout": 1.0}, "dropout must be less than 1, got 1.0. The probability"),
         ({"quaternion": (1.0, 1.0, 0.0, 0.0)}, "of unit norm"),
         ({"pitch": 0.1, "quaternion": (1.0, 0.0, 0.0, 0.0)}, "Give one of them"),
-        ({"range": math.inf}, "range must be above 0"),
+        ({"range": math.inf}, "range must be a finite number, got inf"),
     ],
 )
 def test_cameras_that_cannot_be_are_refused(options, message):

@@ -13,10 +13,14 @@ from torch.nn.functional import normalize, pad
 from torchrl_quad.controllers.policy import Controller, State
 from torchrl_quad.controllers.references import Reference, follow
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.dynamics.modes import Tilt
+from torchrl_quad.options import real
 
 LEAST_LIFT = 0.3  # vertical part of the thrust, in weights: the drone never turns over to dive
 GREATEST_LIFT = 0.9  # of the greatest thrust: there is always some left to go sideways
+
+
+Gain, Heading = real(1e-3, 1e3), real(-2.0 * math.pi, 2.0 * math.pi)
 
 
 class GeometricController(Controller):
@@ -48,12 +52,13 @@ class GeometricController(Controller):
     Args:
         env: as for :class:`~torchrl_quad.controllers.policy.Controller`.
         reference: likewise; its derivatives are taken by central differences.
-        position_gain: :math:`k_x` [1/s2].
-        velocity_gain: :math:`k_v` [1/s].
-        attitude_gain: :math:`k_R` [1/s]; None makes this loop half as quick as the rate loop of the drone.
-        max_error: greatest error of the position that counts [m].
-        max_tilt: greatest angle of F from the vertical [rad].
-        heading: angle of :math:`b_1` from world x [rad]; None leaves it where it is.
+        position_gain: :math:`k_x`, 0.001 to 1000 per s2.
+        velocity_gain: :math:`k_v`, 0.001 to 1000 per s.
+        attitude_gain: :math:`k_R`, 0.001 to 1000 per s; None makes this loop half as quick as the rate loop of the
+            drone.
+        max_error: greatest error of the position that counts, 0.001 to 1000 m.
+        max_tilt: greatest angle of F from the vertical, 0.01 to 1.5 rad, 86 degrees.
+        heading: angle of :math:`b_1` from world x, -2 pi to 2 pi rad; None leaves it where it is.
 
     Raises:
         TypeError: this is no quadrotor environment.
@@ -65,22 +70,14 @@ class GeometricController(Controller):
         env: Any,
         *,
         reference: Reference | None = None,
-        position_gain: float = 10.0,
-        velocity_gain: float = 5.0,
-        attitude_gain: float | None = None,
-        max_error: float = 1.0,
-        max_tilt: float = 1.3,
-        heading: float | None = None,
+        position_gain: Gain = 10.0,
+        velocity_gain: Gain = 5.0,
+        attitude_gain: Gain | None = None,
+        max_error: Gain = 1.0,
+        max_tilt: Tilt = 1.3,
+        heading: Heading | None = None,
     ) -> None:
         super().__init__(env, reference)
-        for name, value in (
-            ("position_gain", position_gain), ("velocity_gain", velocity_gain), ("attitude_gain", attitude_gain),
-            ("max_error", max_error), ("max_tilt", max_tilt),
-        ):  # fmt: skip
-            if value is not None and not 0.0 < value < math.inf:
-                raise UserValueError(f"GeometricController: {name} must be a positive number, got {value!r}.")
-        if max_tilt >= 0.5 * math.pi:
-            raise UserValueError(f"GeometricController: max_tilt must be below pi / 2 [rad], got {max_tilt!r}.")
         self.position_gain, self.velocity_gain, self.max_error = position_gain, velocity_gain, max_error
         self.max_tilt, self.heading = max_tilt, heading
         nominal = self.nominal
@@ -122,7 +119,7 @@ class GeometricController(Controller):
         if self.heading is None:
             return rotation[..., 0]
         ahead = (math.cos(self.heading), math.sin(self.heading), 0.0)
-        return torch.tensor(ahead).to(rotation).expand(rotation.shape[:-1])
+        return rotation.new_tensor(ahead).expand(rotation.shape[:-1])
 
 
 def wanted_rotation(up: Tensor, ahead: Tensor) -> Tensor:

@@ -31,7 +31,9 @@ class Lap:
         self.rates = 2.0 * math.pi / period * torch.arange(1, len(coefficients) // 2 + 1).to(coefficients)
         ends = torch.where(passes > 0.0, passes, period)
         lengths = ends - passes.roll(1)  # of the stretch before each gate
-        self.times = ends[:, None] - lengths[:, None] * torch.linspace(1.0, 0.0, POINTS).to(passes)
+        self.times = ends[:, None] - lengths[:, None] * torch.linspace(
+            1.0, 0.0, POINTS, dtype=passes.dtype, device=passes.device
+        )
         self.points = self.position(self.times)
 
     def position(self, t: Tensor) -> Tensor:

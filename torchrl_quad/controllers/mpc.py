@@ -15,6 +15,7 @@ from torchrl_quad.controllers.references import Reference, follow
 from torchrl_quad.controllers.riccati import feedback
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import real, shown, whole
 
 # Of the squared residuals: each is the square of what one unit of it weighs, and half of it counts.
 WEIGHTS = {
@@ -27,6 +28,9 @@ WEIGHTS = {
 }
 SHORTENED = (1.0, 0.5, 0.2, 0.05)  # shares of a step of Gauss-Newton that are tried at once
 ROWS = 4096  # states whose derivatives are taken at once: what fits into the cache of a processor
+
+
+Plan, Iterations, Weights = whole(1, 1_000), whole(1, 100), Mapping[str, real(0.0, 1e6)]
 
 
 class MPC(Controller):
@@ -52,10 +56,11 @@ class MPC(Controller):
 
     Args:
         env: as for :class:`~torchrl_quad.controllers.policy.Controller`.
-        horizon: control steps of a plan.
-        iterations: steps of Gauss-Newton in each control step.
+        horizon: control steps of a plan, 1 to 1000.
+        iterations: steps of Gauss-Newton in each control step, 1 to 100.
         reference: as for :class:`~torchrl_quad.controllers.policy.Controller`.
-        weights: others than the usual ones, by name: position, attitude, velocity, angular_velocity, action, terminal.
+        weights: others than the usual ones, 0 to 1e6, by name: position, attitude, velocity, angular_velocity,
+            terminal, and action, which is 1e-6 or more.
 
     Raises:
         TypeError: this is no quadrotor environment.
@@ -66,22 +71,18 @@ class MPC(Controller):
         self,
         env: Any,
         *,
-        horizon: int = 20,
-        iterations: int = 1,
+        horizon: Plan = 20,
+        iterations: Iterations = 1,
         reference: Reference | None = None,
-        weights: Mapping[str, float] | None = None,
+        weights: Weights | None = None,
     ) -> None:
         super().__init__(env, reference)
-        for name, value in (("horizon", horizon), ("iterations", iterations)):
-            if not (isinstance(value, int) and value >= 1):
-                raise UserValueError(f"MPC: {name} must be a whole number of at least 1, got {value!r}.")
-        unknown = sorted(set(weights or {}) - set(WEIGHTS))
-        if unknown:
-            raise UserValueError(f"MPC: unknown weight {unknown[0]!r}. Choose from: {', '.join(WEIGHTS)}.")
+        for name in weights or {}:
+            if name not in WEIGHTS:
+                raise UserValueError(f"weights: unknown weight {shown(name)}. Choose from: {', '.join(WEIGHTS)}.")
         self.weights = {**WEIGHTS, **(weights or {})}
-        wrong = [name for name, value in self.weights.items() if not value >= 0 or (name == "action" and value == 0)]
-        if wrong:
-            raise UserValueError(f"MPC: the weight {wrong[0]!r} must be positive, got {self.weights[wrong[0]]!r}.")
+        if self.weights["action"] < 1e-6:
+            raise UserValueError(f"weights: action must be at least 1e-6, got {self.weights['action']!r}.")
         self.out_keys.append("plan")
         self.horizon, self.iterations = horizon, iterations
         self.hover_speed, like = self.dynamics.controller.hover_speed, self.nominal.mass

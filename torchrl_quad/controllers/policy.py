@@ -10,11 +10,12 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_quad.controllers.references import Reference, task_reference
+from torchrl_quad.controllers.references import Reference, check_reference, task_reference
 from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.dynamics import FlightController, Quadrotor
 from torchrl_quad.envs import QuadrotorEnv
 from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.options import checked
 
 State = dict[Any, Tensor]
 
@@ -39,6 +40,11 @@ class Controller(TensorDictModuleBase):
         ValueError: its dynamics or its actions are others, or its task has no reference.
     """
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "__init__" in vars(cls):
+            checked(cls)
+
     def __init__(self, env: Any, reference: Reference | None = None) -> None:
         env, name = base_env(env), type(self).__name__
         if not isinstance(env, QuadrotorEnv):
@@ -61,6 +67,8 @@ class Controller(TensorDictModuleBase):
         self.dynamics, self.nominal, self.control_dt = env.dynamics, env.nominal, env.control_dt
         self.lead = env.action_delay * env.control_dt  # [s], from a command to its effect
         self.reference = task_reference(env, self.lead, name) if reference is None else reference
+        if reference is not None:
+            check_reference(reference, env)
         self._see: list[Callable[[State], State]] = [x.observe for x in env.disturbances.values()]
 
     @torch.no_grad()

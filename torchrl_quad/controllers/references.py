@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl_quad.controllers.laps import plan_lap
 from torchrl_quad.envs import HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import shown
 
 Reference = Callable[[dict[Any, Tensor], Tensor], Tensor]
 
@@ -57,6 +58,26 @@ def task_reference(env: QuadrotorEnv, lead: float, name: str) -> Reference:
         "from the state and times (T) [s] to positions (num_envs, T, 3) [m], such as "
         'lambda state, t: state["target"].unsqueeze(1).expand(-1, len(t), 3).'
     )
+
+
+def check_reference(reference: Any, env: QuadrotorEnv) -> None:
+    """Refuse what is no reference, by asking it for the positions at two times in a state that is safe.
+
+    Raises:
+        ValueError: it is no function, fails, or gives something else.
+    """
+    rule = "reference is a function from the state and times (T) [s] to positions (num_envs, T, 3) [m]"
+    if not callable(reference):
+        raise UserValueError(f"{rule}; got {shown(reference)}.")
+    state = {key: x.clone() for key, x in env.control_step.safe_state.items()}
+    like = state["position"]
+    try:
+        points = reference(state, like.new_tensor((0.0, 0.1)))
+    except Exception as error:
+        raise UserValueError(f"{rule}; given two times it failed: {error}") from error
+    if not isinstance(points, Tensor) or points.shape != (len(like), 2, 3) or points.dtype != like.dtype:
+        got = f"{tuple(points.shape)}, {points.dtype}" if isinstance(points, Tensor) else type(points).__name__
+        raise UserValueError(f"{rule}, here ({len(like)}, 2, 3), {like.dtype}; it made {got}.")
 
 
 def hovering(env: HoveringEnv, lead: float) -> Reference:

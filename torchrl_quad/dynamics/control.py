@@ -30,6 +30,9 @@ from torchrl_quad.dynamics.vector import (
     where_same,
 )
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import checked, validated
+
+Nominal = validated(lambda x: isinstance(x, QuadrotorParams), "QuadrotorParams, such as load_drone('visfly')")
 
 
 class Setpoint(NamedTuple):
@@ -39,6 +42,7 @@ class Setpoint(NamedTuple):
     body_rate: Vector  #: (*, 3) [rad/s], body frame
 
 
+@checked
 class FlightController:
     """Rate controller and mixer with the nominal parameters of the drone: ``control="rates"``.
 
@@ -59,7 +63,7 @@ class FlightController:
         "yaw_share", "yaw_sign", "yaw_reach",
     )  # fmt: skip
 
-    def __init__(self, nominal: QuadrotorParams) -> None:
+    def __init__(self, nominal: Nominal) -> None:
         nominal = nominal.detach()
         self.nominal = nominal
         self.rotors = Rotors(nominal)

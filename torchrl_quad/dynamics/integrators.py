@@ -5,6 +5,7 @@ loop the wrench is held over each physics step, and all three are of first order
 """
 
 from collections.abc import Callable
+from typing import Literal
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.rigid_body import RigidBodyState
@@ -38,6 +39,7 @@ def rk4(state: RigidBodyState, accelerations: Accelerations, dt: float) -> Rigid
     return _normalized(_moved(state, mean, dt))
 
 
+Integrator = Literal["euler", "semi_implicit_euler", "rk4"]
 INTEGRATORS = {"euler": euler, "semi_implicit_euler": semi_implicit_euler, "rk4": rk4}
 
 

@@ -8,6 +8,12 @@ from typing import Any, Protocol
 from torch import Tensor
 
 from torchrl_quad.dynamics.parameters import QuadrotorParams
+from torchrl_quad.options import real, whole
+
+# [s]. In a shorter step a drone at 1 m/s does not move in single precision; with a longer one the rate loop of no drone
+# that ships is stable.
+PhysicsStep = real(1e-6, 0.1)
+Substeps = whole(1, 1_000)
 
 
 class Dynamics(Protocol):

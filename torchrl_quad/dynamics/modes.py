@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.dynamics.control import FlightController, Setpoint, join
+from torchrl_quad.dynamics.control import FlightController, Nominal, Setpoint, join
 from torchrl_quad.dynamics.parameters import QuadrotorParams
-from torchrl_quad.dynamics.presets import is_number
 from torchrl_quad.dynamics.vector import Vector, cat, clamp, dot, minimum, soft_limit
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import checked, real, shown
 
 
 class AttitudeSetpoint(NamedTuple):
@@ -42,19 +42,22 @@ class VelocitySetpoint(NamedTuple):
     yaw_rate: Vector  #: (*, 1) [rad/s], about the world's up
 
 
+Tilt, MaxSpeed = real(0.01, 1.5), real(0.01, 100.0)
+
+
+@checked
 class TiltController(FlightController):
     """What the controllers of attitude and velocity share: a loop that tilts the drone.
 
     Args:
         nominal: the drone it believes to fly.
-        max_tilt: greatest roll and greatest pitch that an action can ask for, each [rad].
+        max_tilt: greatest roll and greatest pitch that an action can ask for, each 0.01 to 1.5 rad, 86 degrees.
     """
 
     constants = (*FlightController.constants, "tilt_gain", "tilt_rate")
 
-    def __init__(self, nominal: QuadrotorParams, max_tilt: float) -> None:
+    def __init__(self, nominal: Nominal, max_tilt: Tilt) -> None:
         super().__init__(nominal)
-        _require_between("max_tilt", max_tilt, 0.0, 0.5 * math.pi, "an angle in rad")
         self.max_tilt = float(max_tilt)
         nominal = self.nominal
         # The rate loop J K / (tau_m J s^2 + (J + D) s + J K) lags by this many seconds.
@@ -70,17 +73,22 @@ class TiltController(FlightController):
         return soft_limit(self.tilt_gain * error, self.tilt_rate)
 
 
+@checked
 class AttitudeController(TiltController):
     """``control="attitude"``: collective thrust, roll, pitch, and rate of yaw.
 
     Roll and pitch are Euler angles in the order z, y, x, of -max_tilt to max_tilt. The heading is free: yaw turns about
     the world's up. Thrust is that of ``control="rates"``.
+
+    Args:
+        nominal: the drone it believes to fly.
+        max_tilt: greatest roll and greatest pitch that an action can ask for, each 0.01 to 1.5 rad, 86 degrees.
     """
 
     action_units = {"thrust": "N", "roll": "rad", "pitch": "rad", "yaw rate": "rad/s"}
     setpoint_type, setpoint_sizes = AttitudeSetpoint, (1, 3, 1)
 
-    def __init__(self, nominal: QuadrotorParams, *, max_tilt: float = math.pi / 6) -> None:
+    def __init__(self, nominal: Nominal, *, max_tilt: Tilt = math.pi / 6) -> None:
         super().__init__(nominal, max_tilt)
         tilt = self.tilt_rate.new_full((2,), self.max_tilt)
         self.scale = join(self.half_range, tilt, self.nominal.max_body_rate[..., 2:])
@@ -101,6 +109,7 @@ class AttitudeController(TiltController):
         return Setpoint(setpoint.thrust, rates)
 
 
+@checked
 class RotorThrustController(FlightController):
     """``control="rotor_thrusts"``: the thrust of each rotor, without any control loop.
 
@@ -111,7 +120,7 @@ class RotorThrustController(FlightController):
     action_units = {f"rotor {i}": "N" for i in (1, 2, 3, 4)}
     setpoint_type, setpoint_sizes = RotorSetpoint, (4,)
 
-    def __init__(self, nominal: QuadrotorParams) -> None:
+    def __init__(self, nominal: Nominal) -> None:
         super().__init__(nominal)
         self.offset, self.scale = self.offset.new_ones(4), self.half_range * self.share
         self.hover_action = self.hover_action[..., :1].expand(*self.hover_action.shape).contiguous()
@@ -125,20 +134,25 @@ class RotorThrustController(FlightController):
         return self.rotors.speed(clamp(setpoint.thrust, self.thrust_min, self.thrust_max))
 
 
+@checked
 class VelocityController(TiltController):
     """``control="velocity"``: velocity in the world frame, and rate of yaw.
 
     The velocity error asks for an acceleration, and with the weight for a thrust, along which the drone tilts. There is
     no integral part: drag, wind, and a weight that differs from the nominal one leave an error.
+
+    Args:
+        nominal: the drone it believes to fly.
+        max_tilt: greatest angle by which it tilts, 0.01 to 1.5 rad, 86 degrees.
+        max_speed: greatest velocity along each axis that an action can ask for, 0.01 to 100 m/s.
     """
 
     action_units = {"velocity x": "m/s", "velocity y": "m/s", "velocity z": "m/s", "yaw rate": "rad/s"}
     setpoint_type, setpoint_sizes = VelocitySetpoint, (3, 1)
     constants = (*TiltController.constants, "velocity_gain", "max_climb", "full_thrust")
 
-    def __init__(self, nominal: QuadrotorParams, *, max_tilt: float = math.pi / 6, max_speed: float = 3.0) -> None:
+    def __init__(self, nominal: Nominal, *, max_tilt: Tilt = math.pi / 6, max_speed: MaxSpeed = 3.0) -> None:
         super().__init__(nominal, max_tilt)
-        _require_between("max_speed", max_speed, 0.0, 100.0, "a speed in m/s")
         nominal = self.nominal
         # Sideways it acts through the tilt: its lag, and the time to tilt fully at the greatest rate. Upwards it acts
         # through the rotors alone, as the tilt does.
@@ -196,22 +210,21 @@ def make_controller(control: str | Mapping[str, Any], nominal: QuadrotorParams) 
     limits = dict(control) if isinstance(control, Mapping) else {"mode": control}
     mode = limits.pop("mode", None)
     if not isinstance(mode, str) or mode not in CONTROLS:
-        what = f"Unknown control {mode!r}" if mode is not None else f"control={control!r} names no mode"
+        what = f"Unknown control {shown(mode)}" if mode is not None else f"control={shown(control)} names no mode"
         raise UserValueError(
             f'{what}. Choose from: {", ".join(CONTROLS)}; or {{"mode": "velocity", "max_speed": 5.0}}.'
         )
     known = [x.name for x in inspect.signature(CONTROLS[mode]).parameters.values() if x.kind is x.KEYWORD_ONLY]
-    unknown = [str(name) for name in limits if name not in known]
-    if unknown:
-        has = f"Choose from: {', '.join(known)}" if known else "It has none; those of the drone hold"
-        raise UserValueError(f"control: {mode!r} has no limit {unknown[0]!r}. {has}.")
-    return CONTROLS[mode](nominal, **limits)
+    for name in limits:
+        if name not in known:
+            has = f"Choose from: {', '.join(known)}" if known else "It has none; those of the drone hold"
+            raise UserValueError(f"control: {mode!r} has no limit {shown(name)}. {has}.")
+    try:
+        return CONTROLS[mode](nominal, **limits)
+    except UserValueError as error:
+        where = "control: " if limits and not str(error).startswith(("drone", "nominal")) else ""
+        raise UserValueError(f"{where}{error}") from None
 
 
 def _entries(vector: Vector) -> tuple[Vector, Vector, Vector]:
     return vector[..., :1], vector[..., 1:2], vector[..., 2:]
-
-
-def _require_between(name: str, value: Any, low: float, high: float, what: str) -> None:
-    if not (is_number(value) and low < value < high):
-        raise UserValueError(f"control: {name} must be {what} between {low:g} and {high:.4g}, got {value!r}.")

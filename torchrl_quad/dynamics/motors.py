@@ -6,11 +6,14 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from torchrl_quad.dynamics.presets import is_number
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import shown
+from torchrl_quad.options import checked, real, shown
+
+SpeedPerVolt, Voltage = real(1e-3, 1e5), real(1e-1, 1e3)
+SpeedAtZero, Lag = real(-1e4, 1e4), real(-0.1, 0.5)
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class MotorCommand:
     """The rotor speed that a motor command asks for: ``speed_at_zero + speed_per_volt * command * voltage``.
@@ -18,26 +21,21 @@ class MotorCommand:
     The command is 0 to 1 of what the electronics can give. Environments command rotor speeds or thrusts, and do not
     read this; :func:`~torchrl_quad.identification.prediction_error` does.
 
+    Args:
+        speed_per_volt: of command times battery voltage, which is what the motor sees on average, 0.001 to 1e5 rad/s
+            per V.
+        nominal_voltage: where a log does not know the battery's, 0.1 to 1000 V.
+        speed_at_zero: -1e4 to 1e4 rad/s.
+        delay: from the command to the motor, -0.1 to 0.5 s.
+
     Raises:
         ValueError: a value is not a finite number in its range.
     """
 
-    speed_per_volt: float  #: [rad/s per V] of command times battery voltage, which is what the motor sees on average
-    nominal_voltage: float  #: [V], where a log does not know the battery's
-    speed_at_zero: float = 0.0  #: [rad/s]
-    delay: float = 0.0  #: [s], from the command to the motor
-
-    def __post_init__(self) -> None:
-        ranges = {
-            "speed_per_volt": (1e-3, 1e5),
-            "nominal_voltage": (1e-1, 1e3),
-            "speed_at_zero": (-1e4, 1e4),
-            "delay": (-0.1, 0.5),
-        }
-        for name, (low, high) in ranges.items():
-            value = getattr(self, name)
-            if not (is_number(value) and low <= value <= high):
-                raise UserValueError(f"motor_command: {name} must be between {low:g} and {high:g}, got {shown(value)}.")
+    speed_per_volt: SpeedPerVolt
+    nominal_voltage: Voltage
+    speed_at_zero: SpeedAtZero = 0.0
+    delay: Lag = 0.0
 
     @classmethod
     def read(cls, source: str, values: Any) -> MotorCommand:
@@ -66,4 +64,4 @@ class MotorCommand:
         try:
             return cls(**values)
         except ValueError as error:
-            raise UserValueError(f"{source}: {error}") from error
+            raise UserValueError(f"{source}: motor_command: {error}") from None

@@ -9,13 +9,18 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
+from torchrl_quad.dynamics.control import Nominal
+from torchrl_quad.dynamics.integrators import Integrator
+from torchrl_quad.dynamics.interface import PhysicsStep, Substeps
 from torchrl_quad.dynamics.modes import RotorThrustController, make_controller
 from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import drag
 from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, split, stack
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import checked
 
 
+@checked
 class PointMass:
     """Thrust and body rates follow the command at once: no rotors, no rate controller, no moments.
 
@@ -25,8 +30,8 @@ class PointMass:
 
     Args:
         nominal: the drone whose weight and limits scale the action.
-        dt: physics step [s].
-        substeps: physics steps in a control step.
+        dt: physics step, 1e-6 to 0.1 s.
+        substeps: physics steps in a control step, 1 to 1000.
         integrator: must be "semi_implicit_euler".
         control: what an action commands, as :func:`~torchrl_quad.dynamics.make_controller` takes it; not rotors.
 
@@ -39,10 +44,10 @@ class PointMass:
 
     def __init__(
         self,
-        nominal: QuadrotorParams,
-        dt: float,
-        substeps: int,
-        integrator: str,
+        nominal: Nominal,
+        dt: PhysicsStep,
+        substeps: Substeps,
+        integrator: Integrator,
         control: str | Mapping[str, Any] = "rates",
     ) -> None:
         if integrator != "semi_implicit_euler":

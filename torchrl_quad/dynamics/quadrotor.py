@@ -9,13 +9,15 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.dynamics.control import FlightController
-from torchrl_quad.dynamics.integrators import INTEGRATORS
+from torchrl_quad.dynamics.control import FlightController, Nominal
+from torchrl_quad.dynamics.integrators import INTEGRATORS, Integrator
+from torchrl_quad.dynamics.interface import PhysicsStep, Substeps
 from torchrl_quad.dynamics.modes import make_controller
 from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
 from torchrl_quad.dynamics.rotors import Rotors
 from torchrl_quad.dynamics.vector import Components, Vector, cat, clamp, split, stack
+from torchrl_quad.options import checked
 
 
 class QuadrotorState(NamedTuple):
@@ -71,14 +73,15 @@ def control_step(
     return state
 
 
+@checked
 class Quadrotor:
     """The quadrotor as environments fly it: an implementation of :class:`~torchrl_quad.dynamics.Dynamics`.
 
     Args:
         nominal: the drone that the flight controller believes in.
-        dt: physics step [s].
-        substeps: physics steps in a control step.
-        integrator: name of the integrator.
+        dt: physics step, 1e-6 to 0.1 s.
+        substeps: physics steps in a control step, 1 to 1000.
+        integrator: how the rigid body moves on in a physics step.
         control: what an action commands, as :func:`~torchrl_quad.dynamics.make_controller` takes it.
     """
 
@@ -87,10 +90,10 @@ class Quadrotor:
 
     def __init__(
         self,
-        nominal: QuadrotorParams,
-        dt: float,
-        substeps: int,
-        integrator: str,
+        nominal: Nominal,
+        dt: PhysicsStep,
+        substeps: Substeps,
+        integrator: Integrator,
         control: str | Mapping[str, Any] = "rates",
     ) -> None:
         self.controller = make_controller(control, nominal)

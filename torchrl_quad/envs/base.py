@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -13,19 +12,51 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams, load_drone
+from torchrl_quad.dynamics.integrators import Integrator
+from torchrl_quad.dynamics.interface import PhysicsStep
 from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compiler, nested
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import checked_task, checks
-from torchrl_quad.envs.disturbances import Disturbance
-from torchrl_quad.envs.options import choose_disturbances
+from torchrl_quad.envs.checks import Weights
+from torchrl_quad.envs.options import (
+    CameraOption,
+    ControlOption,
+    DisturbancesOption,
+    DroneOption,
+    DynamicsOption,
+    NoiseOption,
+    RandomizeOption,
+    SceneOption,
+    StartOption,
+    WindOption,
+    choose_disturbances,
+    require_room,
+)
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenery import merge_reset, visible_state
 from torchrl_quad.envs.specs import describe, set_specs
 from torchrl_quad.envs.step import ControlStep, draw_start, sample_state
 from torchrl_quad.envs.task import Task
+from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, checked, real, require, validated
+
+FloatType = validated(
+    lambda x: isinstance(x, torch.dtype) and x in (torch.float32, torch.float64), "torch.float32 or torch.float64"
+)
+ControlPeriod = real(1e-6, 1.0)
 
 
-class QuadrotorEnv(Task, EnvBase):
+class _Built(type(EnvBase)):
+    """How an environment is built: TorchRL takes ``compile`` before it asks the class."""
+
+    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
+        if "compile" in kwargs:
+            kwargs["compile"] = require("compile", kwargs["compile"], bool | dict[str, Any] | None)
+            checks.check_compilation(kwargs["compile"] if isinstance(kwargs["compile"], dict) else {})
+        return super().__call__(*args, **kwargs)
+
+
+@checked
+class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
     """Base of all tasks: a batch of quadrotors, stateless and differentiable.
 
     A step is a pure function of its tensordict. The complete Markov state is in ``"state"``, and gradients flow from
@@ -40,24 +71,28 @@ class QuadrotorEnv(Task, EnvBase):
 
     Args:
         num_envs: number of drones that fly in parallel.
-        device: device of all tensors.
+        device: of all tensors, such as "cpu" or "cuda".
         dtype: torch.float32 or torch.float64.
-        seed: of the environment's own random generator; None takes another one each time. One seed gives one flight:
-            give each of several copies its own, as in ParallelEnv.
+        seed: of the environment's own random generator, from 0; None takes another one each time. One seed gives one
+            flight: give each of several copies its own, as in ParallelEnv.
         drone: name of a preset, path of a YAML file, mapping, or :class:`~torchrl_quad.QuadrotorParams`.
         dynamics: "quadrotor", or "point_mass", whose thrust and body rates follow the action at once.
         control: what an action (4) in [-1, 1] commands: "rates" (thrust, body rates), "attitude" (thrust, roll, pitch,
-            yaw rate), "rotor_thrusts", "velocity" (and yaw rate), or a mapping with limits; see ``docs/actions.md``.
-        dt: physics step [s].
-        control_dt: control step [s], a whole multiple of dt.
-        action_delay: control steps between an action and its effect.
-        integrator: "euler", "semi_implicit_euler" or "rk4".
+            yaw rate), "rotor_thrusts", "velocity" (and yaw rate), or a mapping with limits, such as {mode: velocity,
+            max_speed: 5.0}. See ``docs/actions.md``.
+        dt: the physics step, 1e-6 to 0.1 s. In a shorter one a drone at 1 m/s does not move in single precision; with a
+            longer one the rate loop of no drone that ships is stable.
+        control_dt: the control step, 1e-6 to 1 s, a whole multiple of dt. Hovering is judged by its last second.
+        action_delay: control steps from a command to its effect, 0 to 1000; 1 is usual.
+        integrator: how the rigid body moves on in a physics step.
         max_episode_steps: control steps after which an episode is truncated.
-        observe_last_action: append the commands that are still on their way to the observation. Off in the paper.
+        observe_last_action: whether the commands that are still on their way are appended to the observation. Off in
+            the paper.
         observation_noise: white noise: a mapping, or :class:`~torchrl_quad.envs.disturbances.Sensors`.
-        observation_delay: control steps by which the observation of the drone lags behind.
-        weights: other weights of reward terms, by name: ``{"velocity": 0.0}``.
-        event_discount: discount per control step by which the time of an event counts; None: events have no gradient.
+        observation_delay: control steps by which the observation of the drone lags behind, 0 to 1000.
+        weights: other weights of reward terms, by name, each within a million: ``{"velocity": 0.0}``.
+        event_discount: the discount per control step by which the time of an event counts, above 0, at most 1; None
+            for no gradient in it.
         randomize: another drone in each episode; see :class:`~torchrl_quad.envs.disturbances.DroneRandomization`.
         wind: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.Wind`, or one of these.
         random_start: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.RandomStart`, or one of these.
@@ -77,37 +112,32 @@ class QuadrotorEnv(Task, EnvBase):
 
     def __init__(
         self,
-        num_envs: int = 64,
+        num_envs: Size = 64,
         *,
-        device: torch.device | str = "cpu",
-        dtype: torch.dtype = torch.float32,
-        seed: int | None = 0,
-        drone: Any = "visfly",
-        dynamics: str = "quadrotor",
-        control: str | Mapping[str, Any] = "rates",
-        dt: float = 0.005,
-        control_dt: float = 0.02,
-        action_delay: int = 1,
-        integrator: str = "semi_implicit_euler",
-        max_episode_steps: int = 256,
+        device: Device = "cpu",
+        dtype: FloatType = torch.float32,
+        seed: Seed | None = 0,
+        drone: DroneOption = "visfly",
+        dynamics: DynamicsOption = "quadrotor",
+        control: ControlOption = "rates",
+        dt: PhysicsStep = 0.005,
+        control_dt: ControlPeriod = 0.02,
+        action_delay: Delay = 1,
+        integrator: Integrator = "semi_implicit_euler",
+        max_episode_steps: Size = 256,
         observe_last_action: bool = False,
-        observation_noise: Mapping[str, float] | Disturbance | None = None,
-        observation_delay: int = 0,
-        weights: Mapping[str, float] | None = None,
-        event_discount: float | None = None,
-        randomize: str | Path | Mapping | None = None,
-        wind: Mapping[str, Any] | Disturbance | None = None,
-        random_start: Mapping[str, float] | Disturbance | None = None,
-        disturbances: Sequence[Disturbance] = (),
-        scene: Any = None,
-        camera: Any = None,
-        **unknown: Any,
+        observation_noise: NoiseOption = None,
+        observation_delay: Delay = 0,
+        weights: Weights = None,
+        event_discount: Share | None = None,
+        randomize: RandomizeOption = None,
+        wind: WindOption = None,
+        random_start: StartOption = None,
+        disturbances: DisturbancesOption = (),
+        scene: SceneOption = None,
+        camera: CameraOption = None,
     ) -> None:
-        checks.refuse_unknown(type(self), unknown)
-        options = checks.check_arguments(
-            num_envs, dtype, seed, dynamics, control, dt, control_dt, action_delay, integrator, max_episode_steps,
-            observe_last_action, event_discount,
-        )  # fmt: skip
+        options = checks.timing(dynamics, control, dt, control_dt, action_delay, integrator, observe_last_action)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.num_envs, self.dtype, self.control_dt, self.action_delay = num_envs, dtype, control_dt, action_delay
         self.max_episode_steps, self.observe_last_action = max_episode_steps, observe_last_action
@@ -118,13 +148,15 @@ class QuadrotorEnv(Task, EnvBase):
         self._make_dynamics = functools.partial(DYNAMICS[dynamics], **options)
         self.dynamics: Dynamics = self._make_dynamics(params)
         self._params = params if params.requires_grad else self.nominal
-        self.weights = {**self.weights, **checks.checked_weights(weights or {}, self.weights)}
+        self.weights = checks.checked_weights({**self.weights, **(weights or {})}, self.weights)
+        self._place_weights()
         self._make_disturbances = functools.partial(
             choose_disturbances, random_start=random_start, randomize=randomize, wind=wind,
             observation_noise=observation_noise, observation_delay=observation_delay, more=disturbances,
             scene=scene, camera=camera,
         )  # fmt: skip
         self.disturbances = self._make_disturbances(self.nominal, self.dynamics.plant_fields)
+        require_room(self)
         self.randomness = Randomness(self.device, dtype)
         self.randomness.seed(seed)
         self.set_up()
@@ -137,6 +169,8 @@ class QuadrotorEnv(Task, EnvBase):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        if "__init__" in vars(cls):
+            checked(cls)
         cls.__signature__ = checks.full_signature(cls, EnvBase)
 
     # -- what its users may set and ask --------------------------------------------------------------------------------
@@ -163,7 +197,8 @@ class QuadrotorEnv(Task, EnvBase):
         self.initial_state_source = source
         self.randomness.forget_starts()
 
-    def sample_start(self, n: int) -> TensorDict:
+    @checked
+    def sample_start(self, n: Size) -> TensorDict:
         """Draw n complete Markov states from the task's own starts: a tensordict [n] with ``state``."""
         return TensorDict({"state": nested(sample_state(self, n))}, [n], self.device)
 
@@ -183,6 +218,7 @@ class QuadrotorEnv(Task, EnvBase):
     def compile(self, **kwargs: Any) -> QuadrotorEnv:
         """Compile the control step and its derivative; the keywords go to torch.compile. Under transforms, compile the
         environment inside, ``TransformedEnv(HoveringEnv(compile=True), ...)``: TransformedEnv's own takes minutes."""
+        checks.check_compilation(kwargs)
         kwargs.pop("warmup", None)  # TorchRL's option for steps whose input changes its layout: ours never does
         return self._run(kwargs if has_compiler() else None)
 
@@ -195,7 +231,8 @@ class QuadrotorEnv(Task, EnvBase):
         """Undo :meth:`compile`."""
         return self._run(None)
 
-    def to(self, device: torch.device | str) -> QuadrotorEnv:
+    @checked
+    def to(self, device: Device) -> QuadrotorEnv:
         """Move the environment to a device, where its random generator starts again from its seed."""
         if torch.device(device) == self.device:
             return self
@@ -203,6 +240,7 @@ class QuadrotorEnv(Task, EnvBase):
         follows = self.params is self.nominal
         self.dynamics = self._make_dynamics(self.nominal.to(device=self.device))
         self._params = self.nominal if follows else self.params.to(device=self.device)
+        self._place_weights()
         self.disturbances = self._make_disturbances(self.nominal, self.dynamics.plant_fields)
         self.randomness = Randomness(self.device, self.dtype)
         self.set_up()
@@ -236,6 +274,13 @@ class QuadrotorEnv(Task, EnvBase):
         self.randomness.draw_start = functools.partial(draw_start, self)
         self.render_state: State = {}  # positions, quaternions and targets, for render()
 
+    def _place_weights(self) -> None:
+        """Bring weights that are tensors to the device and the precision of the environment."""
+        self.weights = {
+            name: x.reshape(()).to(self.device, self.dtype) if isinstance(x, Tensor) else x
+            for name, x in self.weights.items()
+        }
+
     def _run(self, options: dict[str, Any] | None) -> QuadrotorEnv:
         """Run steps compiled with these options, eager for None; and the camera, which starts use, too, likewise."""
         self._stepper = Stepper(self.control_step, options)
@@ -249,7 +294,7 @@ class QuadrotorEnv(Task, EnvBase):
         return super().reset(tensordict, set_state=set_state, **options)
 
     def _set_seed(self, seed: int | None) -> None:
-        self._seed = seed
+        self._seed = require("seed", seed, Seed | None)
         self.randomness.seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False) -> TensorDictBase:
@@ -276,7 +321,7 @@ class QuadrotorEnv(Task, EnvBase):
     def rollout(self, max_steps: int, policy: Any = None, callback: Any = None, **options: Any) -> TensorDictBase:
         """As TorchRL's, with the same numbers; several times faster with ``break_when_any_done=False``, no other option
         than ``tensordict`` (with ``auto_reset=False``), and a TensorDictModule that reads observation or state."""
-        checks.require_count("max_steps", max_steps, 1, checks.MAX_STEPS)
+        max_steps = require("max_steps", max_steps, Horizon)
         start, auto_reset = options.get("tensordict"), options.get("auto_reset", True)
         quick = callback is None and options.get("break_when_any_done") is False and auto_reset == (start is None)
         # The engine knows nothing of a step of a subclass's own.

@@ -5,35 +5,30 @@ from __future__ import annotations
 import difflib
 import inspect
 import math
-import numbers
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import AfterValidator
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_quad.dynamics import DYNAMICS, INTEGRATORS, QuadrotorParams
+from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
 from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.options import Explained, real, shown
+from torchrl_quad.options import require as require_kind
 
-# Beyond these an environment would not fit into memory, or take for ever to build.
-MAX_ENVS, MAX_DELAY, MAX_STEPS = 10_000_000, 1_000, 2**31
+MAX_SUBSTEPS = 1_000  # physics steps of a control step, beyond which it takes for ever
+MAX_STEPS = 2**31  # since the start of an episode
+Weight = real(-1e6, 1e6)  # a larger one would leave none of the seven digits of single precision to the others
 
 
 def require(condition: bool, message: str) -> None:
     """Raise a ValueError with this message unless the condition holds."""
     if not condition:
         raise UserValueError(message)
-
-
-def require_count(name: str, value: Any, least: int, most: int, rule: str | None = None) -> None:
-    """Refuse what is not a whole number from ``least`` to ``most``."""
-    is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-    require(is_whole, f"{name} must be a whole number, got {value!r}.")
-    require(value >= least, f"{name} must be {rule or f'at least {least}'}, got {value}.")
-    require(value <= most, f"{name} must be at most {most:,}, got {value}.")
 
 
 def names(keys: Iterable[Any]) -> str:
@@ -44,56 +39,49 @@ def names(keys: Iterable[Any]) -> str:
 # -- arguments ---------------------------------------------------------------------------------------------------------
 
 
-def check_arguments(
-    num_envs: Any,
-    dtype: Any,
-    seed: Any,
-    dynamics: Any,
-    control: Any,
-    dt: Any,
-    control_dt: Any,
-    action_delay: Any,
-    integrator: Any,
-    max_episode_steps: Any,
-    observe_last_action: Any,
-    event_discount: Any,
+def timing(
+    dynamics: str, control: Any, dt: float, control_dt: float, action_delay: int, integrator: str, shows_actions: bool
 ) -> dict[str, Any]:
-    """Refuse arguments of an environment that are out of range; return those that build its dynamics model."""
-    require_count("num_envs", num_envs, 1, MAX_ENVS)
-    require(dtype in (torch.float32, torch.float64), f"dtype must be torch.float32 or torch.float64, got {dtype}.")
-    is_whole = isinstance(seed, numbers.Integral) and not isinstance(seed, bool)
-    is_seed = seed is None or (is_whole and 0 <= seed < 2**63)
-    require(is_seed, f"seed must be a whole number from 0, or None for another one each time; got {seed!r}.")
-    require(dynamics in list(DYNAMICS), f"Unknown dynamics {dynamics!r}. Choose from: {names(DYNAMICS)}.")
+    """The arguments of the dynamics model, if those of the environment fit each other."""
     takes_control = "control" in inspect.signature(DYNAMICS[dynamics]).parameters
     require(
         takes_control or control == "rates",
-        f"dynamics={dynamics!r} takes no control: its actions have a meaning of their own. Leave out {control=}.",
+        f"dynamics={dynamics!r} takes no control: its actions have a meaning of their own. Leave out "
+        f"control={shown(control)}.",
     )
-    for name, value in (("dt", dt), ("control_dt", control_dt)):
-        is_time = isinstance(value, numbers.Real) and 0 < value < math.inf
-        require(is_time, f"{name} must be positive and finite, got {value!r}.")
     substeps = round(control_dt / dt)
     require(
-        1 <= substeps <= MAX_DELAY and math.isclose(substeps * dt, control_dt, rel_tol=1e-6),
-        f"control_dt must be a whole multiple of dt, and at most {MAX_DELAY} of them; got {control_dt} and {dt}. Try "
-        f"control_dt={min(max(substeps, 1), MAX_DELAY) * dt:g}.",
+        1 <= substeps <= MAX_SUBSTEPS and math.isclose(substeps * dt, control_dt, rel_tol=1e-6),
+        f"control_dt must be a whole multiple of dt, and at most {MAX_SUBSTEPS} of them; got {control_dt} and {dt}. "
+        f"Try control_dt={min(max(substeps, 1), MAX_SUBSTEPS) * dt:g}.",
     )
-    require_count("action_delay", action_delay, 0, MAX_DELAY, "zero or more control steps")
-    require(integrator in INTEGRATORS, f"Unknown integrator {integrator!r}. Choose from: {names(INTEGRATORS)}.")
-    require_count("max_episode_steps", max_episode_steps, 1, MAX_STEPS)
     require(
-        action_delay > 0 or not observe_last_action,
+        action_delay > 0 or not shows_actions,
         "observe_last_action shows the commands that are on their way; with action_delay=0 there are none.",
-    )
-    is_number = isinstance(event_discount, numbers.Real) and not isinstance(event_discount, bool)
-    require(
-        event_discount is None or (is_number and 0 < event_discount <= 1),
-        "event_discount must be above 0 and at most 1, such as the discount of the loss, 0.99, or None for events "
-        f"without a gradient; got {event_discount!r}.",
     )
     options = {"dt": dt, "substeps": substeps, "integrator": integrator}
     return {**options, "control": control} if takes_control else options
+
+
+def check_compilation(options: Mapping[str, Any]) -> None:
+    """Refuse keywords that torch.compile does not take."""
+    known = [*list(inspect.signature(torch.compile).parameters)[1:], "warmup"]
+    unknown = [name for name in options if name not in known]
+    if unknown:
+        raise UserTypeError(f"compile: torch.compile takes no {shown(unknown[0])}. Choose from: {names(known)}.")
+    for name, kind in {"fullgraph": bool, "dynamic": bool | None, "disable": bool}.items():
+        require_kind(f"compile: {name}", options.get(name, False), kind)
+    modes = ["default", *torch._inductor.list_mode_options()]
+    mode = options.get("mode") or "default"
+    require(mode in modes, f"compile: mode must be one of {names(modes)}; got {shown(mode)}.")
+    given = require_kind("compile: options", options.get("options"), dict[str, Any] | None) or {}
+    unknown = [name for name in given if name.replace("-", "_") not in torch._inductor.list_options()]
+    require(not unknown, f"compile: the compiler has no option {names(map(shown, unknown))}.")
+    backend, backends = options.get("backend", "inductor"), torch.compiler.list_backends(())
+    require(
+        callable(backend) or (isinstance(backend, str) and backend in backends),
+        f"compile: backend must be a function, or one of {names(backends)}; got {shown(backend)}.",
+    )
 
 
 def refuse_unknown(cls: type, unknown: Iterable[str]) -> None:
@@ -119,18 +107,31 @@ def full_signature(cls: type, base: type) -> inspect.Signature:
     return inspect.Signature(sorted([*arguments.values(), option], key=lambda x: x.kind))
 
 
-def checked_weights(weights: Any, known: Mapping[str, float]) -> Mapping[str, float]:
-    """Weights of reward terms, if the task has these terms and they are finite numbers."""
-    require(
-        isinstance(weights, Mapping), f"weights must be a mapping from terms of the reward to numbers, got {weights!r}."
-    )
-    unknown = [str(name) for name in weights if name not in known]
-    require(not unknown, f"weights: unknown term {names(unknown)}. Choose from: {names(known)}.")
+def _weights(weights: Any) -> Any:
+    """Weights by name, each a number or a tensor of one."""
+    if weights is None:
+        return None
+    if not isinstance(weights, Mapping):
+        raise UserValueError("be a mapping from terms of the reward to numbers")
     for name, value in weights.items():
         x = value.detach() if isinstance(value, Tensor) else value
-        is_number = x.numel() == 1 if isinstance(x, Tensor) else isinstance(x, numbers.Real)
-        require(is_number and math.isfinite(float(x)), f"weights: {name} must be a finite number, got {value!r}.")
+        if isinstance(x, Tensor) and x.numel() == 1 and not (x.is_complex() or x.dtype == torch.bool):
+            x = x.item()
+        try:
+            require_kind(str(name), x, Weight)
+        except UserValueError as error:
+            raise Explained(str(error)) from None
     return weights
+
+
+Weights = Annotated[Any, AfterValidator(_weights)]
+
+
+def checked_weights(weights: Mapping[str, Any], known: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Weights of reward terms, if the task has these terms."""
+    unknown = [str(name) for name in weights if name not in known]
+    require(not unknown, f"weights: unknown term {names(unknown)}. Choose from: {names(known)}.")
+    return {name: require_kind("weights", {name: x}, Weights)[name] for name, x in weights.items()}
 
 
 def checked_params(params: Any, num_envs: int) -> QuadrotorParams:

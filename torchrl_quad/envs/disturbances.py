@@ -6,19 +6,17 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import QuadrotorParams, presets, quaternion
 from torchrl_quad.dynamics.parameters import CONTROLLER_FIELDS, PLANT_FIELDS
-from torchrl_quad.dynamics.presets import is_number, is_numbers
 from torchrl_quad.engine.simulation import State
-from torchrl_quad.envs.checks import MAX_DELAY, require_count
 from torchrl_quad.envs.guard import MAX_ANGULAR_VELOCITY, MAX_SPEED
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import Delay, checked, list_of, real, require, shown
 
 _DISTRIBUTIONS = {
     "uniform": "low and high",
@@ -26,6 +24,12 @@ _DISTRIBUTIONS = {
     "normal": "mean and standard deviation, cut off at three of them",
 }
 MAX_WIND = 100.0  # [m/s]
+# Noise and starts reach as far as flights do, whose states mean nothing beyond.
+Speed, BodyRate = real(0.0, MAX_SPEED), real(0.0, MAX_ANGULAR_VELOCITY)
+Angle, PositionNoise = real(0.0, math.pi), real(0.0, 100.0)
+Speeds, Spreads = list_of(real(-MAX_WIND, MAX_WIND), 3, 3), list_of(real(0.0, MAX_WIND), 3, 3)
+_PAIR = list_of(real(-1e6, 1e6), 2, 2)
+Gust, GustTime = real(0.0, 0.2 * MAX_WIND), real(1e-3, 1e6)
 
 
 class Disturbance:
@@ -86,18 +90,21 @@ class DroneRandomization(Disturbance):
                 )
             if name not in plant_fields or name == "rotor_spin":
                 allowed = ", ".join(field for field in plant_fields if field != "rotor_spin")
-                raise UserValueError(f"{source}: unknown field {name!r}. Choose from: {allowed}.")
+                raise UserValueError(f"{source}: unknown field {shown(name)}. Choose from: {allowed}.")
             if not (
                 isinstance(distribution, Mapping)
                 and len(distribution) == 1
                 and set(distribution) <= set(_DISTRIBUTIONS)
             ):
                 choices = "; ".join(f"{key}: {numbers}" for key, numbers in _DISTRIBUTIONS.items())
-                raise UserValueError(f"{source}: {name} needs one distribution of: {choices}; got {distribution!r}.")
-            numbers = next(iter(distribution.values()))
-            if not (is_numbers(numbers, 2) and numbers[1] >= (0.0 if "normal" in distribution else numbers[0])):
-                kind = next(iter(distribution))
-                raise UserValueError(f"{source}: {name} needs two numbers, {_DISTRIBUTIONS[kind]}; got {numbers!r}.")
+                raise UserValueError(
+                    f"{source}: {name} needs one distribution of: {choices}; got {shown(distribution)}."
+                )
+            (kind, numbers) = next(iter(distribution.items()))
+            has = f"{name} needs two numbers, {_DISTRIBUTIONS[kind]}"
+            least, most = require(f"{source}: {kind}", numbers, _PAIR, f"{has}.")
+            if most < (0.0 if kind == "normal" else least):
+                raise UserValueError(f"{source}: {has}; got {shown(numbers)}.")
         self.nominal = {name: fields[name] for name in self.spec}
         # The least and the greatest of each; and for what has to lie below something else, the other way round.
         for sign in (-1.0, 1.0):
@@ -123,41 +130,40 @@ class DroneRandomization(Disturbance):
     def _value(self, name: str, unit: Tensor) -> Tensor:
         """From the range [-1, 1] to the one asked for."""
         (kind, (first, second)) = next(iter(self.spec[name].items()))
+        first, second = float(first), float(second)
         if kind == "normal":
             return first + 3.0 * second * unit
         value = 0.5 * (first + second) + 0.5 * (second - first) * unit
         return value * self.nominal[name].to(value) if kind == "scale" else value
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Wind(Disturbance):
     """Blow a mean wind in each episode, and gusts about it: a first-order Gauss-Markov process in time, per axis.
 
     Entries of the state: ``mean_wind`` and ``wind``, each (3) [m/s], world frame, held over a control step.
 
+    Args:
+        mean: along x, y and z [m/s], world frame.
+        spread: by which the mean of an episode may differ to both sides, along x, y and z [m/s]; drawn at reset.
+        gust: standard deviation of the gusts [m/s]; five of them, the mean and the spread add up to 100 m/s at most.
+        gust_time: the time after which a gust has decayed to 1/e, 0.001 to 1e6 s.
+
     Raises:
-        ValueError: a value is negative, not finite, or has the wrong number of entries.
+        ValueError: a value has the wrong type, is out of its range, or has the wrong number of entries.
     """
 
-    mean: Sequence[float] = (0.0, 0.0, 0.0)  #: [m/s], world frame
-    spread: Sequence[float] = (0.0, 0.0, 0.0)  #: [m/s], to both sides of the mean; drawn at reset
-    gust: float = 0.0  #: [m/s], standard deviation of the gusts
-    gust_time: float = 1.0  #: [s], after which a gust has decayed to 1/e
+    mean: Speeds = (0.0, 0.0, 0.0)
+    spread: Spreads = (0.0, 0.0, 0.0)
+    gust: Gust = 0.0
+    gust_time: GustTime = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("mean", "spread"):
-            if not is_numbers(getattr(self, name), 3):
-                raise UserValueError(f"wind: {name} must be three numbers [m/s], got {getattr(self, name)!r}.")
-        if min(self.spread) < 0:
-            raise UserValueError(f"wind: spread must not be negative, got {self.spread!r}.")
-        if not (is_number(self.gust) and self.gust >= 0):
-            raise UserValueError(f"wind: gust must be zero or positive [m/s], got {self.gust!r}.")
-        if not (is_number(self.gust_time) and self.gust_time > 0):
-            raise UserValueError(f"wind: gust_time must be positive [s], got {self.gust_time!r}.")
         strongest = max(abs(m) + s for m, s in zip(self.mean, self.spread, strict=True)) + 5.0 * self.gust
         if strongest > MAX_WIND:
             raise UserValueError(
-                f"wind: mean, spread and five times the gust add up to {strongest:g} m/s; the model holds up to "
+                f"mean, spread and five times the gust add up to {strongest:g} m/s; the model holds up to "
                 f"{MAX_WIND:g} m/s."
             )
 
@@ -181,6 +187,7 @@ class Wind(Disturbance):
         return {"wind": torch.lerp(state["mean_wind"], state["wind"], decay) + gust}
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Sensors(Disturbance):
     """Show the policy the drone late, and with white noise. Rewards, crashes and success use the true state.
@@ -188,23 +195,22 @@ class Sensors(Disturbance):
     Entry of the state: ``measurements`` (delay + 1, 13), oldest first: position, quaternion, velocity and angular
     velocity, as measured.
 
+    Args:
+        position: standard deviation per axis of the world frame, 0 to 100 m.
+        attitude: standard deviation per body axis, 0 to pi rad.
+        velocity: standard deviation per axis of the world frame, 0 to 300 m/s.
+        angular_velocity: standard deviation per axis of the body frame, 0 to 100 rad/s.
+        delay: control steps by which the readings lag behind, 0 to 1000.
+
     Raises:
-        ValueError: a standard deviation or the delay is negative.
+        ValueError: a value has the wrong type or is out of its range.
     """
 
-    position: float = 0.0  #: [m], standard deviation per axis, world frame
-    attitude: float = 0.0  #: [rad], per body axis
-    velocity: float = 0.0  #: [m/s], per axis, world frame
-    angular_velocity: float = 0.0  #: [rad/s], per axis, body frame
-    delay: int = 0  #: control steps
-
-    def __post_init__(self) -> None:
-        for name in ("position", "attitude", "velocity", "angular_velocity"):
-            if not (is_number(getattr(self, name)) and getattr(self, name) >= 0):
-                raise UserValueError(
-                    f"observation_noise: {name} must be zero or positive, got {getattr(self, name)!r}."
-                )
-        require_count("observation_delay", self.delay, 0, MAX_DELAY, "zero or more control steps")
+    position: PositionNoise = 0.0
+    attitude: Angle = 0.0
+    velocity: Speed = 0.0
+    angular_velocity: BodyRate = 0.0
+    delay: Delay = 0
 
     @property
     def noise_size(self) -> int:
@@ -247,27 +253,25 @@ class Sensors(Disturbance):
         return torch.cat((position, attitude, velocity, angular_velocity), -1).unsqueeze(1)
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class RandomStart(Disturbance):
     """Turn and push the drone at the start: the draws are added to the task's own start.
 
+    Args:
+        tilt: the greatest angle by which it is tilted about a random horizontal axis, 0 to pi rad.
+        yaw: the greatest angle by which it is turned to either side, 0 to pi rad.
+        velocity: the greatest speed to either side per axis of the world frame, 0 to 300 m/s.
+        angular_velocity: the greatest rate to either side per axis of the body frame, 0 to 100 rad/s.
+
     Raises:
-        ValueError: a value is negative, not finite, or beyond the bounds of a flight.
+        ValueError: a value has the wrong type or is out of its range, beyond which no flight goes.
     """
 
-    tilt: float = 0.0  #: [rad], at most; about a random horizontal axis
-    yaw: float = 0.0  #: [rad], to both sides
-    velocity: float = 0.0  #: [m/s], to both sides, per axis of the world frame
-    angular_velocity: float = 0.0  #: [rad/s], to both sides, per axis of the body frame
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not (is_number(value) and value >= 0):
-                raise UserValueError(f"random_start: {field.name} must be zero or positive, got {value!r}.")
-        for name, most in (("velocity", MAX_SPEED), ("angular_velocity", MAX_ANGULAR_VELOCITY)):
-            if getattr(self, name) > most:
-                raise UserValueError(f"random_start: {name} must be at most {most:g}, got {getattr(self, name)!r}.")
+    tilt: Angle = 0.0
+    yaw: Angle = 0.0
+    velocity: Speed = 0.0
+    angular_velocity: BodyRate = 0.0
 
     def start(self, random: Randomness, state: State) -> State:
         """Turn and push the starts of a task."""
@@ -281,20 +285,3 @@ class RandomStart(Disturbance):
             "velocity": state["velocity"] + self.velocity * random.uniform(n, 3),
             "angular_velocity": state["angular_velocity"] + self.angular_velocity * random.uniform(n, 3),
         }
-
-
-def build(cls: type, name: str, spec: Any, **more: Any) -> Any:
-    """A disturbance from its mapping, or the disturbance itself, with what is given (not zero) beside it.
-
-    Raises:
-        ValueError: it is neither, or has an unknown key.
-    """
-    if isinstance(spec, cls):
-        return dataclasses.replace(spec, **{name: value for name, value in more.items() if value})
-    allowed = [field.name for field in dataclasses.fields(cls) if field.name not in more]
-    if not isinstance(spec, Mapping):
-        raise UserValueError(f"{name} must be a mapping with any of {', '.join(allowed)}; got {spec!r}.")
-    unknown = sorted(str(key) for key in spec if key not in allowed)
-    if unknown:
-        raise UserValueError(f"{name}: unknown key {unknown[0]!r}. Allowed: {', '.join(allowed)}.")
-    return cls(**spec, **more)

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -11,21 +10,28 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.dynamics.presets import is_number
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.envs.options import CameraOption, SceneOption
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
 from torchrl_quad.envs.scenes import ELSEWHERE, MAX_OBSTACLES, Scene, left_out
 from torchrl_quad.envs.terms import norm, outside
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.vision import DepthCamera, has_way
+from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.options import Size, list_of, real
+from torchrl_quad.vision import has_way
 
 #: Trees per square metre, and the least gap between two of them [m].
 DIFFICULTIES = {"easy": (0.04, 1.5), "middle": (0.08, 1.2), "hard": (0.12, 0.9)}
 CAMERA = {"width": 16, "height": 12, "range": 10.0}
 PLACES = 12  # that are tried for a tree before it is left out
+
+
+Density, Gap, Length = real(0.0, 2.0), real(0.1, 10.0), real(1.0, 1_000.0)
+Radii, Height = list_of(real(0.01, 10.0), 2, 2), real(0.1, 100.0)
+Speed = real(0.1, 30.0)
+Speeds = list_of(Speed, 2, 2)
 
 
 class ForestEnv(QuadrotorEnv):
@@ -64,12 +70,13 @@ class ForestEnv(QuadrotorEnv):
 
     Args:
         num_envs: number of drones that fly in parallel.
-        difficulty: "easy", "middle" or "hard": 0.04, 0.08 or 0.12 trees per square metre, at least 1.5 m, 1.2 m or
-            0.9 m from each other.
-        density: of trees [1/m^2], in the place of that of the difficulty. Trees that find no place are left out.
-        gap: between the surfaces of any two trees, at least [m], in the place of that of the difficulty. Since it is
-            wider than the drone, there always is a way through.
-        speed: the least and the greatest commanded speed [m/s], or one for all.
+        difficulty: how dense the forest is: 0.04 trees per square metre, at least 1.5 m from each other, for "easy",
+            0.08 and 1.2 m for "middle", 0.12 and 0.9 m for "hard".
+        density: of trees, 0 to 2 per square metre, in the place of that of the difficulty. Trees that find no place are
+            left out.
+        gap: between the surfaces of any two trees, at least, 0.1 to 10 m, in the place of that of the difficulty. Since
+            it is wider than the drone, there always is a way through.
+        speed: the least and the greatest commanded speed, 0.1 to 30 m/s, or one for all.
         observe_velocity: whether the policy observes its velocity.
         camera: as for :class:`~torchrl_quad.envs.QuadrotorEnv`; a mapping changes the camera of 16 x 12 pixels, 90
             degrees and 10 m. None flies blind.
@@ -108,27 +115,21 @@ class ForestEnv(QuadrotorEnv):
         self,
         num_envs: int = 64,
         *,
-        difficulty: str = "middle",
-        density: float | None = None,
-        gap: float | None = None,
-        speed: float | Sequence[float] = (2.0, 8.0),
+        difficulty: Literal["easy", "middle", "hard"] = "middle",
+        density: Density | None = None,
+        gap: Gap | None = None,
+        speed: Speed | Speeds = (2.0, 8.0),
         observe_velocity: bool = True,
-        camera: DepthCamera | Mapping[str, Any] | None = CAMERA,
-        scene: Scene | str | Path | Mapping | None = None,
-        max_episode_steps: int = 900,
+        camera: CameraOption = CAMERA,
+        scene: SceneOption = None,
+        max_episode_steps: Size = 900,
         **kwargs: Any,
     ) -> None:
-        if difficulty not in DIFFICULTIES:
-            raise UserValueError(f"Unknown difficulty {difficulty!r}. Choose from: {', '.join(DIFFICULTIES)}.")
         preset = DIFFICULTIES[difficulty]
         density, gap = (own if own is not None else usual for own, usual in zip((density, gap), preset, strict=True))
-        speeds = [speed, speed] if is_number(speed) else speed
-        is_range = isinstance(speeds, Sequence) and len(speeds) == 2
-        is_range = is_range and all(is_number(x) and 0.1 <= x <= 30.0 for x in speeds)
-        if not (is_range and speeds[0] <= speeds[1]):
-            raise UserValueError(
-                f"speed must be one speed, or the least and the greatest, 0.1 to 30 m/s; got {speed!r}."
-            )
+        speeds = speed if isinstance(speed, Sequence) else [speed, speed]
+        if speeds[0] > speeds[1]:
+            raise UserValueError(f"speed must be one speed, or the least and then the greatest; got {speed!r}.")
         self.speeds, self.observe_velocity = tuple(speeds), observe_velocity
         if isinstance(camera, Mapping):
             camera = {**CAMERA, **camera}
@@ -185,7 +186,8 @@ class ForestEnv(QuadrotorEnv):
         distance, away = self.scene.nearest(state)
         closing = (-(away * velocity).sum(-1, keepdim=True)).clamp_min(0.0)
         terms = {
-            "speed": 1.0 - _gentle(velocity - command) / _gentle(command),
+            # Of a command of 0.1 m/s; no less is commanded but next to the target, where nobody flies.
+            "speed": 1.0 - _gentle(velocity - command) / _gentle(command).clamp_min(0.0099),
             "clearance": -self.softness * softplus((self.margin - distance) / self.softness) / self.margin,
             "closing": -closing * torch.exp(-distance.clamp_min(0.0) / self.nearness),
             "smoothness": -state["angular_velocity"].square().sum(-1, keepdim=True),
@@ -217,7 +219,7 @@ class ForestEnv(QuadrotorEnv):
         return {"distance": distance, "flown_speed": along, "clearance": self.scene.nearest(state)[0]}
 
     def state_bounds(self) -> dict[Any, tuple[float, float]]:
-        return {"speed": (0.0, math.inf)}
+        return {"speed": (0.1, 30.0)}
 
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Takes ``flown_speed`` as the mean over the episode [m/s], and ``clearance`` as its least value [m]."""
@@ -239,13 +241,13 @@ class Forest(Scene):
     What does not touch encloses nothing: there is a way through.
 
     Args:
-        density: trees per square metre.
-        gap: the least distance between the surfaces of two trees [m].
-        length: of the forest, along x from 0 [m].
-        half_width: to both sides of y = 0 [m].
-        radius: the least and the greatest radius of a tree [m].
-        height: of all trees [m].
-        **options: as for :class:`~torchrl_quad.Scene`.
+        density: trees per square metre, 0 to 2.
+        gap: the least distance between the surfaces of two trees, 0.1 to 10 m.
+        length: of the forest, along x from 0, 1 to 1000 m.
+        half_width: to both sides of y = 0, 1 to 1000 m.
+        radius: the least and the greatest radius of a tree, 0.01 to 10 m.
+        height: of all trees, 0.1 to 100 m.
+        **options: as for :class:`~torchrl_quad.Scene`, but for ground and source.
 
     Raises:
         ValueError: a value is out of its range, or there are more than 1000 trees; (in use) the drone is as wide as the
@@ -256,26 +258,23 @@ class Forest(Scene):
 
     def __init__(
         self,
-        density: float,
-        gap: float,
-        length: float = 30.0,
-        half_width: float = 8.0,
+        density: Density,
+        gap: Gap,
+        length: Length = 30.0,
+        half_width: Length = 8.0,
         *,
-        radius: Sequence[float] = (0.1, 0.4),
-        height: float = 6.0,
+        radius: Radii = (0.1, 0.4),
+        height: Height = 6.0,
         **options: Any,
     ) -> None:
-        numbers = {"density": density, "gap": gap, "length": length, "half_width": half_width, "height": height}
-        for name, value in numbers.items():
-            if not (is_number(value) and value >= 0 and (value > 0 or name == "density")):
-                least = "zero or more trees per square metre" if name == "density" else "positive [m]"
-                raise UserValueError(f"forest: {name} must be {least}, got {value!r}.")
+        if radius[0] > radius[1]:
+            raise UserValueError(f"radius must be the least and then the greatest radius of a tree; got {radius!r}.")
         self.trees = round(density * 2.0 * half_width * length)
         if self.trees > MAX_OBSTACLES:
-            raise UserValueError(
-                f"forest: density={density:g} makes {self.trees:,} trees; {MAX_OBSTACLES:,} are the most."
-            )
+            raise UserValueError(f"density={density:g} makes {self.trees:,} trees; {MAX_OBSTACLES:,} are the most.")
         self.gap, self.length, self.half_width, self.tree_radius, self.height = gap, length, half_width, radius, height
+        if fixed := sorted({"ground", "source"} & set(options)):
+            raise UserTypeError(f"A forest has a {fixed[0]} of its own: leave it out.")
         super().__init__(ground=True, source="forest", **options)
 
     def bound(self, nominal: Any) -> Scene:

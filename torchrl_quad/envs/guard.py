@@ -83,7 +83,7 @@ def _bounds(key: Any, x: Tensor, dynamics: Dynamics) -> tuple[Tensor, Tensor]:
         speeds = dict.fromkeys(("velocity", "wind", "mean_wind"), MAX_SPEED)
         high = {"angular_velocity": MAX_ANGULAR_VELOCITY, **speeds, **dynamics.limits}.get(key, MAX_VALUE)
         low = -high
-    low, high = (torch.as_tensor(bound).to(x).reshape(-1, 1) for bound in (low, high))
+    low, high = (torch.as_tensor(bound, dtype=x.dtype, device=x.device).reshape(-1, 1) for bound in (low, high))
     width = x[0].numel()
     return low.expand(-1, width), high.expand(-1, width)
 

@@ -4,15 +4,18 @@ import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import presets
+from torchrl_quad.dynamics.presets import as_array
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
+from torchrl_quad.envs.checks import MAX_STEPS
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.envs.events import Event, ball_entry
 from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
@@ -26,12 +29,17 @@ from torchrl_quad.envs.terms import (
     target_reward,
 )
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import Size, real, require, shown, validated
 
 WEIGHTS = {  # of the reward's terms, by reward
     "position": {**TARGET_WEIGHTS, "gate": 20.0},
     "velocity": {"towards": 0.02, "across": 0.02, "angular_velocity": 0.001, "gate": 5.0},
 }
 RELAXATION_WEIGHTS = {"log": {"gate": 5.0}, "reciprocal": {"gate": 1.0}}
+MAX_GATES, GateRadius = 1_000, real(0.01, 100.0)
+TrackOption = validated(
+    lambda x: isinstance(x, str | Path | Mapping), "the name of a track, the path of a YAML file, or a mapping"
+)
 _TRACKS = resources.files(__package__) / "tracks"
 
 
@@ -71,11 +79,11 @@ class RacingEnv(QuadrotorEnv):
 
     Args:
         num_envs: number of drones that fly in parallel.
-        track: "visfly", "six_gates", the path of a YAML file, or a mapping, with ``gates``, a list of at least two
-            centres [m]; and, if wanted, ``starts``, as many points [m] (by default half way between gates), and
-            ``gate_radius`` [m].
-        reward: "velocity" or "position".
-        gate_bonus: "binary", "log" or "reciprocal".
+        track: "visfly", "six_gates", the path of a YAML file, or a mapping, with ``gates``, a list of 2 to 1000 centres
+            [m]; and, if wanted, ``starts``, as many points [m] (by default half way between gates), and
+            ``gate_radius``, 0.01 to 100 m. Coordinates are within 10 km.
+        reward: which of the two rewards above.
+        gate_bonus: how gates are paid, as above.
         max_episode_steps: control steps after which an episode is truncated.
         **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
 
@@ -100,18 +108,12 @@ class RacingEnv(QuadrotorEnv):
         self,
         num_envs: int = 64,
         *,
-        track: str | Path | Mapping = "visfly",
-        reward: str = "velocity",
-        gate_bonus: str = "binary",
-        max_episode_steps: int = 512,
+        track: TrackOption = "visfly",
+        reward: Literal["position", "velocity"] = "velocity",
+        gate_bonus: Literal["binary", "log", "reciprocal"] = "binary",
+        max_episode_steps: Size = 512,
         **kwargs: Any,
     ) -> None:
-        for name, value, choices in (
-            ("reward", reward, ("position", "velocity")),
-            ("gate_bonus", gate_bonus, ("binary", "log", "reciprocal")),
-        ):
-            if value not in choices:
-                raise UserValueError(f"Unknown {name} {value!r}. Choose from: {', '.join(choices)}.")
         self.track, self.reward, self.gate_bonus = load_track(track), reward, gate_bonus
         self.weights = {**WEIGHTS[reward], **RELAXATION_WEIGHTS.get(gate_bonus, {})}
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
@@ -218,8 +220,8 @@ class RacingEnv(QuadrotorEnv):
         return {"gates_passed": state["gates_passed"].to(self.dtype), "lap_time": state["lap_time"]}
 
     def state_bounds(self) -> dict[Any, tuple[float, float]]:
-        counts = dict.fromkeys(("gates_passed", "lap_time"), (0, math.inf))
-        return {"gate": (0, len(self.gates) - 1), "pass_step": (-1, math.inf), **counts}
+        counts = {"gates_passed": (0, MAX_STEPS), "pass_step": (-1, MAX_STEPS)}
+        return {"gate": (0, len(self.gates) - 1), "lap_time": (0, math.inf), **counts}
 
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Gives a ``lap_time`` only to drones that flew a full lap; adds ``time_near_gate``, within 1 m of the next."""
@@ -244,30 +246,29 @@ def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:
         FileNotFoundError: there is no such file.
     """
     source, values = presets.read("track", track, _TRACKS)
-    unknown = sorted(str(key) for key in set(values) - {"gates", "starts", "gate_radius"})
-    if unknown:
-        raise UserValueError(f"{source}: unknown key {unknown[0]!r}. Allowed: gates, starts, gate_radius.")
+    for key in values:
+        if key not in ("gates", "starts", "gate_radius"):
+            raise UserValueError(f"{source}: unknown key {shown(key)}. Allowed: gates, starts, gate_radius.")
     gates = _points(source, "gates", values.get("gates"))
-    if len(gates) < 2:
-        raise UserValueError(f"{source}: a track needs at least two gates, got {len(gates)}.")
+    if not 2 <= len(gates) <= MAX_GATES:
+        raise UserValueError(f"{source}: a track has 2 to {MAX_GATES} gates, got {len(gates)}.")
     before = [gates[-1], *gates[:-1]]
     halfway = [[0.5 * (p + q) for p, q in zip(a, b, strict=True)] for a, b in zip(before, gates, strict=True)]
     starts = _points(source, "starts", values.get("starts", halfway))
     if len(starts) != len(gates):
         raise UserValueError(f"{source}: there must be one start before each gate, got {len(starts)} for {len(gates)}.")
-    radius = values.get("gate_radius", 0.3)
-    if not (isinstance(radius, int | float) and 0 < radius < float("inf")):
-        raise UserValueError(f"{source}: gate_radius must be a positive number [m], got {radius!r}.")
+    radius = require(f"{source}: gate_radius", values.get("gate_radius", 0.3), GateRadius, "Of all gates [m].")
     return {"gates": gates, "starts": starts, "gate_radius": float(radius)}
 
 
 def _points(source: str, name: str, value: Any) -> list[list[float]]:
     try:
-        points = [[float(x) for x in point] for point in value]
-    except (TypeError, ValueError):
-        points = []
-    if not points or any(len(point) != 3 or not all(abs(x) < 1e4 for x in point) or point[2] <= 0 for point in points):
+        points = as_array(value.tolist() if isinstance(value, Tensor) else value)
+    except (ValueError, RecursionError):
+        points = np.zeros(0)
+    if points.ndim != 2 or points.shape[1] != 3 or not ((abs(points) < 1e4).all() and (points[:, 2] > 0).all()):
         raise UserValueError(
-            f"{source}: {name} must be a list of points [x, y, z] in metres above ground, got {value!r}."
+            f"{source}: {name} must be a list of points [x, y, z] in metres above ground, within 10 km; got "
+            f"{shown(value)}."
         )
-    return points
+    return points.tolist()

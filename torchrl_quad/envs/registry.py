@@ -16,6 +16,7 @@ from torchrl_quad.envs.landing import LandingEnv
 from torchrl_quad.envs.racing import RacingEnv
 from torchrl_quad.envs.tracking import TrackingEnv
 from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.options import shown
 
 GROUP = "torchrl_quad.tasks"  # the group of entry points by which an installed package offers its tasks
 
@@ -47,7 +48,7 @@ def register_task(name: str, cls: type[QuadrotorEnv]) -> None:
     """
     if not (isinstance(name, str) and re.fullmatch(r"[a-z][a-z0-9_]*", name)):
         raise UserValueError(
-            f"A task's name is in small letters, digits and underscores, such as 'window'; got {name!r}."
+            f"A task's name is in small letters, digits and underscores, such as 'window'; got {shown(name)}."
         )
     _require_task(cls, f"register_task({name!r}, ...)")
     taken = TASKS.get(name)
@@ -71,7 +72,7 @@ def task_class(task: str) -> type[QuadrotorEnv]:
         ValueError: there is no such task.
         TypeError: what the path or an entry point leads to is no class of a task, or lacks methods.
     """
-    if task in list(TASKS):  # a list compares what cannot be hashed, too
+    if isinstance(task, str) and task in TASKS:
         return TASKS[task]
     offers = _offered().get(task, []) if isinstance(task, str) else []
     if len(offers) > 1:
@@ -83,8 +84,8 @@ def task_class(task: str) -> type[QuadrotorEnv]:
     if isinstance(task, str) and re.fullmatch(r"\w+(\.\w+)+", task):
         return _require_task(_imported(task), f"task {task!r}")
     raise UserValueError(
-        f"Unknown task {task!r}. Choose from: {', '.join(available_tasks())}. For one of your own give the path of "
-        "its class, such as 'mypackage.WindowEnv', or call register_task(name, WindowEnv) before."
+        f"Unknown task {shown(task)}. Choose from: {', '.join(available_tasks())}. For one of your own give the path "
+        "of its class, such as 'mypackage.WindowEnv', or call register_task(name, WindowEnv) before."
     )
 
 

@@ -18,12 +18,16 @@ from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import build, checked, real, require, shown, whole
 from torchrl_quad.vision import Primitives, closest_approach, nearest
 from torchrl_quad.vision.primitives import SIZES, distances, join
 
 TRIES = 20  # how often an obstacle that stands in a start is drawn again before it is left out
 ELSEWHERE = -1e4  # [m], the height of what is left out: nobody sees it, nobody meets it
 MAX_OBSTACLES = 1_000
+SMALLEST = 1e-3  # [m], of an obstacle: what single precision resolves at a distance of ten kilometres
+Obstacles, Count = Sequence[Mapping[str, Any]], whole(1, MAX_OBSTACLES)
+Clearance, Radius = real(0.0, 100.0), real(1e-3, 10.0)
 TOLERANCE = 1e-3  # [m], by which a state may lie nearer to an obstacle than a flight would have left it
 
 # The fields of an obstacle by kind, with the number of their entries; a random one has ranges of them.
@@ -36,6 +40,7 @@ _FIELDS = {
 _OPTIONAL = {"yaw", "quaternion"}
 
 
+@checked
 class Scene(Disturbance):
     """The obstacles of a task: ``HoveringEnv(scene={"ground": True, "cylinders": [...]})``, or a YAML file of it.
 
@@ -60,13 +65,15 @@ class Scene(Disturbance):
 
     Args:
         ground: whether there is the plane z = 0.
-        spheres: a list of mappings, as above.
-        cylinders: likewise.
-        boxes: likewise.
-        walls: likewise, all fixed.
-        clearance: the least way from the drone's surface to random obstacles at its start, and at its target [m].
-        drone_radius: of the sphere around the drone's centre that must not touch anything [m]; by default that of a
-            sphere around the propellers, as large as they can be without touching each other.
+        spheres: a list of mappings with centre, and radius; lengths are 0.001 to 10,000 m, coordinates within 10 km.
+        cylinders: a list of mappings with base, radius and height.
+        boxes: a list of mappings with centre, size, and yaw or quaternion.
+        walls: a list of mappings with point and normal, all fixed.
+        clearance: the least way from the drone's surface to random obstacles at its start, and at its target, 0 to
+            100 m.
+        drone_radius: of the sphere around the drone's centre that must not touch anything, 0.001 to 10 m; by default
+            that of a sphere around the propellers, as large as they can be without touching each other.
+        source: what errors call the scene.
 
     Raises:
         ValueError: an obstacle is not one, or (in use) a drone would start within one.
@@ -78,23 +85,15 @@ class Scene(Disturbance):
         self,
         *,
         ground: bool = False,
-        spheres: Sequence[Mapping] = (),
-        cylinders: Sequence[Mapping] = (),
-        boxes: Sequence[Mapping] = (),
-        walls: Sequence[Mapping] = (),
-        clearance: float = 0.3,
-        drone_radius: float | None = None,
+        spheres: Obstacles = (),
+        cylinders: Obstacles = (),
+        boxes: Obstacles = (),
+        walls: Obstacles = (),
+        clearance: Clearance = 0.3,
+        drone_radius: Radius | None = None,
         source: str = "scene",
     ) -> None:
         self.source, self.ground, self.clearance, self.drone_radius = source, ground, clearance, drone_radius
-        self._require(isinstance(ground, bool), f"ground must be true or false, got {ground!r}.")
-        self._require(
-            is_number(clearance) and clearance >= 0, f"clearance must be zero or positive [m], got {clearance!r}."
-        )
-        self._require(
-            drone_radius is None or (is_number(drone_radius) and drone_radius > 0),
-            f"drone_radius must be positive [m], or left out; got {drone_radius!r}.",
-        )
         self.fixed: dict[str, list[list[float]]] = {kind: [] for kind in SIZES}
         self.random: dict[str, list[dict[str, Any]]] = {kind: [] for kind in SIZES}
         if ground:
@@ -102,8 +101,13 @@ class Scene(Disturbance):
         for kind, entries in {"spheres": spheres, "cylinders": cylinders, "boxes": boxes, "walls": walls}.items():
             self._read(kind, entries)
         count = sum(len(x) for x in self.fixed.values()) + sum(x["count"] for y in self.random.values() for x in y)
-        self._require(count <= MAX_OBSTACLES, f"has {count:,} obstacles; {MAX_OBSTACLES:,} are the most.")
-        self._require(count > 0 or self.is_drawn_elsewhere, "has no obstacle, and no ground: give it one.")
+        self._require(count <= MAX_OBSTACLES, f"{count:,} obstacles are too many; {MAX_OBSTACLES:,} are the most.")
+        self._require(count > 0 or self.is_drawn_elsewhere, "a scene needs an obstacle or the ground: give it one.")
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "__init__" in vars(cls):
+            checked(cls)
 
     @classmethod
     def of(cls, spec: Scene | str | Path | Mapping) -> Scene:
@@ -111,11 +115,7 @@ class Scene(Disturbance):
         if isinstance(spec, Scene):
             return spec
         source, values = presets.read("scene", spec)
-        allowed = ["ground", "spheres", "cylinders", "boxes", "walls", "clearance", "drone_radius"]
-        unknown = sorted(str(key) for key in values if key not in allowed)
-        if unknown:
-            raise UserValueError(f"{source}: unknown key {unknown[0]!r}. Allowed: {', '.join(allowed)}.")
-        return cls(**values, source=source)
+        return build(Scene, source, values, source=source)
 
     @property
     def is_random(self) -> bool:
@@ -153,7 +153,7 @@ class Scene(Disturbance):
         drawn = {("scene", kind): x for kind, x in self.draw(random, state).items()}
         state = {**state, **drawn}
         if looks_are_free(random.device):
-            for complaint, where in self.complaints(state).items():
+            for complaint, where in self._inside(state).items():
                 if where.any():
                     raise UserValueError(
                         f"{self.source}: {complaint}, and drones would start there, such as at "
@@ -187,6 +187,21 @@ class Scene(Disturbance):
 
     def complaints(self, state: State) -> dict[str, Tensor]:
         """What is wrong with a state to start from, in words, and where, bool (n)."""
+        wrong = self._inside(state)
+        for kind, (first, last) in {"spheres": (3, 4), "cylinders": (3, 5), "boxes": (3, 6)}.items():
+            x = state.get(("scene", kind))
+            if x is not None:
+                small = (x[..., first:last] <= 0.0).flatten(1).any(1)
+                wrong[f"('scene', {kind!r}) must have sizes above 0"] = small
+        for kind, first in {"boxes": 6, "planes": 0}.items():  # an attitude, and a normal
+            x = state.get(("scene", kind))
+            if x is not None:
+                length = x[..., first : first + (4 if kind == "boxes" else 3)].square().sum(-1)
+                wrong[f"('scene', {kind!r}) must be turned by unit vectors"] = ((length - 1.0).abs() > 1e-2).any(1)
+        return wrong
+
+    def _inside(self, state: State) -> dict[str, Tensor]:
+        """Which drones start within an obstacle."""
         solids = self.solids(state, ground=False)
         if not solids.count:
             return {}
@@ -197,8 +212,6 @@ class Scene(Disturbance):
 
     def _read(self, kind: str, entries: Any) -> None:
         fields, solids = _FIELDS[kind], "planes" if kind == "walls" else kind
-        is_list = isinstance(entries, Sequence) and all(isinstance(entry, Mapping) for entry in entries)
-        self._require(is_list, f"{kind} must be a list of mappings with {', '.join(fields)}; got {entries!r}.")
         place = next(iter(fields))
         for entry in entries:
             is_random = "count" in entry and kind != "walls"
@@ -207,11 +220,9 @@ class Scene(Disturbance):
             unknown = sorted(str(key) for key in entry if key not in sizes)
             missing = [key for key in sizes if key not in entry and key not in _OPTIONAL]
             what = f"{kind}: an obstacle has {', '.join(sizes)}"
-            self._require(not unknown, f"{what}; unknown: {', '.join(unknown)}.")
+            self._require(not unknown, f"{what}; unknown: {shown(', '.join(unknown))}.")
             self._require(not missing, f"{what}; missing: {', '.join(missing)}.")
-            count = entry.get("count", 1)
-            is_count = isinstance(count, int) and not isinstance(count, bool) and 1 <= count <= MAX_OBSTACLES
-            self._require(is_count, f"{kind}: count must be a whole number from 1 to {MAX_OBSTACLES:,}, got {count!r}.")
+            count = require(f"{kind}: count", entry.get("count", 1), Count)
             read = {
                 name: self._range(f"{kind}: {name}", entry[name], size, is_random and name not in ("low", "high"))
                 for name, size in sizes.items()
@@ -219,8 +230,12 @@ class Scene(Disturbance):
             }
             for name in ("radius", "height", "size"):
                 least = min(read[name][0]) if name in read else 1.0
-                self._require(least > 0, f"{kind}: {name} must be positive [m], got {entry.get(name)!r}.")
+                said = f"{kind}: {name} must be at least {SMALLEST:g} m, got {shown(entry.get(name))}."
+                self._require(least >= SMALLEST, said)
             if is_random:
+                low, high = read["low"][0], read["high"][0]
+                ordered = all(a <= b for a, b in zip(low, high, strict=True))
+                self._require(ordered, f"{kind}: low must not be above high along any axis, got {low} and {high}.")
                 self.random[solids].append({"count": count, **read})
             else:
                 self.fixed[solids].append(self._numbers(kind, {name: low for name, (low, _) in read.items()}))
@@ -239,9 +254,9 @@ class Scene(Disturbance):
         is_pair = may_vary and isinstance(value, Sequence) and len(value) == 2
         low, high = (numbers(x) for x in value) if is_pair else (None, None)
         ordered = low is not None and high is not None and all(a <= b for a, b in zip(low, high, strict=True))
-        entries = "a number" if size == 1 else f"{size} numbers"
+        entries = "a number within 10,000" if size == 1 else f"{size} numbers within 10,000"
         more = f", or the least and the greatest of {'it' if size == 1 else 'them'}" if may_vary else ""
-        self._require(ordered, f"{name} must be {entries}{more}; got {value!r}.")
+        self._require(ordered, f"{name} must be {entries}{more}; got {shown(value)}.")
         return low, high
 
     def _numbers(self, kind: str, entry: dict[str, list[float]]) -> list[float]:
@@ -251,7 +266,7 @@ class Scene(Disturbance):
             yaw = entry.get("yaw", [0.0])[0]
             turned = entry.get("quaternion", [math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)])
             norm = math.sqrt(sum(x * x for x in turned))
-            self._require(norm > 1e-6, f"boxes: quaternion must have unit norm, got {turned!r}.")
+            self._require(norm > 1e-6, f"boxes: quaternion must have unit norm, got {shown(turned)}.")
             return [*entry["centre"], *(0.5 * x for x in entry["size"]), *(x / norm for x in turned)]
         if kind == "walls":
             length = math.sqrt(sum(x * x for x in entry["normal"]))
@@ -262,14 +277,14 @@ class Scene(Disturbance):
 
     def _require(self, condition: bool, message: str) -> None:
         if not condition:
-            raise UserValueError(f"{self.source}: {message}")
+            raise UserValueError(message)
 
     def _draw_clear(self, random: Randomness, kind: str, group: dict[str, Any], points: Tensor) -> Tensor:
         """The obstacles (n, count, ...) of a group; none stands at the points (n, k, 3)."""
-        drawn = _draw(random, kind, group, len(points))
-        blocked = torch.ones_like(drawn[..., 0], dtype=torch.bool)
+        drawn = blocked = None
         for _ in range(TRIES):
-            drawn = torch.where(blocked.unsqueeze(-1), _draw(random, kind, group, len(points)), drawn)
+            new = _draw(random, kind, group, len(points))
+            drawn = new if drawn is None else torch.where(blocked.unsqueeze(-1), new, drawn)
             alone = Primitives(*(drawn if name == kind else x[:, :0] for name, x in _none(points).items()))
             blocked = (distances(alone, points) < self.radius + self.clearance).any(1)
             if looks_are_free(points.device) and not blocked.any():

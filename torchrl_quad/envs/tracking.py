@@ -22,6 +22,7 @@ from torchrl_quad.envs.terms import (
     target_reward,
 )
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import Size, real, validated
 
 Curve = Callable[[Tensor], Tensor]
 
@@ -45,6 +46,13 @@ CURVES: dict[str, tuple[Curve, float]] = {  # by name: the curve, and its period
     # Size and period chosen here.
     "lemniscate": (functools.partial(lemniscate, centre=(2.0, 0.0, 1.5), half_length=2.0), 8.0),
 }
+
+
+CurveOption = validated(
+    lambda x: callable(x) or (isinstance(x, str) and x in CURVES),
+    f"one of {', '.join(CURVES)}, or a function from phases (*) [rad] to positions (*, 3) [m]",
+)
+Period = real(0.1, 10_000.0)
 
 
 class TrackingEnv(QuadrotorEnv):
@@ -78,7 +86,7 @@ class TrackingEnv(QuadrotorEnv):
         curve: "slow_circle" (2 m, 1.26 m/s), "fast_circle" (1.5 m, 4.7 m/s, 14.8 m/s2: out of reach at 2 rad/s, fly it
             with a drone that turns at 6 rad/s), "lemniscate" (2 m, 8 s), or a function of your own from phases (*)
             [rad] to positions (*, 3) [m], of period 2 pi, made of torch operations.
-        period: time for one round [s]; by default that of the named curve.
+        period: time for one round, 0.1 to 10,000 s; by default that of the named curve.
         max_episode_steps: control steps after which an episode is truncated.
         **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
 
@@ -105,21 +113,16 @@ class TrackingEnv(QuadrotorEnv):
         self,
         num_envs: int = 64,
         *,
-        curve: str | Curve = "slow_circle",
-        period: float | None = None,
-        max_episode_steps: int = 512,
+        curve: CurveOption = "slow_circle",
+        period: Period | None = None,
+        max_episode_steps: Size = 512,
         **kwargs: Any,
     ) -> None:
         if isinstance(curve, str):
-            if curve not in CURVES:
-                raise UserValueError(
-                    f"Unknown curve {curve!r}. Choose from: {', '.join(CURVES)}; or give a function from phases (*) "
-                    "[rad] to positions (*, 3) [m], and its period [s]."
-                )
             curve, default_period = CURVES[curve]
             period = default_period if period is None else period
-        if period is None or not 0 < period < math.inf:
-            raise UserValueError(f"A curve of your own needs a period in seconds, such as period=10.0; got {period}.")
+        if period is None:
+            raise UserValueError("A curve of your own needs a period in seconds, such as period=10.0; got none.")
         self.curve = functools.partial(curve)  # not itself: an environment registers modules as its own
         self.period = period
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import numbers
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.dynamics.presets import is_number, is_numbers
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import Below1, Delay, Fraction, build, checked, list_of, real, whole
 from torchrl_quad.vision.primitives import Primitives
 from torchrl_quad.vision.rays import cast_rays
 
-MAX_FIELD_OF_VIEW = math.radians(170.0)  # a picture plane cannot show half of all directions
-MAX_PIXELS, MAX_COUNT, MAX_RANGE = 1_000_000, 1_000, 10_000.0
+MAX_PIXELS = 1_000_000
+MAX_ANGLE = math.radians(170.0)  # a picture plane cannot show half of all directions
+Angle = real(0.01, 2.967)
+Side = whole(1, 10_000)
+Rate = whole(1, 1_000)
+Place = list_of(real(-10.0, 10.0), 3, 3)
+Quaternion = list_of(real(-1.001, 1.001), 4, 4)
+Turn = real(-math.pi, math.pi)
+Range = real(0.01, 10_000.0)
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class DepthCamera:
     """A depth camera on the drone, as an option of every task: ``HoveringEnv(camera=DepthCamera(), scene=...)``.
@@ -32,88 +39,59 @@ class DepthCamera:
     The pixels are square, and the rays go through their centres. Without ``pitch`` and ``quaternion`` the camera looks
     along the body's x axis, and the top of the image is the body's z axis.
 
+    Args:
+        width: pixels of a row, at most 10,000; an image has at most a million.
+        height: rows of pixels, at most 10,000.
+        field_of_view: the horizontal angle from edge to edge, 0.01 to 2.967 rad, 170 degrees, since a plane shows no
+            more; 90 degrees are 1.571 rad.
+        position: of the camera [m], x, y and z in the body frame, each within 10 m.
+        pitch: by which the camera looks upwards [rad], -pi to pi.
+        quaternion: (w, x, y, z) of unit norm, from camera to body, in the place of the pitch.
+        range: how far the camera sees, 0.01 to 10,000 m.
+        rate: control steps from one image to the next, 1 to 1000.
+        delay: control steps from the instant of an image until the policy sees it, 0 to 1000.
+        noise: standard deviation of the depth in each pixel by itself, as a share of the depth, 0 to 1.
+        dropout: the probability that a pixel measures nothing, which it shows as 0; below 1.
+        along_ray: whether a pixel is the length of the ray instead of the depth along the optical axis.
+        differentiable: whether images have their derivative in the pose of the drone.
+
     Raises:
         ValueError: a value is out of its range; there is no pixel, or the field of view is 170 degrees or more.
     """
 
-    width: int = 16  #: pixels of a row
-    height: int = 12  #: rows
-    field_of_view: float = 0.5 * math.pi  #: [rad], horizontal, from edge to edge
-    position: Sequence[float] = (0.0, 0.0, 0.0)  #: of the camera [m], body frame
-    pitch: float = 0.0  #: [rad], by which the camera looks upwards
-    quaternion: Sequence[float] | None = None  #: (w, x, y, z), from camera to body, in the place of the pitch
-    range: float = 10.0  #: [m]
-    rate: int = 1  #: control steps from one image to the next
-    delay: int = 0  #: control steps from the instant of an image until the policy sees it
-    noise: float = 0.0  #: standard deviation of the depth, as a share of it, in each pixel by itself
-    dropout: float = 0.0  #: the probability that a pixel measures nothing, which it shows as 0
-    along_ray: bool = False  #: the length of the ray instead of the depth along the optical axis
-    differentiable: bool = False  #: give images their derivative in the pose of the drone
+    width: Side = 16
+    height: Side = 12
+    field_of_view: Angle = 0.5 * math.pi
+    position: Place = (0.0, 0.0, 0.0)
+    pitch: Turn = 0.0
+    quaternion: Quaternion | None = None
+    range: Range = 10.0
+    rate: Rate = 1
+    delay: Delay = 0
+    noise: Fraction = 0.0
+    dropout: Below1 = 0.0
+    along_ray: bool = False
+    differentiable: bool = False
 
     def __post_init__(self) -> None:
-        for name, least, most in (
-            ("width", 1, MAX_PIXELS),
-            ("height", 1, MAX_PIXELS),
-            ("rate", 1, MAX_COUNT),
-            ("delay", 0, MAX_COUNT),
-        ):
-            value = getattr(self, name)
-            is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-            what = "pixels: an image needs at least one" if most == MAX_PIXELS else "control steps"
-            _require(
-                is_whole and least <= value <= most,
-                f"{name} must be a whole number of {what}, from {least} to {most:,}; got {value!r}.",
+        tall = math.atan(self.height / self.width * math.tan(0.5 * self.field_of_view)) * 2
+        if self.pixels > MAX_PIXELS:
+            raise UserValueError(f"{self.width} x {self.height} pixels are too many. Give a million at most.")
+        if tall >= MAX_ANGLE:
+            raise UserValueError(
+                f"{self.height} rows of {self.width} square pixels see {math.degrees(tall):.0f} degrees from top to "
+                "bottom; 170 are too many. Give fewer rows, or a smaller field_of_view."
             )
-        angle = self.field_of_view
-        hint = f" In degrees? {angle:g} degrees are {math.radians(angle):.4g}." if is_number(angle) else ""
-        _require(
-            is_number(angle) and 0 < angle < MAX_FIELD_OF_VIEW,
-            f"field_of_view must be an angle above 0 and below 170 degrees, {MAX_FIELD_OF_VIEW:.3f} [rad], since a "
-            f"plane shows no more; got {angle!r}.{hint}",
-        )
-        tall = math.atan(self.height / self.width * math.tan(0.5 * angle)) * 2
-        _require(
-            tall < MAX_FIELD_OF_VIEW,
-            f"{self.height} rows of {self.width} square pixels see {math.degrees(tall):.0f} degrees from top to "
-            "bottom; 170 are too many. Give fewer rows, or a smaller field_of_view.",
-        )
-        _require(is_numbers(self.position, 3), f"position must be three numbers [m], got {self.position!r}.")
-        _require(
-            is_number(self.pitch) and abs(self.pitch) <= math.pi,
-            f"pitch must be an angle from -pi to pi [rad], got {self.pitch!r}.",
-        )
         q = self.quaternion
-        is_unit = q is None or (is_numbers(q, 4) and abs(math.sqrt(sum(x * x for x in q)) - 1.0) < 1e-3)
-        _require(is_unit, f"quaternion must be four numbers (w, x, y, z) of unit norm, got {q!r}.")
-        _require(
-            q is None or self.pitch == 0.0, "pitch and quaternion both say where the camera looks. Give one of them."
-        )
-        _require(
-            is_number(self.range) and 0 < self.range <= MAX_RANGE,
-            f"range must be above 0 and at most {MAX_RANGE:g} m, got {self.range!r}.",
-        )
-        _require(
-            is_number(self.noise) and 0 <= self.noise <= 1,
-            f"noise must be a share of the depth, from 0 to 1, got {self.noise!r}.",
-        )
-        _require(
-            is_number(self.dropout) and 0 <= self.dropout < 1,
-            f"dropout must be a probability, from 0 to below 1, got {self.dropout!r}.",
-        )
+        if q is not None and abs(math.sqrt(sum(x * x for x in q)) - 1.0) > 1e-3:
+            raise UserValueError(f"quaternion must be four numbers (w, x, y, z) of unit norm, got {q!r}.")
+        if q is not None and self.pitch != 0.0:
+            raise UserValueError("pitch and quaternion both say where the camera looks. Give one of them.")
 
     @classmethod
     def of(cls, spec: DepthCamera | Mapping[str, Any]) -> DepthCamera:
         """The camera that a mapping of its fields describes, or the camera itself."""
-        if isinstance(spec, cls):
-            return spec
-        allowed = [field.name for field in dataclasses.fields(cls)]
-        if not isinstance(spec, Mapping):
-            raise UserValueError(
-                f"camera must be a DepthCamera, or a mapping with any of {', '.join(allowed)}; got {spec!r}."
-            )
-        unknown = sorted(str(key) for key in spec if key not in allowed)
-        _require(not unknown, f"unknown key {unknown[0] if unknown else ''!r}. Allowed: {', '.join(allowed)}.")
-        return cls(**spec)
+        return build(cls, "camera", spec)
 
     @property
     def pixels(self) -> int:
@@ -183,8 +161,3 @@ class DepthCamera:
         noisy = (depth * (1.0 + self.noise * error)).clamp(0.0, self.range)
         noisy = torch.where(depth < self.range, noisy, depth)
         return noisy if lost is None else torch.where(lost, 0.0, noisy)
-
-
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise UserValueError(f"camera: {message}")

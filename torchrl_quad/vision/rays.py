@@ -191,13 +191,15 @@ def _attached(
 def _chunks(which: bool, inputs: list[Tensor], far: float) -> tuple[Tensor, ...]:
     """Eager: some scenes after the others, so that what lies between stays in the cache."""
     position, attitude, plane, *solids = inputs
-    pairs = max(x.shape[1] for x in solids) * plane.shape[1]
-    step = max(1, CHUNK // max(pairs, 1))
+    most = max(x.shape[1] for x in solids)
+    rays = max(1, CHUNK // max(most, 1))  # of a scene at once, of which an image may have more
+    step = max(1, CHUNK // max(most * plane.shape[1], 1))
     parts = []
     for i in range(0, len(position), step):
         some = slice(i, i + step)
-        own = (x if len(x) == 1 else x[some] for x in solids)
-        parts.append(meet(position[some], attitude[some], plane, *own, far=far, which=which))
+        own = [x if len(x) == 1 else x[some] for x in solids]
+        images = [meet(position[some], attitude[some], p, *own, far=far, which=which) for p in plane.split(rays, 1)]
+        parts.append(images[0] if len(images) == 1 else [torch.cat(x, 1) for x in zip(*images, strict=True)])
     return tuple(torch.cat(x) for x in zip(*parts, strict=True))
 
 
@@ -222,7 +224,7 @@ class _Kernel:
         return outputs
 
 
-@functools.cache
+@functools.lru_cache(maxsize=32)  # the code of one has some megabytes, and few programs see in as many ways
 def _kernel(far: float, which: bool, *kind: object) -> _Kernel:
     return _Kernel(far, which)
 

@@ -2,10 +2,12 @@
 
 import ast
 import re
+import sys
 from collections.abc import Iterator
 from html import escape
+from inspect import unwrap
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 from unicodedata import lookup
 
 from docutils import nodes
@@ -145,14 +147,31 @@ def owners(cls: type) -> list[type]:
     return found
 
 
+def show_plain_types(app: Sphinx, function: Any, bound: bool) -> None:
+    """Show an option of a range by its plain type: docstrings say the range, and signatures stay short."""
+    function = unwrap(function)
+    for owner in (function, vars(function).get("__init__", function)) if isinstance(function, type) else (function,):
+        owner = unwrap(owner)
+        for name, kind in getattr(owner, "__annotations__", {}).items():
+            known = getattr(owner, "__globals__", None) or vars(sys.modules[owner.__module__])
+            try:
+                whole = eval(kind, known) if isinstance(kind, str) else kind
+            except (NameError, TypeError):  # of a type that only type checkers import
+                continue
+            if "Annotated" in repr(whole):
+                plain = get_type_hints(type("", (), {"__annotations__": {name: whole}}))
+                owner.__annotations__[name] = plain[name]
+
+
 def show_constructor(
     app: Sphinx, what: str, name: str, value: Any, options: object, signature: str, returned: str
 ) -> tuple[str, str] | None:
     """Show all arguments of a class: those that metaclasses of TorchRL hide, and those that it hands to its base."""
-    if what != "class" or not (signature == "(*args, **kwargs)" or "**" in (signature or "")):
+    if what != "class" or not ("**" in (signature or "") or "__signature__" in vars(value)):
         return None
     arguments: dict[str, Any] = {}
     for owner in owners(value):
+        show_plain_types(app, owner, True)
         if "__init__" in vars(owner):
             for x in inspect.signature(owner.__init__, bound_method=True).parameters.values():
                 if x.kind not in (x.VAR_KEYWORD, x.VAR_POSITIONAL):
@@ -204,6 +223,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("html-page-context", share_navigation, priority=400)  # before the theme asks for it
     app.connect("autodoc-process-docstring", describe_all_arguments, priority=400)  # before napoleon
     app.connect("autodoc-process-docstring", keep_shapes)
+    app.connect("autodoc-before-process-signature", show_plain_types)
     app.connect("autodoc-process-signature", show_constructor)
     app.connect("env-updated", add_short_names)
     return {"parallel_read_safe": False}

@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 
 from torchrl_quad.deploy import Bundle, load_bundle
-from torchrl_quad.deploy.contract import naming, shown
+from torchrl_quad.deploy.contract import naming
 from torchrl_quad.deploy.judging import PRECISION
 from torchrl_quad.deploy.simulators import make_simulator, simulator_class
 from torchrl_quad.deploy.transfer import MUTANTS, fly
-from torchrl_quad.errors import MissingPackage, UserError, UserValueError
+from torchrl_quad.errors import MissingPackage, UserError, UserValueError, shown
 from torchrl_quad.files import add_rows, machine, make_folder, read_rows
 
 SETTINGS = {

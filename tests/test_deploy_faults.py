@@ -302,6 +302,7 @@ def test_a_step_that_failed_and_is_repeated_equals_one_that_never_failed(export_
         ("hovering", {"target": [True, False, True]}),
         ("tracking", {"phase": "late"}),
         ("tracking", {"phase": 1e308}),
+        ("tracking", {"phase": 10**5000}),
         ("racing", {"gate": [0, 1]}),
         ("racing", {"gate": np.arange(2)}),
         ("forest", {"target": [1, 2, 3], "speed": np.nan}),

@@ -215,7 +215,7 @@ def test_a_drone_that_no_simulator_can_fly_is_refused_with_the_name_of_its_bundl
         fly(bundle, "torchrl_quad")
     for options, why in (
         ({"late": True}, "late must be a whole number from 0 to 1000, got True"),
-        ({"episodes": 0}, "episodes must be a whole number from 1 to inf, got 0"),
+        ({"episodes": 0}, "episodes must be a whole number from 1 to 10000000, got 0"),
         ({"scale": [1]}, "scale must be a mapping"),
         ({"scale": {"mass": "2"}}, "scale: mass must be a number from 0 to 1000, got '2'"),
         ({"mutant": "yaw"}, "mutant must be one of MUTANTS.values.., got 'yaw'"),

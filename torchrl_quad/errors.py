@@ -3,6 +3,9 @@
 The recipes end in one line for these; every other error is a mistake of a program and keeps its traceback.
 """
 
+import reprlib
+from typing import Any
+
 
 class UserError(Exception):
     """What the user wrote, or a file that the user named, cannot be used."""
@@ -30,3 +33,16 @@ class Diverged(UserError, FloatingPointError):
 
 class MissingPackage(UserError, ImportError):
     """An optional package is not installed."""
+
+
+def shown(value: Any) -> str:
+    """What somebody wrote, in a few characters of one line, whatever it is."""
+    try:
+        return one_line(reprlib.repr(value))
+    except ValueError:  # Python writes no integer of more than 4300 digits
+        return f"a {type(value).__name__} of many digits"
+
+
+def one_line(text: object) -> str:
+    """The message of a library in one line of at most 200 characters, without what would garble it."""
+    return "".join(x if x.isprintable() else " " for x in " ".join(str(text).split()))[:200]

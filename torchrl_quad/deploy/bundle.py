@@ -26,12 +26,11 @@ from torchrl_quad.deploy.contract import (
     StaleState,
     TamperedBundle,
     WrongActions,
-    shown,
 )
 from torchrl_quad.deploy.reading import AGAIN, QUANTITIES, Content, read, shapes_of
 from torchrl_quad.deploy.simulators.vehicle import rotate
 from torchrl_quad.deploy.tasks import RULES
-from torchrl_quad.errors import MissingPackage, UserTypeError, UserValueError
+from torchrl_quad.errors import MissingPackage, UserTypeError, UserValueError, one_line, shown
 
 START = np.array([1.0, 0.0, 0.0, 0.0])  # the quaternion that the first one of a flight takes its sign from
 UP = np.array([0.0, 0.0, 1.0])
@@ -64,7 +63,7 @@ class Bundle:
     """
 
     def __init__(self, folder: Path, content: Content, on_fault: Literal["raise", "hover"]) -> None:
-        if on_fault not in ("raise", "hover"):
+        if not isinstance(on_fault, str) or on_fault not in ("raise", "hover"):
             raise UserValueError(f'on_fault must be "raise" or "hover", got {shown(on_fault)}.')
         contract, policy, self._vectors, self._starts = content
         self.folder, self.contract, self.on_fault = folder, contract, on_fault
@@ -160,7 +159,10 @@ class Bundle:
 
         Raises:
             WrongActions: the difference is above the tolerance.
+            ValueError: the tolerance is no number of at least 0.
         """
+        if not isinstance(tolerance, (int, float)) or isinstance(tolerance, bool) or not tolerance >= 0:
+            raise UserValueError(f"{self.folder}: tolerance must be a number, at least 0, got {shown(tolerance)}.")
         with contracts.naming(self.folder):
             found = self._run({name: self._vectors[name] for name in self._reads})
         error = max(float(np.abs(x - self._vectors[name]).max()) for name, x in zip(self._writes, found, strict=True))
@@ -185,7 +187,7 @@ class Bundle:
             own = {"providers": ["CPUExecutionProvider"], "enable_fallback": 0}  # which prints
             session = onnxruntime.InferenceSession(policy, options, **own)
         except Exception as error:  # onnxruntime has a dozen kinds, with nothing else in common
-            why = contracts.one_line(error)
+            why = one_line(error)
             raise TamperedBundle(f"{path}: onnxruntime cannot read it: {why}. {AGAIN}") from error
         for verb, side, shapes in (
             ("reads", session.get_inputs(), self._reads),
@@ -194,7 +196,7 @@ class Bundle:
             found = {x.name: (x.type, *x.shape) for x in side}
             wanted = {name: ("tensor(float)", "batch", *shape) for name, shape in shapes.items()}
             if found != wanted:
-                found = contracts.one_line(found)
+                found = one_line(found)
                 raise TamperedBundle(f"{path} {verb} {found}, and the contract says {wanted}. {AGAIN}")
         return session
 
@@ -203,7 +205,7 @@ class Bundle:
         try:
             found = self._session.run([*self._writes], given)
         except Exception as error:  # see above
-            raise BrokenPolicy(f"onnxruntime cannot run the policy: {contracts.one_line(error)}.") from error
+            raise BrokenPolicy(f"onnxruntime cannot run the policy: {one_line(error)}.") from error
         count = len(given["observation"])
         if [x.shape for x in found] != [(count, *shape) for shape in self._writes.values()]:
             raise BrokenPolicy(f"The policy answered arrays of the shapes {', '.join(str(x.shape) for x in found)}.")

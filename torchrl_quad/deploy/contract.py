@@ -8,7 +8,6 @@ import hashlib
 import itertools
 import json
 import math
-import reprlib
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_quad.deploy.tasks import RULES
-from torchrl_quad.errors import MissingPackage, UserError, UserValueError
+from torchrl_quad.errors import MissingPackage, UserError, UserValueError, shown
 
 VERSION = 3  # of the contract; raise it when a reader of the older one would misunderstand the new one
 FILES = ("README.md", "policy.c", "policy.h", "policy.onnx", "starts.npz", "vectors.npz")  # beside contract.json
@@ -89,16 +88,6 @@ def _range(entry: Mapping[str, Any]) -> str:
     while "prefixItems" in entry or "items" in entry:
         entry = entry["prefixItems"][-1] if "prefixItems" in entry else entry["items"]
     return ", ".join(f"{word} {entry[rule]:g}" for rule, word in _BOUNDS.items() if rule in entry)
-
-
-def shown(value: Any) -> str:
-    """What somebody wrote, in a few characters of one line."""
-    return one_line(reprlib.repr(value))
-
-
-def one_line(text: object) -> str:
-    """The message of a library in one line of at most 200 characters, without what would garble it."""
-    return "".join(x if x.isprintable() else " " for x in " ".join(str(text).split()))[:200]
 
 
 @contextlib.contextmanager

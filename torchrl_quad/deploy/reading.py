@@ -20,14 +20,12 @@ from torchrl_quad.deploy.contract import (
     UnknownContract,
     check,
     digest,
-    one_line,
     sha256,
-    shown,
     writer,
 )
 from torchrl_quad.deploy.network import foreign_parts
 from torchrl_quad.deploy.tasks import PROGRESS
-from torchrl_quad.errors import UserError
+from torchrl_quad.errors import UserError, one_line, shown
 
 MOST_BYTES = {"contract.json": 2**20, **dict.fromkeys(FILES, 2**28)}  # fifty times what policies here take
 QUANTITIES = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}  # that each state must have

@@ -7,14 +7,13 @@ once in each control step after the first, and asks it for its entries of the ob
 from __future__ import annotations
 
 import math
-import reprlib
 from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserValueError, shown
 
 Vector = NDArray[np.float64]
 MOST = 1e6  # of a number that says where a flight starts in the task
@@ -64,7 +63,7 @@ class Course:
         target = _point("target", self.task["target"] if target is None else target)
         speed = _number("speed", self.task["speed"] if speed is None else speed, "a positive number [m/s]")
         if not speed > 0.0:
-            raise UserValueError(f"speed must be a positive number [m/s], got {speed!r}.")
+            raise UserValueError(f"speed must be a positive number [m/s], got {shown(speed)}.")
         self.target, self.speed = target, speed
 
     def advance(self, before: Vector | None, position: Vector | None) -> None:
@@ -125,7 +124,7 @@ class Gates:
         wanted = f"a whole number from 0 to {len(self.gates) - 1}"
         number = _number("gate", gate, wanted)
         if number not in range(len(self.gates)):
-            raise UserValueError(f"gate must be {wanted}, got {gate!r}.")
+            raise UserValueError(f"gate must be {wanted}, got {shown(gate)}.")
         self.gate, self.passed = int(number), 0
 
     def advance(self, before: Vector | None, position: Vector | None) -> None:
@@ -163,7 +162,7 @@ def progress_of(rule: str, start: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 def _number(name: str, value: Any, wanted: str) -> float:
     if isinstance(value, int | float | np.number) and not isinstance(value, bool) and abs(value) <= MOST:
         return float(value)
-    raise UserValueError(f"{name} must be {wanted}, got {reprlib.repr(value)}.")
+    raise UserValueError(f"{name} must be {wanted}, got {shown(value)}.")
 
 
 def _point(name: str, value: ArrayLike) -> Vector:
@@ -173,7 +172,5 @@ def _point(name: str, value: ArrayLike) -> Vector:
     except Exception:  # whatever the conversion of somebody else's type raises
         fits = False
     if not fits:
-        raise UserValueError(
-            f"{name} must be three finite numbers [m], of at most {MOST:g}, got {reprlib.repr(value)}."
-        )
+        raise UserValueError(f"{name} must be three finite numbers [m], of at most {MOST:g}, got {shown(value)}.")
     return point.astype(float)

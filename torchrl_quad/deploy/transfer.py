@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.bundle import Bundle, load_bundle
-from torchrl_quad.deploy.contract import drone_problem, naming, shown
+from torchrl_quad.deploy.contract import drone_problem, naming
 from torchrl_quad.deploy.judging import endings, judge
 from torchrl_quad.deploy.reading import QUANTITIES
 from torchrl_quad.deploy.simulators import make_simulator
 from torchrl_quad.deploy.tasks import PROGRESS, progress_of
-from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError, shown
 
 Array = NDArray[np.float64]
 # Fields of the rate loop, which does not know the true drone.
@@ -95,15 +94,16 @@ def fly(
     """
     bundle = folder if isinstance(folder, Bundle) else load_bundle(folder, on_fault="hover")
     with naming(bundle.folder), np.errstate(all="ignore"):  # what a simulator cannot fly becomes NaN, and a crash
-        return _fly(bundle, simulator, loop, mutant or Mutant("none"), scale or {}, late, episodes)
+        mutant, scale = Mutant("none") if mutant is None else mutant, {} if scale is None else scale
+        return _fly(bundle, simulator, loop, mutant, scale, late, MOST_STATES if episodes is None else episodes)
 
 
 def _fly(
     bundle: Bundle, simulator: str, loop: str, mutant: Mutant, scale: Any, late: Any, episodes: Any
 ) -> dict[str, Any]:
-    for name, value, least, most in (("late", late, 0, MOST_LATE), ("episodes", episodes, 1, math.inf)):
-        if not (isinstance(value, int) and type(value) is not bool and least <= value <= most) and value is not None:
-            raise UserValueError(f"{name} must be a whole number from {least} to {most:g}, got {shown(value)}.")
+    for name, value, least, most in (("late", late, 0, MOST_LATE), ("episodes", episodes, 1, MOST_STATES)):
+        if not (isinstance(value, int) and not isinstance(value, bool) and least <= value <= most):
+            raise UserValueError(f"{name} must be a whole number from {least} to {most}, got {shown(value)}.")
     if not isinstance(mutant, Mutant):
         raise UserTypeError(f"mutant must be one of MUTANTS.values(), got {shown(mutant)}.")
     contract = other_drone(bundle.contract, scale)
@@ -159,7 +159,7 @@ def other_drone(contract: Mapping[str, Any], scale: Mapping[str, float]) -> dict
     for name, factor in scale.items():
         if name not in fields:
             raise UserValueError(f"scale: the drone has no {shown(name)} to scale. Choose from: {', '.join(fields)}.")
-        if type(factor) not in (int, float) or not 0.0 <= factor <= MOST_SCALE:
+        if not isinstance(factor, (int, float)) or isinstance(factor, bool) or not 0.0 <= factor <= MOST_SCALE:
             raise UserValueError(f"scale: {name} must be a number from 0 to {MOST_SCALE:g}, got {shown(factor)}.")
         plant[name] = (factor * np.array(drone[name], float)).tolist()
     scaled = {**contract, "plant": plant}

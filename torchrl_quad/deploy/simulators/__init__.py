@@ -9,8 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_quad.deploy.contract import shown
-from torchrl_quad.errors import MissingPackage, UserValueError
+from torchrl_quad.errors import MissingPackage, UserValueError, shown
 
 Array = NDArray[np.float64]
 

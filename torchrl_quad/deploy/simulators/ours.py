@@ -8,10 +8,9 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 
-from torchrl_quad.deploy.contract import shown
 from torchrl_quad.deploy.simulators.vehicle import Array
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams, load_drone
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserValueError, shown
 
 
 class Ours:

@@ -169,17 +169,23 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             )
         visited = self.sample(fresh.numel()).select(*self.state_keys, *self.memory_keys).to(fresh.device)
         states = visited.select(*self.state_keys)
-        self._require_same(fresh.reshape(-1))
+        self._require_same(fresh.reshape(-1), exact=False)  # a transform may have changed the precision of a rollout
         pick = torch.rand(fresh.shape, generator=self._rng, device=self._rng.device) < fraction
         pick = pick.to(fresh.device)
         return states.reshape(fresh.shape).where(pick, fresh), visited.reshape(fresh.shape), pick
 
-    def _require_same(self, states: TensorDictBase) -> None:
+    def _require_same(self, states: TensorDictBase, exact: bool = True) -> None:
         """Refuse states (n) of another kind than those that are kept, before they are mixed or broadcast in silence."""
         different: set[str] = set()
         for name in filter(states.__contains__, self.names):
             theirs = _kinds(states, name)
-            different |= {str(key) for key, _ in self.kinds.get(name, theirs).items() ^ theirs.items()}
+            ours = self.kinds.get(name, theirs)
+            if not exact:
+                theirs, ours = (
+                    {key: (shape, kind.is_floating_point) for key, (shape, kind) in kinds.items()}
+                    for kinds in (theirs, ours)
+                )
+            different |= {str(key) for key, _ in ours.items() ^ theirs.items()}
         if different:
             raise UserValueError(
                 f"These are other states than those in the visited-state buffer: {', '.join(sorted(different))} differ "
@@ -342,9 +348,10 @@ def _kinds(states: TensorDictBase, name: NestedKey) -> Kinds:
 
 
 def _kinds_of(env: EnvBase) -> dict[NestedKey, Kinds]:
-    """The same of the states of an environment, by name."""
-    base, kinds = base_env(env), {}
-    for key, spec in base.state_spec.items(True, True):
-        name = key if isinstance(key, str) else key[0]
-        kinds.setdefault(name, {})[unravel_key(key)] = (spec.shape[base.ndim :], spec.dtype)
+    """The same of the states of an environment as its rollouts hold them, by name, where they do."""
+    kinds: dict[NestedKey, Kinds] = {}
+    for key, spec in env.observation_spec.items(True, True):
+        if key in base_env(env).state_keys:
+            name = key if isinstance(key, str) else key[0]
+            kinds.setdefault(name, {})[unravel_key(key)] = (spec.shape[env.ndim :], spec.dtype)
     return kinds

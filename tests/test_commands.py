@@ -108,7 +108,7 @@ def understands(words, monkeypatch):
         runpy.run_path(str(ROOT / script))["settings"](arguments)
     elif Path(script).parent.name == "recipes" and script != "recipes/workspace.py":
         settings = [re.sub(r"^([\w.]+=[^,{\[]*),.*", r"\1", x) for x in arguments if not x.startswith(("--", "hydra"))]
-        check(importlib.import_module("running").composed(Path(script).stem, settings))
+        check(importlib.import_module("running").composed(Path(script).stem, settings), settings)
     else:
 
         def parse(parser, *args, read=argparse.ArgumentParser.parse_args):

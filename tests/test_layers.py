@@ -47,7 +47,7 @@ LIBRARIES = {
     "data": TORCHRL,
     "deploy": TORCHRL | {"jsonschema", "numpy", "onnx", "onnxruntime", "mujoco", "rotorpy", "crazyflow", "jax"},
     "errors": set(),
-    "options": {"numpy", "pydantic"},
+    "options": {"numpy", "pydantic", "torch"},
     "files": {"filelock"},
     "diagnostics": TORCHRL,
     "gym": {"gymnasium", "numpy", "torch"},

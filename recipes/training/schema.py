@@ -286,11 +286,7 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
     ("loss.entropy_coeff", lambda c: c["loss"].get("entropy_bonus") is False, "loss.entropy_bonus=false"),
     ("env.difficulty", lambda c: c["env"].get("density") is not None, "env.density is set"),
     ("logger.project logger.group logger.mode", lambda c: c["logger"]["backend"] != "wandb", "it is wandb's"),
-    (
-        "restart_fraction",
-        lambda c: (c.get("buffer") or {}).get("fraction") is not None,
-        "buffer.fraction says where horizons start",
-    ),
+    ("restart_fraction", lambda c: c.get("buffer", {}).get("fraction") is not None, "buffer.fraction is set"),
 ]
 
 
@@ -446,10 +442,7 @@ def _sentence(schema: type[BaseModel], error: Any) -> str:
         return f"{name} is unknown: there is no such setting. Look for a misspelling."
     if error["type"] == "missing":
         return f"{name} is missing: write {name}=... on the command line."
-    text = "" if isinstance(value, dict) else f"={'null' if value is None else _plain(value)}"
+    said = value[:100] if isinstance(value, str) else "null" if value is None else shown(value)
+    text = "" if isinstance(value, dict) else f"={said}"
     described = "" if field is None or not field.description else field.description
     return " ".join(filter(None, (f"{name}{text}: it must {must(error)}.", described)))
-
-
-def _plain(value: Any) -> str:
-    return value[:100] if isinstance(value, str) else shown(value)

@@ -144,7 +144,7 @@ def test_a_new_action_at_the_end_of_a_horizon_has_the_noise_of_the_policy_itself
 
 
 def test_the_correlation_lies_from_0_to_below_1(env):
-    for bad in (-0.1, 1.0, float("nan")):
-        with pytest.raises(ValueError, match="noise_correlation must lie from 0 to below 1"):
+    for bad, must in ((-0.1, "at least 0"), (1.0, "less than 1"), (float("nan"), "a finite number")):
+        with pytest.raises(ValueError, match=f"noise_correlation must be {must}, got {bad}"):
             make_actor(env, noise_correlation=bad)
     assert "noise" not in make_actor(env).out_keys

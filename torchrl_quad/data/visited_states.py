@@ -92,7 +92,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
                 f"The visited-state buffer keeps {self.state_keys}, and the rollout lacks {missing[0]!r}. Give the "
                 "buffer the environment, VisitedStateBuffer(env=env), or the entries of its Markov state, state_keys."
             )
-        if tensordicts.numel() == 0:
+        if tensordicts.batch_size.numel() == 0:
             return torch.zeros(0, dtype=torch.int64)
         states = tensordicts.select(*self.state_keys, *self.memory_keys).detach().reshape(-1)
         keep = torch.ones(states.shape[0], dtype=torch.bool, device=states.device)

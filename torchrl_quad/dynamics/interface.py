@@ -13,7 +13,7 @@ from torchrl_quad.options import real, whole
 # [s]. In a shorter step a drone at 1 m/s does not move in single precision; with a longer one the rate loop of no drone
 # that ships is stable.
 PhysicsStep = real(1e-6, 0.1)
-Substeps = whole(1, 1_000)
+Substeps = whole(1, 200)
 
 
 class Dynamics(Protocol):

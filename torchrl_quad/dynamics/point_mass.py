@@ -31,7 +31,7 @@ class PointMass:
     Args:
         nominal: the drone whose weight and limits scale the action.
         dt: physics step, 1e-6 to 0.1 s.
-        substeps: physics steps in a control step, 1 to 1000.
+        substeps: physics steps in a control step, 1 to 200.
         integrator: must be "semi_implicit_euler".
         control: what an action commands, as :func:`~torchrl_quad.dynamics.make_controller` takes it; not rotors.
 

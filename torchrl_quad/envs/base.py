@@ -82,7 +82,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
             max_speed: 5.0}. See ``docs/actions.md``.
         dt: the physics step, 1e-6 to 0.1 s. In a shorter one a drone at 1 m/s does not move in single precision; with a
             longer one the rate loop of no drone that ships is stable.
-        control_dt: the control step, 1e-6 to 1 s, a whole multiple of dt. Hovering is judged by its last second.
+        control_dt: the control step, 1e-6 to 1 s, 1 to 200 times dt. Hovering is judged by its last second.
         action_delay: control steps from a command to its effect, 0 to 1000; 1 is usual.
         integrator: how the rigid body moves on in a physics step.
         max_episode_steps: control steps after which an episode is truncated.

@@ -20,7 +20,7 @@ from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.options import Explained, real, shown
 from torchrl_quad.options import require as require_kind
 
-MAX_SUBSTEPS = 1_000  # physics steps of a control step, beyond which it takes for ever
+MAX_SUBSTEPS = 200  # physics steps of a control step, which take half a second without compilation
 MAX_STEPS = 2**31  # since the start of an episode
 Weight = real(-1e6, 1e6)  # a larger one would leave none of the seven digits of single precision to the others
 

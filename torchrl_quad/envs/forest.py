@@ -113,7 +113,7 @@ class ForestEnv(QuadrotorEnv):
 
     def __init__(
         self,
-        num_envs: int = 64,
+        num_envs: Size = 64,
         *,
         difficulty: Literal["easy", "middle", "hard"] = "middle",
         density: Density | None = None,

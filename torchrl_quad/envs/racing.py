@@ -106,7 +106,7 @@ class RacingEnv(QuadrotorEnv):
 
     def __init__(
         self,
-        num_envs: int = 64,
+        num_envs: Size = 64,
         *,
         track: TrackOption = "visfly",
         reward: Literal["position", "velocity"] = "velocity",

@@ -111,7 +111,7 @@ class TrackingEnv(QuadrotorEnv):
 
     def __init__(
         self,
-        num_envs: int = 64,
+        num_envs: Size = 64,
         *,
         curve: CurveOption = "slow_circle",
         period: Period | None = None,

@@ -47,7 +47,9 @@ def test_a_benchmark_writes_a_table(name, arguments, rows, tmp_path, monkeypatch
     monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments.split(), "--output", str(output)])
     module = importlib.import_module(name)  # in this process, though some start others
     if hasattr(module, "identify"):
-        monkeypatch.setattr(module, "identify", functools.partial(module.identify, fields=["linear_drag"], iterations=1, draws=2))
+        monkeypatch.setattr(
+            module, "identify", functools.partial(module.identify, fields=["linear_drag"], iterations=1, draws=2)
+        )
     module.main()
     with open(output, newline="") as file:
         results = list(csv.DictReader(file))

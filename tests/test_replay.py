@@ -2,7 +2,6 @@
 
 import base64
 import json
-import os
 import re
 
 import numpy as np
@@ -106,13 +105,6 @@ def test_a_page_that_cannot_be_finished_leaves_the_old_one(tmp_path, monkeypatch
     with pytest.raises(OSError, match="No space"):
         write_replay(rollout, path)
     assert [file.name for file in tmp_path.iterdir()] == ["replay.html"] and path.read_text() == "old"
-
-
-def test_what_a_killed_process_left_is_deleted_by_the_next_replay(tmp_path):
-    for pid in (2**22 + 1, os.getppid()):  # the first is of a process that cannot be
-        (tmp_path / f".replay.{pid}.html").write_text("half of a page")
-    write_replay(HoveringEnv(num_envs=1).rollout(2), tmp_path / "replay.html")
-    assert {file.name for file in tmp_path.iterdir()} == {"replay.html", f".replay.{os.getppid()}.html"}
 
 
 def test_a_rollout_without_attitudes_is_refused(tmp_path):

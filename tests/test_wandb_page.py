@@ -23,6 +23,7 @@ def test_a_sweep_hands_over_mappings_and_null_as_people_write_them(train, tmp_pa
         name: x["values"][last] if "values" in x else x.get("value", 0.01) for name, x in sweep["parameters"].items()
     }
     arguments = create_sweep_command_args({"args": {name: {"value": value} for name, value in values.items()}})[style]
+    arguments = [x for x in arguments if "logger." not in x]
     checkpoint = train("abpt", tmp_path, *arguments, "total_steps=24", "horizon=6", "--logger.backend=None")
     cfg = OmegaConf.create(checkpoint["config"])
     assert cfg.env.wind == {"mean": [1.0, 0.0, 0.0], "gust": 0.5} and cfg.actor.lr == 0.01

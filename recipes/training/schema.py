@@ -275,11 +275,8 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
     ("critic.final_lr", lambda c: c["critic"]["schedule"] == "constant", "critic.schedule=constant"),
     ("actor.schedule actor.final_lr", lambda c: c["algorithm"] == "hybrid", "actor.max_kl sets the rate"),
     ("actor.input_scale critic.input_scale", lambda c: c["normalize"], "normalize=true"),
-    (
-        "actor.vision actor.recurrent actor.hidden_size actor.channels",
-        lambda c: c["env"].get("camera") is None,
-        "env.camera=null",
-    ),
+    ("actor.recurrent actor.hidden_size actor.channels", lambda c: c["env"].get("camera") is None, "env.camera=null"),
+    ("actor.vision", lambda c: c["env"].get("camera") is None and c["actor"]["vision"], "env.camera=null"),
     ("actor.recurrent actor.hidden_size actor.channels", lambda c: not c["actor"]["vision"], "actor.vision=false"),
     ("actor.hidden_size", lambda c: not c["actor"]["recurrent"], "actor.recurrent=false"),
     ("loss.alpha_init loss.target_entropy", lambda c: c["loss"].get("alpha") != "auto", "loss.alpha is not auto"),

@@ -84,10 +84,16 @@ def _fields(part: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Ma
 
 
 def _range(entry: Mapping[str, Any]) -> str:
-    """The range of a field's numbers, in words."""
+    """The range of a field's numbers as an interval: [0, 1] with its ends, (0, 1) without."""
     while "prefixItems" in entry or "items" in entry:
         entry = entry["prefixItems"][-1] if "prefixItems" in entry else entry["items"]
-    return ", ".join(f"{word} {entry[rule]:g}" for rule, word in _BOUNDS.items() if rule in entry)
+    low = next(
+        (f"{end}{entry[rule]:g}" for rule, end in (("minimum", "["), ("exclusiveMinimum", "(")) if rule in entry), ""
+    )
+    high = next(
+        (f"{entry[rule]:g}{end}" for rule, end in (("maximum", "]"), ("exclusiveMaximum", ")")) if rule in entry), ""
+    )
+    return f"{low or '(-inf'}, {high or 'inf)'}" if low or high else ""
 
 
 @contextlib.contextmanager

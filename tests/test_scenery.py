@@ -96,8 +96,8 @@ def test_gates_may_have_axes_and_radii_of_their_own():
     [
         (lambda: Shape([(0, 0)]), r"Shape: points must be points \(n, 3\) \[m\], got shape \(1, 2\)"),
         (lambda: Shape([(0, 0, 0)], [(0, 0, 1)]), "faces must be indices .* of its 1 points"),
-        (lambda: Shape([(0, 0, 0)], color="red"), "must be written as #rrggbb, such as #c8452f; got 'red'"),
-        (lambda: Shape([(0, 0, 0)], opacity=0), "opacity must be above 0"),
+        (lambda: Shape([(0, 0, 0)], color="red"), "color must be written as #rrggbb, such as #c8452f, got 'red'"),
+        (lambda: Shape([(0, 0, 0)], opacity=0), "opacity must be greater than 0, got 0"),
         (lambda: Scenery(gates=[1, 2, 3]), "Scenery: gates must be points"),
         (lambda: Scenery(gates=[(0, 0, 1)], gate_radius=torch.ones(2)), "one for all 1 gates or one each"),
         (lambda: Scenery(gates=[(0, 0, 1)], gate_axes=torch.ones(2, 3)), "2 directions for 1 gates"),

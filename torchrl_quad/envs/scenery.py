@@ -10,23 +10,32 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.engine.packing import like
-from torchrl_quad.envs.shapes import Shape, along_the_course, as_points, rings
+from torchrl_quad.envs.shapes import Shape, along_the_course, as_numbers, as_points, rings
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import Real, Scale, checked
 from torchrl_quad.vision.primitives import SIZES
 
 
+@checked
 @dataclass(frozen=True)
 class Metric:
     """How a metric is summed up over episodes, printed, and drawn.
 
     Values themselves are in SI units everywhere; only print and pictures use ``scale`` and ``unit``.
+
+    Args:
+        label: its name in prose, such as "position error".
+        unit: in print, such as "cm".
+        scale: how many of these units make one SI unit, 100 for cm.
+        median: whether it is summed up with the median instead of the mean, which a few crashes would dominate.
+        log: whether it is drawn on a logarithmic axis.
     """
 
-    label: str  #: its name in prose, such as "position error"
-    unit: str = ""  #: the unit in print, such as "cm"
-    scale: float = 1.0  #: how many of these units make one SI unit, 100 for cm
-    median: bool = False  #: sum up with the median instead of the mean, which a few crashes would dominate
-    log: bool = False  #: draw on a logarithmic axis
+    label: str
+    unit: str = ""
+    scale: Scale = 1.0
+    median: bool = False
+    log: bool = False
 
     @property
     def is_length(self) -> bool:
@@ -64,6 +73,7 @@ def describe_metric(name: str, metric_info: Mapping[str, Metric]) -> Metric:
     return metric_info.get(name) or EPISODE_METRICS.get(name) or Metric(name.replace("_", " "))
 
 
+@checked
 @dataclass(frozen=True)
 class Scenery:
     """The things that pictures show beside the drones; positions are in m, in the world frame.
@@ -71,31 +81,44 @@ class Scenery:
     Pictures show all of them. Without places, a curve, or gates that are the targets, they also show where the entry
     ``target`` (num_envs, 3) of the state has been in the flight.
 
+    Args:
+        target: the name of the target, as in "distance to the target".
+        places: targets that do not move (k, 3).
+        curve: a line (m, 3) along which the target moves.
+        gates: centres of gates (k, 3), in the order of flight.
+        gate_radius: of all gates, or of each (k) [m].
+        gate_axes: the direction (k, 3) in which each gate is flown; by default along the course.
+        shapes: objects of your own.
+        progress: the metric that best shows how a flight goes; by default the distance to the target.
+        success: the value of the progress, in SI units, from which a state fulfils the task.
+
     Raises:
-        ValueError: something has another shape.
+        ValueError: something has another type or shape.
     """
 
-    target: str = "target"  #: the name of the target, as in "distance to the target"
-    places: Tensor | None = None  #: targets that do not move (k, 3)
-    curve: Tensor | None = None  #: a line (m, 3) along which the target moves
-    gates: Tensor | None = None  #: centres of gates (k, 3), in the order of flight
-    gate_radius: float | Tensor = 0.3  #: of all gates, or of each (k) [m]
-    gate_axes: Tensor | None = None  #: the direction (k, 3) in which each gate is flown; by default along the course
-    shapes: Sequence[Shape] = ()  #: objects of your own
-    progress: str | None = None  #: the metric that best shows how a flight goes; by default the distance to the target
-    success: float | None = None  #: the value of the progress, in SI units, from which a state fulfils the task
+    target: str = "target"
+    places: Tensor | None = None
+    curve: Tensor | None = None
+    gates: Tensor | None = None
+    gate_radius: float | Tensor = 0.3
+    gate_axes: Tensor | None = None
+    shapes: Sequence[Shape] = ()
+    progress: str | None = None
+    success: Real | None = None
 
     def __post_init__(self) -> None:
         for name in ("places", "curve", "gates", "gate_axes"):
             if (points := getattr(self, name)) is not None:
                 object.__setattr__(self, name, as_points(f"Scenery: {name}", points))
         count = 0 if self.gates is None else len(self.gates)
-        radius = torch.as_tensor(self.gate_radius).detach().cpu().float()
-        if radius.numel() not in (1, count) or not (radius > 0).all():
+        radius = as_numbers(self.gate_radius)
+        is_radius = radius is not None and radius.numel() in (1, count)
+        if not is_radius or not ((radius > 0) & radius.isfinite()).all():
             raise UserValueError(f"Scenery: gate_radius must be positive [m], one for all {count} gates or one each.")
         if self.gate_axes is not None and len(self.gate_axes) != count:
             raise UserValueError(f"Scenery: gate_axes has {len(self.gate_axes)} directions for {count} gates.")
-        if not all(isinstance(shape, Shape) for shape in self.shapes):
+        is_list = isinstance(self.shapes, Sequence) and not isinstance(self.shapes, str | bytes)
+        if not is_list or not all(isinstance(shape, Shape) for shape in self.shapes):
             raise UserValueError("Scenery: shapes must be a list of Shape, such as [Shape.sphere((0, 0, 2), 0.5)].")
 
     def rings(self) -> Tensor | None:

@@ -7,15 +7,23 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import Share, checked, real, shown, validated
 
+MAX_POINTS = 1_000_000  # of an object; no picture shows more
+Length = real(1e-6, 1e6)  # [m]
+Color = validated(
+    lambda x: isinstance(x, str) and re.fullmatch("#[0-9a-fA-F]{6}", x), "written as #rrggbb, such as #c8452f"
+)
 _RING = 33  # points of a circle, the first again at its end
 
 
+@checked
 @dataclass(frozen=True)
 class Shape:
     """An object that does not move: an obstacle, a wall, a path. Figures, films and replays draw it.
@@ -23,30 +31,35 @@ class Shape:
     The class methods make the usual ones. ``Shape(points, faces)`` takes any mesh, such as
     ``Shape(mesh.vertices, mesh.faces)`` of trimesh.
 
+    Args:
+        points: (n, 3) [m], world frame; a line has a gap where a point is NaN.
+        faces: the corners of triangles, as indices of points (m, 3); None for a line.
+        name: of the object in the legend.
+        color: of lines and surfaces.
+        opacity: of a surface, above 0, at most 1.
+
     Raises:
-        ValueError: points, faces or colour are not as below.
+        ValueError: points, faces or colour are something else.
     """
 
-    points: Tensor  #: (n, 3) [m], world frame; a line has a gap where a point is NaN
-    faces: Tensor | None = None  #: the corners of triangles, as indices of points (m, 3); None for a line
-    name: str = ""  #: for the legend
-    color: str = "#6b7a90"  #: as "#rrggbb"
-    opacity: float = 0.35  #: of a surface, above 0, at most 1
+    points: Tensor
+    faces: Tensor | None = None
+    name: str = ""
+    color: Color = "#6b7a90"
+    opacity: Share = 0.35
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", as_points("Shape: points", self.points))
         if self.faces is not None:
-            faces = torch.as_tensor(self.faces).detach().cpu().long()
-            if faces.dim() != 2 or faces.shape[1] != 3 or not ((faces >= 0) & (faces < len(self.points))).all():
+            faces = as_numbers(self.faces)
+            is_triangles = faces is not None and faces.dim() == 2 and faces.shape[1] == 3
+            if not is_triangles or not ((faces >= 0) & (faces < len(self.points)) & (faces == faces.floor())).all():
+                got = type(self.faces).__name__ if faces is None else f"shape {tuple(faces.shape)}"
                 raise UserValueError(
                     f"Shape: faces must be indices (m, 3) of its {len(self.points)} points, three for each triangle; "
-                    f"got shape {tuple(faces.shape)}."
+                    f"got {got}."
                 )
-            object.__setattr__(self, "faces", faces)
-        if not re.fullmatch("#[0-9a-fA-F]{6}", self.color):
-            raise UserValueError(f"Shape: color must be written as #rrggbb, such as #c8452f; got {self.color!r}.")
-        if not 0 < self.opacity <= 1:
-            raise UserValueError(f"Shape: opacity must be above 0 and at most 1, got {self.opacity}.")
+            object.__setattr__(self, "faces", faces.long())
 
     @classmethod
     def line(cls, points: Any, **style: Any) -> Shape:
@@ -54,11 +67,14 @@ class Shape:
         return cls(points, **style)
 
     @classmethod
-    def ring(cls, centre: Any, radius: float, axis: Any = (1.0, 0.0, 0.0), **style: Any) -> Shape:
+    @checked
+    def ring(cls, centre: Any, radius: Length, axis: Any = (1.0, 0.0, 0.0), **style: Any) -> Shape:
         """A circle around an axis (3), such as a gate."""
-        return cls(rings(*(torch.as_tensor(x).float().reshape(1, 3) for x in (centre, axis)), radius)[0], **style)
+        centre, axis = as_points("Shape.ring: centre and axis", [centre, axis]).split(1)
+        return cls(rings(centre, axis, radius)[0], **style)
 
     @classmethod
+    @checked
     def box(cls, low: Any, high: Any, **style: Any) -> Shape:
         """A box along the axes, from its lowest corner (3) to its highest (3) [m]."""
         low, high = as_points("Shape.box: low and high", [low, high])
@@ -67,13 +83,15 @@ class Shape:
         return cls(low + bits * (high - low), [x for a, b, c, d in sides for x in ((a, b, c), (a, c, d))], **style)
 
     @classmethod
-    def sphere(cls, centre: Any, radius: float, **style: Any) -> Shape:
+    @checked
+    def sphere(cls, centre: Any, radius: Length, **style: Any) -> Shape:
         """A ball."""
         angle = torch.linspace(-0.5 * math.pi, 0.5 * math.pi, 13)
         return cls._turned(centre, radius * angle.cos(), radius * angle.sin(), style)
 
     @classmethod
-    def cylinder(cls, base: Any, radius: float, height: float, **style: Any) -> Shape:
+    @checked
+    def cylinder(cls, base: Any, radius: Length, height: Length, **style: Any) -> Shape:
         """An upright cylinder on the centre (3) of its base, such as a tree or a pillar."""
         return cls._turned(base, radius * torch.tensor([0.0, 1, 1, 0]), height * torch.tensor([0.0, 0, 1, 1]), style)
 
@@ -95,15 +113,27 @@ def as_points(what: str, points: Any) -> Tensor:
     Raises:
         ValueError: they are something else.
     """
+    found = as_numbers(points)
+    if found is None:
+        raise UserValueError(f"{what} must be points (n, 3) [m], got {shown(points)}.")
+    if found.dim() != 2 or found.shape[1] != 3 or not len(found):
+        raise UserValueError(f"{what} must be points (n, 3) [m], got shape {tuple(found.shape)}.")
+    return found
+
+
+def as_numbers(values: Any) -> Tensor | None:
+    """A tensor, an array, or a list of numbers, or of any of these, on the CPU, in single precision; None if none."""
     try:
-        if isinstance(points, list | tuple):
-            points = torch.stack([torch.as_tensor(point).detach().cpu().float() for point in points])
-        points = torch.as_tensor(points).detach().cpu().float()
-    except (TypeError, ValueError, RuntimeError):
-        raise UserValueError(f"{what} must be points (n, 3) [m], got {points!r}.") from None
-    if points.dim() != 2 or points.shape[1] != 3 or not len(points):
-        raise UserValueError(f"{what} must be points (n, 3) [m], got shape {tuple(points.shape)}.")
-    return points
+        if isinstance(values, list | tuple) and all(map(_is_few, [values, *values[:MAX_POINTS]])):
+            values = torch.stack([torch.as_tensor(x).detach().cpu().float() for x in values])
+        return torch.as_tensor(values).detach().cpu().float() if _is_few(values) else None
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        return None
+
+
+def _is_few(values: Any) -> bool:
+    is_one = isinstance(values, Tensor | np.ndarray) or not hasattr(values, "__len__")
+    return is_one or len(values) <= MAX_POINTS
 
 
 def along_the_course(gates: Tensor) -> Tensor:

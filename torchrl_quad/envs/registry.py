@@ -46,7 +46,7 @@ def register_task(name: str, cls: type[QuadrotorEnv]) -> None:
         ValueError: the name is not of this form, or another class has it.
         TypeError: this is no class of a task, or it lacks methods.
     """
-    if not (isinstance(name, str) and re.fullmatch(r"[a-z][a-z0-9_]*", name)):
+    if not (isinstance(name, str) and re.fullmatch(r"[a-z][a-z0-9_]{0,63}", name)):
         raise UserValueError(
             f"A task's name is in small letters, digits and underscores, such as 'window'; got {shown(name)}."
         )

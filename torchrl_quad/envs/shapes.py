@@ -123,10 +123,13 @@ def as_points(what: str, points: Any) -> Tensor:
 
 def as_numbers(values: Any) -> Tensor | None:
     """A tensor, an array, or a list of numbers, or of any of these, on the CPU, in single precision; None if none."""
+    parts = values[:MAX_POINTS] if isinstance(values, list | tuple) else ()
+    if not all(map(_is_few, (values, *parts))):
+        return None
     try:
-        if isinstance(values, list | tuple) and all(map(_is_few, [values, *values[:MAX_POINTS]])):
-            values = torch.stack([torch.as_tensor(x).detach().cpu().float() for x in values])
-        return torch.as_tensor(values).detach().cpu().float() if _is_few(values) else None
+        if parts:
+            values = torch.stack([torch.as_tensor(x).detach().cpu().float() for x in parts])
+        return torch.as_tensor(values).detach().cpu().float()
     except (TypeError, ValueError, RuntimeError, OverflowError):
         return None
 

@@ -203,7 +203,7 @@ def test_every_number_that_ships_has_a_type_and_a_range():
 
     for recipe in RECIPES:
         values = OmegaConf.to_container(composed(recipe), resolve=True)
-        found = dict(numbers(values, schema_of(values)))
+        found = dict(numbers(values, schema_of(values, {})))
         assert len(found) > 20
         for name, field in found.items():
             assert field is not None, name

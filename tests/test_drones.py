@@ -9,8 +9,7 @@ import torch
 import yaml
 
 from torchrl_quad import HoveringEnv, QuadrotorParams, available_drones, load_drone
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import shown
+from torchrl_quad.errors import UserValueError, shown
 
 VISFLY = {name: value.squeeze().tolist() for name, value in load_drone("visfly").fields().items()}
 

@@ -16,12 +16,12 @@ from torchrl.envs import EnvBase
 
 from torchrl_quad.data import differentiable_rollout
 from torchrl_quad.data.unwrap import require_env
-from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
+from torchrl_quad.errors import UserTypeError, UserValueError, WrongState, shown
 from torchrl_quad.objectives.action_gradients import sources_of_steps
 from torchrl_quad.objectives.calls import require_tensordict
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.objectives.segments import discounts
-from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, checked, require, shown
+from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, checked, require
 
 Inputs = nn.Module | Tensor | Iterable[Tensor]
 

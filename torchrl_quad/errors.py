@@ -35,12 +35,18 @@ class MissingPackage(UserError, ImportError):
     """An optional package is not installed."""
 
 
+_SHORT = reprlib.Repr()  # which looks at no more of a value than it shows
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 100
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 30
+
+
 def shown(value: Any) -> str:
-    """What somebody wrote, in a few characters of one line, whatever it is."""
+    """What somebody wrote, in one line of a hundred characters, whatever it is."""
     try:
-        return one_line(reprlib.repr(value))
-    except ValueError:  # Python writes no integer of more than 4300 digits
-        return f"a {type(value).__name__} of many digits"
+        text = one_line(_SHORT.repr(value))
+    except (ValueError, RecursionError):  # Python writes no integer of more than 4300 digits
+        text = f"a whole number of {value.bit_length()} bits" if isinstance(value, int) else type(value).__name__
+    return text if len(text) <= 100 else f"{text[:97]}..."
 
 
 def one_line(text: object) -> str:

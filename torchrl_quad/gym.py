@@ -21,8 +21,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from torchrl_quad.envs import make_env
-from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
-from torchrl_quad.options import shown
+from torchrl_quad.errors import UserTypeError, UserValueError, WrongState, shown
 
 # An episode ends before an entry of the state exceeds this, where a task does not know better.
 _LIMIT = 1e6

@@ -26,14 +26,14 @@ import inspect
 import re
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
-from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError, shown
 
 Real = Annotated[float, Field(allow_inf_nan=False, ge=-1e30, le=1e30)]
 Positive = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e30)]
@@ -144,7 +144,9 @@ def checked(target: _F, described_by: type | None = None) -> _F:
         try:
             bound = signature.bind(*args, **kwargs)
         except TypeError as error:
-            raise UserTypeError(_misfit(target, args, kwargs, error)) from None
+            called = type(args[0]) if target.__name__ == "__init__" and args else target
+            refuse_unknown(called, kwargs)
+            raise UserTypeError(f"{called.__name__}: {error}.") from None
         adapters = _adapters(target, described_by)
         for name, value in bound.arguments.items():
             if name in adapters:
@@ -226,15 +228,6 @@ def must(error: Mapping[str, Any]) -> str:
     return asked
 
 
-def shown(value: Any) -> str:
-    """A value in a message, in one line of a hundred characters."""
-    try:
-        text = " ".join(repr(value).split())
-    except (ValueError, RecursionError):  # Python writes no integer of more than 4300 digits, and no list in a thousand
-        text = f"a whole number of {value.bit_length()} bits" if isinstance(value, int) else type(value).__name__
-    return text if len(text) <= 100 else f"{text[:97]}..."
-
-
 def _checked(name: str, value: Any, adapter: TypeAdapter[Any], description: str) -> Any:
     try:
         plain = _without_numpy(value)
@@ -266,17 +259,20 @@ def _without_numpy(value: Any) -> Any:
     return value
 
 
-def _misfit(target: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any], error: TypeError) -> str:
-    """Python's words for arguments that a function does not take, with the closest one that it takes."""
-    called = type(args[0]) if target.__name__ == "__init__" and args else target
+def refuse_unknown(called: Callable[..., Any], given: Iterable[str]) -> None:
+    """Refuse the first name that is no argument, with the closest one that is.
+
+    Raises:
+        UserTypeError: there is one.
+    """
     known = _names(called)
-    unknown = next((name for name in kwargs if name not in known), None)
-    if unknown is None:
-        return f"{called.__name__}: {error}."
-    close = difflib.get_close_matches(unknown, known, 1)
-    hint = f" Did you mean {close[0]!r}?" if close else ""
-    said = f"{called.__name__} got an unexpected keyword argument {shown(unknown)}."
-    return f"{said}{hint} Choose from: {', '.join(known)}."
+    for unknown in (name for name in given if name not in known):
+        close = difflib.get_close_matches(unknown, known, 1)
+        hint = f" Did you mean {close[0]!r}?" if close else ""
+        raise UserTypeError(
+            f"{called.__name__} got an unexpected keyword argument {shown(unknown)}.{hint} Choose from: "
+            f"{', '.join(known)}."
+        )
 
 
 def _names(called: Callable[..., Any]) -> list[str]:

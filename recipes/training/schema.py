@@ -21,8 +21,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from torchrl_quad import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
 from torchrl_quad.envs import task_class
-from torchrl_quad.envs.checks import refuse_unknown
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import (
     Below1,
     Count,
@@ -34,7 +33,7 @@ from torchrl_quad.options import (
     Size,
     declared,
     must,
-    shown,
+    refuse_unknown,
 )
 from training.own import CONFIG, OWN, SET_BY_RECIPES
 
@@ -319,10 +318,8 @@ def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
         raise UserValueError(f"{error.full_key or 'the configuration'}: {str(error).splitlines()[0]}") from None
     _refuse_none(values)
     kinds = {"logs": Identifying, "folder": Exporting, "checkpoint": Flying}
-    schema = next((kind for name, kind in kinds.items() if name in values), None) or schema_of(values)
     asked = {name.lstrip("+~"): value for name, _, value in (override.partition("=") for override in overrides)}
-    if "algorithm" in values:
-        _refuse_unknown(values, asked)
+    schema = next((kind for name, kind in kinds.items() if name in values), None) or schema_of(values, asked)
     try:
         schema.model_validate(values)
     except ValidationError as error:
@@ -331,12 +328,13 @@ def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
         _refuse_idle(values, asked)
 
 
-def schema_of(values: dict[str, Any]) -> type[Training]:
-    """The schema of a training run: of its recipe, its task and its loss."""
+def schema_of(values: dict[str, Any], asked: Mapping[str, str]) -> type[Training]:
+    """The schema of a training run, of its recipe, its task and its loss, if these have what was asked for."""
     for name in ("algorithm", "task"):
         if not isinstance(values.get(name), str):
             raise UserValueError(f"{name}={shown(values.get(name))}: it must be a name.")
     known = settings(values["algorithm"])
+    _refuse_unread(known or values, asked)
     if known is None:  # of a recipe that is somebody's own, in another program
         return create_model("Training", __base__=Training, env=(_environment(values), ...), loss=(dict[str, Any], ...))
     _require_all(values, known)
@@ -360,7 +358,7 @@ def _environment(values: dict[str, Any]) -> Any:
         if name in SET_BY_RECIPES:
             raise UserValueError(f"env.{name}: recipes set it for all environments. Write {name}=..., without env.")
     if isinstance(env, dict):
-        refuse_unknown(cls, sorted(set(env) - set(inspect.signature(cls).parameters)))
+        refuse_unknown(cls, sorted(map(str, env)))
     return _section("Env", declared(cls), inspect.signature(cls).parameters)
 
 
@@ -387,21 +385,21 @@ def _section(name: str, kinds: Mapping[str, tuple[Any, str]], names: Iterable[st
     return create_model(name, __base__=Section, **fields)
 
 
-def _refuse_unknown(values: dict[str, Any], asked: Mapping[str, str]) -> None:
+def _refuse_unread(known: dict[str, Any], asked: Mapping[str, str]) -> None:
     """Refuse settings on the command line that the recipe has not, and a file in tuned/ that is not there."""
-    known = OmegaConf.create(settings(values["algorithm"]) or values)
+    node = OmegaConf.create(known)
     for name in asked:
         section, *inner = name.split(".")
-        is_known = section in ("env", "loss", "tuned") or "/" in name or OmegaConf.select(known, name, default="") != ""
+        is_known = section in ("env", "loss", "tuned") or "/" in name or OmegaConf.select(node, name, default="") != ""
         if not is_known:
             among = known.get(section, {}) if inner else known
             close = difflib.get_close_matches(name.split(".")[-1], map(str, among), 1)
             hint = f"Did you mean {'.'.join([section, *close] if inner else close)}?" if close else "Leave it out."
             raise UserValueError(f"{name} is unknown: this recipe has no such setting. {hint}")
     tuned = asked.get("tuned", "null")
-    known = sorted(path.stem for path in (CONFIG / "tuned").glob("*.yaml"))
-    if tuned not in ("null", *known):
-        close = difflib.get_close_matches(tuned, known, 1) or known
+    files = sorted(path.stem for path in (CONFIG / "tuned").glob("*.yaml"))
+    if tuned not in ("null", *files):
+        close = difflib.get_close_matches(tuned, files, 1) or files
         raise UserValueError(
             f"tuned={tuned}: there is no such file in recipes/config/tuned. Choose from: {', '.join(close)}."
         )

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import datetime
 from pathlib import Path
-from threading import Lock
 
 import torch
 from running import arguments, command_line, side_by_side
@@ -21,11 +20,10 @@ from shipped import METHODS, TASKS, train
 from training.building import build_env
 from training.evaluation import drawing_from, evaluate, load_policy
 
-from torchrl_quad.files import machine, read_rows, write_rows
+from torchrl_quad.files import add_rows, machine, read_rows
 
 SETS, STARTS, FIRST = 16, 256, 2_000_000  # sets, starts in each, and the seed of the first, that of evaluate.py
 MEASURED = ("return", "solved", "gates_passed")
-ADDING = Lock()
 
 
 def fly(task: str, method: str, seed: int, output: Path, data: Path, quick: bool) -> None:
@@ -45,8 +43,7 @@ def fly(task: str, method: str, seed: int, output: Path, data: Path, quick: bool
             metrics, _ = evaluate(env, actor)
         reached = {name: f"{metrics[f'eval/{name}']:.6g}" for name in MEASURED if f"eval/{name}" in metrics}
         rows.append(about | {"starts_seed": first} | reached)
-    with ADDING:
-        write_rows(data / "starts.csv", [*read_rows(data / "starts.csv"), *rows])
+    add_rows(data / "starts.csv", rows)
     print(task, method, seed, *(row["return"] for row in rows), flush=True)
 
 

@@ -14,8 +14,8 @@ from torchrl_quad.controllers.policy import Controller, State
 from torchrl_quad.controllers.references import Reference, follow
 from torchrl_quad.controllers.riccati import feedback
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import real, shown, whole
+from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.options import real, whole
 
 # Of the squared residuals: each is the square of what one unit of it weighs, and half of it counts.
 WEIGHTS = {

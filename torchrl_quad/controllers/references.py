@@ -10,8 +10,7 @@ from torch import Tensor
 
 from torchrl_quad.controllers.laps import plan_lap
 from torchrl_quad.envs import HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import shown
+from torchrl_quad.errors import UserValueError, shown
 
 Reference = Callable[[dict[Any, Tensor], Tensor], Tensor]
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ObservationNorm
 
 from torchrl_quad.data.unwrap import base_env, require_env
-from torchrl_quad.errors import UserTypeError, UserValueError
-from torchrl_quad.options import Entry, Positive, checked, shown
+from torchrl_quad.errors import UserTypeError, UserValueError, shown
+from torchrl_quad.options import Entry, Positive, checked
 
 
 @checked

@@ -13,8 +13,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.normalizer import NormalizedPolicy, ObservationNormalizer
 from torchrl_quad.data.unwrap import base_env, memory_keys, require_env, require_whole_state
-from torchrl_quad.errors import UserTypeError, UserValueError
-from torchrl_quad.options import Horizon, checked, shown
+from torchrl_quad.errors import UserTypeError, UserValueError, shown
+from torchrl_quad.options import Horizon, checked
 
 
 @checked

@@ -17,8 +17,8 @@ from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Nominal, Setpoint, join
 from torchrl_quad.dynamics.parameters import QuadrotorParams
 from torchrl_quad.dynamics.vector import Vector, cat, clamp, dot, minimum, soft_limit
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import checked, real, shown
+from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.options import checked, real
 
 
 class AttitudeSetpoint(NamedTuple):

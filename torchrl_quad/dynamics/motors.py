@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import checked, real, shown
+from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.options import checked, real
 
 SpeedPerVolt, Voltage = real(1e-3, 1e5), real(1e-1, 1e3)
 SpeedAtZero, Lag = real(-1e4, 1e4), real(-0.1, 0.5)

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import presets
 from torchrl_quad.dynamics.motors import MotorCommand
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import shown
+from torchrl_quad.errors import UserValueError, shown
 
 _DRONES = resources.files(__package__) / "drones"
 

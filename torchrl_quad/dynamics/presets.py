@@ -12,8 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import shown
+from torchrl_quad.errors import UserValueError, shown
 
 MAX_BYTES = 1_000_000  # of a file; the largest that ships with the package has 1 kB
 MAX_DEPTH = 20  # of lists and mappings within each other
@@ -169,8 +168,3 @@ def as_array(value: Any) -> NDArray[np.float64]:
         return np.float64(float(value))
     except OverflowError:
         raise ValueError(f"{shown(value)} is more than a float holds") from None
-
-
-def is_numbers(value: Any, count: int) -> bool:
-    """Whether a setting is a list of so many finite numbers."""
-    return isinstance(value, Sequence) and len(value) == count and all(is_number(x) for x in value)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import math
 from collections.abc import Iterable, Mapping
@@ -16,8 +15,8 @@ from torch import Tensor
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
 from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine.simulation import State
-from torchrl_quad.errors import UserTypeError, UserValueError
-from torchrl_quad.options import Explained, real, shown
+from torchrl_quad.errors import UserTypeError, UserValueError, shown
+from torchrl_quad.options import Explained, real
 from torchrl_quad.options import require as require_kind
 
 MAX_SUBSTEPS = 200  # physics steps of a control step, which take half a second without compilation
@@ -82,17 +81,6 @@ def check_compilation(options: Mapping[str, Any]) -> None:
         callable(backend) or (isinstance(backend, str) and backend in backends),
         f"compile: backend must be a function, or one of {names(backends)}; got {shown(backend)}.",
     )
-
-
-def refuse_unknown(cls: type, unknown: Iterable[str]) -> None:
-    """Refuse keyword arguments that a task does not have, with the closest one that it has."""
-    for name in unknown:
-        known = sorted(set(inspect.signature(cls).parameters) - {"kwargs"})
-        close = difflib.get_close_matches(name, known, 1)
-        hint = f" Did you mean {close[0]!r}?" if close else ""
-        raise UserTypeError(
-            f"{cls.__name__} got an unexpected keyword argument {name!r}.{hint} Choose from: {names(known)}."
-        )
 
 
 def full_signature(cls: type, base: type) -> inspect.Signature:

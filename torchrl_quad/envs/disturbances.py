@@ -15,8 +15,8 @@ from torchrl_quad.dynamics.parameters import CONTROLLER_FIELDS, PLANT_FIELDS
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.guard import MAX_ANGULAR_VELOCITY, MAX_SPEED
 from torchrl_quad.envs.randomness import Randomness
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import Delay, checked, list_of, real, require, shown
+from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.options import Delay, checked, list_of, real, require
 
 _DISTRIBUTIONS = {
     "uniform": "low and high",

@@ -28,8 +28,8 @@ from torchrl_quad.envs.terms import (
     outside,
     target_reward,
 )
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import Size, real, require, shown, validated
+from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.options import Size, real, require, validated
 
 WEIGHTS = {  # of the reward's terms, by reward
     "position": {**TARGET_WEIGHTS, "gate": 20.0},

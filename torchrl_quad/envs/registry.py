@@ -15,8 +15,7 @@ from torchrl_quad.envs.hovering import HoveringEnv
 from torchrl_quad.envs.landing import LandingEnv
 from torchrl_quad.envs.racing import RacingEnv
 from torchrl_quad.envs.tracking import TrackingEnv
-from torchrl_quad.errors import UserTypeError, UserValueError
-from torchrl_quad.options import shown
+from torchrl_quad.errors import UserTypeError, UserValueError, shown
 
 GROUP = "torchrl_quad.tasks"  # the group of entry points by which an installed package offers its tasks
 

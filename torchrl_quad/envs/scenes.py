@@ -17,8 +17,8 @@ from torchrl_quad.engine import looks_are_free
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.randomness import Randomness
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import build, checked, real, require, shown, whole
+from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.options import build, checked, real, require, whole
 from torchrl_quad.vision import Primitives, closest_approach, nearest
 from torchrl_quad.vision.primitives import SIZES, distances, join
 

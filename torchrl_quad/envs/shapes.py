@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import Share, checked, real, shown, validated
+from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.options import Share, checked, real, validated
 
 MAX_POINTS = 1_000_000  # of an object; no picture shows more
 Length = real(1e-6, 1e6)  # [m]

@@ -10,10 +10,9 @@ from numpy.typing import ArrayLike
 
 from torchrl_quad.deploy import frames
 from torchrl_quad.dynamics.presets import as_array
-from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
 from torchrl_quad.identification.streams import LARGEST, Array, Signal, Stream
-from torchrl_quad.options import shown
 
 SIZES = {  # how many columns a quantity has; setpoints may have any number
     "position": 3,

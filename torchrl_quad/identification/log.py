@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from torchrl_quad.deploy.frames import Convention
-from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.identification.attitude import body_rates, continuous, from_euler, rotate, slope
 from torchrl_quad.identification.checks import (
     check_motors,
@@ -33,7 +33,7 @@ from torchrl_quad.identification.layouts import SIZES, Columns, Layout, gather
 from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
 from torchrl_quad.identification.sources import read_streams
 from torchrl_quad.identification.streams import LARGEST, Array, Signal, Stream, clean, covered, frozen, resample
-from torchrl_quad.options import NonNegative, checked, shown
+from torchrl_quad.options import NonNegative, checked
 
 _LONGEST = 3000  # letters of an error: it lists up to 60 columns of a file
 LEAST_STEP, MAX_STEPS = 1e-3, 1_000_000  # [s] of a log, and how many: 17 minutes at 1 kHz, half a gigabyte

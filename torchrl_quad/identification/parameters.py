@@ -12,9 +12,9 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
 from torchrl_quad.dynamics.parameters import RawParams
+from torchrl_quad.errors import shown
 from torchrl_quad.identification.errors import UnknownField
 from torchrl_quad.identification.windows import MAX_DELAY, Plant
-from torchrl_quad.options import shown
 
 #: What ``fields`` of :func:`~torchrl_quad.identification.identify` may name, and the unknowns that each stands for.
 FIELDS: dict[str, tuple[str, ...]] = {

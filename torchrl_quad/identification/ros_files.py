@@ -20,10 +20,9 @@ from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 
 from torchrl_quad.dynamics import presets
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.identification.errors import UnreadableLog
 from torchrl_quad.identification.streams import open_plain
-from torchrl_quad.options import shown
 
 MAX_CHUNK, MAX_RATIO = 256 * 10**6, 100  # [bytes] of what a chunk unpacks to; of all of them to the file
 MAX_FILE = 2 * 10**9  # [bytes] of what a file that is packed as a whole unpacks to

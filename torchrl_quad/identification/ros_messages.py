@@ -6,8 +6,8 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from torchrl_quad.errors import shown
 from torchrl_quad.identification.ros_files import Connection
-from torchrl_quad.options import shown
 
 MAX_DEFINITION = 100_000  # characters
 _NUMBERS = {

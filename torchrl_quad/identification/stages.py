@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.files import replacing
 from torchrl_quad.identification.fitting import Linear, Problem, State, bootstrap, covariance, minimise
 from torchrl_quad.identification.log import FlightLog
@@ -23,7 +23,6 @@ from torchrl_quad.identification.parameters import FIELDS, UNKNOWNS, Model, repo
 from torchrl_quad.identification.prediction import CONSTANT_VELOCITY, ERRORS, differences, predict
 from torchrl_quad.identification.result import IdentificationResult
 from torchrl_quad.identification.windows import Trajectory, Windows, stream_delay
-from torchrl_quad.options import shown
 
 MAX_BYTES = 10**7  # of a checkpoint, which has some numbers for each unknown
 HORIZONS = (0.1, 0.25, 0.5)

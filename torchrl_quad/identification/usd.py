@@ -17,9 +17,9 @@ from array import array
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from torchrl_quad.errors import shown
 from torchrl_quad.identification.errors import UnreadableLog
 from torchrl_quad.identification.streams import Array, Stream
-from torchrl_quad.options import shown
 
 MAX_COLUMNS, MAX_EVENTS = 100_000, 20 * 10**6  # columns of all kinds of events together
 

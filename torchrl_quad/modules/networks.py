@@ -17,10 +17,10 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_quad.data.unwrap import base_env, require_env
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead
 from torchrl_quad.modules.plain import CorrelatedActor, Critic, Network, TanhGaussianActor
-from torchrl_quad.options import AfterValidator, Below1, Entries, Field, Scale, Width, checked, shown
+from torchrl_quad.options import AfterValidator, Below1, Entries, Field, Scale, Width, checked
 
 OBSERVATION = ("observation",)
 MOST_WEIGHTS = 100_000_000  # of a network

@@ -15,11 +15,11 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import ValueEstimators, default_value_kwargs, dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, WrongState
+from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, WrongState, shown
 from torchrl_quad.objectives.action_gradients import MedianClip, act_again, action_gradient
 from torchrl_quad.objectives.calls import require_tensordict, takes_rollout
 from torchrl_quad.objectives.segments import discounts
-from torchrl_quad.options import Coefficient, Device, Entry, Fraction, Positive, Scale, checked, real, require, shown
+from torchrl_quad.options import Coefficient, Device, Entry, Fraction, Positive, Scale, checked, real, require
 
 MOST_WEIGHTS = 100_000_000  # of all copies of a critic; more fit into no memory that trains on a horizon
 

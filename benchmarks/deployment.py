@@ -11,7 +11,6 @@ checkpoints, the policies are untrained. Writes ``benchmarks/results/deployment.
 import argparse
 import ctypes
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -30,7 +29,6 @@ from torchrl_quad import ObservationNormalizer, differentiable_rollout, make_act
 from torchrl_quad.deploy import export_policy, load_bundle
 from torchrl_quad.envs import TASKS
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
 ENVS = 64
 
@@ -40,8 +38,8 @@ def build(source: str) -> tuple[EnvBase, TensorDictModuleBase]:
     if source in TASKS:
         env = make_env(source, num_envs=ENVS, seed=7)
         return env, (make_visual_actor if "depth" in env.observation_spec else make_actor)(env)
-    from training.building import build_env
-    from training.evaluation import load_policy
+    from torchrl_quad.training.building import build_env
+    from torchrl_quad.training.evaluation import load_policy
 
     cfg, actor, normalizer = load_policy(Path(source))
     if normalizer is not None:

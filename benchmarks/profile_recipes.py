@@ -21,7 +21,6 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from tqdm import tqdm
 
 RECIPES = Path(__file__).parents[1] / "recipes"
-sys.path.insert(0, str(RECIPES))
 
 PARTS = ("physics", "actor", "critic", "loss", "optimiser", "bookkeeping", "logging")
 
@@ -63,13 +62,12 @@ class Clocks:
 
 def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) -> dict[str, float | str]:
     """What each part of a recipe takes; changes the modules that it measures, and so wants a process of its own."""
-    from training import building, loop
-
     import torchrl_quad
     from torchrl_quad import objectives
     from torchrl_quad.data import rollout as rollouts
     from torchrl_quad.engine import node, stepper
     from torchrl_quad.envs import base
+    from torchrl_quad.training import building, loop
 
     clocks = Clocks()
     clocks.around(stepper.Stepper, "step", "physics")

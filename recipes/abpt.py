@@ -4,7 +4,9 @@ python recipes/abpt.py task=hovering seed=0
 """
 
 from omegaconf import DictConfig
-from training.building import (
+
+from torchrl_quad import ABPTLoss, VisitedStateBuffer, differentiable_rollout, make_qvalue, restart
+from torchrl_quad.training.building import (
     TargetUpdate,
     actor_parameters,
     iterations,
@@ -16,10 +18,8 @@ from training.building import (
     trust_region,
     update_normalizer,
 )
-from training.launch import recipe
-from training.loop import Run
-
-from torchrl_quad import ABPTLoss, VisitedStateBuffer, differentiable_rollout, make_qvalue, restart
+from torchrl_quad.training.launch import recipe
+from torchrl_quad.training.loop import Run
 
 
 @recipe("abpt")

@@ -4,7 +4,9 @@ python recipes/ahac.py task=hovering seed=0
 """
 
 from omegaconf import DictConfig
-from training.building import (
+
+from torchrl_quad import AHACLoss, differentiable_rollout, make_value, restart
+from torchrl_quad.training.building import (
     actor_parameters,
     advance,
     iterations,
@@ -15,11 +17,9 @@ from training.building import (
     trust_region,
     update_normalizer,
 )
-from training.launch import recipe
-from training.loop import Run
-from training.processes import mean_of_all
-
-from torchrl_quad import AHACLoss, differentiable_rollout, make_value, restart
+from torchrl_quad.training.launch import recipe
+from torchrl_quad.training.loop import Run
+from torchrl_quad.training.processes import mean_of_all
 
 
 @recipe("ahac")

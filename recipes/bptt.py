@@ -4,11 +4,18 @@ python recipes/bptt.py task=hovering seed=0
 """
 
 from omegaconf import DictConfig
-from training.building import actor_parameters, iterations, make_optimizer, set_up, trust_region, update_normalizer
-from training.launch import recipe
-from training.loop import Run
 
 from torchrl_quad import BPTTLoss, differentiable_rollout, restart
+from torchrl_quad.training.building import (
+    actor_parameters,
+    iterations,
+    make_optimizer,
+    set_up,
+    trust_region,
+    update_normalizer,
+)
+from torchrl_quad.training.launch import recipe
+from torchrl_quad.training.loop import Run
 
 
 @recipe("bptt")

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
-from training.building import build_env
-from training.drawing import draw_flight, publish_flight
-from training.evaluation import final_evaluation, load_policy, print_summary, title, write_summary
-from training.launch import recipe
+
+from torchrl_quad.training.building import build_env
+from torchrl_quad.training.drawing import draw_flight, publish_flight
+from torchrl_quad.training.evaluation import final_evaluation, load_policy, print_summary, title, write_summary
+from torchrl_quad.training.launch import recipe
 
 
 @recipe("evaluate")

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
-from training.building import build_env
-from training.checkpoints import read_checkpoint
-from training.evaluation import load_policy
-from training.launch import recipe
 
 from torchrl_quad.deploy import export_policy, load_bundle
 from torchrl_quad.deploy.contract import sha256
 from torchrl_quad.deploy.export import STARTS
+from torchrl_quad.training.building import build_env
+from torchrl_quad.training.checkpoints import read_checkpoint
+from torchrl_quad.training.evaluation import load_policy
+from torchrl_quad.training.launch import recipe
 
 
 @recipe("export")

@@ -4,12 +4,20 @@ python recipes/hybrid.py task=racing seed=0
 """
 
 from omegaconf import DictConfig
-from training.building import AdaptiveRate, iterations, make_optimizer, network, set_up, shuffled, update_normalizer
-from training.launch import recipe
-from training.loop import Run
-from training.processes import mean_of_all
 
 from torchrl_quad import HybridLoss, differentiable_rollout, make_value, restart
+from torchrl_quad.training.building import (
+    AdaptiveRate,
+    iterations,
+    make_optimizer,
+    network,
+    set_up,
+    shuffled,
+    update_normalizer,
+)
+from torchrl_quad.training.launch import recipe
+from torchrl_quad.training.loop import Run
+from torchrl_quad.training.processes import mean_of_all
 
 
 @recipe("hybrid")

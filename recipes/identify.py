@@ -5,10 +5,10 @@ python recipes/identify.py 'logs=[flight1.csv, flight2.csv]' drone=crazyflie mas
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from training.launch import recipe
 
 from torchrl_quad.files import make_folder
 from torchrl_quad.identification import identify, read_log
+from torchrl_quad.training.launch import recipe
 
 
 @recipe("identify")

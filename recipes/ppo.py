@@ -8,12 +8,12 @@ from omegaconf import DictConfig
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
-from training.building import iterations, make_optimizer, network, set_up, shuffled, update_normalizer
-from training.launch import recipe
-from training.loop import Run
-from training.processes import mean_of_all
 
 from torchrl_quad import differentiable_rollout, make_value, restart
+from torchrl_quad.training.building import iterations, make_optimizer, network, set_up, shuffled, update_normalizer
+from torchrl_quad.training.launch import recipe
+from torchrl_quad.training.loop import Run
+from torchrl_quad.training.processes import mean_of_all
 
 
 @recipe("ppo")

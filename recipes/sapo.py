@@ -4,7 +4,9 @@ python recipes/sapo.py task=hovering seed=0
 """
 
 from omegaconf import DictConfig
-from training.building import (
+
+from torchrl_quad import SAPOLoss, differentiable_rollout, make_value, restart
+from torchrl_quad.training.building import (
     actor_parameters,
     iterations,
     make_optimizer,
@@ -14,10 +16,8 @@ from training.building import (
     trust_region,
     update_normalizer,
 )
-from training.launch import recipe
-from training.loop import Run
-
-from torchrl_quad import SAPOLoss, differentiable_rollout, make_value, restart
+from torchrl_quad.training.launch import recipe
+from torchrl_quad.training.loop import Run
 
 
 @recipe("sapo")

@@ -4,7 +4,9 @@ python recipes/shac.py task=hovering seed=0
 """
 
 from omegaconf import DictConfig
-from training.building import (
+
+from torchrl_quad import SHACLoss, differentiable_rollout, make_value, restart
+from torchrl_quad.training.building import (
     TargetUpdate,
     actor_parameters,
     iterations,
@@ -15,10 +17,8 @@ from training.building import (
     trust_region,
     update_normalizer,
 )
-from training.launch import recipe
-from training.loop import Run
-
-from torchrl_quad import SHACLoss, differentiable_rollout, make_value, restart
+from torchrl_quad.training.launch import recipe
+from torchrl_quad.training.loop import Run
 
 
 @recipe("shac")

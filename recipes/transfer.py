@@ -59,7 +59,7 @@ def main() -> None:
     loops = [cfg["loop"]] if cfg["loop"] else simulator_class(cfg["simulator"]).loops
     if cfg["pictures"]:
         try:
-            from training.drawing import draw_transfer
+            from torchrl_quad.training.drawing import draw_transfer
         except ImportError as error:
             what = 'pictures=true needs torch and the extra render: pip install ".[render]"'
             raise MissingPackage(f"{what} ({error})") from error

@@ -16,7 +16,6 @@ from torchrl_quad.envs.scenery import Scenery  # noqa: E402
 from torchrl_quad.envs.shapes import Shape  # noqa: E402
 
 RECIPES = Path(__file__).parent.parent / "recipes"
-sys.path.insert(0, str(RECIPES))
 
 
 @pytest.fixture(autouse=True)
@@ -105,7 +104,7 @@ def refused(launch, capsys):
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Runs in this process draw nothing, which is most of what a small one does."""
-    from training import drawing
+    from torchrl_quad.training import drawing
 
     monkeypatch.setattr(drawing, "draw_flight", lambda *args: None)
     monkeypatch.setattr(drawing, "publish_flight", lambda *args: None)
@@ -116,7 +115,8 @@ def no_pictures(monkeypatch):
 def train(launch, no_pictures):
     """A small run without pictures; its checkpoint."""
     from small_runs import SMALL
-    from training.checkpoints import read_checkpoint
+
+    from torchrl_quad.training.checkpoints import read_checkpoint
 
     def train(recipe, folder, *overrides):
         launch(recipe, *SMALL, f"hydra.run.dir={folder}", *overrides)

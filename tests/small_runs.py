@@ -48,7 +48,7 @@ def assert_equal(a, b, path=""):
 
 def stop_at_save(monkeypatch, number, error=KeyboardInterrupt):
     """Let a run end with an error when it is about to write its n-th checkpoint."""
-    from training.loop import Run
+    from torchrl_quad.training.loop import Run
 
     save, saves = Run._save, []
 

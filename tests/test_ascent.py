@@ -1,20 +1,12 @@
 """Gradients are compared with what the simulator measures: of every method, and of the hybrid in phases of training."""
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 from test_reproduce import run_main
 
+from benchmarks.paper import ascent, phases, running
 from torchrl_quad import BPTTLoss, HybridLoss, differentiable_rollout, make_actor, make_env, make_value
 from torchrl_quad.files import read_rows
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "recipes/trial"))
-
-import ascent
-import phases
-import running
 
 
 def test_the_gradients_of_every_method_are_compared_with_the_simulator(

@@ -5,7 +5,9 @@ import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
-from training.building import (
+
+from torchrl_quad import ABPTLoss, BPTTLoss, HoveringEnv, SHACLoss, make_actor, make_qvalue, make_value
+from torchrl_quad.training.building import (
     AdaptiveRate,
     TargetUpdate,
     actor_parameters,
@@ -14,9 +16,7 @@ from training.building import (
     minibatches,
     shuffled,
 )
-from training.processes import backward
-
-from torchrl_quad import ABPTLoss, BPTTLoss, HoveringEnv, SHACLoss, make_actor, make_qvalue, make_value
+from torchrl_quad.training.processes import backward
 
 
 def adam(lr):

@@ -10,9 +10,10 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 from small_runs import SMALL, poison, rows, stop_at_save
-from training import checkpoints, evaluation
-from training.building import average_policy
-from training.checkpoints import previous, read_checkpoint, write_checkpoint
+
+from torchrl_quad.training import checkpoints, evaluation
+from torchrl_quad.training.building import average_policy
+from torchrl_quad.training.checkpoints import previous, read_checkpoint, write_checkpoint
 
 
 @pytest.fixture(scope="module")

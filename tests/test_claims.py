@@ -1,32 +1,31 @@
 """The paper's claims, and the page that is made of the results."""
 
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from test_reproduce import curve, run_main
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "recipes/trial"))
-
-import ablations
-import claims
-import elsewhere
-import matrix
-import phases
-import rates
-import results
-import running
-import shipped
-from claims import Claim, try_claim
-from comparison import interval, is_level
-from evidence import Part, Results, Starts, bootstrap, gap, judged, mean, probability, roughness, shares
-
+from benchmarks.paper import ablations, claims, elsewhere, matrix, phases, rates, results, running, shipped
+from benchmarks.paper.claims import Claim, try_claim
+from benchmarks.paper.comparison import interval, is_level
+from benchmarks.paper.evidence import (
+    Part,
+    Results,
+    Starts,
+    bootstrap,
+    gap,
+    judged,
+    mean,
+    probability,
+    roughness,
+    shares,
+)
 from torchrl_quad.files import read_rows, write_rows
 
 PROJECT = Path(__file__).parents[1]
-RENEW = "the page differs from the data: python recipes/trial/results.py"
+RENEW = "the page differs from the data: python -m benchmarks.paper.results"
 
 
 def data(folder, task="hovering", seeds=matrix.SEEDS, **ends):
@@ -235,15 +234,17 @@ def test_the_page_of_the_project_shows_what_its_data_hold():
     shown = readme + (PROJECT / "docs/choosing.md").read_text()
     for name, block in shipped.blocks(running.DATA).items():
         assert f"{results.MARKER.format(name)}\n\n{block}\n\n{results.END}" in shown, (
-            "run: python recipes/trial/shipped.py"
+            "run: python -m benchmarks.paper.shipped"
         )
     options = (PROJECT / "docs/ablations.md").read_text()
-    assert ablations.summary(running.DATA) in options, "run: python recipes/trial/ablations.py --tasks landing"
-    assert rates.summary(running.DATA) in options, "recipes/trial/rates.py fills it"
+    assert ablations.summary(running.DATA) in options, "run: python -m benchmarks.paper.ablations --tasks landing"
+    assert rates.summary(running.DATA) in options, "benchmarks/paper/rates.py fills it"
     far = (PROJECT / "docs/elsewhere.md").read_text()
-    assert all(block in far for block in elsewhere.blocks(running.DATA).values()), "recipes/trial/elsewhere.py fills it"
+    assert all(block in far for block in elsewhere.blocks(running.DATA).values()), (
+        "benchmarks/paper/elsewhere.py fills it"
+    )
     assert phases.block(running.DATA) in (PROJECT / "docs/more_losses.md").read_text(), (
-        "recipes/trial/phases.py fills it"
+        "benchmarks/paper/phases.py fills it"
     )
     assert page.count("<!-- generated") == page.count(results.END)
 

@@ -15,7 +15,8 @@ from packaging.requirements import Requirement
 from test_docs import PAGES, code, files, importable, name_of  # noqa: F401, a fixture
 from test_examples import EXAMPLES
 from test_recipes import RECIPES, ROOT, SMALL, run
-from training.schema import check
+
+from torchrl_quad.training.schema import check
 
 AFTER_TRAINING = ("evaluate", "export")  # recipes that read a checkpoint
 SMOKE = {  # the test that runs a program on a reduced budget
@@ -29,19 +30,19 @@ SMOKE = {  # the test that runs a program on a reduced budget
     "recipes/transfer.py": "test_transfer: "
     "test_the_recipe_flies_without_torch_keeps_a_table_and_finds_mistakes_of_a_port",
     "recipes/workspace.py": "test_wandb_page: test_the_workspace_is_built_and_shows_what_runs_log",
-    "recipes/trial/ablations.py": "test_reproduce: test_options_are_changed_one_at_a_time_and_shown_beside_what_ships",
-    "recipes/trial/ascent.py": "test_ascent: test_the_gradients_of_every_method_are_compared_with_the_simulator",
-    "recipes/trial/elsewhere.py": "test_elsewhere: "
+    "benchmarks/paper/ablations.py": "test_reproduce: test_options_are_changed_one_at_a_time_and_shown_beside_what_ships",
+    "benchmarks/paper/ascent.py": "test_ascent: test_the_gradients_of_every_method_are_compared_with_the_simulator",
+    "benchmarks/paper/elsewhere.py": "test_elsewhere: "
     "test_a_loss_trains_on_an_environment_that_is_not_ours_once_and_has_a_row_in_the_table",
-    "recipes/trial/forest.py": "test_reproduce: "
+    "benchmarks/paper/forest.py": "test_reproduce: "
     "test_policies_of_the_forest_are_flown_at_the_speeds_and_densities_and_not_twice",
-    "recipes/trial/phases.py": "test_ascent: test_the_phases_of_the_hybrid_are_flown_and_measured_once",
-    "recipes/trial/rates.py": "test_reproduce: test_half_and_twice_a_rate_fly_once_and_are_judged_by_their_worst_seed",
-    "recipes/trial/reproduce.py": "test_reproduce: test_a_shrunken_matrix_runs_and_goes_on_where_it_was_stopped",
-    "recipes/trial/results.py": "test_claims: test_the_page_is_made_of_the_results_and_what_is_written_by_hand_stays",
-    "recipes/trial/shipped.py": "test_reproduce: "
+    "benchmarks/paper/phases.py": "test_ascent: test_the_phases_of_the_hybrid_are_flown_and_measured_once",
+    "benchmarks/paper/rates.py": "test_reproduce: test_half_and_twice_a_rate_fly_once_and_are_judged_by_their_worst_seed",
+    "benchmarks/paper/reproduce.py": "test_reproduce: test_a_shrunken_matrix_runs_and_goes_on_where_it_was_stopped",
+    "benchmarks/paper/results.py": "test_claims: test_the_page_is_made_of_the_results_and_what_is_written_by_hand_stays",
+    "benchmarks/paper/shipped.py": "test_reproduce: "
     "test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again",
-    "recipes/trial/starts.py": "test_reproduce: test_a_policy_is_flown_from_every_set_of_starts_once",
+    "benchmarks/paper/starts.py": "test_reproduce: test_a_policy_is_flown_from_every_set_of_starts_once",
     **dict.fromkeys(
         (
             f"benchmarks/{name}.py"
@@ -102,7 +103,7 @@ def understands(words, monkeypatch):
     script, *arguments = words
     is_run(script)
     arguments = [re.sub(r"\b(mypackage|shuttle)\.\w+", "own_task.CornerEnv", x) for x in arguments]
-    monkeypatch.syspath_prepend(ROOT / "recipes/trial")
+    monkeypatch.syspath_prepend(ROOT / "benchmarks/paper")
     monkeypatch.syspath_prepend((ROOT / script).parent)  # as python does
     if script == "recipes/transfer.py":
         runpy.run_path(str(ROOT / script))["settings"](arguments)

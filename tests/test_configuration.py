@@ -6,12 +6,12 @@ import pytest
 import yaml
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from training.processes import joined
-from training.schema import IDLE, check, schema_of, settings
 
 from torchrl_quad import load_drone
 from torchrl_quad.dynamics import presets
 from torchrl_quad.envs import TASKS
+from torchrl_quad.training.processes import joined
+from torchrl_quad.training.schema import IDLE, check, schema_of, settings
 
 CONFIG = Path(__file__).parent.parent / "recipes/config"
 TUNED = sorted((CONFIG / "tuned").glob("*.yaml"))

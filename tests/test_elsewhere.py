@@ -10,7 +10,7 @@ import torch
 from torchrl_quad import differentiable_rollout, make_actor
 from torchrl_quad.files import read_rows
 
-SCRIPT = Path(__file__).parent.parent / "recipes/trial/elsewhere.py"
+SCRIPT = Path(__file__).parent.parent / "benchmarks/paper/elsewhere.py"
 RANGE = {"pendulum": (-4 * 16.3, 0.0), "balance": (-20.0, 20.0)}  # returns that four steps can have
 
 

@@ -15,10 +15,10 @@ from types import SimpleNamespace
 
 import pytest
 from small_runs import SMALL, stop_at_save
-from training.checkpoints import read_checkpoint
-from training.folders import own_folder
 
 from torchrl_quad import BPTTLoss
+from torchrl_quad.training.checkpoints import read_checkpoint
+from torchrl_quad.training.folders import own_folder
 
 ROOT = Path(__file__).parent.parent
 

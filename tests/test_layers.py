@@ -28,6 +28,7 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "files": set(),
     "diagnostics": {"data", "objectives"},
     "gym": {"envs"},
+    "training": {"data", "deploy", "diagnostics", "dynamics", "envs", "files", "modules", "objectives", "render"},
     "adapters": {"gym"},
     "identification": {"deploy.frames", "dynamics", "files", "render.canvas"},
 }
@@ -51,6 +52,8 @@ LIBRARIES = {
     "files": {"filelock"},
     "diagnostics": TORCHRL,
     "gym": {"gymnasium", "numpy", "torch"},
+    "training": TORCHRL
+    | {"hydra", "joblib", "omegaconf", "pydantic", "tensorboard", "tqdm", "wandb", "yaml", "filelock", "numpy"},
     "adapters": TORCHRL | {"gymnasium", "numpy", "rsl_rl", "skrl", "stable_baselines3"},
     "identification": {"torch", "numpy", "yaml", "pydantic", "rosbags", "lz4", "backports", "compression"},
 }

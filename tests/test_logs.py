@@ -9,8 +9,9 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 from small_runs import EVERYTHING, SMALL, assert_equal, poison, rows, stop_at_save
-from training import loop
-from training.checkpoints import read_checkpoint, revision
+
+from torchrl_quad.training import loop
+from torchrl_quad.training.checkpoints import read_checkpoint, revision
 
 
 def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(launch, tmp_path):

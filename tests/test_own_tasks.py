@@ -14,12 +14,12 @@ from own_task import CornerEnv
 from small_runs import SMALL, rows
 from test_configuration import composed
 from test_docs import ROOT, files, importable  # noqa: F401, a fixture
-from training.checkpoints import read_checkpoint
-from training.own import defaults, offer_tasks
-from training.schema import check
 
 from torchrl_quad import HoveringEnv, QuadrotorEnv, available_tasks, make_env, register_task
 from torchrl_quad.envs import TASKS, registry
+from torchrl_quad.training.checkpoints import read_checkpoint
+from torchrl_quad.training.own import defaults, offer_tasks
+from torchrl_quad.training.schema import check
 
 
 @pytest.fixture(autouse=True)

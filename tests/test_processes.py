@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 import torch
 from small_runs import EVERYTHING, SMALL, assert_equal
-from training.checkpoints import read_checkpoint
-from training.processes import backward
+
+from torchrl_quad.training.checkpoints import read_checkpoint
+from torchrl_quad.training.processes import backward
 
 ROOT = Path(__file__).parent.parent
 
@@ -22,7 +23,6 @@ ROOT = Path(__file__).parent.parent
 def join(rank, port):
     """Be one of two processes, as torchrun tells them."""
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": "2", "MASTER_ADDR": "localhost", "MASTER_PORT": port}
-    sys.path.insert(0, str(ROOT / "recipes"))
     torch.set_num_threads(1)
 
 
@@ -41,7 +41,7 @@ def free_port():
 
 def draw_nothing():
     """As conftest's ``no_pictures``, in a process that has no fixtures."""
-    from training import drawing
+    from torchrl_quad.training import drawing
 
     drawing.draw_flight = drawing.publish_flight = lambda *args: None
     drawing.draw_learning_curve = lambda metrics, path, env: path.touch()

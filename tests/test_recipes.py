@@ -12,13 +12,13 @@ import torch
 from omegaconf import OmegaConf
 from small_runs import SMALL as SMALL_RUN
 from tensordict import TensorDict
-from training.building import build_env, make_optimizer
-from training.checkpoints import read_checkpoint
-from training.evaluation import drawing_from, evaluate
 
 from torchrl_quad import LandingEnv, make_actor, restart
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.scenery import EPISODE_METRICS
+from torchrl_quad.training.building import build_env, make_optimizer
+from torchrl_quad.training.checkpoints import read_checkpoint
+from torchrl_quad.training.evaluation import drawing_from, evaluate
 
 ROOT = Path(__file__).parent.parent
 SMALL = [*SMALL_RUN, "total_steps=96"]

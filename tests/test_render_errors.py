@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import imageio_ffmpeg
 import pytest
 from small_runs import SMALL
-from training import drawing
 
 from torchrl_quad import HoveringEnv
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, write_replay
 from torchrl_quad.render.frames import NoFfmpeg
+from torchrl_quad.training import drawing
 
 FILES = {animate_flight: "flight.gif"}
 

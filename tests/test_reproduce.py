@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,22 +15,21 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from scipy.stats import mannwhitneyu
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "recipes/trial"))
-
-import ablations
-import claims
-import comparison
-import forest
-import matrix
-import rates
-import reproduce
-import running
-import shipped
-import starts
-import tables
-from evidence import Starts
-from matrix import Job
-
+from benchmarks.paper import (
+    ablations,
+    claims,
+    comparison,
+    forest,
+    matrix,
+    rates,
+    reproduce,
+    running,
+    shipped,
+    starts,
+    tables,
+)
+from benchmarks.paper.evidence import Starts
+from benchmarks.paper.matrix import Job
 from torchrl_quad.files import read_rows, write_rows
 
 
@@ -124,8 +122,7 @@ def test_a_signal_ends_the_runs_and_starts_no_others(number, tmp_path):
     program = f"""
 import sys
 from pathlib import Path
-sys.path.insert(0, {str(running.RECIPES / "trial")!r})
-from running import run, side_by_side
+from benchmarks.paper.running import run, side_by_side
 folder = Path({str(tmp_path)!r})
 side_by_side(1, [(run, [sys.executable, "-c", {sleeper!r}], folder / str(i)) for i in range(3)])
 """

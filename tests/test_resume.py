@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 from small_runs import EVERYTHING, SMALL, assert_equal, rows, stop_at_save
-from training import loop
-from training.checkpoints import read_checkpoint
+
+from torchrl_quad.training import loop
+from torchrl_quad.training.checkpoints import read_checkpoint
 
 ROOT = Path(__file__).parent.parent
 
@@ -67,8 +68,7 @@ def test_equal_runs_have_equal_checkpoints_which_hold_no_memory_that_was_never_w
 
 KILLED = """
 import os, runpy, signal, sys
-sys.path.insert(0, "recipes")
-from training.loop import Run
+from torchrl_quad.training.loop import Run
 
 def save(self, path, save=Run._save, saves=[]):
     saves.append(path)

@@ -274,7 +274,7 @@ def test_the_recipe_flies_without_torch_keeps_a_table_and_finds_mistakes_of_a_po
 
 
 def test_the_recipe_films_a_flight_beside_ours(hovering, tmp_path, launch, monkeypatch):
-    from training import drawing
+    from torchrl_quad.training import drawing
 
     films = []
     monkeypatch.setattr(drawing, "animate_flight", lambda *args, **options: films.append((args, options)))

@@ -7,7 +7,8 @@ import pytest
 import yaml
 from conftest import RECIPES
 from omegaconf import OmegaConf
-from training.arguments import hydra_argument
+
+from torchrl_quad.training.arguments import hydra_argument
 
 
 @pytest.mark.parametrize("style", ["args", "args_no_hyphens"])

@@ -1,6 +1,6 @@
 """Train the hybrid on racing, and measure in phases of its training which of its two gradients points uphill.
 
-python recipes/trial/phases.py --tasks racing racing_position --seeds 100
+python -m benchmarks.paper.phases --tasks racing racing_position --seeds 100
 
 In states that the policy of a phase visits, the gradient of the return in the mean of the next action is measured: the
 action is changed a little up and down, together with what it carries into later noise, and the policy flies on, gates
@@ -8,7 +8,7 @@ and crashes included. That gradient, the pathwise one, that of the score functio
 become gradients in the policy's weights over all these states. The result is the cosine of each with the measured one.
 Two halves of the measurement are compared in the same way: their cosine shows its noise.
 
-It may be stopped at any moment. Started again, it skips what is in docs/results/data/phases.csv, and resumes what was
+It may be stopped at any moment. Started again, it skips what is in benchmarks/paper/data/phases.csv, and resumes what was
 cut off. It fills in the table of docs/more_losses.md.
 """
 
@@ -22,23 +22,23 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from ascent import SEED, return_of, visited
-from comparison import LABELS, column
 from omegaconf import OmegaConf
-from results import fill
-from running import QUICK, RECIPES, arguments, command_line, page, run, side_by_side
-from shipped import overrides
-from tables import table
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import cosine_similarity
 from torchrl.envs import EnvBase
-from training.building import build_env, make_policy, network
-from training.checkpoints import read_checkpoint
 
+from benchmarks.paper.ascent import SEED, return_of, visited
+from benchmarks.paper.comparison import LABELS, column
+from benchmarks.paper.results import fill
+from benchmarks.paper.running import QUICK, RECIPES, arguments, command_line, page, run, side_by_side
+from benchmarks.paper.shipped import overrides
+from benchmarks.paper.tables import table
 from torchrl_quad import HybridLoss, differentiable_rollout, make_value
 from torchrl_quad.files import add_rows, read_rows, replacing
 from torchrl_quad.objectives.action_gradients import distribution_again
+from torchrl_quad.training.building import build_env, make_policy, network
+from torchrl_quad.training.checkpoints import read_checkpoint
 
 SHARES = (0.05, 0.125, 0.25, 0.5, 0.75, 1.0)  # of the steps of a run
 GRADIENTS = {"pathwise": "pathwise", "score": "score function", "hybrid": "hybrid", "halves": "two halves"}

@@ -21,8 +21,8 @@ from torchrl_quad.dynamics import presets
 from torchrl_quad.envs import available_tasks
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import replacing
-from training.own import CONFIG
-from training.schema import check
+from torchrl_quad.training.own import CONFIG
+from torchrl_quad.training.schema import check
 
 FORMAT = 4  # of the content; raise it when older files can no longer be read
 MARK = b"\ntorchrl_quad checkpoint, sha256 "  # then 64 digits: the checksum of all bytes before the mark

@@ -16,9 +16,8 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-RECIPES = Path(__file__).parents[1]
-sys.path += [str(RECIPES), os.getcwd()]  # the recipes' code, and tasks of your own
-DATA = RECIPES.parent / "docs/results/data"
+RECIPES = Path(__file__).parents[2] / "recipes"
+DATA = RECIPES.parent / "benchmarks/paper/data"
 QUICK = [
     *("num_envs=4", "horizon=4", "total_steps=64", "env.max_episode_steps=20", "compile=false"),
     *("eval.interval=1", "eval.episodes=null"),

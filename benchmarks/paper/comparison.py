@@ -12,12 +12,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from evidence import Starts, bootstrap, judged, probability
 from numpy.typing import ArrayLike, NDArray
-from results import COLORS
 from scipy.stats import trim_mean
-from tables import table
 
+from benchmarks.paper.evidence import Starts, bootstrap, judged, probability
+from benchmarks.paper.results import COLORS
+from benchmarks.paper.tables import table
 from torchrl_quad.files import replacing
 
 Row = Mapping[str, str]

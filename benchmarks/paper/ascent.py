@@ -1,7 +1,7 @@
 """Compare first-order gradients, and their parts, with the gradient of the return that the simulator gives.
 
-python recipes/trial/ascent.py outputs/reproduce/*/{abpt,shac,bptt}/seed*/checkpoint.pt \\
-    --output docs/results/data/ascent.csv
+python -m benchmarks.paper.ascent outputs/reproduce/*/{abpt,shac,bptt}/seed*/checkpoint.pt \\
+    --output benchmarks/paper/data/ascent.csv
 
 In states that the policy of a checkpoint visits, the true gradient of the return in the next action is measured: each
 component of the action is changed a little up and down, and the policy flies on with the same noise, gates and crashes
@@ -16,24 +16,23 @@ import argparse
 import math
 from pathlib import Path
 
-import running  # noqa: F401  makes the recipes' code known
 import torch
-from matrix import VARIANTS
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import cosine_similarity
 from torchrl.envs import EnvBase
 from tqdm import tqdm
-from training.building import build_env, make_policy, network
-from training.checkpoints import read_checkpoint
 
+from benchmarks.paper.matrix import VARIANTS
 from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss, differentiable_rollout, make_qvalue, make_value
 from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.files import add_rows, read_rows
 from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.objectives.action_gradients import action_gradient
 from torchrl_quad.objectives.segments import discounts
+from torchrl_quad.training.building import build_env, make_policy, network
+from torchrl_quad.training.checkpoints import read_checkpoint
 
 CRITICS = {"abpt": (ABPTLoss, make_qvalue), "shac": (SHACLoss, make_value)}
 SEED = 3_000_000

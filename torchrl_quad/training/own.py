@@ -16,7 +16,7 @@ from torchrl_quad import QuadrotorEnv, available_tasks
 from torchrl_quad.envs import task_class
 from torchrl_quad.errors import UserValueError
 
-CONFIG = Path(__file__).parents[1] / "config"
+CONFIG = Path(__file__).parents[2] / "recipes/config"
 SET_BY_RECIPES = ("num_envs", "device", "seed", "compile")  # settings outside ``env``
 OWN: dict[str, tuple[str, Mapping[str, Any]]] = {}  # recipes of your own: the configuration each is made from, and more
 PLAIN = (bool, int, float, str, NoneType)

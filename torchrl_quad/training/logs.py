@@ -15,7 +15,7 @@ from torchrl.record.loggers import get_logger
 
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import write_rows
-from training.evaluation import as_json
+from torchrl_quad.training.evaluation import as_json
 
 ARTIFACT = ("checkpoint.pt", "config.yaml", "policy")  # of a run's folder, where they are there; and summary.json
 NOT_IN_A_NAME = ("task=", "seed=", "resume=", "device=", "threads=", "logger.")

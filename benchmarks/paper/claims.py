@@ -21,10 +21,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from evidence import NotRunError, Part, Results, beats, bootstrap, deviation, gap, mean, roughness
-from matrix import EXPERIMENTS, SEEDS, TASKS
-from matrix import METHODS as METHOD_VARIANTS
 
+from benchmarks.paper.evidence import NotRunError, Part, Results, beats, bootstrap, deviation, gap, mean, roughness
+from benchmarks.paper.matrix import EXPERIMENTS, SEEDS, TASKS
+from benchmarks.paper.matrix import METHODS as METHOD_VARIANTS
 from torchrl_quad.files import read_rows
 
 METHODS = tuple(METHOD_VARIANTS)

@@ -28,14 +28,13 @@ import torchrl_quad
 from torchrl_quad.dynamics import presets
 from torchrl_quad.envs import available_tasks, task_class
 from torchrl_quad.errors import UserError, UserValueError
-from training.arguments import hydra_argument
-from training.checkpoints import take_over
-from training.folders import own_folder
-from training.own import OWN, offer_tasks, own_recipe
-from training.processes import from_the_first, joined, rank
-from training.schema import check
+from torchrl_quad.training.arguments import hydra_argument
+from torchrl_quad.training.checkpoints import take_over
+from torchrl_quad.training.folders import own_folder
+from torchrl_quad.training.own import CONFIG, OWN, offer_tasks, own_recipe
+from torchrl_quad.training.processes import from_the_first, joined, rank
+from torchrl_quad.training.schema import check
 
-RECIPES = Path(__file__).parents[1]
 MAX_DEPTH = 20  # of lists and mappings within each other, as in a YAML file
 FOLDER_SETTINGS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
 NO_MEMORY = "the memory is full. Lower num_envs, horizon, batch_size, or the size of the networks."
@@ -79,7 +78,7 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
     flies = []  # once main has been called
 
     def decorate(main: Callable[[DictConfig], None]) -> Callable[[], None]:
-        @hydra.main(config_path=str(RECIPES / "config"), config_name=name, version_base=None)
+        @hydra.main(config_path=str(CONFIG), config_name=name, version_base=None)
         @functools.wraps(main)
         def job(cfg: DictConfig) -> None:
             torchrl_quad.envs.TASKS.update(registered)  # of this process, whatever has been copied into it
@@ -111,7 +110,7 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
             registered.update(torchrl_quad.envs.TASKS)
             try:
                 with _explained():
-                    for path in sorted((RECIPES / "config").rglob("*.yaml")):
+                    for path in sorted(CONFIG.rglob("*.yaml")):
                         presets.parse(path.read_bytes(), str(path))
                     sys.argv[1:] = offer_tasks(sys.argv[1:])
                     for argument in sys.argv[1:]:

@@ -1,11 +1,11 @@
 """Fly policies from many sets of starts, to see how much of a mean over 256 starts is due to the starts.
 
-python recipes/trial/starts.py --cores 2
-python recipes/trial/starts.py --tasks landing --methods abpt --seeds 0 1
+python -m benchmarks.paper.starts --cores 2
+python -m benchmarks.paper.starts --tasks landing --methods abpt --seeds 0 1
 
 A policy is judged on one set of 256 starts, the same for all. Other starts would give another mean, which no interval
 over seeds can tell. This trains as shipped.py does, and flies each policy from SETS sets, of which the first is the one
-that policies are judged on. comparison.py widens its intervals by what docs/results/data/starts.csv holds. It may be
+that policies are judged on. comparison.py widens its intervals by what benchmarks/paper/data/starts.csv holds. It may be
 stopped at any moment. Started again, it skips what is there.
 """
 
@@ -15,12 +15,12 @@ import datetime
 from pathlib import Path
 
 import torch
-from running import arguments, command_line, side_by_side
-from shipped import METHODS, TASKS, train
-from training.building import build_env
-from training.evaluation import drawing_from, evaluate, load_policy
 
+from benchmarks.paper.running import arguments, command_line, side_by_side
+from benchmarks.paper.shipped import METHODS, TASKS, train
 from torchrl_quad.files import add_rows, machine, read_rows
+from torchrl_quad.training.building import build_env
+from torchrl_quad.training.evaluation import drawing_from, evaluate, load_policy
 
 SETS, STARTS, FIRST = 16, 256, 2_000_000  # sets, starts in each, and the seed of the first, that of evaluate.py
 MEASURED = ("return", "solved", "gates_passed")

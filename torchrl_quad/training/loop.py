@@ -31,10 +31,10 @@ from torchrl_quad import (
 from torchrl_quad.errors import Diverged, UserValueError
 from torchrl_quad.files import replacing
 from torchrl_quad.objectives import PathwiseLoss
-from training import drawing
-from training.building import average_policy, iterations, own_seed
-from training.checkpoints import fits, read_checkpoint, revision, write_checkpoint
-from training.evaluation import (
+from torchrl_quad.training import drawing
+from torchrl_quad.training.building import average_policy, iterations, own_seed
+from torchrl_quad.training.checkpoints import fits, read_checkpoint, revision, write_checkpoint
+from torchrl_quad.training.evaluation import (
     best_policy,
     drawing_from,
     evaluate,
@@ -44,8 +44,8 @@ from training.evaluation import (
     title,
     write_summary,
 )
-from training.logs import Logs
-from training.processes import backward, gather, rank, wait_for_all, world_size
+from torchrl_quad.training.logs import Logs
+from torchrl_quad.training.processes import backward, gather, rank, wait_for_all, world_size
 
 CELL = 0.5  # [m]: train/start_cells counts the cubes of this size in which horizons have started
 

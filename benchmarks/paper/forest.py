@@ -1,9 +1,9 @@
 """Train policies that see in the middle forest, and fly them through fresh ones, at all speeds and densities.
 
-python recipes/trial/forest.py --cores 2
-python recipes/trial/forest.py --policies bptt blind --seeds 0 --speeds 4 6 --difficulties middle
+python -m benchmarks.paper.forest --cores 2
+python -m benchmarks.paper.forest --policies bptt blind --seeds 0 --speeds 4 6 --difficulties middle
 
-It may be stopped at any moment. Started again, it skips what is in docs/results/data/forest.csv, and resumes what was
+It may be stopped at any moment. Started again, it skips what is in benchmarks/paper/data/forest.csv, and resumes what was
 cut off. docs/seeing.md shows the table and the picture.
 """
 
@@ -15,17 +15,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from results import fill
-from running import QUICK, RECIPES, arguments, command_line, page, run, ships, side_by_side
-from tables import table
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
-from training.building import build_env
-from training.evaluation import load_policy
 
+from benchmarks.paper.results import fill
+from benchmarks.paper.running import QUICK, RECIPES, arguments, command_line, page, run, ships, side_by_side
+from benchmarks.paper.tables import table
 from torchrl_quad import differentiable_rollout
 from torchrl_quad.files import add_rows, machine, read_rows, replacing
+from torchrl_quad.training.building import build_env
+from torchrl_quad.training.evaluation import load_policy
 
 HALF = "total_steps=2_048_000"  # of what BPTT ships with
 POLICIES = {  # recipe, and what differs from what it ships with

@@ -1,7 +1,7 @@
 """Run what is missing of the matrix that puts the paper on trial, side by side, and keep the results as CSV files.
 
-python recipes/trial/reproduce.py --cores 2
-python recipes/trial/reproduce.py --collect --output FOLDER   # add runs that were flown elsewhere; fly nothing
+python -m benchmarks.paper.reproduce --cores 2
+python -m benchmarks.paper.reproduce --collect --output FOLDER   # add runs that were flown elsewhere; fly nothing
 
 It may be stopped at any moment. Started again, it skips what is in the results, and resumes what was cut off. matrix.py
 lists the runs; results.py makes figures, tables and verdicts of them.
@@ -17,12 +17,23 @@ import sys
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
-from audits import audit_tasks
-from matrix import DYNAMICS, EVALUATIONS, EXPERIMENTS, LEARNING_RATES, SEEDS, TASKS, VARIANTS, Job, jobs, search_jobs
 from omegaconf import DictConfig
-from running import QUICK, RECIPES, arguments, command_line, composed, end_runs_with_this, run
 from tqdm import tqdm
 
+from benchmarks.paper.audits import audit_tasks
+from benchmarks.paper.matrix import (
+    DYNAMICS,
+    EVALUATIONS,
+    EXPERIMENTS,
+    LEARNING_RATES,
+    SEEDS,
+    TASKS,
+    VARIANTS,
+    Job,
+    jobs,
+    search_jobs,
+)
+from benchmarks.paper.running import QUICK, RECIPES, arguments, command_line, composed, end_runs_with_this, run
 from torchrl_quad.envs import task_class
 from torchrl_quad.files import add_rows, machine, read_rows, write_rows
 
@@ -51,7 +62,7 @@ def known_task(name: str) -> str:
 
 def configuration(job: Job, lr: float) -> DictConfig:
     """Compose the configuration of a job's recipe, with its overrides."""
-    from training.own import offer_tasks  # from the folder above
+    from torchrl_quad.training.own import offer_tasks  # from the folder above
 
     offer_tasks([f"task={job.task}"])
     return composed(VARIANTS[job.variant].algorithm, job.overrides(lr))

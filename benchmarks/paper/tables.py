@@ -9,13 +9,13 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from claims import METHODS, PUBLISHED, Verdict
-from evidence import NotRunError, Part, Results
-from matrix import EXPERIMENTS, LEARNING_RATES, TASKS, VARIANTS
 from omegaconf import DictConfig, OmegaConf
-from reproduce import best_learning_rate
-from running import composed
 
+from benchmarks.paper.claims import METHODS, PUBLISHED, Verdict
+from benchmarks.paper.evidence import NotRunError, Part, Results
+from benchmarks.paper.matrix import EXPERIMENTS, LEARNING_RATES, TASKS, VARIANTS
+from benchmarks.paper.reproduce import best_learning_rate
+from benchmarks.paper.running import composed
 from torchrl_quad.files import read_rows
 
 COLUMNS = {  # of the tables of ends: heading, column of the curves, factor, digits

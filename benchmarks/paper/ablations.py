@@ -1,9 +1,9 @@
 """Change one option of the recipes at a time: what is each of them worth on landing, and on racing?
 
-python recipes/trial/ablations.py --cores 2
-python recipes/trial/ablations.py --tasks landing --methods shac --changes "KL bound" --seeds 0
+python -m benchmarks.paper.ablations --cores 2
+python -m benchmarks.paper.ablations --tasks landing --methods shac --changes "KL bound" --seeds 0
 
-It may be stopped at any moment. Started again, it skips what is in docs/results/data/ablations.csv, and resumes what
+It may be stopped at any moment. Started again, it skips what is in benchmarks/paper/data/ablations.csv, and resumes what
 was cut off. What the recipes reach as they ship is in shipped.csv beside it. docs/ablations.md shows the table.
 """
 
@@ -14,12 +14,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-from comparison import LABELS, column
-from results import fill
-from running import arguments, command_line, page, side_by_side
-from shipped import METHODS, train
-from tables import table
 
+from benchmarks.paper.comparison import LABELS, column
+from benchmarks.paper.results import fill
+from benchmarks.paper.running import arguments, command_line, page, side_by_side
+from benchmarks.paper.shipped import METHODS, train
+from benchmarks.paper.tables import table
 from torchrl_quad.files import add_rows, read_rows
 
 Job = tuple[str, str, str, int, str, Sequence[str]]

@@ -35,7 +35,7 @@ from torchrl_quad.options import (
     must,
     refuse_unknown,
 )
-from training.own import CONFIG, OWN, SET_BY_RECIPES
+from torchrl_quad.training.own import CONFIG, OWN, SET_BY_RECIPES
 
 MAX_ROLLOUT = 100_000_000  # control steps of a rollout: with a graph they take more than 50 GB
 

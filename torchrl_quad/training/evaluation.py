@@ -22,8 +22,8 @@ from torchrl_quad.envs.episodes import first_episode
 from torchrl_quad.envs.scenery import EPISODE_METRICS, describe_metric
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import replacing
-from training.building import build_env, make_policy
-from training.checkpoints import fits, read_checkpoint, saved_config
+from torchrl_quad.training.building import build_env, make_policy
+from torchrl_quad.training.checkpoints import fits, read_checkpoint, saved_config
 
 
 def evaluate(

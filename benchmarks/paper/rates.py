@@ -1,12 +1,12 @@
 """Train every recipe with half and twice its learning rate: is what ships the best of the three?
 
-python recipes/trial/rates.py --cores 2
-python recipes/trial/rates.py --tasks landing --methods shac ppo
+python -m benchmarks.paper.rates --cores 2
+python -m benchmarks.paper.rates --tasks landing --methods shac ppo
 
 Every method gets the same: three rates, each with three seeds that shipped.py does not report. A rate is judged by the
 worst of its seeds. The hybrid has no rate of its own choice: its bound on the KL divergence takes the place.
 
-It may be stopped at any moment. Started again, it skips what is in docs/results/data/rates.csv, and resumes what was
+It may be stopped at any moment. Started again, it skips what is in benchmarks/paper/data/rates.csv, and resumes what was
 cut off. docs/ablations.md shows the table.
 """
 
@@ -15,14 +15,14 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-from ablations import fly_missing
-from comparison import LABELS, column
 from omegaconf import OmegaConf
-from results import fill
-from running import arguments, command_line, composed, page
-from shipped import METHODS, TASKS, overrides
-from tables import table
 
+from benchmarks.paper.ablations import fly_missing
+from benchmarks.paper.comparison import LABELS, column
+from benchmarks.paper.results import fill
+from benchmarks.paper.running import arguments, command_line, composed, page
+from benchmarks.paper.shipped import METHODS, TASKS, overrides
+from benchmarks.paper.tables import table
 from torchrl_quad.files import read_rows
 
 SEEDS = (101, 102, 103)

@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from matrix import SEEDS, TASKS
 
+from benchmarks.paper.matrix import SEEDS, TASKS
 from torchrl_quad.files import read_rows
 
 RESAMPLES = 4_000

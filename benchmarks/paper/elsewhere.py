@@ -1,9 +1,9 @@
 """Train the losses on two environments that are not ours: are they what they say?
 
-python recipes/trial/elsewhere.py --environments pendulum
-python recipes/trial/elsewhere.py --environments balance --losses shac hybrid ppo
+python -m benchmarks.paper.elsewhere --environments pendulum
+python -m benchmarks.paper.elsewhere --environments balance --losses shac hybrid ppo
 
-It may be stopped at any moment. Started again, it skips what is in docs/results/data/elsewhere.csv, and it fills in the
+It may be stopped at any moment. Started again, it skips what is in benchmarks/paper/data/elsewhere.csv, and it fills in the
 tables of docs/elsewhere.md: those of the two environments, and that of a track which no setting was chosen on, from
 tracks.csv beside it. That track is flown by shipped.py.
 
@@ -29,13 +29,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from comparison import column, reached_table
-from evidence import Starts
 from omegaconf import DictConfig
-from results import fill
-from running import DATA, composed, page  # whose import makes the recipes' code known
-from shipped import METHODS, TASKS
-from tables import table
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
@@ -44,9 +38,13 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss, SoftUpdate
 from torchrl.objectives.value import GAE
-from training.building import AdaptiveRate, iterations, make_optimizer, make_policy, network, shuffled
-from training.processes import backward
 
+from benchmarks.paper.comparison import column, reached_table
+from benchmarks.paper.evidence import Starts
+from benchmarks.paper.results import fill
+from benchmarks.paper.running import DATA, composed, page  # whose import makes the recipes' code known
+from benchmarks.paper.shipped import METHODS, TASKS
+from benchmarks.paper.tables import table
 from torchrl_quad import (
     ABPTLoss,
     AHACLoss,
@@ -60,6 +58,8 @@ from torchrl_quad import (
     make_value,
 )
 from torchrl_quad.files import add_rows, machine, read_rows
+from torchrl_quad.training.building import AdaptiveRate, iterations, make_optimizer, make_policy, network, shuffled
+from torchrl_quad.training.processes import backward
 
 ENVS, HORIZON, EPISODE, EPISODES = 256, 16, 200, 256
 STEPS = 1_024_000  # of all environments together

@@ -19,7 +19,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_quad import ObservationNormalizer, TrustRegion, make_actor, make_env, make_visual_actor
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives import PathwiseLoss
-from training.processes import cat_all, mean_of_all, rank, world_size
+from torchrl_quad.training.processes import cat_all, mean_of_all, rank, world_size
 
 SEEDS_PER_RUN = 10_000  # the process of rank r draws from seed + r * this
 

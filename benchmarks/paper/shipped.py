@@ -1,10 +1,10 @@
 """Fly every recipe on every task as it ships, over ten seeds, and fill in the table of the README.
 
-python recipes/trial/shipped.py --cores 2
-python recipes/trial/shipped.py --tasks mypackage.WindowEnv --data FOLDER   # a task of your own; the table in FOLDER
-python recipes/trial/shipped.py --tasks six_gates six_gates_back --data FOLDER   # a track it was not tuned on
+python -m benchmarks.paper.shipped --cores 2
+python -m benchmarks.paper.shipped --tasks mypackage.WindowEnv --data FOLDER   # a task of your own; the table in FOLDER
+python -m benchmarks.paper.shipped --tasks six_gates six_gates_back --data FOLDER   # a track it was not tuned on
 
-It may be stopped at any moment. Started again, it skips what is in docs/results/data/shipped.csv, and resumes what was
+It may be stopped at any moment. Started again, it skips what is in benchmarks/paper/data/shipped.csv, and resumes what was
 cut off. The README shows each method on each task: the episodes solved over all seeds, and by the worst of them.
 docs/choosing.md compares the methods.
 """
@@ -19,14 +19,22 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from comparison import LABELS, WANTED, choice_table, draw, improvement_table, reached_table, speed_table
-from evidence import Starts
-from matrix import EVALUATIONS
-from reproduce import CURVE, OWN, known_task
-from results import fill
-from running import DATA, QUICK, RECIPES, arguments, command_line, run, ships, side_by_side
-from tables import table
 
+from benchmarks.paper.comparison import (
+    LABELS,
+    WANTED,
+    choice_table,
+    draw,
+    improvement_table,
+    reached_table,
+    speed_table,
+)
+from benchmarks.paper.evidence import Starts
+from benchmarks.paper.matrix import EVALUATIONS
+from benchmarks.paper.reproduce import CURVE, OWN, known_task
+from benchmarks.paper.results import fill
+from benchmarks.paper.running import DATA, QUICK, RECIPES, arguments, command_line, run, ships, side_by_side
+from benchmarks.paper.tables import table
 from torchrl_quad.envs import task_class
 from torchrl_quad.envs.racing import load_track
 from torchrl_quad.envs.scenery import EPISODE_METRICS

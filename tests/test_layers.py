@@ -22,7 +22,8 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "modules": {UNWRAP},
     "objectives": {UNWRAP},
     "data": set(),
-    "deploy": {"data", "dynamics", "envs", "files"},
+    "deploy": {"data", "dynamics", "envs", "files", "rotations"},
+    "rotations": set(),
     "errors": set(),
     "options": set(),
     "files": set(),
@@ -30,7 +31,7 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "gym": {"envs"},
     "training": {"data", "deploy", "diagnostics", "dynamics", "envs", "files", "modules", "objectives", "render"},
     "adapters": {"gym"},
-    "identification": {"deploy.frames", "dynamics", "files", "render.canvas"},
+    "identification": {"deploy.frames", "dynamics", "files", "render.canvas", "rotations"},
 }
 # Imports within a function: of what needs an optional package, and of gymnasium's ids, which name all tasks.
 EXCEPTIONS = {("torchrl_quad.envs.base", "torchrl_quad.render.frames"), ("torchrl_quad.envs.registry", "torchrl_quad")}
@@ -47,6 +48,7 @@ LIBRARIES = {
     "objectives": TORCHRL,
     "data": TORCHRL,
     "deploy": TORCHRL | {"jsonschema", "numpy", "onnx", "onnxruntime", "mujoco", "rotorpy", "crazyflow", "jax"},
+    "rotations": {"numpy"},
     "errors": set(),
     "options": {"numpy", "pydantic", "torch"},
     "files": {"filelock"},

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.rotations import conjugate, multiply
 
 Array = NDArray[np.float64]
 Quaternion = tuple[float, float, float, float]
@@ -139,10 +140,10 @@ class Convention:
         if name == "motors":
             return x[..., np.argsort(self.motors) if back else list(self.motors)]
         if not back:
-            q = multiply(multiply(np.array(self.world), x), _conjugate(self.body))
+            q = multiply(multiply(self.world, x), conjugate(self.body))
             return np.roll(q, -1, -1) if self.xyzw else q
         q = np.roll(x, 1, -1) if self.xyzw else x
-        return multiply(multiply(_conjugate(self.world), q), np.array(self.body))
+        return multiply(multiply(conjugate(self.world), q), self.body)
 
 
 _SIZES = {"position": 3, "velocity": 3, "quaternion": 4, "angular_velocity": 3, "body_rate": 3, "motors": 4}
@@ -253,17 +254,6 @@ def _choose(turns: Mapping[str, Quaternion], world: str) -> Quaternion:
             f'Unknown world {world!r}. Choose from: "enu", x east and y north; "nwu", x north and y west.'
         )
     return turns[world]
-
-
-def multiply(p: Array, q: Array) -> Array:
-    """Hamilton product (..., 4)."""
-    pw, pv, qw, qv = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
-    scalar = pw * qw - (pv * qv).sum(-1, keepdims=True)
-    return np.concatenate((scalar, pw * qv + qw * pv + np.cross(pv, qv)), -1)
-
-
-def _conjugate(q: Quaternion) -> Array:
-    return np.array(q) * (1.0, -1.0, -1.0, -1.0)
 
 
 def _matrix(q: Quaternion) -> Array:

@@ -6,8 +6,7 @@ import torch
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.envs.episodes import first_episode
-from torchrl_quad.envs.scenery import Metric
+from torchrl_quad.envs.metrics import Metric, first_episode
 from torchrl_quad.render import plot_flight
 
 STEPS = 256

@@ -12,8 +12,7 @@ from browsing import browser, open_page  # noqa: E402, F401, fixtures
 from deploying import export_once  # noqa: E402, F401, a fixture
 
 from torchrl_quad import HoveringEnv  # noqa: E402
-from torchrl_quad.envs.scenery import Scenery  # noqa: E402
-from torchrl_quad.envs.shapes import Shape  # noqa: E402
+from torchrl_quad.envs.markers import Markers, Shape  # noqa: E402
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 
@@ -55,19 +54,19 @@ def crashing():
 
 
 @pytest.fixture
-def own_scenery():
-    """A task of one's own, whose scenery names everything that there is."""
+def own_markers():
+    """A task of one's own, whose markers names everything that there is."""
 
     class Window(HoveringEnv):
         """To a point behind a window."""
 
-        def scenery(self):
+        def markers(self):
             wall = Shape.box((0.2, -1.0, 0.0), (0.3, -0.4, 2.5), name="wall")
             ball = Shape.sphere((1.5, 0.8, 1.0), 0.2, name="ball", color="#c8452f")
             tree = Shape.cylinder((0.8, -0.8, 0.0), 0.1, 1.8, name="tree", color="#3a9a5b")
             rope = Shape.line([(0, 0, 1), (1, 0, 2), (2, 1, 1)], name="rope")
             targets = {"places": [(2.0, 0.0, 1.5)], "curve": [(0, 0, 1.5), (1, 0, 1.5)]}
-            return Scenery(gates=[(0.25, 0.0, 1.5)], gate_radius=0.4, shapes=[wall, ball, tree, rope], **targets)
+            return Markers(gates=[(0.25, 0.0, 1.5)], gate_radius=0.4, shapes=[wall, ball, tree, rope], **targets)
 
     return Window
 

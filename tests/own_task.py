@@ -3,7 +3,7 @@
 import torch
 
 from torchrl_quad import QuadrotorEnv
-from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric
 from torchrl_quad.envs.terms import body_observation, norm, outside
 
 

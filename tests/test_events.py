@@ -10,7 +10,7 @@ from torchrl.envs import check_env_specs
 
 from torchrl_quad import LandingEnv, RacingEnv, audit_reward, make_env
 from torchrl_quad.envs import Event, ball_entry, level_crossing
-from torchrl_quad.envs.events import time_terms
+from torchrl_quad.envs.terms import time_terms
 
 GAMMA = 0.97
 STEPS = 8

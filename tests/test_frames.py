@@ -183,7 +183,7 @@ def test_drones_that_are_nowhere_are_left_out_and_the_view_follows_the_others():
 
 
 @pytest.mark.parametrize("task", ["racing", "tracking"])
-def test_the_view_holds_the_scenery_whatever_the_drones_do(task, monkeypatch):
+def test_the_view_holds_the_markers_whatever_the_drones_do(task, monkeypatch):
     from torchrl_quad.render import frames
 
     scenes = []
@@ -193,5 +193,5 @@ def test_the_view_holds_the_scenery_whatever_the_drones_do(task, monkeypatch):
     env = make_env(task, num_envs=1)
     env.reset()
     env.render()
-    points = torch.cat([x for x in (env.scenery().gates, env.scenery().curve) if x is not None])
+    points = torch.cat([x for x in (env.markers().gates, env.markers().curve) if x is not None])
     assert ((scenes[0].low <= points) & (points <= scenes[0].high)).all()

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from torchrl_quad import LandingEnv, make_actor, restart
 from torchrl_quad.envs import TASKS
-from torchrl_quad.envs.scenery import EPISODE_METRICS
+from torchrl_quad.envs.metrics import EPISODE_METRICS
 from torchrl_quad.training.building import build_env, make_optimizer
 from torchrl_quad.training.checkpoints import read_checkpoint
 from torchrl_quad.training.evaluation import drawing_from, evaluate

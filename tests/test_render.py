@@ -11,7 +11,7 @@ from PIL import Image
 from torchrl.envs import RewardSum, TransformedEnv
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, envs, make_actor, make_env
-from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric
 from torchrl_quad.render import animate_flight, frames, plot_episode, plot_flight, write_replay
 from torchrl_quad.render.frames import Scene
 
@@ -78,7 +78,7 @@ def saved(monkeypatch):
 
 @pytest.fixture
 def scenes(monkeypatch):
-    """The scenery of each film."""
+    """The markers of each film."""
     scenes = []
     monkeypatch.setattr(frames, "Scene", lambda *args, **more: scenes.append(args[-1]) or Scene(*args, **more))
     return scenes
@@ -136,7 +136,7 @@ def test_without_the_environment_targets_are_those_of_the_first_episodes(task, s
 
 
 @pytest.mark.parametrize("transformed", [False, True])
-def test_the_environment_provides_the_control_step_the_scenery_and_the_units(transformed, saved, scenes, tmp_path):
+def test_the_environment_provides_the_control_step_the_markers_and_the_units(transformed, saved, scenes, tmp_path):
     env = make_env("racing", num_envs=2, max_episode_steps=20, control_dt=0.04)
     flight = env.rollout(20, break_when_any_done=False)
     named = TransformedEnv(env, RewardSum()) if transformed else env

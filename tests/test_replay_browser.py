@@ -6,7 +6,7 @@ import torch
 
 from torchrl_quad import HoveringEnv, RacingEnv, TrackingEnv, make_env
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.envs.metrics import first_episode
 from torchrl_quad.render import write_replay
 
 NUM_ENVS, STEPS = 3, 1000
@@ -224,14 +224,14 @@ def test_keys_of_the_browser_are_left_to_it_and_those_of_the_page_work_after_a_c
     assert replay.page.inner_text("#play") == "Pause"
 
 
-def test_everything_that_the_scenery_of_a_task_names_is_drawn(open_page, own_scenery, tmp_path):
-    env = own_scenery(num_envs=2)
+def test_everything_that_the_markers_of_a_task_name_is_drawn(open_page, own_markers, tmp_path):
+    env = own_markers(num_envs=2)
     write_replay(env.rollout(6, break_when_any_done=False), tmp_path / "replay.html", env=env)
-    replay, scenery = open_page(tmp_path / "replay.html"), env.scenery()
-    np.testing.assert_allclose(replay.trace("gates")[:33], scenery.rings()[0], atol=1e-6)
-    np.testing.assert_allclose(replay.trace("places"), scenery.places, atol=1e-6)
-    np.testing.assert_allclose(replay.trace("path"), scenery.curve, atol=1e-6)
-    for shape in scenery.shapes:
+    replay, markers = open_page(tmp_path / "replay.html"), env.markers()
+    np.testing.assert_allclose(replay.trace("gates")[:33], markers.rings()[0], atol=1e-6)
+    np.testing.assert_allclose(replay.trace("places"), markers.places, atol=1e-6)
+    np.testing.assert_allclose(replay.trace("path"), markers.curve, atol=1e-6)
+    for shape in markers.shapes:
         np.testing.assert_allclose(replay.trace(shape.name), shape.points, atol=1e-6)
     target = replay.trace("target")  # which is no gate
     np.testing.assert_allclose(target, np.tile(env.target, (2, 1)), atol=1e-6)

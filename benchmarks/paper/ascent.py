@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from benchmarks.paper.matrix import VARIANTS
 from torchrl_quad import ABPTLoss, BPTTLoss, SHACLoss, differentiable_rollout, make_qvalue, make_value
-from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.envs.metrics import first_episode
 from torchrl_quad.files import add_rows, read_rows
 from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.objectives.action_gradients import action_gradient

@@ -36,8 +36,8 @@ from benchmarks.paper.results import fill
 from benchmarks.paper.running import DATA, QUICK, RECIPES, arguments, command_line, run, ships, side_by_side
 from benchmarks.paper.tables import table
 from torchrl_quad.envs import task_class
+from torchrl_quad.envs.metrics import EPISODE_METRICS
 from torchrl_quad.envs.racing import load_track
-from torchrl_quad.envs.scenery import EPISODE_METRICS
 from torchrl_quad.files import add_rows, machine, read_rows
 
 SEEDS = tuple(range(WANTED))

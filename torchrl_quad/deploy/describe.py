@@ -16,7 +16,7 @@ from torchrl_quad.deploy.simulators.vehicle import bandwidth, damping_ratio
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
 from torchrl_quad.envs import ForestEnv, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv
 from torchrl_quad.envs.disturbances import DroneRandomization, Sensors, Wind
-from torchrl_quad.envs.scenery import describe_metric
+from torchrl_quad.envs.metrics import describe_metric
 from torchrl_quad.errors import UserValueError
 
 MAX_HARMONICS = 64  # of a curve

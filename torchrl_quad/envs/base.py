@@ -18,6 +18,7 @@ from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compile
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import checked_task, checks
 from torchrl_quad.envs.checks import Weights
+from torchrl_quad.envs.markers import merge_reset, visible_state
 from torchrl_quad.envs.options import (
     CameraOption,
     ControlOption,
@@ -33,7 +34,6 @@ from torchrl_quad.envs.options import (
     require_room,
 )
 from torchrl_quad.envs.randomness import Randomness
-from torchrl_quad.envs.scenery import merge_reset, visible_state
 from torchrl_quad.envs.specs import describe, set_specs
 from torchrl_quad.envs.step import ControlStep, draw_start, sample_state
 from torchrl_quad.envs.task import Task

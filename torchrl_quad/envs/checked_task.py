@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.checks import names, require
-from torchrl_quad.envs.events import Event
-from torchrl_quad.envs.scenery import EPISODE_METRICS
+from torchrl_quad.envs.metrics import EPISODE_METRICS
 from torchrl_quad.envs.task import Task
+from torchrl_quad.envs.terms import Event
 from torchrl_quad.errors import UserValueError
 
 

@@ -12,10 +12,10 @@ from torch.nn.functional import softplus
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
-from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.envs.markers import Markers
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode
 from torchrl_quad.envs.options import CameraOption, SceneOption
 from torchrl_quad.envs.randomness import Randomness
-from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
 from torchrl_quad.envs.scenes import ELSEWHERE, MAX_OBSTACLES, Scene, left_out
 from torchrl_quad.envs.terms import norm, outside
 from torchrl_quad.errors import UserTypeError, UserValueError
@@ -229,8 +229,8 @@ class ForestEnv(QuadrotorEnv):
         own = {"flown_speed": speed.squeeze(-1), "clearance": clearance.squeeze(-1)}
         return {**super().episode_metrics(rollout), **own}
 
-    def scenery(self) -> Scenery:
-        return Scenery(progress="distance", success=self.length)
+    def markers(self) -> Markers:
+        return Markers(progress="distance", success=self.length)
 
 
 class Forest(Scene):

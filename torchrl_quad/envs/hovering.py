@@ -6,8 +6,8 @@ from torch import Tensor
 
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
-from torchrl_quad.envs.episodes import first_episode
-from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
+from torchrl_quad.envs.markers import Markers
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode
 from torchrl_quad.envs.terms import BODY_BOUNDS, TARGET_WEIGHTS, body_observation, distance, outside, target_reward
 
 
@@ -75,5 +75,5 @@ class HoveringEnv(QuadrotorEnv):
         solved = (error < self.success_radius) * (1 - metrics["crash"])
         return {**metrics, "solved": solved, "position_error": error}
 
-    def scenery(self) -> Scenery:
-        return Scenery(success=self.success_radius)
+    def markers(self) -> Markers:
+        return Markers(success=self.success_radius)

@@ -6,11 +6,9 @@ from torch import Tensor
 
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
-from torchrl_quad.envs.episodes import at_episode_end
-from torchrl_quad.envs.events import Event, ball_entry, level_crossing
-from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
-from torchrl_quad.envs.shapes import Shape
-from torchrl_quad.envs.terms import BODY_BOUNDS, body_observation, norm, outside
+from torchrl_quad.envs.markers import Markers, Shape
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, at_episode_end
+from torchrl_quad.envs.terms import BODY_BOUNDS, Event, ball_entry, body_observation, level_crossing, norm, outside
 
 
 class LandingEnv(QuadrotorEnv):
@@ -123,7 +121,7 @@ class LandingEnv(QuadrotorEnv):
         came_down = height <= self.success_height
         return {**metrics, "landing_speed": torch.where(came_down, metrics["landing_speed"], torch.nan)}
 
-    def scenery(self) -> Scenery:
+    def markers(self) -> Markers:
         (x, y, _), reach = self.target, self.success_radius
         zone = (x - reach, y - reach, 0.0), (x + reach, y + reach, self.success_height)
-        return Scenery(shapes=[Shape.box(*zone, name="landing zone")])
+        return Markers(shapes=[Shape.box(*zone, name="landing zone")])

@@ -16,12 +16,13 @@ from torchrl_quad.dynamics.presets import as_array
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.checks import MAX_STEPS
-from torchrl_quad.envs.episodes import first_episode
-from torchrl_quad.envs.events import Event, ball_entry
-from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
+from torchrl_quad.envs.markers import Markers
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode
 from torchrl_quad.envs.terms import (
     BODY_BOUNDS,
     TARGET_WEIGHTS,
+    Event,
+    ball_entry,
     body_observation,
     distance,
     norm,
@@ -230,9 +231,9 @@ class RacingEnv(QuadrotorEnv):
         near = (distance(rollout["next", "state"]) < 1.0) & first_episode(rollout)
         return {**metrics, "lap_time": lap_time, "time_near_gate": self.control_dt * near.sum((1, 2)).to(self.dtype)}
 
-    def scenery(self) -> Scenery:
+    def markers(self) -> Markers:
         goal = {"progress": "gates_passed", "success": self.success_gates}
-        return Scenery("next gate", gates=self.gates, gate_radius=self.track["gate_radius"], **goal)
+        return Markers("next gate", gates=self.gates, gate_radius=self.track["gate_radius"], **goal)
 
 
 def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:

@@ -14,9 +14,9 @@ from torchrl_quad.engine import Transition, nested
 from torchrl_quad.engine.packing import like
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.checks import check_action, restore_state
-from torchrl_quad.envs.events import time_terms
 from torchrl_quad.envs.guard import MAX_VALUE, Containment, Guard, is_true
 from torchrl_quad.envs.task import Task
+from torchrl_quad.envs.terms import time_terms
 
 
 class ControlStep:

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import Dynamics, QuadrotorParams
 from torchrl_quad.engine.simulation import State
-from torchrl_quad.envs.episodes import summarise_episodes
-from torchrl_quad.envs.events import Event
+from torchrl_quad.envs.markers import Markers
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, summarise_episodes
 from torchrl_quad.envs.randomness import Randomness
-from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
 from torchrl_quad.envs.scenes import Scene
+from torchrl_quad.envs.terms import Event
 from torchrl_quad.vision import DepthCamera
 
 
@@ -106,9 +106,9 @@ class Task(abc.ABC):
         """
         return None
 
-    def scenery(self) -> Scenery:
+    def markers(self) -> Markers:
         """The things that pictures show beside the drones."""
-        return Scenery()
+        return Markers()
 
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Judge the first episode of each environment, in a rollout (num_envs, time) from fresh starts.

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
-from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, Scenery
+from torchrl_quad.envs.markers import Markers
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric
 from torchrl_quad.envs.terms import (
     BODY_BOUNDS,
     TARGET_WEIGHTS,
@@ -185,9 +186,9 @@ class TrackingEnv(QuadrotorEnv):
         solved = (metrics["tracking_rmse"] < self.success_radius) * (1 - metrics["crash"])
         return {**metrics, "solved": solved}
 
-    def scenery(self) -> Scenery:
+    def markers(self) -> Markers:
         phase = torch.linspace(0, 2 * math.pi, 129, device=self.device, dtype=self.dtype)
-        return Scenery(curve=self.curve(phase), success=self.success_radius)
+        return Markers(curve=self.curve(phase), success=self.success_radius)
 
     @property
     def settling_steps(self) -> int:

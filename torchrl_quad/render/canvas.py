@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_quad.envs.scenery import Scenery
+from torchrl_quad.envs.markers import Markers
 from torchrl_quad.errors import MissingPackage
 from torchrl_quad.files import replacing
 
@@ -81,7 +81,7 @@ def set_scale(axis: Any, log: bool) -> None:
     axis.yaxis.set_major_formatter("{x:g}")
 
 
-def draw_scenery(space: Any, scenery: Scenery, size: float = 12.0) -> None:
+def draw_markers(space: Any, markers: Markers, size: float = 12.0) -> None:
     """Draw what a task shows beside its drones into three-dimensional axes, with names for a legend.
 
     Args:
@@ -89,19 +89,19 @@ def draw_scenery(space: Any, scenery: Scenery, size: float = 12.0) -> None:
     """
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-    for shape in scenery.shapes:
+    for shape in markers.shapes:
         if shape.faces is None:
             space.plot(*shape.points.T.numpy(), color=shape.color, linewidth=1.5, zorder=2, label=shape.name or None)
         else:
             triangles = shape.points[shape.faces].numpy()
             style = {"facecolors": shape.color, "alpha": shape.opacity, "linewidths": 0, "shade": True}
             space.add_collection(Poly3DCollection(triangles, **style, zorder=2, label=shape.name or None))
-    if scenery.curve is not None:
-        space.plot(*scenery.curve.T.numpy(), color=RED, linestyle="--", linewidth=1.0, label=scenery.target, zorder=3)
-    if scenery.places is not None:
+    if markers.curve is not None:
+        space.plot(*markers.curve.T.numpy(), color=RED, linestyle="--", linewidth=1.0, label=markers.target, zorder=3)
+    if markers.places is not None:
         star = {"marker": "*", "color": RED, "s": size**2}
-        space.scatter(*scenery.places.T.numpy(), label=scenery.target, zorder=10, **star)
-    if (rings := scenery.rings()) is not None:
+        space.scatter(*markers.places.T.numpy(), label=markers.target, zorder=10, **star)
+    if (rings := markers.rings()) is not None:
         space.add_collection(Line3DCollection(list(rings.numpy()), color=RED, linewidth=1.8, zorder=10, label="gate"))
 
 

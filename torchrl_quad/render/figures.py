@@ -10,14 +10,14 @@ import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from torchrl_quad.envs.episodes import first_episode
+from torchrl_quad.envs.metrics import first_episode
 from torchrl_quad.render.canvas import (
     BLUE,
     INK,
     RED,
     bounds,
     box,
-    draw_scenery,
+    draw_markers,
     drone_colors,
     make_figure,
     save,
@@ -60,14 +60,14 @@ def plot_flight(
 ) -> None:
     """Draw the first episodes of a flight: their paths in space, and over time how well they go.
 
-    The second panel shows the metric that the task names in its scenery, else the distance to the target, and for a
+    The second panel shows the metric that the task names in its markers, else the distance to the target, and for a
     task without targets its first metric, or the reward. A dashed line marks the value from which a state fulfils the
-    task, if the scenery names it.
+    task, if the markers name it.
 
     Args:
         rollout: (num_envs, time), of any task.
         path: the picture to write, PNG, PDF or SVG by its suffix.
-        env: the environment that flew, also under transforms. It provides the control step, the scenery, and the units
+        env: the environment that flew, also under transforms. It provides the control step, the markers, and the units
             of metrics; without it, the picture shows the targets in the rollout.
         num_envs: how many environments to draw, at most.
         control_dt: control step [s]; used only without ``env``.
@@ -90,9 +90,9 @@ def plot_flight(
         space.scatter(*position[i, 0], color=color, s=14)
         over_time.plot(flight.times[flown], values[i, flown], color=color, linewidth=1.2)
     alike = len(flight) == 1 or not getattr(getattr(flight.env, "scene", None), "is_random", False)
-    scenery = with_obstacles(flight.scenery, flight.solids(0) if alike else None)
-    draw_scenery(space, scenery)
-    set_box(space, *box(*bounds(position, *scenery.points())), zoom=0.9)
+    markers = with_obstacles(flight.markers, flight.solids(0) if alike else None)
+    draw_markers(space, markers)
+    set_box(space, *box(*bounds(position, *markers.points())), zoom=0.9)
     named = dict(zip(*reversed(space.get_legend_handles_labels()), strict=True))  # a name once
     if named:
         space.legend(named.values(), named.keys(), loc="upper left", frameon=False)
@@ -100,7 +100,7 @@ def plot_flight(
     set_scale(over_time, log)
     over_time.grid(alpha=0.3)
     if success is not None:
-        near = "" if flight.scenery.progress else "below "
+        near = "" if flight.markers.progress else "below "
         over_time.axhline(success, color=RED, linestyle="--", linewidth=1.0, label=f"success: {near}{success:g}")
         over_time.legend(loc="best", frameon=False)
     figure.suptitle(flight.title if title is None else title, x=0.04, y=0.965, ha="left", fontsize=13)
@@ -117,15 +117,15 @@ def plot_episode(
 ) -> None:
     """Draw the first episode of one drone as a figure for a paper, as wide as a page of two columns (7.16 inches).
 
-    Shows its path in space, coloured by speed, with the task's scenery and numbers at its gates. Shows over time the
+    Shows its path in space, coloured by speed, with the task's markers and numbers at its gates. Shows over time the
     distance to the target with the metrics that are lengths (without targets: all metrics, or the reward), the actions,
     and the rotor speeds if the state holds them. Dotted lines mark the times at which the drone passes gates, a dashed
-    line the distance from which a state fulfils the task, if the scenery names it.
+    line the distance from which a state fulfils the task, if the markers name it.
 
     Args:
         rollout: (num_envs, time), of any task, with or without its graph.
         path: the figure to write: PDF or SVG with embedded fonts, or PNG with 300 dots per inch, by its suffix.
-        env: the environment that flew, also under transforms. It provides the control step, the scenery, and the units
+        env: the environment that flew, also under transforms. It provides the control step, the markers, and the units
             of metrics; without it, the figure shows the targets in the rollout.
         env_index: which environment.
         control_dt: control step [s]; used only without ``env``.
@@ -177,7 +177,7 @@ def plot_episode(
 
 
 def _draw_path(space: Any, below: Any, flight: Flight) -> None:
-    """Draw the path of an episode in space, coloured by speed, with the scenery around it."""
+    """Draw the path of an episode in space, coloured by speed, with the markers around it."""
     from matplotlib.patheffects import withStroke
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
@@ -187,13 +187,13 @@ def _draw_path(space: Any, below: Any, flight: Flight) -> None:
     path.set_array(0.5 * (speed[:-1] + speed[1:]))
     space.add_collection(path)
     space.scatter(*position[0], color=INK, s=10, zorder=6)
-    scenery = with_obstacles(flight.scenery, flight.solids(0))
-    if scenery.gates is not None:
+    markers = with_obstacles(flight.markers, flight.solids(0))
+    if markers.gates is not None:
         halo = [withStroke(linewidth=2, foreground="white")]
-        for i, centre in enumerate(scenery.gates.tolist(), 1):
+        for i, centre in enumerate(markers.gates.tolist(), 1):
             space.text(*centre, f"   {i}", color=RED, zorder=11, path_effects=halo)
-    draw_scenery(space, scenery)
-    set_box(space, *box(*bounds(*points, *scenery.points())), zoom=0.86)
+    draw_markers(space, markers)
+    set_box(space, *box(*bounds(*points, *markers.points())), zoom=0.86)
     bar = space.figure.colorbar(path, cax=below, orientation="horizontal")
     bar.set_label("speed [m/s]")
     bar.outline.set_linewidth(0.6)

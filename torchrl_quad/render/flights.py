@@ -13,8 +13,8 @@ from torchrl.envs import EnvBase
 
 from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.dynamics import FlightController
-from torchrl_quad.envs.episodes import first_episode
-from torchrl_quad.envs.scenery import Scenery, describe_metric, visible_state
+from torchrl_quad.envs.markers import Markers, visible_state
+from torchrl_quad.envs.metrics import describe_metric, first_episode
 from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.vision import Primitives
 
@@ -51,8 +51,8 @@ class Flight:
         self.metric_info = {} if env is None else self.env.metric_info
         self.steps = self._count_steps()  # of each first episode (num_envs)
         self.target = self.state("target")
-        self.named = Scenery() if env is None else self.env.scenery()  # by the task
-        self.scenery = self.named
+        self.named = Markers() if env is None else self.env.markers()  # by the task
+        self.markers = self.named
         self._add_targets()
 
     def __len__(self) -> int:
@@ -122,13 +122,13 @@ class Flight:
         That is the metric that the task names, else the distance to the target, else the first metric or the reward.
         Success is the value from which a state fulfils the task, if the task says so.
         """
-        outputs, name = self.outputs(), self.scenery.progress
+        outputs, name = self.outputs(), self.markers.progress
         if name not in outputs and self.target is not None:
-            return f"distance to the {self.scenery.target} [m]", self.log_distance, self.distance, self.near_enough
+            return f"distance to the {self.markers.target} [m]", self.log_distance, self.distance, self.near_enough
         known = name in outputs
         name = name if known else next(iter(outputs))
         metric = describe_metric(name, self.metric_info)
-        success = metric.scale * self.scenery.success if known and self.scenery.success is not None else None
+        success = metric.scale * self.markers.success if known and self.markers.success is not None else None
         return metric.axis_label, metric.log, metric.scale * outputs[name], success
 
     def progress_lines(self) -> tuple[str, bool, dict[str, np.ndarray]]:
@@ -141,7 +141,7 @@ class Flight:
         if self.target is None:
             return "", False, {metric.axis_label: metric.scale * x for metric, x in outputs.items()}
         distance = self.distance
-        lines = {f"to the {self.scenery.target}": distance}
+        lines = {f"to the {self.markers.target}": distance}
         for metric, x in outputs.items():
             if metric.is_length and not np.allclose(x[:, 1:], distance[:, 1:], atol=1e-5, equal_nan=True):
                 lines[metric.label] = x
@@ -155,7 +155,7 @@ class Flight:
     @property
     def near_enough(self) -> float | None:
         """The distance to the target from which a state fulfils the task [m], if the task says so."""
-        return self.scenery.success if self.scenery.progress is None else None
+        return self.markers.success if self.markers.progress is None else None
 
     @property
     def action_names(self) -> list[str]:
@@ -166,9 +166,9 @@ class Flight:
 
     def gate_index(self) -> Tensor | None:
         """The index of the gate that each drone flies to (num_envs, time + 1), if the targets are gates."""
-        if self.scenery.gates is None or self.target is None:
+        if self.markers.gates is None or self.target is None:
             return None
-        gap, index = (self.target.unsqueeze(-2) - self.scenery.gates).norm(dim=-1).min(-1)
+        gap, index = (self.target.unsqueeze(-2) - self.markers.gates).norm(dim=-1).min(-1)
         return index if gap.nan_to_num(0.0).max() < 1e-3 else None
 
     def _count_steps(self) -> Tensor:
@@ -178,8 +178,8 @@ class Flight:
 
     def _add_targets(self) -> None:
         """Show where the targets of these episodes have been, if the task shows nothing of them."""
-        scenery = self.scenery
-        if self.target is None or scenery.places is not None or scenery.curve is not None:
+        markers = self.markers
+        if self.target is None or markers.places is not None or markers.curve is not None:
             return
         if self.gate_index() is not None:
             return
@@ -188,7 +188,7 @@ class Flight:
             known = {"curve": self.target[self.steps.argmax()]}
         else:
             known = {"places": self.target.flatten(0, 1).mul(1e3).round().div(1e3).unique(dim=0)}
-        self.scenery = dataclasses.replace(scenery, **known)
+        self.markers = dataclasses.replace(markers, **known)
 
 
 def state_keys(*names: str) -> list[tuple[str, ...]]:
@@ -204,7 +204,7 @@ def check_rollout(
     num_envs: int | None = None,
 ) -> None:
     """Refuse what cannot be drawn; arguments and errors are those of :class:`Flight`."""
-    if env is not None and not (isinstance(env, EnvBase) and hasattr(env, "scenery")):
+    if env is not None and not (isinstance(env, EnvBase) and hasattr(env, "markers")):
         raise UserTypeError(
             f"{who}: env must be the quadrotor environment that flew, with or without transforms, or None; got "
             f"{type(env).__name__}."

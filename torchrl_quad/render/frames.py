@@ -21,10 +21,10 @@ from torchrl.envs import EnvBase
 
 from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.envs.scenery import Scenery
+from torchrl_quad.envs.markers import Markers
 from torchrl_quad.errors import MissingPackage, UserValueError
 from torchrl_quad.files import replacing
-from torchrl_quad.render.canvas import INK, RED, bounds, box, draw_scenery, drone_colors, make_figure, set_box
+from torchrl_quad.render.canvas import INK, RED, bounds, box, draw_markers, drone_colors, make_figure, set_box
 from torchrl_quad.render.flights import Flight, state_keys
 from torchrl_quad.render.obstacles import depth_image, with_obstacles
 
@@ -38,20 +38,20 @@ class NoFfmpeg(MissingPackage):
 
 
 class Scene:
-    """A view for many frames of the same drones; it draws axes and scenery only once.
+    """A view for many frames of the same drones; it draws axes and markers only once.
 
     Args:
         points: (*, 3) [m]; the finite ones, and the ground below, are in view.
         num_drones: how many drones a frame shows.
         size: width and height of a frame [pixels].
-        scenery: what to draw beside the drones.
+        markers: what to draw beside the drones.
         image: the height and width of a camera's images [pixels], if a frame shows one.
     """
 
     def __init__(
-        self, points: Tensor, num_drones: int, size: int, scenery: Scenery, image: tuple[int, int] | None = None
+        self, points: Tensor, num_drones: int, size: int, markers: Markers, image: tuple[int, int] | None = None
     ) -> None:
-        low, high = bounds(points, *scenery.points())
+        low, high = bounds(points, *markers.points())
         low[2].clamp_(max=0.0)
         self.low, self.high = box(low, high)
         extent = self.high - self.low
@@ -60,7 +60,7 @@ class Scene:
         self.figure = make_figure(figsize=(_INCHES, _INCHES), dpi=(size + 0.01) / _INCHES)
         space = self.figure.add_axes((0.0, 0.02, 0.96, 0.98), projection="3d")
         set_box(space, self.low, self.high, zoom=0.82)
-        draw_scenery(space, scenery, size=8)
+        draw_markers(space, markers, size=8)
         animated = {"animated": True}  # drawn onto the axes in each frame
         colors = drone_colors(num_drones)
         self.drones = [space.plot([], [], [], color=color, linewidth=2.5, **animated)[0] for color in colors]
@@ -127,7 +127,7 @@ def animate_flight(
     beside: TensorDictBase | None = None,
     labels: tuple[str, str] = ("", ""),
 ) -> None:
-    """Film the first episodes of a flight in real time: drones with trails, their targets, and the task's scenery.
+    """Film the first episodes of a flight in real time: drones with trails, their targets, and the task's markers.
 
     A task with a camera shows what the first drone saw, the nearer the brighter. Where each episode has obstacles of
     its own, the film shows the first environment alone.
@@ -135,7 +135,7 @@ def animate_flight(
     Args:
         rollout: (num_envs, time), of any task.
         path: the film to write: GIF, or MP4 (H.264) with ``imageio-ffmpeg`` of the extra ``render``, by its suffix.
-        env: the environment that flew, also under transforms. It provides the control step and the scenery; without
+        env: the environment that flew, also under transforms. It provides the control step and the markers; without
             it, the film shows the targets in the rollout.
         num_envs: how many environments to show, at most.
         control_dt: control step [s]; used only without ``env``.
@@ -173,7 +173,7 @@ def animate_flight(
             view,
             len(flight),
             size + size % 2,
-            with_obstacles(flight.scenery, flight.solids(0)),
+            with_obstacles(flight.markers, flight.solids(0)),
             image=None if depth is None else depth.shape[-2:],
         )
         for flight, depth in zip(flights, seen, strict=True)
@@ -297,9 +297,9 @@ def draw_frame(env: EnvBase, drones: Sequence[int] | None, size: int) -> np.ndar
     if env.camera is not None:
         pose = (env.render_state[key][chosen[:1]] for key in ("position", "quaternion"))
         image = depth_image(env.camera.depth(solids, *pose)[0, 0], env.camera.range)
-    if scene is None:  # half a metre of room around all drones, their targets and the scenery
+    if scene is None:  # half a metre of room around all drones, their targets and the markers
         everything = [x for key, x in env.render_state.items() if isinstance(key, str) and key != "quaternion"]
-        low, high = bounds(*everything, *env.scenery().points())
+        low, high = bounds(*everything, *env.markers().points())
         low, high = low - torch.tensor([0.5, 0.5, 0.0]), high + 0.5
     else:  # a side that has become too near moves out by half of the view, so that it need not at every step
         low, high = bounds(*points, scene.low, scene.high)
@@ -307,10 +307,10 @@ def draw_frame(env: EnvBase, drones: Sequence[int] | None, size: int) -> np.ndar
         low, high = low - room * (low < scene.low), high + room * (high > scene.high)
     if scene is None or (low < scene.low).any() or (high > scene.high).any():
         corners = torch.stack((low, high))
-        scenery, pixels = with_obstacles(env.scenery(), solids), None if image is None else image.shape
+        markers, pixels = with_obstacles(env.markers(), solids), None if image is None else image.shape
         if drawn:
             scenes.clear()  # of episodes that are over
-        scenes[len(chosen), size, known] = scene = Scene(corners, len(chosen), size, scenery, image=pixels)
+        scenes[len(chosen), size, known] = scene = Scene(corners, len(chosen), size, markers, image=pixels)
     return scene.draw(*shown.values(), image=image)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_quad.envs.scenery import EPISODE_METRICS, Metric, describe_metric
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, describe_metric
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.render.canvas import BLUE, INK, make_figure, save, set_scale
 

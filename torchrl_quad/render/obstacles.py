@@ -14,9 +14,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.envs.scenery import Scenery
+from torchrl_quad.envs.markers import Markers, Shape
 from torchrl_quad.envs.scenes import ELSEWHERE
-from torchrl_quad.envs.shapes import Shape
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.render.canvas import INK, RED, make_figure, save
 from torchrl_quad.render.flights import Flight, state_keys
@@ -51,10 +50,10 @@ def obstacle_shapes(solids: Primitives) -> list[Shape]:
     return [Shape(torch.cat([mesh.points for mesh in meshes]), torch.cat(faces), color=GREEN, opacity=0.6)]
 
 
-def with_obstacles(scenery: Scenery, solids: Primitives | None) -> Scenery:
-    """A scenery with the obstacles of a scene, if there are any."""
+def with_obstacles(markers: Markers, solids: Primitives | None) -> Markers:
+    """Markers with the obstacles of a scene, if there are any."""
     shapes = [] if solids is None else obstacle_shapes(solids)
-    return dataclasses.replace(scenery, shapes=[*scenery.shapes, *shapes]) if shapes else scenery
+    return dataclasses.replace(markers, shapes=[*markers.shapes, *shapes]) if shapes else markers
 
 
 def plot_from_above(

@@ -220,8 +220,8 @@ function obstacle() {
   return object({ name: "obstacles", points, faces, color: "#3a7d4f", opacity: 0.7 });
 }
 
-// What the task's scenery names.
-function scenery() {
+// What the task's markers name.
+function taskMarkers() {
   const named = shapes.filter((shape) => shape.name);
   return [...shapes.map(object), ...(obstacles.length ? [obstacle()] : []),
     ...(named.length ? [labels("names", named.map((shape) => shape.name), named.map((shape) => shape.points))] : []),
@@ -253,7 +253,7 @@ function drawSpace() {
   };
   const axis = (title, j) => ({ title: { text: title }, range: spaceRange(j), showgrid: false, zeroline: false,
     showbackground: false, showspikes: false, color: "#777", nticks: 6 });
-  const still = [ground(), ...scenery()];
+  const still = [ground(), ...taskMarkers()];
   const sides = [0, 1, 2].map((j) => spaceRange(j)[1] - spaceRange(j)[0]), scale = Math.hypot(...sides) / 1.65;
   return Plotly.newPlot("space", [...still, ...MOVING.map((name) => traces[name]())], {
     scene: { xaxis: axis("x [m]", 0), yaxis: axis("y [m]", 1), zaxis: axis("z [m]", 2), aspectmode: "manual",

@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.dynamics.parameters import RawParams
 from torchrl_quad.dynamics.rotors import Rotors
-from torchrl_quad.envs.episodes import at_episode_end
+from torchrl_quad.envs.metrics import at_episode_end
 from torchrl_quad.errors import MissingPackage, UserValueError
 from torchrl_quad.files import replacing
 from torchrl_quad.render.flights import Flight
@@ -39,7 +39,7 @@ def write_replay(
 ) -> None:
     """Write the first episodes of a flight as an HTML page to play, pause, scrub and turn in a browser.
 
-    The page shows the drones with attitude and rotor thrust, trails, and the task's scenery; the obstacles of the
+    The page shows the drones with attitude and rotor thrust, trails, and the task's markers; the obstacles of the
     environment that is followed, or of the first, and beside the flight what its camera saw; and over time the reward
     terms, the actions, the speed, and the distance to the target (or the height). It is one file of about 5 MB, most
     of it plotly.js, and needs no network. A drone stays where its episode ended, and the page says how it ended:
@@ -49,7 +49,7 @@ def write_replay(
         rollout: (num_envs, time), of any task. It must hold ``("next", "state", "position")`` and ``("next", "state",
             "quaternion")``; the page leaves out whatever else is missing.
         path: the HTML file to write, whole or not at all.
-        env: the environment that flew, also under transforms. It provides the control step, the scenery, the positions
+        env: the environment that flew, also under transforms. It provides the control step, the markers, the positions
             of the rotors, and their thrust in newtons. Without it, the page shows an X frame and the squared speed of
             each rotor.
         num_envs: how many environments to show, at most.
@@ -105,19 +105,19 @@ def _content(flight: Flight) -> dict[str, Any]:
         "lift": None if lift is None else _encoded(lift),
         "target": None if target is None else _encoded(target),
     }
-    scenery = flight.named
+    markers = flight.named
     content |= {
-        "gates": None if scenery.gates is None else _encoded(scenery.rings()),
+        "gates": None if markers.gates is None else _encoded(markers.rings()),
         "gate": None if (gate := flight.gate_index()) is None else _encoded(gate[:, first:].float()),
-        "places": None if scenery.places is None else _encoded(scenery.places),
-        "curve": None if scenery.curve is None else _encoded(scenery.curve),
+        "places": None if markers.places is None else _encoded(markers.places),
+        "curve": None if markers.curve is None else _encoded(markers.curve),
         "shapes": [
             {
                 "points": _encoded(shape.points),
                 "faces": None if shape.faces is None else _encoded(shape.faces.float()),
                 **{key: getattr(shape, key) for key in ("name", "color", "opacity")},
             }
-            for shape in scenery.shapes
+            for shape in markers.shapes
         ],
         "obstacles": _obstacles(flight),
         "images": _images(flight, first),
@@ -129,7 +129,7 @@ def _content(flight: Flight) -> dict[str, Any]:
     if target is not None:
         distance = torch.from_numpy(flight.distance)
         options = {"log": flight.log_distance, "success": flight.near_enough}
-        series.append((f"distance to the {scenery.target} [m]", {"distance": distance}, options))
+        series.append((f"distance to the {markers.target} [m]", {"distance": distance}, options))
     else:
         series.append(("height [m]", {"height": flight.state("position")[..., 2]}, {}))
     ended = torch.arange(time + 1) > steps[:, None]  # panels show nothing after the end of the episode

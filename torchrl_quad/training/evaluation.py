@@ -18,8 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_quad import differentiable_rollout
-from torchrl_quad.envs.episodes import first_episode
-from torchrl_quad.envs.scenery import EPISODE_METRICS, describe_metric
+from torchrl_quad.envs.metrics import EPISODE_METRICS, describe_metric, first_episode
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import replacing
 from torchrl_quad.training.building import build_env, make_policy

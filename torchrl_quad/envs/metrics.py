@@ -1,0 +1,101 @@
+"""What is measured of episodes: names and units of metrics, and the ends of episodes in a rollout."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import Scale, checked
+
+
+@checked
+@dataclass(frozen=True)
+class Metric:
+    """How a metric is summed up over episodes, printed, and drawn.
+
+    Values themselves are in SI units everywhere; only print and pictures use ``scale`` and ``unit``.
+
+    Args:
+        label: its name in prose, such as "position error".
+        unit: in print, such as "cm".
+        scale: how many of these units make one SI unit, 100 for cm.
+        median: whether it is summed up with the median instead of the mean, which a few crashes would dominate.
+        log: whether it is drawn on a logarithmic axis.
+    """
+
+    label: str
+    unit: str = ""
+    scale: Scale = 1.0
+    median: bool = False
+    log: bool = False
+
+    @property
+    def is_length(self) -> bool:
+        """Whether the values are metres, so that they can share an axis with a distance."""
+        return self.unit in ("mm", "cm", "m", "km")
+
+    @property
+    def axis_label(self) -> str:
+        """The label of an axis of values times ``scale``: "position error [cm]"."""
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
+
+    def summarise(self, values: Tensor) -> float:
+        """Sum up the values of episodes (n); leave out those without one, which are NaN."""
+        return (values.nanmedian() if self.median else values.nanmean()).item()
+
+    def format(self, value: float) -> str:
+        """A summed-up value in print, with three significant digits: "3.21 cm (median)", "93 %"; "none" for NaN."""
+        if math.isnan(value):
+            return "none"
+        value = self.scale * value
+        number = f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
+        return " ".join(filter(None, (number, self.unit, "(median)" if self.median else "")))
+
+
+#: The metrics of every task. A task adds its own by ``metric_info = {**EPISODE_METRICS, "lap_time": Metric(...)}``.
+EPISODE_METRICS: dict[str, Metric] = {
+    "return": Metric("return"),
+    "solved": Metric("episodes solved", "%", 100.0),
+    "crash": Metric("crashes", "%", 100.0),
+}
+
+
+def describe_metric(name: str, metric_info: Mapping[str, Metric]) -> Metric:
+    """The description of a metric; one without a description gets its name, without a unit."""
+    return metric_info.get(name) or EPISODE_METRICS.get(name) or Metric(name.replace("_", " "))
+
+
+def first_episode(rollout: TensorDictBase) -> Tensor:
+    """Mark the steps of each environment's first episode, its last one included, bool (num_envs, time, 1)."""
+    done = rollout["next", "done"]
+    return (done.cumsum(1) - done.int()) == 0
+
+
+def at_episode_end(rollout: TensorDictBase, value: Tensor) -> Tensor:
+    """A value (num_envs, time, 1) at the last step of the first episode of each environment, (num_envs)."""
+    last = first_episode(rollout).sum(1, keepdim=True) - 1
+    return value.gather(1, last).flatten()
+
+
+def summarise_episodes(rollout: TensorDictBase) -> dict[str, Tensor]:
+    """Judge the first episode of each environment; see ``QuadrotorEnv.episode_metrics``."""
+    missing = [name for name in ("crash", "success", "reward", "done") if ("next", name) not in rollout]
+    if missing:
+        raise UserValueError(
+            f'episode_metrics reads ("next", {missing[0]!r}), which is not in the rollout. Judge a rollout before you '
+            "leave out entries, and evaluate without the transform that drops this one."
+        )
+    ends, first = rollout["next"], first_episode(rollout)
+    crash, success = (at_episode_end(rollout, ends[name]) for name in ("crash", "success"))
+    dtype = ends["reward"].dtype
+    return {
+        "return": (ends["reward"] * first).sum(1).squeeze(-1),
+        "crash": crash.to(dtype),
+        "solved": (success & ~crash).to(dtype),
+        **{name: at_episode_end(rollout, value) for name, value in ends.get("metrics", {}).items()},
+    }

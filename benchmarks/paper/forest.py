@@ -4,7 +4,7 @@ python -m benchmarks.paper.forest --cores 2
 python -m benchmarks.paper.forest --policies bptt blind --seeds 0 --speeds 4 6 --difficulties middle
 
 It may be stopped at any moment. Started again, it skips what is in benchmarks/paper/data/forest.csv, and resumes what was
-cut off. docs/seeing.md shows the table and the picture.
+cut off. docs/camera.md shows the table and the picture.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def main() -> None:
     side_by_side(args.cores, jobs)
     rows = read_rows(args.data / "forest.csv")
     draw(rows, page(args.data, "images/forest_success.png"))
-    fill(page(args.data, "seeing.md"), {"forest": summary(rows)})
+    fill(page(args.data, "camera.md"), {"forest": summary(rows)})
 
 
 if __name__ == "__main__":

@@ -49,7 +49,7 @@ def name_of(path):
 def public_names():
     for module in map(importlib.import_module, PUBLIC):
         yield from (f"{module.__name__}.{name}" for name in module.__all__)
-    for module in map(importlib.import_module, ("torchrl_quad.diagnostics", "torchrl_quad.gym")):
+    for module in map(importlib.import_module, ("torchrl_quad.diagnostics", "torchrl_quad.adapters.gym")):
         for name, value in vars(module).items():
             if getattr(value, "__module__", None) == module.__name__ and not name.startswith("_"):
                 yield f"{module.__name__}.{name}"

@@ -21,7 +21,7 @@ from torchrl import envs as torchrl_envs
 
 import torchrl_quad
 from torchrl_quad import load_drone, make_env
-from torchrl_quad.gym import GymEnv, GymVectorEnv
+from torchrl_quad.adapters.gym import GymEnv, GymVectorEnv
 
 TASKS = ["forest", "hovering", "landing", "racing", "tracking"]
 MODES = list(AutoresetMode)
@@ -54,8 +54,8 @@ def test_gymnasium_imports_the_package_by_its_prefix_environments_when_they_are_
         "import contextlib, sys, gymnasium\n"
         "with contextlib.suppress(gymnasium.error.Error):\n"
         "    gymnasium.make('torchrl_quad:torchrl_quad/Walking-v0')\n"
-        f"assert gymnasium.spec('{HOVERING}').vector_entry_point == 'torchrl_quad.gym:GymVectorEnv'\n"
-        "assert 'torchrl_quad.gym' not in sys.modules\n"
+        f"assert gymnasium.spec('{HOVERING}').vector_entry_point == 'torchrl_quad.adapters.gym:GymVectorEnv'\n"
+        "assert 'torchrl_quad.adapters.gym' not in sys.modules\n"
         f"gymnasium.make('torchrl_quad:{HOVERING}').reset()\n"
         f"gymnasium.make_vec('torchrl_quad:{HOVERING}', num_envs=2).reset()\n"
         "assert not {'torchrl_quad.render', 'matplotlib'} & set(sys.modules)\n"

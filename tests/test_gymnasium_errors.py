@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 
+from torchrl_quad.adapters.gym import GymEnv, GymVectorEnv
 from torchrl_quad.errors import UserError
-from torchrl_quad.gym import GymEnv, GymVectorEnv
 
 HOVERING = "torchrl_quad/Hovering-v0"
 

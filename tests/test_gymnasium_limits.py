@@ -3,8 +3,8 @@
 import gymnasium
 import numpy as np
 
+from torchrl_quad.adapters.gym import GymEnv, GymVectorEnv
 from torchrl_quad.envs import TASKS
-from torchrl_quad.gym import GymEnv, GymVectorEnv
 
 HOVERING = "torchrl_quad/Hovering-v0"
 

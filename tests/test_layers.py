@@ -28,9 +28,8 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "options": set(),
     "files": set(),
     "diagnostics": {"data", "objectives"},
-    "gym": {"envs"},
     "training": {"data", "deploy", "diagnostics", "dynamics", "envs", "files", "modules", "objectives", "render"},
-    "adapters": {"gym"},
+    "adapters": {"envs"},
     "identification": {"deploy.frames", "dynamics", "files", "render.canvas", "rotations"},
 }
 # Imports within a function: of what needs an optional package, and of gymnasium's ids, which name all tasks.
@@ -53,7 +52,6 @@ LIBRARIES = {
     "options": {"numpy", "pydantic", "torch"},
     "files": {"filelock"},
     "diagnostics": TORCHRL,
-    "gym": {"gymnasium", "numpy", "torch"},
     "training": TORCHRL
     | {"hydra", "joblib", "omegaconf", "pydantic", "tensorboard", "tqdm", "wandb", "yaml", "filelock", "numpy"},
     "adapters": TORCHRL | {"gymnasium", "numpy", "rsl_rl", "skrl", "stable_baselines3"},

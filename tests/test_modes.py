@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from torchrl_quad import HoveringEnv, available_drones, load_drone
+from torchrl_quad.adapters.gym import GymVectorEnv
 from torchrl_quad.dynamics import CONTROLS, DYNAMICS, quaternion
-from torchrl_quad.gym import GymVectorEnv
 
 F64 = torch.float64
 each_mode = pytest.mark.parametrize("control", CONTROLS)

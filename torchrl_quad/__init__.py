@@ -110,10 +110,11 @@ def register_envs(*tasks: str) -> None:
     """
     import gymnasium
 
+    module = "torchrl_quad.adapters.gym"
     for task in tasks or (*_TASKS, *(point.name for point in entry_points(group="torchrl_quad.tasks"))):
         name = f"torchrl_quad/{task.title().replace('_', '')}-v0"
         if name not in gymnasium.registry:
-            classes = {"entry_point": "torchrl_quad.gym:GymEnv", "vector_entry_point": "torchrl_quad.gym:GymVectorEnv"}
+            classes = {"entry_point": f"{module}:GymEnv", "vector_entry_point": f"{module}:GymVectorEnv"}
             own = {} if task in _TASKS else {"max_episode_steps": None}  # a task of yours ends its episodes itself
             gymnasium.register(name, **classes, max_episode_steps=_TASKS.get(task), kwargs={"task": task, **own})
 

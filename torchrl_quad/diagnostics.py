@@ -21,7 +21,7 @@ from torchrl_quad.objectives.action_gradients import sources_of_steps
 from torchrl_quad.objectives.calls import require_tensordict
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.objectives.segments import discounts
-from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, checked, require
+from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, check_value, checked
 
 Inputs = nn.Module | Tensor | Iterable[Tensor]
 
@@ -261,7 +261,7 @@ def gradient_by_horizon(
     """
     horizons = _listed(horizons, "horizons must be numbers of control steps, such as (8, 32)")
     horizons = {
-        require("horizons", horizon, Horizon, "They are numbers of control steps."): None for horizon in horizons
+        check_value("horizons", horizon, Horizon, "They are numbers of control steps."): None for horizon in horizons
     }
     require_env(env)
     start = env.reset() if start is None else start

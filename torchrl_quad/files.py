@@ -40,7 +40,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         OSError: the folder does not exist, is read-only or is full; ``path`` is then as it was.
     """
     path = Path(path)
-    require_file(path)
+    check_file(path)
     _delete_leftovers(path)
     temporary = _temporary(path)
     os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
@@ -48,34 +48,34 @@ def replacing(path: str | Path) -> Iterator[Path]:
         yield temporary
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
-        require_file(path)  # again: writing took its time
+        check_file(path)  # again: writing took its time
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
-def replacing_folder(folder: Path, require: Callable[[Path], None]) -> Iterator[Path]:
+def replacing_folder(folder: Path, check: Callable[[Path], None]) -> Iterator[Path]:
     """Replace a folder as a whole by what the block writes into a temporary one, which disappears when it raises.
 
     Args:
         folder: which may be missing, and its parents too.
-        require: refuses a folder that must not be replaced; called before the block and after it.
+        check: refuses a folder that must not be replaced; called before the block and after it.
 
     Raises:
         FileExistsError: ``folder`` is anything else but a folder.
     """
     make_folder(folder.parent)
-    require_folder(folder)
+    check_folder(folder)
     _restore(folder)
-    require(folder)
+    check(folder)
     temporary = _temporary(folder)
     old = temporary.with_name(f"{temporary.name}.old")
     temporary.mkdir()
     try:
         yield temporary
-        require_folder(folder)
-        require(folder)
+        check_folder(folder)
+        check(folder)
         if folder.exists():
             os.replace(folder, old)
         os.replace(temporary, folder)
@@ -102,7 +102,7 @@ def make_folder(path: str | Path) -> Path:
     return path
 
 
-def require_file(path: Path) -> None:
+def check_file(path: Path) -> None:
     """Refuse to replace what exists and is not a plain file.
 
     Raises:
@@ -112,7 +112,7 @@ def require_file(path: Path) -> None:
         raise FileExistsError(f"{path} is {kind}, and no plain file: it is not replaced. Choose another path.")
 
 
-def require_folder(path: Path) -> None:
+def check_folder(path: Path) -> None:
     """Refuse to replace what exists and is not a folder.
 
     Raises:
@@ -136,7 +136,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[Path]:
         FileExistsError: ``path`` is anything else but a plain file.
         filelock.Timeout: another process or thread holds it, and ``wait`` is false.
     """
-    require_file(path)
+    check_file(path)
     lock = FileLock(path, timeout=-1 if wait else 0, fallback_to_soft=False, thread_local=False)
     try:
         lock.acquire(poll_interval=0.02)
@@ -204,7 +204,7 @@ def add_rows(path: str | Path, rows: Sequence[Mapping[str, Any]], same: Sequence
     """
     path = Path(path)
     make_folder(path.parent)
-    require_file(path)
+    check_file(path)
     with locked(path.with_name(f".{path.name}.lock")):
         own = {tuple(str(row[name]) for name in same) for row in rows} if same else set()
         others = [row for row in read_rows(path) if tuple(row.get(name) for name in same) not in own]

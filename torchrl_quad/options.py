@@ -145,7 +145,7 @@ def checked(target: _F, described_by: type | None = None) -> _F:
             bound = signature.bind(*args, **kwargs)
         except TypeError as error:
             called = type(args[0]) if target.__name__ == "__init__" and args else target
-            refuse_unknown(called, kwargs)
+            check_known(called, kwargs)
             raise UserTypeError(f"{called.__name__}: {error}.") from None
         adapters = _adapters(target, described_by)
         for name, value in bound.arguments.items():
@@ -156,7 +156,7 @@ def checked(target: _F, described_by: type | None = None) -> _F:
     return function
 
 
-def require(name: str, value: Any, kind: Any, description: str = "") -> Any:
+def check_value(name: str, value: Any, kind: Any, description: str = "") -> Any:
     """A value that fits an annotation, for what no signature can hold.
 
     Raises:
@@ -259,7 +259,7 @@ def _without_numpy(value: Any) -> Any:
     return value
 
 
-def refuse_unknown(called: Callable[..., Any], given: Iterable[str]) -> None:
+def check_known(called: Callable[..., Any], given: Iterable[str]) -> None:
     """Refuse the first name that is no argument, with the closest one that is.
 
     Raises:

@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from torchrl_quad.adapters.gym import checked_action, checked_options, checked_seed
 from torchrl_quad.errors import MissingPackage, Unsupported, UserTypeError, UserValueError, WrongState
-from torchrl_quad.gym import checked_action, checked_options, checked_seed
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -34,7 +34,7 @@ class DronesVecEnv(VecEnv):
     Raises:
         ImportError: stable-baselines3 is missing.
         TypeError: it is no vector environment with actions of floats.
-        ValueError: the autoreset mode is another. Of a call: as :class:`~torchrl_quad.gym.GymVectorEnv`.
+        ValueError: the autoreset mode is another. Of a call: as :class:`~torchrl_quad.adapters.gym.GymVectorEnv`.
     """
 
     def __init__(self, env: VectorEnv) -> None:

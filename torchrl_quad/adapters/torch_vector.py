@@ -13,8 +13,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_quad.adapters.gym import Closed, ResetNeeded, checked_options, checked_seed
 from torchrl_quad.errors import UserTypeError, UserValueError
-from torchrl_quad.gym import Closed, ResetNeeded, checked_options, checked_seed
 
 _FLOATS = torch.float16, torch.bfloat16, torch.float32, torch.float64
 _INFO = "success", "crash", "reward_terms", "metrics"

@@ -33,7 +33,7 @@ from torchrl_quad.deploy.page import write_page
 from torchrl_quad.deploy.tasks import PROGRESS, RULES, Rule, progress_of
 from torchrl_quad.envs import QuadrotorEnv
 from torchrl_quad.errors import MissingPackage, UserValueError
-from torchrl_quad.files import replacing_folder, require_folder
+from torchrl_quad.files import check_folder, replacing_folder
 
 VECTORS, SELF_TEST_VECTORS = 1024, 16
 IMAGES, SELF_TEST_IMAGES = 256, 4  # the same with images, which are large
@@ -100,7 +100,7 @@ def export_policy(
         raise MissingPackage("export_policy needs onnx and onnxruntime: pip install onnx onnxruntime") from error
     env, normalizer = _unwrapped(env, normalizer)
     place = Path(folder) if Path(folder).name not in ("", "..") else Path(folder).resolve()
-    require_folder(place)
+    check_folder(place)
     require_bundle(place)
     camera = env.camera
     network = fold(actor, normalizer, camera and (camera.height, camera.width))

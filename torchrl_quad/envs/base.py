@@ -37,7 +37,7 @@ from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.specs import describe, set_specs
 from torchrl_quad.envs.step import ControlStep, draw_start, sample_state
 from torchrl_quad.envs.task import Task
-from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, checked, real, require, validated
+from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, check_value, checked, real, validated
 
 FloatType = validated(
     lambda x: isinstance(x, torch.dtype) and x in (torch.float32, torch.float64), "torch.float32 or torch.float64"
@@ -50,7 +50,7 @@ class _Built(type(EnvBase)):
 
     def __call__(cls, *args: Any, **kwargs: Any) -> Any:
         if "compile" in kwargs:
-            kwargs["compile"] = require("compile", kwargs["compile"], bool | dict[str, Any] | None)
+            kwargs["compile"] = check_value("compile", kwargs["compile"], bool | dict[str, Any] | None)
             checks.check_compilation(kwargs["compile"] if isinstance(kwargs["compile"], dict) else {})
         return super().__call__(*args, **kwargs)
 
@@ -294,7 +294,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         return super().reset(tensordict, set_state=set_state, **options)
 
     def _set_seed(self, seed: int | None) -> None:
-        self._seed = require("seed", seed, Seed | None)
+        self._seed = check_value("seed", seed, Seed | None)
         self.randomness.seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False) -> TensorDictBase:
@@ -321,7 +321,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
     def rollout(self, max_steps: int, policy: Any = None, callback: Any = None, **options: Any) -> TensorDictBase:
         """As TorchRL's, with the same numbers; several times faster with ``break_when_any_done=False``, no other option
         than ``tensordict`` (with ``auto_reset=False``), and a TensorDictModule that reads observation or state."""
-        max_steps = require("max_steps", max_steps, Horizon)
+        max_steps = check_value("max_steps", max_steps, Horizon)
         start, auto_reset = options.get("tensordict"), options.get("auto_reset", True)
         quick = callback is None and options.get("break_when_any_done") is False and auto_reset == (start is None)
         # The engine knows nothing of a step of a subclass's own.

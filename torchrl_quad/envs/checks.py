@@ -16,8 +16,7 @@ from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
 from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
-from torchrl_quad.options import Explained, real
-from torchrl_quad.options import require as require_kind
+from torchrl_quad.options import Explained, check_value, real
 
 MAX_SUBSTEPS = 200  # physics steps of a control step, which take half a second without compilation
 MAX_STEPS = 2**31  # since the start of an episode
@@ -69,11 +68,11 @@ def check_compilation(options: Mapping[str, Any]) -> None:
     if unknown:
         raise UserTypeError(f"compile: torch.compile takes no {shown(unknown[0])}. Choose from: {names(known)}.")
     for name, kind in {"fullgraph": bool, "dynamic": bool | None, "disable": bool}.items():
-        require_kind(f"compile: {name}", options.get(name, False), kind)
+        check_value(f"compile: {name}", options.get(name, False), kind)
     modes = ["default", *torch._inductor.list_mode_options()]
     mode = options.get("mode") or "default"
     require(mode in modes, f"compile: mode must be one of {names(modes)}; got {shown(mode)}.")
-    given = require_kind("compile: options", options.get("options"), dict[str, Any] | None) or {}
+    given = check_value("compile: options", options.get("options"), dict[str, Any] | None) or {}
     unknown = [name for name in given if name.replace("-", "_") not in torch._inductor.list_options()]
     require(not unknown, f"compile: the compiler has no option {names(map(shown, unknown))}.")
     backend, backends = options.get("backend", "inductor"), torch.compiler.list_backends(())
@@ -106,7 +105,7 @@ def _weights(weights: Any) -> Any:
         if isinstance(x, Tensor) and x.numel() == 1 and not (x.is_complex() or x.dtype == torch.bool):
             x = x.item()
         try:
-            require_kind(str(name), x, Weight)
+            check_value(str(name), x, Weight)
         except UserValueError as error:
             raise Explained(str(error)) from None
     return weights
@@ -119,7 +118,7 @@ def checked_weights(weights: Mapping[str, Any], known: Mapping[str, Any]) -> Map
     """Weights of reward terms, if the task has these terms."""
     unknown = [str(name) for name in weights if name not in known]
     require(not unknown, f"weights: unknown term {names(unknown)}. Choose from: {names(known)}.")
-    return {name: require_kind("weights", {name: x}, Weights)[name] for name, x in weights.items()}
+    return {name: check_value("weights", {name: x}, Weights)[name] for name, x in weights.items()}
 
 
 def checked_params(params: Any, num_envs: int) -> QuadrotorParams:

@@ -16,7 +16,7 @@ from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.guard import MAX_ANGULAR_VELOCITY, MAX_SPEED
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import Delay, checked, list_of, real, require
+from torchrl_quad.options import Delay, check_value, checked, list_of, real
 
 _DISTRIBUTIONS = {
     "uniform": "low and high",
@@ -102,7 +102,7 @@ class DroneRandomization(Disturbance):
                 )
             (kind, numbers) = next(iter(distribution.items()))
             has = f"{name} needs two numbers, {_DISTRIBUTIONS[kind]}"
-            least, most = require(f"{source}: {kind}", numbers, _PAIR, f"{has}.")
+            least, most = check_value(f"{source}: {kind}", numbers, _PAIR, f"{has}.")
             if most < (0.0 if kind == "normal" else least):
                 raise UserValueError(f"{source}: {has}; got {shown(numbers)}.")
         self.nominal = {name: fields[name] for name in self.spec}

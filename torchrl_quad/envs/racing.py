@@ -30,7 +30,7 @@ from torchrl_quad.envs.terms import (
     target_reward,
 )
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import Size, real, require, validated
+from torchrl_quad.options import Size, check_value, real, validated
 
 WEIGHTS = {  # of the reward's terms, by reward
     "position": {**TARGET_WEIGHTS, "gate": 20.0},
@@ -258,7 +258,7 @@ def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:
     starts = _points(source, "starts", values.get("starts", halfway))
     if len(starts) != len(gates):
         raise UserValueError(f"{source}: there must be one start before each gate, got {len(starts)} for {len(gates)}.")
-    radius = require(f"{source}: gate_radius", values.get("gate_radius", 0.3), GateRadius, "Of all gates [m].")
+    radius = check_value(f"{source}: gate_radius", values.get("gate_radius", 0.3), GateRadius, "Of all gates [m].")
     return {"gates": gates, "starts": starts, "gate_radius": float(radius)}
 
 

@@ -18,7 +18,7 @@ from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import build, checked, real, require, whole
+from torchrl_quad.options import build, check_value, checked, real, whole
 from torchrl_quad.vision import Primitives, closest_approach, nearest
 from torchrl_quad.vision.primitives import SIZES, distances, join
 
@@ -222,7 +222,7 @@ class Scene(Disturbance):
             what = f"{kind}: an obstacle has {', '.join(sizes)}"
             self._require(not unknown, f"{what}; unknown: {shown(', '.join(unknown))}.")
             self._require(not missing, f"{what}; missing: {', '.join(missing)}.")
-            count = require(f"{kind}: count", entry.get("count", 1), Count)
+            count = check_value(f"{kind}: count", entry.get("count", 1), Count)
             read = {
                 name: self._range(f"{kind}: {name}", entry[name], size, is_random and name not in ("low", "high"))
                 for name, size in sizes.items()

@@ -19,7 +19,7 @@ from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, Wron
 from torchrl_quad.objectives.action_gradients import MedianClip, act_again, action_gradient
 from torchrl_quad.objectives.calls import require_tensordict, takes_rollout
 from torchrl_quad.objectives.segments import discounts
-from torchrl_quad.options import Coefficient, Device, Entry, Fraction, Positive, Scale, checked, real, require
+from torchrl_quad.options import Coefficient, Device, Entry, Fraction, Positive, Scale, check_value, checked, real
 
 MOST_WEIGHTS = 100_000_000  # of all copies of a critic; more fit into no memory that trains on a horizon
 
@@ -252,7 +252,7 @@ class PathwiseLoss(LossModule):
         for name, key in keys.items():
             if name not in known:
                 raise UserValueError(f"{type(self).__name__} reads no {name!r}. Choose from: {', '.join(known)}.")
-            keys[name] = require(name, key, Entry | None)
+            keys[name] = check_value(name, key, Entry | None)
         super().set_keys(**keys)
 
     def _forward_value_estimator_keys(self, **_: Any) -> None:

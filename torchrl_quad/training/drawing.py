@@ -23,7 +23,7 @@ from torchrl_quad.deploy import Bundle
 from torchrl_quad.deploy.replaying import as_rollout, environment
 from torchrl_quad.deploy.transfer import fly
 from torchrl_quad.errors import UserError
-from torchrl_quad.files import require_file
+from torchrl_quad.files import check_file
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, write_replay
 from torchrl_quad.render.frames import NoFfmpeg, find_ffmpeg
 
@@ -112,7 +112,7 @@ def _log_traceback(path: Path) -> str:
     """Add the traceback of the present error to drawing.log, or print it where that cannot be written; say which."""
     log = path.with_name("drawing.log")
     try:
-        require_file(log)
+        check_file(log)
         with open(log, "a", encoding="utf-8") as file:
             file.write(f"{path.name} is missing.\n{traceback.format_exc()}\n")
     except OSError:

@@ -31,9 +31,9 @@ from torchrl_quad.options import (
     Real,
     Share,
     Size,
+    check_known,
     declared,
     must,
-    refuse_unknown,
 )
 from torchrl_quad.training.own import CONFIG, OWN, SET_BY_RECIPES
 
@@ -358,7 +358,7 @@ def _environment(values: dict[str, Any]) -> Any:
         if name in SET_BY_RECIPES:
             raise UserValueError(f"env.{name}: recipes set it for all environments. Write {name}=..., without env.")
     if isinstance(env, dict):
-        refuse_unknown(cls, sorted(map(str, env)))
+        check_known(cls, sorted(map(str, env)))
     return _section("Env", declared(cls), inspect.signature(cls).parameters)
 
 

@@ -29,7 +29,6 @@ SMOKE = {  # the test that runs a program on a reduced budget
     "recipes/identify.py": "test_identification: test_the_recipe_fits_a_real_flight_and_draws_it",
     "recipes/transfer.py": "test_transfer: "
     "test_the_recipe_flies_without_torch_keeps_a_table_and_finds_mistakes_of_a_port",
-    "recipes/workspace.py": "test_wandb_page: test_the_workspace_is_built_and_shows_what_runs_log",
     "benchmarks/paper/ablations.py": "test_reproduce: test_options_are_changed_one_at_a_time_and_shown_beside_what_ships",
     "benchmarks/paper/ascent.py": "test_ascent: test_the_gradients_of_every_method_are_compared_with_the_simulator",
     "benchmarks/paper/elsewhere.py": "test_elsewhere: "
@@ -107,7 +106,7 @@ def understands(words, monkeypatch):
     monkeypatch.syspath_prepend((ROOT / script).parent)  # as python does
     if script == "recipes/transfer.py":
         runpy.run_path(str(ROOT / script))["settings"](arguments)
-    elif Path(script).parent.name == "recipes" and script != "recipes/workspace.py":
+    elif Path(script).parent.name == "recipes":
         settings = [re.sub(r"^([\w.]+=[^,{\[]*),.*", r"\1", x) for x in arguments if not x.startswith(("--", "hydra"))]
         check(importlib.import_module("running").composed(Path(script).stem, settings), settings)
     else:
@@ -161,8 +160,6 @@ def words_of(command):
         return shlex.split(command.rpartition('"')[0], comments=True)
 
 
-# wandb-workspaces uses pydantic's old decorators.
-@pytest.mark.filterwarnings("ignore:Pydantic V1 style:DeprecationWarning")
 def test_every_command_in_a_sentence_or_a_docstring_is_one_that_a_test_runs(monkeypatch):
     seen, wrong = {tuple(param.values[0]) for param in commands()}, []
     for path, command in written():

@@ -36,6 +36,9 @@ def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(lau
     assert config["revision"] == revision() != "unknown"
     axes = {(x.metric.glob_name or x.metric.name): x.metric.step_metric for x in first["metric"]}
     assert axes.pop("*") == "steps" and set(axes.values()) <= {"", "steps"}
+    best = {x.metric.name: (x.metric.summary.max, x.metric.summary.min) for x in first["metric"]}
+    assert best["eval/return"] == best["eval/solved"] == (True, False)
+    assert best["eval/crash"] == best["eval/position_error"] == (False, True)
 
     history = [logged(record) for record in first["history"]]
     assert all("steps" in row for row in history) and not any(name.endswith("/step") for row in history for name in row)

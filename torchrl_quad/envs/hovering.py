@@ -39,7 +39,10 @@ class HoveringEnv(QuadrotorEnv):
     box_height = 6.0  # [m]
     weights = TARGET_WEIGHTS
     success_radius = 0.1  # [m]
-    metric_info = {**EPISODE_METRICS, "position_error": Metric("position error", "cm", 100.0, median=True, log=True)}
+    metric_info = {
+        **EPISODE_METRICS,
+        "position_error": Metric("position error", "cm", 100.0, median=True, log=True, goal="min"),
+    }
 
     def initial_state(self, n: int) -> State:
         target = self.tensor(self.target).repeat(n, 1)

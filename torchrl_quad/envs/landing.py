@@ -56,8 +56,8 @@ class LandingEnv(QuadrotorEnv):
     ends_on_success = True
     metric_info = {
         **EPISODE_METRICS,
-        "position_error": Metric("distance over ground", "cm", 100.0, median=True, log=True),
-        "landing_speed": Metric("landing speed", "m/s"),
+        "position_error": Metric("distance over ground", "cm", 100.0, median=True, log=True, goal="min"),
+        "landing_speed": Metric("landing speed", "m/s", goal="min"),
     }
 
     def initial_state(self, n: int) -> State:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -26,6 +27,7 @@ class Metric:
         scale: how many of these units make one SI unit, 100 for cm.
         median: whether it is summed up with the median instead of the mean, which a few crashes would dominate.
         log: whether it is drawn on a logarithmic axis.
+        goal: "max" if more is better, "min" if less is; wandb keeps the best value of such a metric.
     """
 
     label: str
@@ -33,6 +35,7 @@ class Metric:
     scale: Scale = 1.0
     median: bool = False
     log: bool = False
+    goal: Literal["max", "min"] | None = None
 
     @property
     def is_length(self) -> bool:
@@ -59,9 +62,9 @@ class Metric:
 
 #: The metrics of every task. A task adds its own by ``metric_info = {**EPISODE_METRICS, "lap_time": Metric(...)}``.
 EPISODE_METRICS: dict[str, Metric] = {
-    "return": Metric("return"),
-    "solved": Metric("episodes solved", "%", 100.0),
-    "crash": Metric("crashes", "%", 100.0),
+    "return": Metric("return", goal="max"),
+    "solved": Metric("episodes solved", "%", 100.0, goal="max"),
+    "crash": Metric("crashes", "%", 100.0, goal="min"),
 }
 
 

@@ -100,8 +100,8 @@ class RacingEnv(QuadrotorEnv):
     success_gates = 8
     metric_info = {
         **EPISODE_METRICS,
-        "gates_passed": Metric("gates passed"),
-        "lap_time": Metric("lap time", "s"),
+        "gates_passed": Metric("gates passed", goal="max"),
+        "lap_time": Metric("lap time", "s", goal="min"),
         "time_near_gate": Metric("time near a gate", "s"),
     }
 

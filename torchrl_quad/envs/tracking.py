@@ -106,8 +106,8 @@ class TrackingEnv(QuadrotorEnv):
     success_radius = 0.1  # [m]
     metric_info = {
         **EPISODE_METRICS,
-        "tracking_rmse": Metric("tracking RMSE", "cm", 100.0, median=True, log=True),
-        "position_error": Metric("position error", "cm", 100.0, median=True, log=True),
+        "tracking_rmse": Metric("tracking RMSE", "cm", 100.0, median=True, log=True, goal="min"),
+        "position_error": Metric("position error", "cm", 100.0, median=True, log=True, goal="min"),
     }
 
     def __init__(

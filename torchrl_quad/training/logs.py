@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import get_logger
 
+from torchrl_quad.envs.metrics import Metric
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import write_rows
 from torchrl_quad.training.evaluation import as_json
@@ -30,6 +31,7 @@ class Logs:
         revision: of the code, for wandb.
         rows: of metrics.csv so far.
         steps: of training so far; tensorboard forgets what it was given later.
+        metrics: of the task, for wandb.
         saved: the logger's state in the checkpoint from which the run goes on; it then goes on in the same wandb run.
     """
 
@@ -40,6 +42,7 @@ class Logs:
         revision: str,
         rows: list[dict[str, float]],
         steps: int,
+        metrics: Mapping[str, Metric],
         saved: dict[str, Any] | None,
     ) -> None:
         self.cfg, self.folder, self.rows = cfg, folder, rows
@@ -66,6 +69,9 @@ class Logs:
         if cfg.logger.backend == "wandb":
             self.backend.experiment.define_metric("steps", hidden=True)
             self.backend.experiment.define_metric("*", step_metric="steps")
+            for metric, described in metrics.items():
+                if described.goal:  # the table of runs then shows the best value, not the last
+                    self.backend.experiment.define_metric(f"eval/{metric}", step_metric="steps", summary=described.goal)
         if steps and cfg.logger.backend == "tensorboard":
             self.backend.experiment.close()
             writer = type(self.backend.experiment)

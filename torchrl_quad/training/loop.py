@@ -120,7 +120,7 @@ class Run:
         if rank() == 0 and not self.is_over:
             for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
                 (self.folder / name).unlink(missing_ok=True)
-            self.logs = Logs(cfg, self.folder, self.revision, self.rows, self.steps, logger_state)
+            self.logs = Logs(cfg, self.folder, self.revision, self.rows, self.steps, env.metric_info, logger_state)
             with replacing(self.folder / "config.yaml") as path:
                 OmegaConf.save(cfg, path, resolve=True)
 

@@ -149,7 +149,8 @@ class RacingEnv(QuadrotorEnv):
 
     def advance(self, previous: State, state: State) -> State:
         gate, step = previous["gate"], state["step"]
-        passed = self.miss(previous["position"], state["position"], previous["target"]) < self.track["gate_radius"]
+        centre = self.gates[gate[:, 0]]
+        passed = self.miss(previous["position"], state["position"], centre) < self.track["gate_radius"]
         this_gate = passed & (gate == self.gate_indices)
         last_pass = previous["pass_step"].gather(1, gate)
         lap = (step - last_pass).to(self.dtype) * self.control_dt
@@ -182,8 +183,8 @@ class RacingEnv(QuadrotorEnv):
         return {"gate": Event(state["gate_passed"], time, self.weights["gate"])}
 
     def observe(self, state: State) -> Tensor:
-        after = self.gates[(state["gate"][:, 0] + 1) % len(self.gates)]
-        relative = [gate - state["position"] for gate in (state["target"], after)]
+        gate = state["gate"][:, 0]
+        relative = [self.gates[k] - state["position"] for k in (gate, (gate + 1) % len(self.gates))]
         return torch.cat((*relative, *body_observation(state)), -1)
 
     def observation_bounds(self) -> Tensor:

@@ -91,25 +91,23 @@ class ControlStep:
                 new = advanced[key]
                 state[key] = new if everywhere else torch.where(like(keep, new), new, state[key])
         terms = env.reward_terms(state)
+        ends = self.ends(state, keep)
+        if self.event_names:
+            terms = {**terms, **self.event_terms(before, state, terms, ends["terminated"])}
+        if not everywhere:
+            terms = {name: torch.where(keep, term, 0.0) for name, term in terms.items()}
+        outputs = {**self.measure(state), "reward": sum(terms.values()), "reward_terms": terms, **ends}
+        return Transition(state, outputs, valid)
+
+    def ends(self, state: State, keep: Tensor) -> State:
+        """Whether a state ends its episode, and how, each bool (n, 1); ``keep`` (n, 1): where it is meaningful."""
+        env = self.env
         crash, success = env.is_crash(state) | ~keep, env.is_success(state) & keep
         crash = crash if env.scene is None else crash | state["collided"]
         terminated = crash | success if env.ends_on_success else crash
-        if self.event_names:
-            terms = {**terms, **self.event_terms(before, state, terms, terminated)}
-        if not everywhere:
-            terms = {name: torch.where(keep, term, 0.0) for name, term in terms.items()}
         truncated = state["step"] >= env.max_episode_steps
-        outputs = {
-            **self.measure(state),
-            "reward": sum(terms.values()),
-            "reward_terms": terms,
-            "success": success,
-            "crash": crash,
-            "terminated": terminated,
-            "truncated": truncated,
-            "done": terminated | truncated,
-        }
-        return Transition(state, outputs, valid)
+        done = terminated | truncated
+        return {"success": success, "crash": crash, "terminated": terminated, "truncated": truncated, "done": done}
 
     def event_terms(self, before: State, state: State, terms: State, terminated: Tensor) -> State:
         """The reward terms that carry the gradients in the times of events; their values are zero."""

@@ -68,30 +68,25 @@ class Explained(UserValueError):
     """What a validator of an annotation raises whose message says all that there is to say."""
 
 
-def real(least: float, most: float) -> Any:
-    """The type of a number from ``least`` to ``most``."""
-    return Annotated[float, Field(allow_inf_nan=False, ge=least, le=most)]
+def between(least: float, most: float) -> Any:
+    """The range of a number: ``Annotated[float, between(0.0, 1.0)]``, or ``Annotated[int, between(0, 10)]``."""
+    return Field(ge=least, le=most, allow_inf_nan=False if isinstance(least, float) else None)
 
 
-def whole(least: int, most: int) -> Any:
-    """The type of a whole number from ``least`` to ``most``."""
-    return Annotated[int, Field(ge=least, le=most)]
+def entries(least: int, most: int) -> Any:
+    """How many entries a list has: ``Annotated[Sequence[Real], entries(3, 3)]``."""
+    return Field(min_length=least, max_length=most)
 
 
-def list_of(kind: Any, least: int, most: int) -> Any:
-    """The type of a list of ``least`` to ``most`` entries."""
-    return Annotated[Sequence[kind], Field(min_length=least, max_length=most)]
-
-
-def validated(accepts: Callable[[Any], bool], wanted: str) -> Any:
-    """The type of a value that a function accepts; ``wanted`` ends the sentence "It must be ..."."""
+def accepted(accepts: Callable[[Any], bool], wanted: str) -> AfterValidator:
+    """What a function accepts, ``Annotated[Any, accepted(...)]``; ``wanted`` ends the sentence "It must be ..."."""
 
     def validate(value: Any) -> Any:
         if not accepts(value):
             raise UserValueError(f"be {wanted}")
         return value
 
-    return Annotated[Any, AfterValidator(validate)]
+    return AfterValidator(validate)
 
 
 def _is_device(device: Any) -> bool:
@@ -104,7 +99,7 @@ def _is_device(device: Any) -> bool:
     return isinstance(device, str | torch.device)
 
 
-Device = validated(_is_device, "a device of this machine that torch knows, such as 'cpu' or 'cuda'")
+Device = Annotated[Any, accepted(_is_device, "a device of this machine that torch knows, such as 'cpu' or 'cuda'")]
 
 _CONFIG = ConfigDict(strict=True, allow_inf_nan=False)
 _PLAIN = (bool, int, float, str, type(None), Path, list, tuple, dict, Mapping, Sequence)
@@ -188,8 +183,8 @@ def build(cls: type[_T], name: str, spec: Any, **more: Any) -> _T:
         raise UserValueError(f"{name}: {error}") from None
 
 
-def buildable(cls: type, name: str) -> Any:
-    """The type of what :func:`build` makes such an object of, or None."""
+def buildable(cls: type, name: str) -> AfterValidator:
+    """What :func:`build` makes such an object of, or None: ``Annotated[Any, buildable(...)]``."""
 
     def validate(value: Any) -> Any:
         try:
@@ -197,7 +192,7 @@ def buildable(cls: type, name: str) -> Any:
         except UserValueError as error:
             raise Explained(str(error).removeprefix(f"{name}: ")) from None
 
-    return Annotated[Any, AfterValidator(validate)]
+    return AfterValidator(validate)
 
 
 def declared(target: Callable[..., Any]) -> dict[str, tuple[Any, str]]:
@@ -265,7 +260,7 @@ def check_known(called: Callable[..., Any], given: Iterable[str]) -> None:
     Raises:
         UserTypeError: there is one.
     """
-    known = _names(called)
+    known = argument_names(called)
     for unknown in (name for name in given if name not in known):
         close = difflib.get_close_matches(unknown, known, 1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
@@ -275,7 +270,7 @@ def check_known(called: Callable[..., Any], given: Iterable[str]) -> None:
         )
 
 
-def _names(called: Callable[..., Any]) -> list[str]:
+def argument_names(called: Callable[..., Any]) -> list[str]:
     """The names of all arguments; those of a class include what it hands on to its bases."""
     whole = [called] if hasattr(called, "__signature__") else [function for _, function in _takers(called)]
     parameters = (inspect.signature(function).parameters.items() for function in whole)

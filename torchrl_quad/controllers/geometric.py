@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -14,13 +14,14 @@ from torchrl_quad.controllers.policy import Controller, State
 from torchrl_quad.controllers.references import Reference, follow
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.modes import Tilt
-from torchrl_quad.options import real
+from torchrl_quad.options import between
 
 LEAST_LIFT = 0.3  # vertical part of the thrust, in weights: the drone never turns over to dive
 GREATEST_LIFT = 0.9  # of the greatest thrust: there is always some left to go sideways
 
 
-Gain, Heading = real(1e-3, 1e3), real(-2.0 * math.pi, 2.0 * math.pi)
+Gain = Annotated[float, between(1e-3, 1e3)]
+Heading = Annotated[float, between(-2.0 * math.pi, 2.0 * math.pi)]
 
 
 class GeometricController(Controller):

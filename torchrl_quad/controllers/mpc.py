@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -15,7 +15,7 @@ from torchrl_quad.controllers.references import Reference, follow
 from torchrl_quad.controllers.riccati import feedback
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import real, whole
+from torchrl_quad.options import between
 
 # Of the squared residuals: each is the square of what one unit of it weighs, and half of it counts.
 WEIGHTS = {
@@ -30,7 +30,9 @@ SHORTENED = (1.0, 0.5, 0.2, 0.05)  # shares of a step of Gauss-Newton that are t
 ROWS = 4096  # states whose derivatives are taken at once: what fits into the cache of a processor
 
 
-Plan, Iterations, Weights = whole(1, 1_000), whole(1, 100), Mapping[str, real(0.0, 1e6)]
+Plan = Annotated[int, between(1, 1_000)]
+Iterations = Annotated[int, between(1, 100)]
+Weights = Mapping[str, Annotated[float, between(0.0, 1e6)]]
 
 
 class MPC(Controller):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,9 +30,11 @@ from torchrl_quad.dynamics.vector import (
     where_same,
 )
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import checked, validated
+from torchrl_quad.options import accepted, checked
 
-Nominal = validated(lambda x: isinstance(x, QuadrotorParams), "QuadrotorParams, such as load_drone('visfly')")
+Nominal = Annotated[
+    Any, accepted(lambda x: isinstance(x, QuadrotorParams), "QuadrotorParams, such as load_drone('visfly')")
+]
 
 
 class Setpoint(NamedTuple):

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 from torch import Tensor
 
 from torchrl_quad.dynamics.parameters import QuadrotorParams
-from torchrl_quad.options import real, whole
+from torchrl_quad.options import between
 
 # [s]. In a shorter step a drone at 1 m/s does not move in single precision; with a longer one the rate loop of no drone
 # that ships is stable.
-PhysicsStep = real(1e-6, 0.1)
-Substeps = whole(1, 200)
+PhysicsStep = Annotated[float, between(1e-6, 0.1)]
+Substeps = Annotated[int, between(1, 200)]
 
 
 class Dynamics(Protocol):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from torch import Tensor
 
@@ -18,7 +18,7 @@ from torchrl_quad.dynamics.control import FlightController, Nominal, Setpoint, j
 from torchrl_quad.dynamics.parameters import QuadrotorParams
 from torchrl_quad.dynamics.vector import Vector, cat, clamp, dot, minimum, soft_limit
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import checked, real
+from torchrl_quad.options import between, checked
 
 
 class AttitudeSetpoint(NamedTuple):
@@ -42,7 +42,8 @@ class VelocitySetpoint(NamedTuple):
     yaw_rate: Vector  #: (*, 1) [rad/s], about the world's up
 
 
-Tilt, MaxSpeed = real(0.01, 1.5), real(0.01, 100.0)
+Tilt = Annotated[float, between(0.01, 1.5)]
+MaxSpeed = Annotated[float, between(0.01, 100.0)]
 
 
 @checked

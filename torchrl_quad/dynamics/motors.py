@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import checked, real
+from torchrl_quad.options import between, checked
 
-SpeedPerVolt, Voltage = real(1e-3, 1e5), real(1e-1, 1e3)
-SpeedAtZero, Lag = real(-1e4, 1e4), real(-0.1, 0.5)
+SpeedPerVolt = Annotated[float, between(1e-3, 1e5)]
+Voltage = Annotated[float, between(1e-1, 1e3)]
+SpeedAtZero = Annotated[float, between(-1e4, 1e4)]
+Lag = Annotated[float, between(-0.1, 0.5)]
 
 
 @checked

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -37,12 +37,15 @@ from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.specs import describe, set_specs
 from torchrl_quad.envs.step import ControlStep, draw_start, sample_state
 from torchrl_quad.envs.task import Task
-from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, check_value, checked, real, validated
+from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, accepted, between, check_value, checked
 
-FloatType = validated(
-    lambda x: isinstance(x, torch.dtype) and x in (torch.float32, torch.float64), "torch.float32 or torch.float64"
-)
-ControlPeriod = real(1e-6, 1.0)
+FloatType = Annotated[
+    Any,
+    accepted(
+        lambda x: isinstance(x, torch.dtype) and x in (torch.float32, torch.float64), "torch.float32 or torch.float64"
+    ),
+]
+ControlPeriod = Annotated[float, between(1e-6, 1.0)]
 
 
 class _Built(type(EnvBase)):

@@ -16,11 +16,13 @@ from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
 from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
-from torchrl_quad.options import Explained, check_value, real
+from torchrl_quad.options import Explained, between, check_value
 
 MAX_SUBSTEPS = 200  # physics steps of a control step, which take half a second without compilation
 MAX_STEPS = 2**31  # since the start of an episode
-Weight = real(-1e6, 1e6)  # a larger one would leave none of the seven digits of single precision to the others
+Weight = Annotated[
+    float, between(-1e6, 1e6)
+]  # a larger one would leave none of the seven digits of single precision to the others
 
 
 def require(condition: bool, message: str) -> None:

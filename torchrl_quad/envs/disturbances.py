@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.guard import MAX_ANGULAR_VELOCITY, MAX_SPEED
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import Delay, check_value, checked, list_of, real
+from torchrl_quad.options import Delay, between, check_value, checked, entries
 
 _DISTRIBUTIONS = {
     "uniform": "low and high",
@@ -25,11 +26,15 @@ _DISTRIBUTIONS = {
 }
 MAX_WIND = 100.0  # [m/s]
 # Noise and starts reach as far as flights do, whose states mean nothing beyond.
-Speed, BodyRate = real(0.0, MAX_SPEED), real(0.0, MAX_ANGULAR_VELOCITY)
-Angle, PositionNoise = real(0.0, math.pi), real(0.0, 100.0)
-Speeds, Spreads = list_of(real(-MAX_WIND, MAX_WIND), 3, 3), list_of(real(0.0, MAX_WIND), 3, 3)
-_PAIR = list_of(real(-1e6, 1e6), 2, 2)
-Gust, GustTime = real(0.0, 0.2 * MAX_WIND), real(1e-3, 1e6)
+Speed = Annotated[float, between(0.0, MAX_SPEED)]
+BodyRate = Annotated[float, between(0.0, MAX_ANGULAR_VELOCITY)]
+Angle = Annotated[float, between(0.0, math.pi)]
+PositionNoise = Annotated[float, between(0.0, 100.0)]
+Speeds = Annotated[Sequence[Annotated[float, between(-MAX_WIND, MAX_WIND)]], entries(3, 3)]
+Spreads = Annotated[Sequence[Annotated[float, between(0.0, MAX_WIND)]], entries(3, 3)]
+_PAIR = Annotated[Sequence[Annotated[float, between(-1e6, 1e6)]], entries(2, 2)]
+Gust = Annotated[float, between(0.0, 0.2 * MAX_WIND)]
+GustTime = Annotated[float, between(1e-3, 1e6)]
 
 
 class Disturbance:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -19,7 +19,7 @@ from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenes import ELSEWHERE, MAX_OBSTACLES, Scene, left_out
 from torchrl_quad.envs.terms import norm, outside
 from torchrl_quad.errors import UserTypeError, UserValueError
-from torchrl_quad.options import Size, list_of, real
+from torchrl_quad.options import Size, between, entries
 from torchrl_quad.vision import has_way
 
 #: Trees per square metre, and the least gap between two of them [m].
@@ -28,10 +28,13 @@ CAMERA = {"width": 16, "height": 12, "range": 10.0}
 PLACES = 12  # that are tried for a tree before it is left out
 
 
-Density, Gap, Length = real(0.0, 2.0), real(0.1, 10.0), real(1.0, 1_000.0)
-Radii, Height = list_of(real(0.01, 10.0), 2, 2), real(0.1, 100.0)
-Speed = real(0.1, 30.0)
-Speeds = list_of(Speed, 2, 2)
+Density = Annotated[float, between(0.0, 2.0)]
+Gap = Annotated[float, between(0.1, 10.0)]
+Length = Annotated[float, between(1.0, 1_000.0)]
+Radii = Annotated[Sequence[Annotated[float, between(0.01, 10.0)]], entries(2, 2)]
+Height = Annotated[float, between(0.1, 100.0)]
+Speed = Annotated[float, between(0.1, 30.0)]
+Speeds = Annotated[Sequence[Speed], entries(2, 2)]
 
 
 class ForestEnv(QuadrotorEnv):

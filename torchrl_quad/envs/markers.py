@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -15,14 +15,17 @@ from torch.nn.functional import normalize
 
 from torchrl_quad.engine.packing import like
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import Real, Share, checked, real, validated
+from torchrl_quad.options import Real, Share, accepted, between, checked
 from torchrl_quad.vision.primitives import SIZES
 
 MAX_POINTS = 1_000_000  # of an object; no picture shows more
-Length = real(1e-6, 1e6)  # [m]
-Color = validated(
-    lambda x: isinstance(x, str) and re.fullmatch("#[0-9a-fA-F]{6}", x), "written as #rrggbb, such as #c8452f"
-)
+Length = Annotated[float, between(1e-6, 1e6)]  # [m]
+Color = Annotated[
+    Any,
+    accepted(
+        lambda x: isinstance(x, str) and re.fullmatch("#[0-9a-fA-F]{6}", x), "written as #rrggbb, such as #c8452f"
+    ),
+]
 _RING = 33  # points of a circle, the first again at its end
 
 

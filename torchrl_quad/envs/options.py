@@ -13,7 +13,7 @@ from torchrl_quad.envs.disturbances import Disturbance, DroneRandomization, Rand
 from torchrl_quad.envs.eyes import Eye
 from torchrl_quad.envs.scenes import Scene
 from torchrl_quad.errors import UserTypeError, UserValueError
-from torchrl_quad.options import Explained, build, buildable, validated
+from torchrl_quad.options import Explained, accepted, build, buildable
 from torchrl_quad.vision import DepthCamera
 
 # Numbers of all states of an environment and of the noise of 32 steps: 2 GB in single precision, 64 on an accelerator.
@@ -47,18 +47,25 @@ def _is_file_or(*kinds: type) -> Any:
 
 
 #: The types of an environment's options that are no plain numbers.
-DroneOption = validated(
-    _is_file_or(QuadrotorParams), "the name of a preset, the path of a YAML file, a mapping, or QuadrotorParams"
-)
+DroneOption = Annotated[
+    Any,
+    accepted(
+        _is_file_or(QuadrotorParams), "the name of a preset, the path of a YAML file, a mapping, or QuadrotorParams"
+    ),
+]
 DynamicsOption = Annotated[Any, AfterValidator(_dynamics)]
-ControlOption = validated(lambda x: isinstance(x, str | Mapping), "a name, such as rates, or a mapping with limits")
-NoiseOption = buildable(Sensors, "observation_noise")
-WindOption = buildable(Wind, "wind")
-StartOption = buildable(RandomStart, "random_start")
-RandomizeOption = validated(lambda x: x is None or _is_file_or()(x), "a mapping, or the path of a YAML file")
+ControlOption = Annotated[
+    Any, accepted(lambda x: isinstance(x, str | Mapping), "a name, such as rates, or a mapping with limits")
+]
+NoiseOption = Annotated[Any, buildable(Sensors, "observation_noise")]
+WindOption = Annotated[Any, buildable(Wind, "wind")]
+StartOption = Annotated[Any, buildable(RandomStart, "random_start")]
+RandomizeOption = Annotated[
+    Any, accepted(lambda x: x is None or _is_file_or()(x), "a mapping, or the path of a YAML file")
+]
 DisturbancesOption = Annotated[Any, AfterValidator(_disturbances)]
 SceneOption = Annotated[Any, AfterValidator(_scene)]
-CameraOption = buildable(DepthCamera, "camera")
+CameraOption = Annotated[Any, buildable(DepthCamera, "camera")]
 
 
 def choose_disturbances(

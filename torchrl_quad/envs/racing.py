@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -30,17 +30,21 @@ from torchrl_quad.envs.terms import (
     target_reward,
 )
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import Size, check_value, real, validated
+from torchrl_quad.options import Size, accepted, between, check_value
 
 WEIGHTS = {  # of the reward's terms, by reward
     "position": {**TARGET_WEIGHTS, "gate": 20.0},
     "velocity": {"towards": 0.02, "across": 0.02, "angular_velocity": 0.001, "gate": 5.0},
 }
 RELAXATION_WEIGHTS = {"log": {"gate": 5.0}, "reciprocal": {"gate": 1.0}}
-MAX_GATES, GateRadius = 1_000, real(0.01, 100.0)
-TrackOption = validated(
-    lambda x: isinstance(x, str | Path | Mapping), "the name of a track, the path of a YAML file, or a mapping"
-)
+MAX_GATES = 1_000
+GateRadius = Annotated[float, between(0.01, 100.0)]
+TrackOption = Annotated[
+    Any,
+    accepted(
+        lambda x: isinstance(x, str | Path | Mapping), "the name of a track, the path of a YAML file, or a mapping"
+    ),
+]
 _TRACKS = resources.files(__package__) / "tracks"
 
 

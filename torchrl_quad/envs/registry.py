@@ -81,7 +81,7 @@ def task_class(task: str) -> type[QuadrotorEnv]:
     if offers:
         return _require_task(offers[0].load(), f"The entry point {task} = {offers[0].value!r}")
     if isinstance(task, str) and re.fullmatch(r"\w+(\.\w+)+", task):
-        return _require_task(_imported(task), f"task {task!r}")
+        return _require_task(imported(task), f"task {task!r}")
     raise UserValueError(
         f"Unknown task {shown(task)}. Choose from: {', '.join(available_tasks())}. For one of your own give the path "
         "of its class, such as 'mypackage.WindowEnv', or call register_task(name, WindowEnv) before."
@@ -109,7 +109,12 @@ def _offered() -> dict[str, list[EntryPoint]]:
     return offers
 
 
-def _imported(path: str) -> Any:
+def imported(path: str, what: str = "task") -> Any:
+    """What a path leads to, such as "mypackage.WindowEnv"; its module is imported.
+
+    Raises:
+        ValueError: there is no such module, or it has nothing of that name.
+    """
     module, _, name = path.rpartition(".")
     try:
         found = importlib.import_module(module)
@@ -117,11 +122,11 @@ def _imported(path: str) -> Any:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # the module is there, and needs one that is not
         raise UserValueError(
-            f"task {path!r}: Python finds no module {error.name!r}. Put its folder on PYTHONPATH, or install its "
+            f"{what} {path!r}: Python finds no module {error.name!r}. Put its folder on PYTHONPATH, or install its "
             "package."
         ) from None
     if not hasattr(found, name):
-        raise UserValueError(f"task {path!r}: the module {module!r} ({found.__file__}) has no {name!r}.")
+        raise UserValueError(f"{what} {path!r}: the module {module!r} ({found.__file__}) has no {name!r}.")
     return getattr(found, name)
 
 

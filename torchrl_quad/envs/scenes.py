@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import build, check_value, checked, real, whole
+from torchrl_quad.options import between, build, check_value, checked
 from torchrl_quad.vision import Primitives, closest_approach, nearest
 from torchrl_quad.vision.primitives import SIZES, distances, join
 
@@ -26,8 +26,10 @@ TRIES = 20  # how often an obstacle that stands in a start is drawn again before
 ELSEWHERE = -1e4  # [m], the height of what is left out: nobody sees it, nobody meets it
 MAX_OBSTACLES = 1_000
 SMALLEST = 1e-3  # [m], of an obstacle: what single precision resolves at a distance of ten kilometres
-Obstacles, Count = Sequence[Mapping[str, Any]], whole(1, MAX_OBSTACLES)
-Clearance, Radius = real(0.0, 100.0), real(1e-3, 10.0)
+Obstacles = Sequence[Mapping[str, Any]]
+Count = Annotated[int, between(1, MAX_OBSTACLES)]
+Clearance = Annotated[float, between(0.0, 100.0)]
+Radius = Annotated[float, between(1e-3, 10.0)]
 TOLERANCE = 1e-3  # [m], by which a state may lie nearer to an obstacle than a flight would have left it
 
 # The fields of an obstacle by kind, with the number of their entries; a random one has ranges of them.

@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -23,7 +23,7 @@ from torchrl_quad.envs.terms import (
     target_reward,
 )
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import Size, real, validated
+from torchrl_quad.options import Size, accepted, between
 
 Curve = Callable[[Tensor], Tensor]
 
@@ -49,11 +49,14 @@ CURVES: dict[str, tuple[Curve, float]] = {  # by name: the curve, and its period
 }
 
 
-CurveOption = validated(
-    lambda x: callable(x) or (isinstance(x, str) and x in CURVES),
-    f"one of {', '.join(CURVES)}, or a function from phases (*) [rad] to positions (*, 3) [m]",
-)
-Period = real(0.1, 10_000.0)
+CurveOption = Annotated[
+    Any,
+    accepted(
+        lambda x: callable(x) or (isinstance(x, str) and x in CURVES),
+        f"one of {', '.join(CURVES)}, or a function from phases (*) [rad] to positions (*, 3) [m]",
+    ),
+]
+Period = Annotated[float, between(0.1, 10_000.0)]
 
 
 class TrackingEnv(QuadrotorEnv):

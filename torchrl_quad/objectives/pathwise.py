@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -19,7 +19,7 @@ from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, Wron
 from torchrl_quad.objectives.action_gradients import MedianClip, act_again, action_gradient
 from torchrl_quad.objectives.calls import require_tensordict, takes_rollout
 from torchrl_quad.objectives.segments import discounts
-from torchrl_quad.options import Coefficient, Device, Entry, Fraction, Positive, Scale, check_value, checked, real
+from torchrl_quad.options import Coefficient, Device, Entry, Fraction, Positive, Scale, between, check_value, checked
 
 MOST_WEIGHTS = 100_000_000  # of all copies of a critic; more fit into no memory that trains on a horizon
 
@@ -97,7 +97,7 @@ class PathwiseLoss(LossModule):
         actor_network: TensorDictModule,
         *,
         alpha: Coefficient | Literal["auto"] = 0.0,
-        target_entropy: real(-1e6, 1e6) | Literal["auto"] = "auto",
+        target_entropy: Annotated[float, between(-1e6, 1e6)] | Literal["auto"] = "auto",
         alpha_init: Scale = 1e-2,
         clip_action_gradient: Positive | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrl_quad.objectives.calls import refuse_fixed
 from torchrl_quad.objectives.shac import SHACLoss
-from torchrl_quad.options import Copies, Scale, real
+from torchrl_quad.options import Copies, Scale, between
 
 
 class SAPOLoss(SHACLoss):
@@ -48,7 +48,7 @@ class SAPOLoss(SHACLoss):
         num_value_nets: Copies = 2,
         alpha: Scale | Literal["auto"] = "auto",
         alpha_init: Scale = 1.0,
-        target_entropy: real(-1e6, -1e-3) | Literal["auto"] = "auto",
+        target_entropy: Annotated[float, between(-1e6, -1e-3)] | Literal["auto"] = "auto",
         terminal_gradient: bool = True,
         average_over_horizon: bool = False,
         **kwargs: Any,

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import Below1, Delay, Fraction, build, checked, list_of, real, whole
+from torchrl_quad.options import Below1, Delay, Fraction, between, build, checked, entries
 from torchrl_quad.vision.primitives import Primitives
 from torchrl_quad.vision.rays import cast_rays
 
 MAX_PIXELS = 1_000_000
 MAX_ANGLE = math.radians(170.0)  # a picture plane cannot show half of all directions
-Angle = real(0.01, 2.967)
-Side = whole(1, 10_000)
-Rate = whole(1, 1_000)
-Place = list_of(real(-10.0, 10.0), 3, 3)
-Quaternion = list_of(real(-1.001, 1.001), 4, 4)
-Turn = real(-math.pi, math.pi)
-Range = real(0.01, 10_000.0)
+Angle = Annotated[float, between(0.01, 2.967)]
+Side = Annotated[int, between(1, 10_000)]
+Rate = Annotated[int, between(1, 1_000)]
+Place = Annotated[Sequence[Annotated[float, between(-10.0, 10.0)]], entries(3, 3)]
+Quaternion = Annotated[Sequence[Annotated[float, between(-1.001, 1.001)]], entries(4, 4)]
+Turn = Annotated[float, between(-math.pi, math.pi)]
+Range = Annotated[float, between(0.01, 10_000.0)]
 
 
 @checked

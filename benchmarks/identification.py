@@ -20,10 +20,9 @@ from tqdm import tqdm
 
 from torchrl_quad import QuadrotorParams, load_drone
 from torchrl_quad.dynamics import MotorCommand, quaternion
-from torchrl_quad.dynamics.integrators import rk4
 from torchrl_quad.dynamics.modes import make_controller
 from torchrl_quad.dynamics.quadrotor import QuadrotorState
-from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
+from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations, rk4
 from torchrl_quad.dynamics.rotors import Rotors
 from torchrl_quad.files import read_rows
 from torchrl_quad.identification import FlightLog, identify

@@ -22,6 +22,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import importlib
 import inspect
 import re
 import types
@@ -164,12 +165,13 @@ def build(cls: type[_T], name: str, spec: Any, **more: Any) -> _T:
     """An object from a mapping of its arguments, or the object itself, with what is given (not zero) beside it.
 
     Raises:
-        UserValueError: it is neither, has an unknown key, or a value that does not fit.
+        UserValueError: it is neither, has an unknown key, lacks one, or has a value that does not fit.
     """
     if isinstance(spec, cls):
         changes = {key: value for key, value in more.items() if value}
         return dataclasses.replace(spec, **changes) if changes else spec
-    allowed = [key for key in inspect.signature(cls).parameters if key not in more]
+    arguments = inspect.signature(cls).parameters
+    allowed = [key for key in arguments if key not in more]
     if not isinstance(spec, Mapping):
         raise UserValueError(
             f"{name} must be a mapping with any of {', '.join(allowed)}, or a {cls.__name__}; got {shown(spec)}."
@@ -177,6 +179,9 @@ def build(cls: type[_T], name: str, spec: Any, **more: Any) -> _T:
     for key in spec:
         if key not in allowed:
             raise UserValueError(f"{name}: unknown key {shown(key)}. Allowed: {', '.join(allowed)}.")
+    for key in allowed:
+        if key not in spec and arguments[key].default is inspect.Parameter.empty:
+            raise UserValueError(f"{name}: missing key {key!r}. Allowed: {', '.join(allowed)}.")
     try:
         return cls(**spec, **more)
     except UserValueError as error:
@@ -193,6 +198,27 @@ def buildable(cls: type, name: str) -> AfterValidator:
             raise Explained(str(error).removeprefix(f"{name}: ")) from None
 
     return AfterValidator(validate)
+
+
+def imported(path: str, what: str = "task") -> Any:
+    """What a path leads to, such as "mypackage.WindowEnv"; its module is imported.
+
+    Raises:
+        ValueError: there is no such module, or it has nothing of that name.
+    """
+    module, _, name = path.rpartition(".")
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # the module is there, and needs one that is not
+        raise UserValueError(
+            f"{what} {path!r}: Python finds no module {error.name!r}. Put its folder on PYTHONPATH, or install its "
+            "package."
+        ) from None
+    if not hasattr(found, name):
+        raise UserValueError(f"{what} {path!r}: the module {module!r} ({found.__file__}) has no {name!r}.")
+    return getattr(found, name)
 
 
 def declared(target: Callable[..., Any]) -> dict[str, tuple[Any, str]]:

@@ -2,8 +2,7 @@
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Setpoint
-from torchrl_quad.dynamics.integrators import INTEGRATORS, euler, rk4, semi_implicit_euler
-from torchrl_quad.dynamics.interface import Dynamics
+from torchrl_quad.dynamics.model import Dynamics
 from torchrl_quad.dynamics.modes import (
     CONTROLS,
     AttitudeController,
@@ -11,11 +10,17 @@ from torchrl_quad.dynamics.modes import (
     VelocityController,
     make_controller,
 )
-from torchrl_quad.dynamics.motors import MotorCommand
-from torchrl_quad.dynamics.parameters import QuadrotorParams, available_drones, load_drone
+from torchrl_quad.dynamics.parameters import MotorCommand, QuadrotorParams, available_drones, load_drone
 from torchrl_quad.dynamics.point_mass import PointMass
 from torchrl_quad.dynamics.quadrotor import Quadrotor, QuadrotorState, control_step, physics_step
-from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
+from torchrl_quad.dynamics.rigid_body import (
+    INTEGRATORS,
+    RigidBodyState,
+    accelerations,
+    euler,
+    rk4,
+    semi_implicit_euler,
+)
 
 #: The dynamics models by name.
 DYNAMICS: dict[str, type[Dynamics]] = {"quadrotor": Quadrotor, "point_mass": PointMass}

@@ -17,12 +17,9 @@ from torchrl_quad.dynamics.vector import (
     Vector,
     cat,
     clamp,
-    greatest,
     is_same,
     larger,
-    least,
     matvec,
-    multiply_add,
     smaller,
     unbind,
     unbind_rows,
@@ -58,9 +55,9 @@ class FlightController:
     action_units = {"thrust": "N", "roll rate": "rad/s", "pitch rate": "rad/s", "yaw rate": "rad/s"}
     """What the four entries of an action command, and in which unit."""
 
-    setpoint_type, setpoint_sizes = Setpoint, (1, 3)
-    # Of its tensors, those that each physics step reads.
-    constants: tuple[str, ...] = (
+    setpoint_type: type[Any] = Setpoint
+    setpoint_sizes: tuple[int, ...] = (1, 3)
+    constants: tuple[str, ...] = (  # of its tensors, those that each physics step reads
         "thrust_min", "thrust_max", "gain", "tiny", "share", "per_share", "middle", "half_span",
         "yaw_share", "yaw_sign", "yaw_reach",
     )  # fmt: skip
@@ -77,8 +74,8 @@ class FlightController:
         self.tiny = 1e-6 * weight
         # What a rotor contributes to collective thrust; its limits, and the thrust it has for yaw, in these units.
         self.share, self.per_share = self.mixer[..., 0], 1.0 / self.mixer[..., 0]
-        lowest, highest = self.thrust_min * self.per_share, self.thrust_max * self.per_share
-        lowest, highest = lowest.amax(-1, keepdim=True), highest.amin(-1, keepdim=True)
+        lowest = (self.thrust_min * self.per_share).amax(-1, keepdim=True)
+        highest = (self.thrust_max * self.per_share).amin(-1, keepdim=True)
         self.middle, self.half_span = 0.5 * (highest + lowest), 0.5 * (highest - lowest)
         self.yaw_share = self.mixer[..., 3] * self.per_share
         self.yaw_sign, self.yaw_reach = self.yaw_share.sign(), self.yaw_share.abs().amax(-1, keepdim=True)
@@ -88,18 +85,13 @@ class FlightController:
         self.offset = pad(weight.new_ones(1), (0, 3))
         self.scale = join(self.half_range, nominal.max_body_rate)
         self.hover_action = pad(2.0 / nominal.max_thrust_to_weight - 1.0, (0, 3))
-        _require_hover(nominal, self.hover_speed)
+        _check_hover(nominal, self.hover_speed)
 
     def unbind(self) -> FlightController:
         """The same on components: its numbers become constants of the code that is compiled with it."""
         apart = copy.copy(self)
-        apart.nominal = RawParams(
-            **{
-                name: unbind(value, constant=True)
-                for name, value in self.nominal.fields().items()
-                if name != "rotor_positions"
-            }
-        )
+        fields = {k: unbind(x, constant=True) for k, x in self.nominal.fields().items() if k != "rotor_positions"}
+        apart.nominal = RawParams(**fields)
         apart.rotors, apart.mixer = self.rotors.unbind(), unbind_rows(self.mixer)
         for name in self.constants:
             setattr(apart, name, unbind(getattr(self, name), constant=True))
@@ -122,9 +114,8 @@ class FlightController:
         rates = self.rate_setpoint(setpoint, state.quaternion, state.velocity)
         moment = None
         if self.knows_moment:
-            moment = drag_moment(
-                drag(quaternion.rotate_inverse(state.quaternion, state.velocity), self.nominal), self.nominal
-            )
+            velocity_body = quaternion.rotate_inverse(state.quaternion, state.velocity)
+            moment = drag_moment(drag(velocity_body, self.nominal), self.nominal)
         return self.rotor_speed(rates, state.angular_velocity, wrench, moment)
 
     def rate_setpoint(self, setpoint: Any, attitude: Vector, velocity: Vector) -> Setpoint:
@@ -146,7 +137,7 @@ class FlightController:
         if moment is not None:
             held = held - moment
         acceleration = (wrench[..., 1:] - held) / inertia
-        torque = multiply_add(held, self.gain, setpoint.body_rate - angular_velocity)
+        torque = held.addcmul(self.gain, setpoint.body_rate - angular_velocity)
         torque = torque - self.nominal.rate_damping * acceleration
         thrust = matvec(self.mixer, cat(setpoint.thrust, torque))
         return self.rotors.speed(self._within_limits(thrust, setpoint.thrust, torque[..., 2:]))
@@ -158,10 +149,8 @@ class FlightController:
         for roll and pitch, up as well as down (airmode); roll and pitch shrink only where they need more than the whole
         range. Thrusts within the limits pass unchanged.
 
-        Args:
-            thrust: what the mixer asks of each rotor (*, 4) [N].
-            collective: the part of it that is collective thrust (*, 1) [N].
-            yaw_torque: the part of it that is torque about body z (*, 1) [N m].
+        The mixer asks for ``thrust`` (*, 4) [N]; of this, ``collective`` (*, 1) [N] is collective thrust, and
+        ``yaw_torque`` (*, 1) [N m] the torque about body z.
         """
         limited = clamp(thrust, self.thrust_min, self.thrust_max)
         if is_same(limited, thrust):
@@ -169,14 +158,14 @@ class FlightController:
         # In units of collective thrust, of which every rotor has its share; half its range above and below the middle.
         yaw = self.yaw_share * yaw_torque
         tilt = thrust * self.per_share - yaw - collective
-        least_tilt, greatest_tilt = least(tilt), greatest(tilt)
+        least_tilt, greatest_tilt = tilt.amin(-1, keepdim=True), tilt.amax(-1, keepdim=True)
         shrink = (self.half_span * 2.0 / larger(greatest_tilt - least_tilt, self.tiny)).clamp_max(1.0)
         highest = self.middle + self.half_span - greatest_tilt * shrink
         lowest = self.middle - self.half_span - least_tilt * shrink
         level = larger(smaller(collective, highest), lowest) + tilt * shrink
         # The rotors that yaw speeds up have room above, the others below.
         used = (level - self.middle) * self.yaw_sign
-        used = where_positive(yaw_torque, greatest(used), -least(used))
+        used = where_positive(yaw_torque, used.amax(-1, keepdim=True), -used.amin(-1, keepdim=True))
         yaw_fits = (self.half_span - used) / larger(yaw_torque.abs() * self.yaw_reach, self.tiny)
         level = level + yaw * yaw_fits.clamp_min(0.0).clamp_max(1.0)
         return where_same(limited, thrust, clamp(level * self.share, self.thrust_min, self.thrust_max))
@@ -188,7 +177,7 @@ def join(*parts: Tensor) -> Tensor:
     return torch.cat([x.expand(*batch, x.shape[-1]) for x in parts], -1)
 
 
-def _require_hover(nominal: QuadrotorParams, speed: Tensor) -> None:
+def _check_hover(nominal: QuadrotorParams, speed: Tensor) -> None:
     low, high = nominal.rotor_speed_min, nominal.rotor_speed_max
     if not ((low < speed) & (speed < high)).all():
         raise UserValueError(

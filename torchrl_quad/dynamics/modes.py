@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Nominal, Setpoint, join
 from torchrl_quad.dynamics.parameters import QuadrotorParams
-from torchrl_quad.dynamics.vector import Vector, cat, clamp, dot, minimum, soft_limit
+from torchrl_quad.dynamics.vector import Vector, cat, clamp, dot, soft_limit
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import between, checked
 
@@ -180,7 +180,7 @@ class VelocityController(TiltController):
         sideways = sideways * (dot(sideways, sideways) / reach.square() + 1.0).rsqrt()
         wanted = cat(sideways, climb)
         seen = quaternion.rotate_inverse(attitude, wanted)
-        thrust = minimum((seen[..., 2:] * self.nominal.mass).clamp_min(0.0), self.full_thrust)
+        thrust = (seen[..., 2:] * self.nominal.mass).clamp_min(0.0).minimum(self.full_thrust)
         x, y, _ = _entries(seen * dot(wanted, wanted).rsqrt())
         error = cat(-y, x)  # body z x wanted direction of thrust
         # The thrust keeps its direction in the world while the drone turns under it.

@@ -4,54 +4,85 @@ from __future__ import annotations
 
 import collections
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import presets
-from torchrl_quad.dynamics.motors import MotorCommand
 from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.options import between, build, checked
 
-_DRONES = resources.files(__package__) / "drones"
+_DRONES = resources.files("torchrl_quad.dynamics") / "drones"
 
-# Per field: the shape of one drone's value, and the least and the greatest number that makes sense for it. Beyond them
-# the numbers of a drone that could never fly overflow, and their derivatives with them.
+
+class _Field(NamedTuple):
+    """The shape of one drone's value, the least and the greatest number that makes sense for it, and its unit.
+
+    Beyond them the numbers of a drone that could never fly overflow, and their derivatives with them.
+    """
+
+    shape: tuple[int, ...]
+    low: float
+    high: float
+    unit: str = ""
+
+
 _FIELDS = {
-    "mass": ((1,), 1e-3, 1e3),
-    "inertia": ((3,), 1e-8, 1e3),
-    "rotor_positions": ((4, 2), -1e1, 1e1),
-    "rotor_spin": ((4,), -1.0, 1.0),
-    "yaw_torque_coefficient": ((1,), 1e-5, 1e1),
-    "thrust_map": ((3,), -1e3, 1e3),
-    "rotor_speed_min": ((1,), 0.0, 1e5),
-    "rotor_speed_max": ((1,), 1e0, 1e5),
-    "motor_time_constant": ((1,), 1e-4, 1e1),
-    "linear_drag": ((3,), 0.0, 1e2),
-    "quadratic_drag": ((3,), 0.0, 1e2),
-    "rate_gain": ((3,), 1e-3, 1e4),
-    "rate_damping": ((3,), 0.0, 1e3),
-    "max_body_rate": ((3,), 1e-2, 1e2),
-    "max_thrust_to_weight": ((1,), 1e-1, 1e2),
-    "gravity": ((1,), 1e-2, 1e3),
-    "drag_height": ((1,), -1e0, 1e0),
+    "mass": _Field((1,), 1e-3, 1e3, "kg"),
+    "inertia": _Field((3,), 1e-8, 1e3, "kg m2"),
+    "rotor_positions": _Field((4, 2), -1e1, 1e1, "m"),
+    "rotor_spin": _Field((4,), -1.0, 1.0),
+    "yaw_torque_coefficient": _Field((1,), 1e-5, 1e1, "m"),
+    "thrust_map": _Field((3,), -1e3, 1e3, "N s2, N s, N"),
+    "rotor_speed_min": _Field((1,), 0.0, 1e5, "rad/s"),
+    "rotor_speed_max": _Field((1,), 1e0, 1e5, "rad/s"),
+    "motor_time_constant": _Field((1,), 1e-4, 1e1, "s"),
+    "linear_drag": _Field((3,), 0.0, 1e2, "N s/m"),
+    "quadratic_drag": _Field((3,), 0.0, 1e2, "N s2/m2"),
+    "rate_gain": _Field((3,), 1e-3, 1e4, "1/s"),
+    "rate_damping": _Field((3,), 0.0, 1e3, "kg m2"),
+    "max_body_rate": _Field((3,), 1e-2, 1e2, "rad/s"),
+    "max_thrust_to_weight": _Field((1,), 1e-1, 1e2),
+    "gravity": _Field((1,), 1e-2, 1e3, "m/s2"),
+    "drag_height": _Field((1,), -1e0, 1e0, "m"),
 }
 _OTHER_SHAPES = {"motor_time_constant": (2,)}  # which a field may have as well
 _OPTIONAL = {"drag_height": 0.0}
-LIMITS = {name: (low, high) for name, (_, low, high) in _FIELDS.items()}
+_ZERO = cast(Tensor, 0.0)  # a number, until QuadrotorParams has made it like the others
+LIMITS = {name: (field.low, field.high) for name, field in _FIELDS.items()}
 # The fields that only the flight controller reads, from its nominal drone; and those of the drone that flies.
 CONTROLLER_FIELDS = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
 PLANT_FIELDS = tuple(name for name in _FIELDS if name not in CONTROLLER_FIELDS)
 
-# As QuadrotorParams, but unchecked and of any form: for drones that are drawn at random, and for compiled code.
-RawParams = collections.namedtuple("RawParams", _FIELDS, defaults=[None] * len(_FIELDS))
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class MotorCommand:
+    """The rotor speed that a motor command asks for: ``speed_at_zero + speed_per_volt * command * voltage``.
+
+    The command is 0 to 1 of what the electronics can give. It is needed to replay flights
+    (:func:`~torchrl_quad.identification.prediction_error`); environments command rotor speeds or thrusts.
+
+    Args:
+        speed_per_volt: of command times battery voltage, which is what the motor gets on average, 0.001 to 1e5 rad/s
+            per V.
+        nominal_voltage: where a log has no battery voltage, 0.1 to 1000 V.
+        speed_at_zero: -1e4 to 1e4 rad/s.
+        delay: from the command to the motor, -0.1 to 0.5 s.
+    """
+
+    speed_per_volt: Annotated[float, between(1e-3, 1e5)]
+    nominal_voltage: Annotated[float, between(1e-1, 1e3)]
+    speed_at_zero: Annotated[float, between(-1e4, 1e4)] = 0.0
+    delay: Annotated[float, between(-0.1, 0.5)] = 0.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class QuadrotorParams:
     """The physical parameters of a quadrotor, SI units, body frame x forward, y left, z up.
 
@@ -78,29 +109,34 @@ class QuadrotorParams:
     max_body_rate: Tensor  #: (3) [rad/s], commanded at full stick
     max_thrust_to_weight: Tensor  #: (1), commanded at full stick
     gravity: Tensor  #: (1) [m/s2]
-    drag_height: Tensor | float = 0.0  #: (1) [m], above the centre of mass, where the drag acts
-    motor_command: MotorCommand | None = None  #: from motor commands of logs to rotor speeds; None where unknown
+    drag_height: Tensor = _ZERO  #: (1) [m], above the centre of mass, where the drag acts
+    motor_command: MotorCommand | None = None  #: from motor commands of logs to rotor speeds; None if unknown
 
     def __post_init__(self) -> None:
+        like = self.mass if isinstance(self.mass, Tensor) and self.mass.is_floating_point() else torch.empty(0)
         for name, value in self.fields().items():
-            like = self.mass if isinstance(self.mass, Tensor) and self.mass.is_floating_point() else torch.empty(0)
-            value = _tensor(name, value, like, "QuadrotorParams")
-            value = value if value.dim() else value.reshape(1)
-            object.__setattr__(self, name, value)
-            _check(name, value, "QuadrotorParams")
+            object.__setattr__(self, name, _field(name, value, like, "QuadrotorParams"))
         low, high = self.rotor_speed_min.detach(), self.rotor_speed_max.detach()
         if not (low < high).all():
             raise UserValueError(
                 "QuadrotorParams: rotor_speed_min must be below rotor_speed_max, "
                 f"got {low.tolist()} and {high.tolist()}."
             )
-
         k2, k1, _ = self.thrust_map.detach().split(1, -1)
-        if not (k1 + 2.0 * k2 * low >= 0).all():
+        slope = k1 + 2.0 * k2 * low
+        if not (slope >= 0).all():
             raise UserValueError(
                 "QuadrotorParams: thrust_map must not fall with rotor speed: k1 + 2 k2 rotor_speed_min must be zero "
-                f"or positive, got {(k1 + 2.0 * k2 * low).tolist()}."
+                f"or positive, got {slope.tolist()}."
             )
+
+    def __repr__(self) -> str:
+        """A table with units."""
+        labels = {name: f"{name} [{field.unit}]" if field.unit else name for name, field in _FIELDS.items()}
+        rows = {labels[name]: _table(x, len(_FIELDS[name].shape)) for name, x in self.fields().items()}
+        rows |= {} if self.motor_command is None else {"motor_command": str(self.motor_command)}
+        width = max(map(len, rows))
+        return "\n  ".join([type(self).__name__, *(f"{label:{width}}  {value}" for label, value in rows.items())])
 
     def fields(self) -> dict[str, Tensor]:
         """The fields by name, in the order of their declaration."""
@@ -110,18 +146,16 @@ class QuadrotorParams:
         """The fields of the drone that flies, in the order of ``PLANT_FIELDS``."""
         return tuple(getattr(self, name) for name in PLANT_FIELDS)
 
-    def replace(self, **changes: Tensor | float | list) -> QuadrotorParams:
-        """A copy with some fields changed: ``params.replace(mass=0.5)``.
+    def replace(self, **changes: Any) -> QuadrotorParams:
+        """A copy with some fields changed, to tensors, numbers or lists: ``params.replace(mass=0.5)``.
 
         A tensor keeps its graph, so that a parameter can be fitted through the simulator.
         """
         unknown = sorted(set(changes) - set(_FIELDS))
         if unknown:
             raise UserValueError(f"QuadrotorParams has no field {unknown[0]!r}. Choose from: {', '.join(_FIELDS)}.")
-        like = self.mass
-        return dataclasses.replace(
-            self, **{k: _tensor(k, v, like, "QuadrotorParams").to(like) for k, v in changes.items()}
-        )
+        changed = {k: _tensor(k, v, self.mass, "QuadrotorParams").to(self.mass) for k, v in changes.items()}
+        return dataclasses.replace(self, **changed)
 
     def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> QuadrotorParams:
         """A copy on another device or with another floating-point type; gradients flow through the copy."""
@@ -139,11 +173,24 @@ class QuadrotorParams:
     @staticmethod
     def dim(name: str) -> int:
         """The number of dimensions of a field of a single drone."""
-        return len(_FIELDS[name][0])
+        return len(_FIELDS[name].shape)
 
-    def _map(self, function) -> QuadrotorParams:
+    def _map(self, function: Callable[[Tensor], Tensor]) -> QuadrotorParams:
         mapped = {name: function(value) for name, value in self.fields().items()}
         return QuadrotorParams(**mapped, motor_command=self.motor_command)
+
+
+if TYPE_CHECKING:
+
+    class RawParams(QuadrotorParams):
+        """See below."""
+
+        def __init__(self, **fields: Tensor) -> None: ...
+        def _asdict(self) -> dict[str, Tensor]: ...
+
+else:
+    # As QuadrotorParams, but unchecked and of any form: for drones that are drawn at random, and for compiled code.
+    RawParams = collections.namedtuple("RawParams", _FIELDS, defaults=[None] * len(_FIELDS))
 
 
 def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torch.float32) -> QuadrotorParams:
@@ -163,18 +210,16 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
     source, values = presets.read("drone", drone, _DRONES)
     values = {**_OPTIONAL, **values}
     motors = values.pop("motor_command", None)
-    missing = [name for name in _FIELDS if name not in values]
+    required = [name for name in _FIELDS if name not in _OPTIONAL]
+    missing = [name for name in required if name not in values]
     unknown = sorted(str(name) for name in values if name not in _FIELDS)
     if missing:
-        required = ", ".join(name for name in _FIELDS if name not in _OPTIONAL)
-        raise UserValueError(f"{source}: missing field {missing[0]!r}. Required: {required}.")
+        raise UserValueError(f"{source}: missing field {missing[0]!r}. Required: {', '.join(required)}.")
     if unknown:
         raise UserValueError(f"{source}: unknown field {unknown[0]!r}. Allowed: {', '.join(_FIELDS)}, motor_command.")
-    fields = {}
-    for name in _FIELDS:
-        fields[name] = _tensor(name, values[name], torch.empty(0, dtype=torch.float64), source).to(torch.float64)
-        _check(name, fields[name] if fields[name].dim() else fields[name].reshape(1), source)
-    command = None if motors is None else MotorCommand.read(source, motors)
+    like = torch.empty(0, dtype=torch.float64)
+    fields = {name: _field(name, values[name], like, source).to(torch.float64) for name in _FIELDS}
+    command = None if motors is None else build(MotorCommand, f"{source}: motor_command", motors)
     return QuadrotorParams(**fields, motor_command=command).to(dtype=dtype)
 
 
@@ -183,14 +228,22 @@ def available_drones() -> list[str]:
     return presets.names(_DRONES)
 
 
+def _table(value: Tensor, dim: int) -> str:
+    """A field as its table shows it; of several drones the least and the greatest number."""
+    if value.dim() > dim:
+        return f"{value.min():.5g} to {value.max():.5g} over {len(value)} drones"
+    if dim == 2:
+        return ", ".join(f"({_table(row, 1)})" for row in value)
+    return ", ".join(f"{x:.5g}" for x in value.tolist())
+
+
 def _tensor(name: str, value: Any, like: Tensor, source: str) -> Tensor:
     """A value as a tensor: its own, with its graph, or one like another tensor."""
     if isinstance(value, Tensor) and value.dtype != torch.bool and not value.is_complex():
         return value
     try:
-        parts = value if isinstance(value, Sequence) and any(isinstance(x, Tensor) for x in value) else None
-        if parts is not None:
-            return torch.stack([_tensor(name, x, like, source).to(like) for x in parts])
+        if isinstance(value, Sequence) and any(isinstance(x, Tensor) for x in value):
+            return torch.stack([_tensor(name, x, like, source).to(like) for x in value])
         return torch.from_numpy(np.asarray(presets.as_array(value))).to(like)
     except (ValueError, RuntimeError, RecursionError) as error:
         raise UserValueError(
@@ -198,21 +251,23 @@ def _tensor(name: str, value: Any, like: Tensor, source: str) -> Tensor:
         ) from error
 
 
-def _check(name: str, value: Tensor, source: str) -> None:
-    shape, low, high = _FIELDS[name]
+def _field(name: str, value: Any, like: Tensor, source: str) -> Tensor:
+    """A value as the tensor of a field, checked."""
+    value = _tensor(name, value, like, source)
+    value = value if value.dim() else value.reshape(1)
+    shape, low, high, _ = _FIELDS[name]
     shapes = (shape, _OTHER_SHAPES.get(name))
     if value.shape not in shapes and value.shape[1:] not in shapes:
-        batched = ("num_envs", *shape)
         raise UserValueError(
             f"{source}: field {name!r} has shape {tuple(value.shape)}; it must be {shape} for one drone, "
-            f"or {batched} for one per environment."
+            f"or {('num_envs', *shape)} for one per environment."
         )
-    with torch.no_grad():
-        plain, value = value, value.float()  # which finds a limit fit that was rounded to float32 on its way
-        fits, rule = (value >= low) & (value <= high), f"between {low:g} and {high:g}"
-        if name == "rotor_spin":
-            fits, rule = value.abs() == 1, "+1 or -1"
-        if name == "thrust_map" and not (value[..., 0] > 0).all():
-            fits, rule = value > 0, "rising at high speed, k2 above zero"
-        if not fits.all():
-            raise UserValueError(f"{source}: field {name!r} must be {rule}, in SI units; got {shown(plain.tolist())}.")
+    numbers = value.detach().float()  # which finds a limit fit that was rounded to float32 on its way
+    fits, rule = (numbers >= low) & (numbers <= high), f"between {low:g} and {high:g}"
+    if name == "rotor_spin":
+        fits, rule = numbers.abs() == 1, "+1 or -1"
+    if name == "thrust_map" and not (numbers[..., 0] > 0).all():
+        fits, rule = numbers > 0, "rising at high speed, k2 above zero"
+    if not fits.all():
+        raise UserValueError(f"{source}: field {name!r} must be {rule}, in SI units; got {shown(value.tolist())}.")
+    return value

@@ -3,7 +3,7 @@
 import math
 import numbers
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from importlib.abc import Traversable
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
         return kind, preset
     known = [] if folder is None else names(folder)
     choices = f"Choose from: {', '.join(known)}; or give" if known else "Give"
-    if isinstance(preset, str) and preset in known:
+    if folder is not None and isinstance(preset, str) and preset in known:
         source, path = f"{preset}.yaml", folder / f"{preset}.yaml"
     elif isinstance(preset, Path) or (isinstance(preset, str) and preset.endswith((".yaml", ".yml"))):
         source, path = str(preset), Path(preset)
@@ -94,7 +94,7 @@ class _Loader(yaml.SafeLoader):
     yaml_implicit_resolvers = {}  # those of YAML 1.1 read 1:30 as 90 and 010 as 8, in time that grows with the square
     depth = 0
 
-    def compose_node(self, parent: Any, index: Any) -> yaml.Node:
+    def compose_node(self, parent: Any, index: Any) -> yaml.Node | None:
         event = self.peek_event()
         line = event.start_mark.line + 1
         if isinstance(event, yaml.AliasEvent):
@@ -108,8 +108,8 @@ class _Loader(yaml.SafeLoader):
         self.depth -= 1
         return node
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        found: dict[Hashable, Any] = {}
         for key, value in node.value:
             name = self.construct_object(key, deep=True) if isinstance(key, yaml.ScalarNode) else None
             line = key.start_mark.line + 1
@@ -165,6 +165,6 @@ def as_array(value: Any) -> NDArray[np.float64]:
     if not isinstance(value, numbers.Real) or isinstance(value, bool | np.bool_):
         raise ValueError(f"{shown(value)} is no number")
     try:
-        return np.float64(float(value))
+        return np.array(float(value))
     except OverflowError:
         raise ValueError(f"{shown(value)} is more than a float holds") from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -10,13 +10,11 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Nominal
-from torchrl_quad.dynamics.integrators import INTEGRATORS, Integrator
-from torchrl_quad.dynamics.interface import PhysicsStep, Substeps
-from torchrl_quad.dynamics.modes import make_controller
-from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams, RawParams
-from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
+from torchrl_quad.dynamics.model import ControlledModel, PhysicsStep, Substeps
+from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams
+from torchrl_quad.dynamics.rigid_body import INTEGRATORS, Integrator, RigidBodyState, accelerations
 from torchrl_quad.dynamics.rotors import Rotors
-from torchrl_quad.dynamics.vector import Components, Vector, cat, clamp, split, stack
+from torchrl_quad.dynamics.vector import Vector, clamp
 from torchrl_quad.options import checked
 
 
@@ -74,7 +72,7 @@ def control_step(
 
 
 @checked
-class Quadrotor:
+class Quadrotor(ControlledModel):
     """The quadrotor as environments fly it: an implementation of :class:`~torchrl_quad.dynamics.Dynamics`.
 
     Args:
@@ -96,10 +94,7 @@ class Quadrotor:
         integrator: Integrator,
         control: str | Mapping[str, Any] = "rates",
     ) -> None:
-        self.controller = make_controller(control, nominal)
-        self.nominal, self.hover_action = self.controller.nominal, self.controller.hover_action
-        self.action_units = self.controller.action_units
-        self.dt, self.substeps, self.integrator = dt, substeps, integrator
+        super().__init__(nominal, dt, substeps, integrator, control)
         self.limits = {"rotor_speed": 2.0 * self.nominal.rotor_speed_max}
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
@@ -120,23 +115,15 @@ class Quadrotor:
         after = control_step(drone, action, params, self.controller, self.dt, self.substeps, self.integrator, wind)
         return after._asdict()
 
-    def setpoint_rows(self, action: Tensor) -> Tensor:
-        """What an action (n, 4) asks of the controller, as rows (k, n)."""
-        return torch.cat([x.t() for x in self.controller.setpoint(action)])
-
-    def rows_step(self) -> Callable[..., Tensor]:
-        """A physics step on rows (17, n), for a compiler, with the nominal parameters as constants of its code."""
-        controller, dt, integrator = self.controller.unbind(), self.dt, self.integrator
-
-        def step(x: Tensor, setpoint: Tensor, plant: tuple[Tensor, ...], wind: tuple[Tensor, ...]) -> Tensor:
-            state = split(Components(x.unbind()), self.sizes.values())
-            wanted = controller.setpoint_type(*split(Components(setpoint.unbind()), controller.setpoint_sizes))
-            params, rotors = controller.nominal, controller.rotors
-            if plant:
-                params = RawParams(**{k: Components(v.unbind()) for k, v in zip(PLANT_FIELDS, plant, strict=True)})
-                rotors = Rotors(params)
-            air = Components(wind[0].unbind()) if wind else None
-            after = physics_step(QuadrotorState(*state), wanted, params, rotors, controller, dt, integrator, air)
-            return stack(cat(*after))
-
-        return step
+    def substep(
+        self,
+        state: Sequence[Vector],
+        setpoint: Any,
+        params: QuadrotorParams,
+        controller: FlightController,
+        wind: Vector | None,
+    ) -> QuadrotorState:
+        """See :func:`physics_step`."""
+        rotors = controller.rotors if params is controller.nominal else Rotors(params)
+        before = QuadrotorState(*state)
+        return physics_step(before, setpoint, params, rotors, controller, self.dt, self.integrator, wind)

@@ -8,16 +8,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchrl_quad.dynamics.vector import Vector, cat, cross, dot, multiply_add
+from torchrl_quad.dynamics.vector import Vector, cat, cross, dot
 
 
 def multiply(p: Tensor, q: Tensor) -> Tensor:
     """Hamilton product p q, (*, 4): the rotation q followed, in the outer frame, by p."""
     pw, pv = p.split((1, 3), -1)
     qw, qv = q.split((1, 3), -1)
-    scalar = pw * qw - (pv * qv).sum(-1, keepdim=True)
-    vector = pw * qv + qw * pv + torch.linalg.cross(pv, qv)
-    return torch.cat((scalar, vector), -1)
+    scalar = pw * qw - dot(pv, qv)
+    return torch.cat((scalar, pw * qv + qw * pv + torch.linalg.cross(pv, qv)), -1)
 
 
 def identity(like: Tensor) -> Tensor:
@@ -50,13 +49,13 @@ def derivative(q: Vector, angular_velocity: Vector) -> Vector:
     """Time derivative (*, 4) [1/s] under the body-frame angular velocity (*, 3) [rad/s]: half of q (0, w)."""
     half = q * 0.5
     w, u = half[..., :1], half[..., 1:]
-    return cat(-dot(u, angular_velocity), multiply_add(cross(u, angular_velocity), w, angular_velocity))
+    return cat(-dot(u, angular_velocity), cross(u, angular_velocity).addcmul(w, angular_velocity))
 
 
 def from_axis_angle(axis_angle: Tensor) -> Tensor:
     """The rotation by |axis_angle| [rad] about the axis axis_angle (*, 3), as a unit quaternion (*, 4)."""
     half = 0.5 * axis_angle
-    angle = (half * half).sum(-1, keepdim=True).clamp_min(1e-24).sqrt()
+    angle = dot(half, half).clamp_min(1e-24).sqrt()
     return torch.cat((angle.cos(), half * angle.sin() / angle), -1)
 
 
@@ -65,7 +64,7 @@ def distance(p: Tensor, q: Tensor) -> Tensor:
 
     p and -p are one attitude, so the error does not depend on either sign.
     """
-    flip = torch.where((p * q).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(p)
+    flip = torch.where(dot(p, q) < 0, -1.0, 1.0).to(p)
     return torch.linalg.vector_norm(p - flip * q, dim=-1, keepdim=True)
 
 
@@ -80,7 +79,7 @@ def from_xyzw(q_xyzw: Tensor) -> Tensor:
 
 
 def _rotate(q: Vector, v: Vector, sign: float) -> Vector:
-    """v + u x t + sign w t with t = 2 u x v, for q = (w, u)."""
+    # v + u x t + sign w t with t = 2 u x v, for q = (w, u)
     w, u = q[..., :1] * sign, q[..., 1:]
     turned = cross(u * 2.0, v)
-    return v + multiply_add(cross(u, turned), w, turned)
+    return v + cross(u, turned).addcmul(w, turned)

@@ -11,17 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics.parameters import QuadrotorParams
-from torchrl_quad.dynamics.vector import (
-    Components,
-    Vector,
-    matvec,
-    maximum,
-    multiply_add,
-    unbind,
-    unbind_rows,
-    where_positive,
-    width,
-)
+from torchrl_quad.dynamics.vector import Components, Vector, matvec, unbind, unbind_rows, where_positive
 
 
 class Rotors:
@@ -48,7 +38,7 @@ class Rotors:
 
     def thrust(self, speed: Vector) -> Vector:
         """Rotor thrust (*, 4) [N] at the rotor speed (*, 4) [rad/s]."""
-        return multiply_add(self.vertex_thrust, self.curvature, (speed - self.vertex_speed).square())
+        return self.vertex_thrust.addcmul(self.curvature, (speed - self.vertex_speed).square())
 
     def speed(self, thrust: Vector) -> Vector:
         """Rotor speed (*, 4) [rad/s] that gives the thrust (*, 4) [N]: the inverse of :meth:`thrust`.
@@ -57,7 +47,7 @@ class Rotors:
         thousandth of its range above that point, so that derivatives stay finite.
         """
         squared = (thrust - self.vertex_thrust) / self.curvature
-        return maximum(squared, self.least_root).sqrt() + self.vertex_speed
+        return squared.maximum(self.least_root).sqrt() + self.vertex_speed
 
     def wrench(self, speed: Vector) -> Vector:
         """The wrench (*, 4) on the body at the rotor speeds (*, 4) [rad/s]."""
@@ -66,9 +56,9 @@ class Rotors:
     def follow(self, speed: Vector, commanded: Vector, dt: float) -> Vector:
         """Rotor speed (*, 4) after dt [s] of first-order lag towards a constant command: exact for any dt."""
         remains = (-dt / self.time_constant).exp()
-        if width(remains) > 1:  # one rotor speeds up at the pace of the first, and slows down at that of the second
+        if remains.shape[-1] > 1:  # one rotor speeds up at the pace of the first, and slows down at that of the second
             remains = where_positive(commanded - speed, remains[..., :1], remains[..., 1:])
-        return multiply_add(commanded, remains, speed - commanded)
+        return commanded.addcmul(remains, speed - commanded)
 
 
 def thrust_limits(params: QuadrotorParams) -> tuple[Tensor, Tensor]:
@@ -77,7 +67,7 @@ def thrust_limits(params: QuadrotorParams) -> tuple[Tensor, Tensor]:
     return rotors.thrust(params.rotor_speed_min).clamp_min(0.0), rotors.thrust(params.rotor_speed_max)
 
 
-def allocation_matrix(params: QuadrotorParams) -> Tensor | tuple[Components, ...]:
+def allocation_matrix(params: QuadrotorParams) -> Vector:
     """The matrix (*, 4, 4) that turns four rotor thrusts into a wrench, for any rotor layout.
 
     Torque is r x F of each rotor, (y f, -x f), plus the drag torque kappa s f about z. The paper prints the matrix of a
@@ -86,6 +76,6 @@ def allocation_matrix(params: QuadrotorParams) -> Tensor | tuple[Components, ...
     yaw = params.yaw_torque_coefficient * params.rotor_spin
     if isinstance(yaw, Components):  # then the positions are (x, y, x, y, ...)
         x, y = params.rotor_positions[..., 0::2], params.rotor_positions[..., 1::2]
-        return Components([1.0]), y, -x, yaw
+        return Components([Components([1.0]), y, -x, yaw])
     x, y = params.rotor_positions.unbind(-1)
     return torch.stack(torch.broadcast_tensors(torch.ones_like(x), y, -x, yaw), -2)

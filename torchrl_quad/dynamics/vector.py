@@ -1,7 +1,8 @@
 """Vectors (*, k) in two forms: one tensor, or k components.
 
-The physics is written for both. One tensor takes the fewest calls, which is what an eager step costs. Components leave
-no indices, so that a compiler makes one loop over drones of everything and keeps its numbers in registers.
+The physics is written once for both, in the methods of a tensor. One tensor takes the fewest calls, which is what an
+eager step costs. Components leave no indices, so that a compiler fuses everything into one loop over drones and keeps
+its numbers in registers.
 """
 
 from __future__ import annotations
@@ -10,68 +11,104 @@ import functools
 import itertools
 import math
 import operator
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-Component = Tensor | float
+if TYPE_CHECKING:  # to a type checker both forms are tensors
 
+    class Components(Tensor):
+        """See below."""
 
-class Components:
-    """The k components of a vector (*, k), each a tensor (*) or, where all drones share it, a number.
+        components: tuple[Tensor, ...]
 
-    Behaves like the tensor (*, k): arithmetic goes entry by entry, and k = 1 goes with any k.
-    """
+        def __init__(self, components: Iterable[Tensor | float]) -> None: ...
 
-    def __init__(self, components: Iterable[Component]) -> None:
-        self.components = tuple(components)
+    Vector = Tensor
+else:
 
-    def __getitem__(self, index: tuple[type(Ellipsis), slice]) -> Components:
-        return Components(self.components[index[1]])
+    class Components:
+        """The k components of a vector (*, k), each a tensor (*) or, where all drones share it, a number.
 
-    def __add__(self, other: Components | float) -> Components:
-        return _each(operator.add, self, other)
+        Behaves like the tensor (*, k): arithmetic goes entry by entry, and k = 1 goes with any k. Its methods are those
+        of a tensor that the physics uses, along the last dimension, which stays.
+        """
 
-    def __sub__(self, other: Components | float) -> Components:
-        return _each(operator.sub, self, other)
+        def __init__(self, components):
+            self.components = tuple(components)
 
-    def __mul__(self, other: Components | float) -> Components:
-        return _each(operator.mul, self, other)
+        @property
+        def shape(self):
+            return (len(self.components),)
 
-    def __truediv__(self, other: Components | float) -> Components:
-        return _each(operator.truediv, self, other)
+        def __getitem__(self, index):
+            return Components(self.components[index[1]])  # of [..., a:b]
 
-    def __rtruediv__(self, other: float) -> Components:
-        return Components([other / x for x in self.components])
+        def __add__(self, other):
+            return _each(operator.add, self, other)
 
-    def __neg__(self) -> Components:
-        return Components([-x for x in self.components])
+        def __sub__(self, other):
+            return _each(operator.sub, self, other)
 
-    def abs(self) -> Components:
-        return Components([abs(x) for x in self.components])
+        def __mul__(self, other):
+            return _each(operator.mul, self, other)
 
-    def square(self) -> Components:
-        return self * self
+        def __truediv__(self, other):
+            return _each(operator.truediv, self, other)
 
-    def sqrt(self) -> Components:
-        return Components([x.sqrt() for x in self.components])
+        def __rtruediv__(self, other):
+            return Components([other / x for x in self.components])
 
-    def rsqrt(self) -> Components:
-        return Components([torch.rsqrt(x) for x in self.components])
+        def __neg__(self):
+            return Components([-x for x in self.components])
 
-    def exp(self) -> Components:
-        return Components([x.exp() if isinstance(x, Tensor) else math.exp(x) for x in self.components])
+        def abs(self):
+            return Components([abs(x) for x in self.components])
 
-    def clamp_min(self, low: float) -> Components:
-        return Components([x.clamp_min(low) for x in self.components])
+        def square(self):
+            return self * self
 
-    def clamp_max(self, high: float) -> Components:
-        return Components([x.clamp_max(high) for x in self.components])
+        def sqrt(self):
+            return Components([x.sqrt() for x in self.components])
 
+        def rsqrt(self):
+            return Components([torch.rsqrt(x) for x in self.components])
 
-Vector = Tensor | Components
+        def exp(self):
+            return Components([x.exp() if isinstance(x, Tensor) else math.exp(x) for x in self.components])
+
+        def clamp_min(self, low):
+            return Components([x.clamp_min(low) for x in self.components])
+
+        def clamp_max(self, high):
+            return Components([x.clamp_max(high) for x in self.components])
+
+        def maximum(self, other):
+            return _each(lambda x, y: torch.maximum(x, y) if isinstance(y, Tensor) else x.clamp_min(y), self, other)
+
+        def minimum(self, other):
+            return _each(lambda x, y: torch.minimum(x, y) if isinstance(y, Tensor) else x.clamp_max(y), self, other)
+
+        def addcmul(self, factor, other):
+            return self + factor * other
+
+        def sum(self, dim, keepdim):
+            return Components([functools.reduce(operator.add, self.components)])
+
+        def amax(self, dim, keepdim):
+            return functools.reduce(larger, [Components([x]) for x in self.components])
+
+        def amin(self, dim, keepdim):
+            return functools.reduce(smaller, [Components([x]) for x in self.components])
+
+        def split(self, sizes, dim):
+            entries = iter(self.components)
+            return [Components(itertools.islice(entries, size)) for size in sizes]
+
+    Vector = Tensor | Components
 
 
 def unbind(vector: Tensor, constant: bool = False) -> Components:
@@ -80,64 +117,56 @@ def unbind(vector: Tensor, constant: bool = False) -> Components:
     return Components(vector.flatten().tolist() if shared else vector.unbind(-1))
 
 
-def unbind_rows(matrix: Tensor) -> list[Components]:
+def unbind_rows(matrix: Tensor) -> Components:
     """The rows of a constant matrix (*, k, k), each as components."""
-    return [unbind(row, constant=True) for row in matrix.unbind(-2)]
+    return Components([unbind(row, constant=True) for row in matrix.unbind(-2)])
 
 
-def split(vector: Components, sizes: Iterable[int]) -> list[Components]:
-    """Its parts of these sizes, in their order."""
-    entries = iter(vector.components)
-    return [Components(itertools.islice(entries, size)) for size in sizes]
+def parts(vector: Vector) -> tuple[Tensor, ...]:
+    """The k entries one by one, each (*)."""
+    return vector.components if isinstance(vector, Components) else vector.unbind(-1)
 
 
-def stack(vector: Components) -> Tensor:
-    """The components, each a tensor (n), as rows (k, n)."""
-    return torch.stack(vector.components)
+def stack(vector: Vector) -> Tensor:
+    """The entries, each (n), as rows (k, n)."""
+    return torch.stack(parts(vector))
 
 
 def cross(a: Vector, b: Vector) -> Vector:
     """Cross product of vectors (*, 3)."""
-    if isinstance(a, Tensor):
-        return torch.linalg.cross(a, b)
-    (ax, ay, az), (bx, by, bz) = a.components, b.components
-    return Components((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+    if isinstance(a, Components):
+        (ax, ay, az), (bx, by, bz) = parts(a), parts(b)
+        return Components((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+    return torch.linalg.cross(a, b)
 
 
 def dot(a: Vector, b: Vector) -> Vector:
     """Scalar product (*, 1)."""
-    if isinstance(a, Tensor):
-        return (a * b).sum(-1, keepdim=True)
-    return Components([_sum((a * b).components)])
+    return (a * b).sum(-1, keepdim=True)
 
 
-def multiply_add(a: Vector, b: Vector, c: Vector) -> Vector:
-    """a + b c, entry by entry."""
-    return torch.addcmul(a, b, c) if isinstance(c, Tensor) else a + b * c
-
-
-def matvec(matrix: Tensor | Sequence[Components], vector: Vector) -> Vector:
-    """The product (*, k) of a matrix (*, k, k), or its rows, and a vector (*, k)."""
-    if isinstance(vector, Tensor):
-        return (matrix * vector.unsqueeze(-2)).sum(-1)
-    return Components([_sum((row * vector).components) for row in matrix])
+def matvec(matrix: Vector, vector: Vector) -> Vector:
+    """The product (*, k) of a matrix (*, k, k), a tensor or Components of its rows, and a vector (*, k)."""
+    if isinstance(vector, Components):
+        return cat(*(dot(row, vector) for row in parts(matrix)))
+    return (matrix * vector.unsqueeze(-2)).sum(-1)
 
 
 def cat(*vectors: Vector) -> Vector:
     """The entries of several vectors as one."""
     if isinstance(vectors[0], Tensor):
         return torch.cat(vectors, -1)
-    return Components([x for vector in vectors for x in vector.components])
+    return Components([x for vector in vectors for x in parts(vector)])
 
 
 def along_z(z: Vector) -> Vector:
     """The vector (0, 0, z), (*, 3), for z (*, 1)."""
-    return pad(z, (2, 0)) if isinstance(z, Tensor) else Components((0.0, 0.0, *z.components))
+    return Components((0.0, 0.0, *parts(z))) if isinstance(z, Components) else pad(z, (2, 0))
 
 
 def clamp(x: Vector, low: Vector, high: Vector) -> Vector:
-    """x, but not below low nor above high, entry by entry."""
-    return minimum(maximum(x, low), high)
+    """x within limits, entry by entry."""
+    return x.maximum(low).minimum(high)
 
 
 def soft_limit(x: Vector, limit: Vector) -> Vector:
@@ -145,64 +174,33 @@ def soft_limit(x: Vector, limit: Vector) -> Vector:
     return x * ((x / limit).square() + 1.0).rsqrt()
 
 
-def maximum(a: Vector, b: Vector) -> Vector:
-    """The greater, entry by entry."""
-    if isinstance(a, Tensor):
-        return torch.maximum(a, b)
-    return _each(lambda x, y: torch.maximum(x, y) if isinstance(y, Tensor) else x.clamp_min(y), a, b)
-
-
-def minimum(a: Vector, b: Vector) -> Vector:
-    """The smaller, entry by entry."""
-    if isinstance(a, Tensor):
-        return torch.minimum(a, b)
-    return _each(lambda x, y: torch.minimum(x, y) if isinstance(y, Tensor) else x.clamp_max(y), a, b)
-
-
-def greatest(x: Vector) -> Vector:
-    """The greatest entry, (*, 1)."""
-    return x.amax(-1, keepdim=True) if isinstance(x, Tensor) else _reduce(larger, x)
-
-
-def least(x: Vector) -> Vector:
-    """The least entry, (*, 1)."""
-    return x.amin(-1, keepdim=True) if isinstance(x, Tensor) else _reduce(smaller, x)
-
-
 def larger(a: Vector, b: Vector) -> Vector:
-    """The greater, entry by entry, as :func:`maximum`; its derivative costs a compiled step less."""
-    return torch.maximum(a, b) if isinstance(a, Tensor) else _each(lambda x, y: torch.where(x > y, x, y), a, b)
+    """The greater, entry by entry, as ``maximum``; its derivative costs a compiled step less."""
+    return _each(lambda x, y: torch.where(x > y, x, y), a, b) if isinstance(a, Components) else torch.maximum(a, b)
 
 
 def smaller(a: Vector, b: Vector) -> Vector:
-    """The smaller, entry by entry, as :func:`minimum`; its derivative costs a compiled step less."""
-    return torch.minimum(a, b) if isinstance(a, Tensor) else _each(lambda x, y: torch.where(x < y, x, y), a, b)
+    """The smaller, entry by entry, as ``minimum``; its derivative costs a compiled step less."""
+    return _each(lambda x, y: torch.where(x < y, x, y), a, b) if isinstance(a, Components) else torch.minimum(a, b)
 
 
 def where_positive(condition: Vector, a: Vector, b: Vector) -> Vector:
     """a where the condition is above zero, b elsewhere, entry by entry."""
     if isinstance(condition, Tensor):
         return torch.where(condition > 0, a, b)
-    k = len(condition.components)
-    a, b = (x.components * k if len(x.components) == 1 else x.components for x in (a, b))
-    entries = zip(condition.components, a, b, strict=True)
-    return Components([torch.where(x > 0, y, z) for x, y, z in entries])
-
-
-def width(x: Vector) -> int:
-    """The number k of entries of a vector (*, k)."""
-    return x.shape[-1] if isinstance(x, Tensor) else len(x.components)
+    chosen = _each(lambda x, y: (x, y), a, b)  # pairs, of which the condition takes one
+    return _each(lambda x, pair: torch.where(x > 0, *pair), condition, chosen)
 
 
 def is_same(a: Vector, b: Vector) -> bool:
-    """Whether a tensor on the processor equals another, where a look at its values is free; False where it is not."""
+    """Whether a tensor on the CPU equals another; False where reading values would cost a device synchronisation."""
     if not isinstance(a, Tensor) or a.device.type != "cpu":
         return False
     return not is_traced() and torch.equal(a, b)
 
 
 def is_traced() -> bool:
-    """Whether no value of a tensor can be looked at here."""
+    """Whether no value of a tensor can be read here."""
     return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
 
 
@@ -210,24 +208,12 @@ def where_same(a: Vector, b: Vector, other: Vector) -> Vector:
     """b (*, k) for those drones whose entries all equal those of a, the other for the rest."""
     if isinstance(a, Tensor):
         return torch.where((a == b).all(-1, keepdim=True), b, other)
-    same = functools.reduce(operator.and_, (x == y for x, y in zip(a.components, b.components, strict=True)))
-    return Components([torch.where(same, x, y) for x, y in zip(b.components, other.components, strict=True)])
+    same = functools.reduce(operator.and_, [x == y for x, y in zip(parts(a), parts(b), strict=True)])
+    return _each(lambda x, y: torch.where(same, x, y), b, other)
 
 
-def _reduce(function: Callable, x: Components) -> Components:
-    return functools.reduce(function, (Components([entry]) for entry in x.components))
-
-
-def _each(function: Callable, a: Components, b: Components | float) -> Components:
-    left = a.components
-    right = b.components if isinstance(b, Components) else (b,)
+def _each(function: Callable, a: Vector, b: Vector | float) -> Components:
+    left, right = parts(a), parts(b) if isinstance(b, Components) else (b,)
     k = max(len(left), len(right))
     left, right = (x * k if len(x) == 1 else x for x in (left, right))
     return Components([function(x, y) for x, y in zip(left, right, strict=True)])
-
-
-def _sum(values: Sequence[Component]) -> Component:
-    total = values[0]
-    for value in values[1:]:
-        total = total + value
-    return total

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.dynamics.integrators import rk4
-from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations
+from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations, rk4
 from torchrl_quad.dynamics.rotors import Rotors
 from torchrl_quad.identification.errors import TooShort
 from torchrl_quad.identification.log import FlightLog

@@ -216,7 +216,7 @@ def test_files_that_are_no_flight_are_refused_by_name(tmp_path, read):
     cases = {
         "empty.csv": (b"", "is empty"),
         "junk.bin": (bytes(range(128, 256)), "no log of a known kind"),
-        "text.csv": (b"Dear reader,\nthis is a letter.\n", "names"),
+        "text.csv": (b"Dear reader,\nthis is a letter.\n", "fewer than two samples"),
         "ragged.csv": (b"t,x\n1,2\n1,2,3\n", "no table of numbers"),
         "cut.csv.gz": (FLIGHT.read_bytes()[:2000], "broken gz"),
         "cut.ulg": (b"ULog\x01\x12\x35\x01", "no readable ULog"),

@@ -15,7 +15,7 @@ from log_writers import flight, write_csv, write_ulog, write_usd
 from test_log_files import px4_messages, times, usd_events, write_bag
 from test_log_tables import OURS, own_table
 
-from torchrl_quad.identification import GapsTooLarge, LogError, UnreadableLog, read_log, ros_files, sources
+from torchrl_quad.identification import GapsTooLarge, LogError, UnreadableLog, bag_files, read_log, sources
 from torchrl_quad.identification.ulog import read_ulog
 
 BATTERY = {"battery_voltage": "/drone/battery.x"}
@@ -138,7 +138,7 @@ def lots(compression):
 
     import lz4.frame
 
-    return {"zstd": ros_files._zstd().compress, "lz4": lz4.frame.compress, "bz2": bz2.compress}[compression](
+    return {"zstd": bag_files._zstd().compress, "lz4": lz4.frame.compress, "bz2": bz2.compress}[compression](
         bytes(10**6)
     )
 
@@ -157,7 +157,7 @@ ENDLESS = {  # what no reader should follow to its end: a file, and what its ref
     "definition.mcap": (MCAP + mcap_of("int32 x\n" * 20_000, MESSAGE), "more than 100,000 characters"),
     "zeros.bag": (b"#ROSBAG V2.0\n" + bytes(1000), "no readable ROS bag"),
     "line.csv": (b"t" * 5_000_000, "line 1 has more than 4,000,000 bytes"),
-    "columns.csv": (b"," * 100_000 + b"\n1\n", "has 100,001 columns; the most is 100,000"),
+    "columns.csv": (b"," * 100_000 + b"\n1\n", "has more than 100,000 columns, the maximum"),
     "zeros.ulg": (b"ULog\x01\x12\x35\x01" + bytes(10**6), "no sample"),
 }
 
@@ -172,12 +172,12 @@ def test_what_would_take_for_ever_is_refused_at_once(name, tmp_path):
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "bz2"])
 @pytest.mark.parametrize("lies", [False, True])
 def test_chunks_unpack_to_what_they_may_and_no_further(compression, lies, tmp_path, monkeypatch):
-    monkeypatch.setattr(ros_files, "MAX_CHUNK", 10**5)
+    monkeypatch.setattr(bag_files, "MAX_CHUNK", 10**5)
     size, path = 1000 if lies else 10**6, tmp_path / "a.mcap"
     path.write_bytes(MCAP + mcap_chunk(lots(compression), compression, size))
-    asked, unpack = [], ros_files.BagFile._unpack
-    monkeypatch.setattr(ros_files.BagFile, "_unpack", lambda *a: asked.append(unpack(*a)) or asked[-1])
-    assert ("a record of the kind 0" if lies else "unpacks to 1,000,000 bytes; the most is 100,000") in refused(path)
+    asked, unpack = [], bag_files.BagFile._unpack
+    monkeypatch.setattr(bag_files.BagFile, "_unpack", lambda *a: asked.append(unpack(*a)) or asked[-1])
+    assert ("a record of the kind 0" if lies else "unpacks to 1,000,000 bytes; the maximum is 100,000") in refused(path)
     assert all(len(chunk) <= 1000 for chunk in asked) and len(asked) == lies
 
 
@@ -185,13 +185,13 @@ def test_limits_of_size_are_named_before_memory_is_full(tmp_path, monkeypatch):
     path = tmp_path / "a.csv.gz"
     path.write_bytes(gzip.compress(b"t,px,py,pz\n" + b"0,0,0,0\n" * 200_000))
     monkeypatch.setattr(sources, "MAX_UNPACKED", 10**6)
-    assert "unpacks to more than 1,000,000 bytes" in refused(path)
+    assert "has more than 1,000,000 bytes when it is unpacked" in refused(path)
     monkeypatch.undo()
     monkeypatch.setattr(sources, "MAX_ROWS", 1000)
     assert "has more than 1,000 lines" in refused(path)
     with open(tmp_path / "large.csv", "wb") as file:
         file.truncate(10**11)  # which takes no room on the disk
-    assert "has 100,000,000,000 bytes; the most is 2,000,000,000" in refused(tmp_path / "large.csv")
+    assert "has more than 2,000,000,000 bytes, the maximum" in refused(tmp_path / "large.csv")
 
 
 def test_a_pipe_a_socket_and_a_device_are_refused_unopened(tmp_path):
@@ -252,7 +252,7 @@ def test_packed_bags_are_read(packed, tmp_path):
 def test_a_clock_that_jumps_ahead_is_refused_before_it_is_put_on_a_grid(tmp_path):
     t = times(100)
     path = write_csv(tmp_path / "a.csv", own_table(t) | {"t": t + 1e7 * (t > 5.0)})
-    with pytest.raises(GapsTooLarge, match=r"1e\+09 steps of 0.01 s; the most is 1,000,000. The clock of position"):
+    with pytest.raises(GapsTooLarge, match=r"1e\+09 steps of 0.01 s; the maximum is 1,000,000. The clock of position"):
         read_log(path, TABLE)
     write_csv(path, own_table(t) | {"t": np.where(np.arange(len(t)) == 500, 1e300, t)})
     assert "1 samples of position (x, y, z) are not finite" in str(read_log(path, TABLE))  # damage, and no jump

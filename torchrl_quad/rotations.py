@@ -41,3 +41,19 @@ def cross(a: Array, b: Array) -> Array:
     """The cross product (..., 3), in a fifth of the time of ``numpy.cross``."""
     (ax, ay, az), (bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
     return np.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), -1)
+
+
+def continuous(q: Array) -> Array:
+    """A series (T, 4) without jumps of sign: q and -q are one attitude, but not when they are interpolated."""
+    jumps = (q[1:] * q[:-1]).sum(-1) < 0.0
+    return q * np.where(np.concatenate(([False], np.cumsum(jumps) % 2 == 1)), -1.0, 1.0)[:, None]
+
+
+def from_euler(angles: Array) -> Array:
+    """Quaternions of roll, pitch and yaw [rad] (..., 3): yaw about z first, then pitch about y, then roll about x."""
+    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(angles / 2.0), -1, 0), np.moveaxis(np.sin(angles / 2.0), -1, 0)
+    w = cr * cp * cy + sr * sp * sy
+    x = sr * cp * cy - cr * sp * sy
+    y = cr * sp * cy + sr * cp * sy
+    z = cr * cp * sy - sr * sp * cy
+    return np.stack((w, x, y, z), -1)

@@ -1,18 +1,16 @@
-"""Does a log mean what its columns claim? Each quantity is held against what follows from another one."""
+"""Does a log mean what its columns claim? Each quantity is compared with what follows from another one."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-from torchrl_quad.identification.attitude import FLIP, body_rates, rotate, slope, smooth
 from torchrl_quad.identification.errors import InconsistentRates, WrongFrame, WrongQuaternion, WrongUnit
 from torchrl_quad.identification.layouts import G
-from torchrl_quad.identification.streams import Array, Signal
+from torchrl_quad.identification.signals import Array, Mask, Signal, body_rates, slope, smooth
+from torchrl_quad.rotations import conjugate, rotate, rotate_inverse
 
-Mask = NDArray[np.bool_]
 MAX_LAG = 0.3  # [s] between streams
 CALM = 0.1  # [rad/s]: slower rotations are lost in the noise of motion capture
 SURE = 0.05  # how much better a hypothesis must correlate than the log as it is given
@@ -22,39 +20,30 @@ _TURN = "conjugate it: Columns(names, scale=(1, -1, -1, -1)), whose second to fo
 _FIRST = (
     "The convention in use expects x y z w, and the file has w x y z: say another convention, or name the columns so"
 )
-_FIXES = {
+_FIXES = {  # by hypothesis
     "from world to body": f"To {_TURN}.",
     "scalar last": f"{_NAME}.",
     "scalar last, from world to body": f"{_NAME}, and {_TURN}.",
     "scalar first": f"{_FIRST}.",
     "scalar first, from world to body": f"{_FIRST}, and {_TURN}.",
 }
+_FULL = {101.0: "scale=1 / 100", 2600.0: "scale=1e-3, offset=1000", 65535.5: "scale=1 / 65535"}  # by the largest
 
 
-def check_motors(signal: Signal) -> str | None:
-    """Refuse commands outside of 0 to 1.
-
-    Raises:
-        WrongUnit: they are counts, pulses or percents.
-    """
+def check_motors(signal: Signal) -> list[str]:
+    """Refuse motor commands that are counts, pulses or percents; commands just outside of 0 to 1 get a note."""
     low, high = signal.values.min(), signal.values.max()
     if low >= -0.01 and high <= 1.01:
-        outside = (signal.values < 0.0).any() or (signal.values > 1.0).any()
-        return f"{signal} reaches {low:.3f} to {high:.3f}: clipped to 0 to 1" if outside else None
-    names = f"Columns({signal.columns!r}, "
-    guess = "scale=1 / FULL)"
-    for full, text in ((101.0, "scale=1 / 100)"), (2600.0, "scale=1e-3, offset=1000)"), (65535.5, "scale=1 / 65535)")):
-        if high <= full:
-            guess = text
-            break
+        return [f"{signal} reaches {low:.3f} to {high:.3f}: clipped to 0 to 1"] if low < 0.0 or high > 1.0 else []
+    guess = next((text for full, text in _FULL.items() if high <= full), "scale=1 / FULL")
     raise WrongUnit(
         f"{signal} runs from {low:.4g} to {high:.4g}, and must run from 0 to 1, the full command. "
-        f'Write columns={{"motor_command": {names}{guess}}}.'
+        f'Write columns={{"motor_command": Columns({signal.columns!r}, {guess})}}.'
     )
 
 
-def check_quaternion(signal: Signal) -> str | None:
-    """Refuse quaternions that are not of unit length; those of a tracker that lost the drone are all zero."""
+def check_quaternion(signal: Signal) -> list[str]:
+    """Refuse quaternions that are not of unit length; a note if only some are, as of a tracker that lost the drone."""
     norm = np.linalg.norm(signal.values, axis=-1)
     off = np.abs(norm - 1.0) > 0.05
     if off.mean() > 0.01:
@@ -62,18 +51,12 @@ def check_quaternion(signal: Signal) -> str | None:
             f"{off.mean():.0%} of {signal} are not of length 1; the median is {np.median(norm):.3g}. Name the four "
             "columns of one quaternion, scalar first, or scale them."
         )
-    return f"{off.sum()} samples of {signal} are not of length 1; they count as missing" if off.any() else None
+    return [f"{off.sum()} samples of {signal} are not of length 1; they count as missing"] if off.any() else []
 
 
 def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> None:
-    """Hold the velocity against the derivative of the position, and both against the specific force.
-
-    Raises:
-        WrongUnit: they, or the clock, are in other units.
-        WrongFrame: the velocity is in the body frame.
-    """
-    position, q = at["position"], at["quaternion"]
-    derived = smooth(slope(position, dt), dt)
+    """Refuse a position or velocity in other units, and a velocity that is not the derivative of the position."""
+    derived = smooth(slope(at["position"], dt), dt)
     speed = np.linalg.norm(derived[moving], axis=-1)
     place = signals["position"]
     if np.percentile(speed, 99) > 100.0:
@@ -92,7 +75,7 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
             f"{signal} is {factor:.3g} times the derivative of {place}: one of them, or the clock, is in {what}. Write "
             f'columns={{"position": Columns({place.columns!r}, scale=1e-3)}} for millimetres.'
         )
-    body, _, _ = _compare(smooth(rotate(q, at["velocity"]), dt), derived, dt, moving)
+    body, _, _ = _compare(smooth(rotate(at["quaternion"], at["velocity"]), dt), derived, dt, moving)
     if body > fit + 0.02 and body > 0.9:
         raise WrongFrame(
             f"{signal} fits the derivative of {place} in the body frame (correlation {body:.2f}) and not in the world "
@@ -106,12 +89,7 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
 
 
 def check_specific_force(at: Mapping[str, Array], signals: Mapping[str, Signal], moving: Mask) -> None:
-    """Refuse an accelerometer in g, or of a body with z down.
-
-    Raises:
-        WrongUnit: its length is not about 9.8 m/s^2.
-        WrongFrame: it measures -9.8 m/s^2 along z.
-    """
+    """Refuse an accelerometer in g, or of a body with z down."""
     if "acceleration" not in at:
         return
     signal, force = signals["acceleration"], at["acceleration"][moving]
@@ -130,25 +108,19 @@ def check_specific_force(at: Mapping[str, Array], signals: Mapping[str, Signal],
 
 
 def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> str:
-    """Hold the gyro against the derivative of the attitude, under every convention that a file may have used.
+    """Compare the gyro with the derivative of the attitude, under every convention that a file may have used.
 
-    Returns:
-        what was found, with the time by which the gyro lags the attitude.
-
-    Raises:
-        WrongUnit: the gyro is in degrees or milliradians.
-        WrongQuaternion: another order, or the inverse, fits.
-        WrongFrame: the gyro is of another frame.
-        InconsistentRates: nothing fits.
+    The note that it returns says by which time the gyro lags the attitude.
     """
     q, given = at["quaternion"], signals.get("quaternion") or signals["euler"]
+    last, first = np.roll(q, 1, -1), np.roll(q, -1, -1)
     hypotheses = {
         "as given": q,
-        "from world to body": q * FLIP,
-        "scalar last": np.roll(q, 1, -1),
-        "scalar last, from world to body": np.roll(q, 1, -1) * FLIP,
-        "scalar first": np.roll(q, -1, -1),
-        "scalar first, from world to body": np.roll(q, -1, -1) * FLIP,
+        "from world to body": conjugate(q),
+        "scalar last": last,
+        "scalar last, from world to body": conjugate(last),
+        "scalar first": first,
+        "scalar first, from world to body": conjugate(first),
     }
     if "angular_velocity" not in signals:
         _check_by_thrust(at, given, hypotheses, dt, moving)
@@ -161,7 +133,7 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
         return calm
     trials = {name: (smooth(body_rates(h, dt), dt), smooth(gyro, dt)) for name, h in hypotheses.items()}
     trials["body y right, z down"] = (right, smooth(gyro * FRD, dt))
-    trials["in the world frame"] = (right, smooth(rotate(q * FLIP, gyro), dt))
+    trials["in the world frame"] = (right, smooth(rotate_inverse(q, gyro), dt))
     fits = {name: _compare(b, a, dt, moving) for name, (a, b) in trials.items()}
     fit, factor, lag = fits["as given"]
     best = max(fits, key=lambda name: fits[name][0])
@@ -172,9 +144,7 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
                 f"{told} if the quaternion is {best}. We need w x y z, from body to world. {_FIXES[best]}"
             )
         if best == "in the world frame":
-            raise WrongFrame(
-                f"{told} if the gyro is in the world frame. Name the rates of the body, or leave them out."
-            )
+            raise WrongFrame(f"{told} if the gyro is in the world frame. Name the body rates, or leave them out.")
         raise WrongFrame(
             f"{told} if the gyro is of a body with y right and z down. Write scale=(1, -1, -1) in its Columns, or "
             "convention=frames.px4() if all of the log is in NED and FRD."
@@ -202,7 +172,7 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
 def _check_by_thrust(
     at: Mapping[str, Array], given: Signal, hypotheses: Mapping[str, Array], dt: float, moving: Mask
 ) -> None:
-    """Without a gyro: thrust pulls along the body's z, so that must be where the drone accelerates."""
+    """Without a gyro: thrust pulls along the body's z, so the drone must accelerate that way."""
     pull = smooth(slope(at["velocity"], dt), dt) + (0.0, 0.0, G)
     pull /= np.linalg.norm(pull, axis=-1, keepdims=True)
     up = {name: smooth(rotate(h, np.broadcast_to([0.0, 0.0, 1.0], pull.shape)), dt) for name, h in hypotheses.items()}

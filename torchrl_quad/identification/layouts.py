@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,20 +12,23 @@ from torchrl_quad.deploy import frames
 from torchrl_quad.dynamics.presets import as_array
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
-from torchrl_quad.identification.streams import LARGEST, Array, Signal, Stream
+from torchrl_quad.identification.signals import LARGEST, Signal, Stream
 
-SIZES = {  # how many columns a quantity has; setpoints may have any number
-    "position": 3,
-    "quaternion": 4,
-    "euler": 3,
-    "velocity": 3,
-    "velocity_body": 3,
-    "angular_velocity": 3,
-    "acceleration": 3,
-    "motor_command": 4,
-    "battery_voltage": 1,
+# How many columns a quantity has, and which quantity of a convention has its frame and order. Setpoints may have any
+# number of columns.
+QUANTITIES: dict[str, tuple[int, str | None]] = {
+    "position": (3, "position"),
+    "quaternion": (4, "quaternion"),
+    "euler": (3, None),
+    "velocity": (3, "velocity"),
+    "velocity_body": (3, "angular_velocity"),  # as all vectors of the body
+    "angular_velocity": (3, "angular_velocity"),
+    "acceleration": (3, "angular_velocity"),
+    "motor_command": (4, "motors"),
+    "battery_voltage": (1, None),
 }
-NEEDED = (("position",), ("quaternion", "euler"), ("motor_command",))
+_TRANSLATED = ("position", "velocity", "quaternion", "angular_velocity")  # setpoints
+_NEEDED = (("position",), ("quaternion", "euler"), ("motor_command",))
 DEGREE = np.pi / 180.0
 G = 9.80665
 OURS = frames.Convention("torchrl_quad", motors=(0, 1, 2, 3))
@@ -46,8 +49,7 @@ class Columns:
 
     def __post_init__(self) -> None:
         names = (self.names,) if isinstance(self.names, str) else self.names
-        is_names = isinstance(names, Sequence) and len(names) > 0 and all(isinstance(name, str) for name in names)
-        if not is_names:
+        if not (isinstance(names, Sequence) and names and all(isinstance(name, str) for name in names)):
             raise UserValueError(f"Columns: names must be the names of columns, got {shown(self.names)}.")
         object.__setattr__(self, "names", tuple(names))
         for field in ("scale", "offset"):
@@ -74,13 +76,12 @@ class Layout:
     required: frozenset[str] = frozenset()  #: quantities that a caller named; a file without their columns is refused
 
     def __post_init__(self) -> None:
+        onboard = None if isinstance(self.onboard, str) else self.onboard
         rules = {
             "columns must map quantities to tuples of Columns": isinstance(self.columns, Mapping)
-            and all(isinstance(c, Sequence) and all(isinstance(x, Columns) for x in c) for c in self.columns.values()),
+            and all(_are(c, Columns) for c in self.columns.values()),
             "convention must be one of torchrl_quad.deploy.frames": isinstance(self.convention, frames.Convention),
-            "onboard must be a tuple of fields": isinstance(self.onboard, Sequence)
-            and not isinstance(self.onboard, str)
-            and all(isinstance(field, str) for field in self.onboard),
+            "onboard must be a tuple of fields": _are(onboard, str),
             "time must be Columns of one name": isinstance(self.time, Columns) and len(self.time.names) == 1,
             "required must be a set of quantities": isinstance(self.required, Set),
         }
@@ -91,25 +92,31 @@ class Layout:
             for choice in choices:
                 _check_quantity(quantity, choice)
 
+    @property
+    def names(self) -> set[str]:
+        """The columns of all quantities."""
+        return {name for choices in self.columns.values() for choice in choices for name in choice.names}
 
-def _c(names: str, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> Columns:
-    return Columns(tuple(names.split()), scale, offset)
 
-
-def _three(stem: str) -> str:
-    return " ".join(f"{stem}[{k}]" for k in range(3))
+def _are(values: object, kind: type) -> bool:
+    return isinstance(values, Sequence) and all(isinstance(value, kind) for value in values)
 
 
 def _check_quantity(quantity: object, columns: Columns) -> None:
-    known = [*SIZES, "time", "setpoint.NAME"]
-    is_known = isinstance(quantity, str) and (quantity in known[:-1] or quantity.startswith("setpoint."))
-    if not is_known:
-        raise MissingColumns(f"Unknown quantity {shown(quantity)} in columns. Choose from: {', '.join(known)}.")
-    size = 1 if quantity == "time" else SIZES.get(quantity, len(columns.names))
-    if len(columns.names) != size:
+    known = [*QUANTITIES, "time"]
+    if not (isinstance(quantity, str) and (quantity in known or quantity.startswith("setpoint."))):
         raise MissingColumns(
-            f"{quantity} takes {size} column(s), got {len(columns.names)}: {', '.join(columns.names)}. Name each."
+            f"Unknown quantity {shown(quantity)} in columns. Choose from: {', '.join(known)}, setpoint.NAME."
         )
+    count = len(columns.names)
+    size = 1 if quantity == "time" else QUANTITIES.get(quantity, (count, None))[0]
+    if count != size:
+        raise MissingColumns(f"{quantity} takes {size} column(s), got {count}: {', '.join(columns.names)}. Name each.")
+
+
+def _c(names: str, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0, *, of: str = "") -> Columns:
+    """Columns whose names all begin alike."""
+    return Columns(tuple(of + name for name in names.split()), scale, offset)
 
 
 LAYOUTS = {
@@ -118,11 +125,11 @@ LAYOUTS = {
             "position": (_c("px py pz"),),
             "quaternion": (_c("qx qy qz qw"),),
             "velocity": (_c("vx vy vz"),),
-            "angular_velocity": (_c("imu_gyro_x imu_gyro_y imu_gyro_z"),),
-            "acceleration": (_c("imu_acc_x imu_acc_y imu_acc_z", G),),
-            "motor_command": (_c("motor_motor_m1 motor_motor_m2 motor_motor_m3 motor_motor_m4", 1 / 65535),),
+            "angular_velocity": (_c("x y z", of="imu_gyro_"),),
+            "acceleration": (_c("x y z", G, of="imu_acc_"),),
+            "motor_command": (_c("m1 m2 m3 m4", 1 / 65535, of="motor_motor_"),),
             "battery_voltage": (_c("pwr_pm_vbat"),),
-            "setpoint.position": (_c("sp_ctrltarget_x sp_ctrltarget_y sp_ctrltarget_z"),),
+            "setpoint.position": (_c("x y z", of="sp_ctrltarget_"),),
             "setpoint.yaw": (_c("sp_ctrltarget_yaw", DEGREE),),
         },
         frames.crazyflie(),
@@ -131,52 +138,45 @@ LAYOUTS = {
     ),
     "px4": Layout(  # msg/*.msg of PX4 1.14; older firmware has no actuator_motors
         {
-            "position": (_c("vehicle_local_position.x vehicle_local_position.y vehicle_local_position.z"),),
-            "quaternion": (_c(f"vehicle_attitude.q[0] {' '.join(f'vehicle_attitude.q[{k}]' for k in (1, 2, 3))}"),),
-            "velocity": (_c("vehicle_local_position.vx vehicle_local_position.vy vehicle_local_position.vz"),),
-            "angular_velocity": (_c(_three("vehicle_angular_velocity.xyz")), _c(_three("sensor_combined.gyro_rad"))),
+            "position": (_c("x y z", of="vehicle_local_position."),),
+            "quaternion": (_c("[0] [1] [2] [3]", of="vehicle_attitude.q"),),
+            "velocity": (_c("vx vy vz", of="vehicle_local_position."),),
+            "angular_velocity": (
+                _c("[0] [1] [2]", of="vehicle_angular_velocity.xyz"),
+                _c("[0] [1] [2]", of="sensor_combined.gyro_rad"),
+            ),
             "acceleration": (
-                _c(_three("vehicle_acceleration.xyz")),
-                _c(_three("sensor_combined.accelerometer_m_s2")),
+                _c("[0] [1] [2]", of="vehicle_acceleration.xyz"),
+                _c("[0] [1] [2]", of="sensor_combined.accelerometer_m_s2"),
             ),
             "motor_command": (
-                _c(" ".join(f"actuator_motors.signal[{k}]" for k in range(4))),
-                _c(" ".join(f"actuator_outputs.output[{k}]" for k in range(4)), 1e-3, 1000.0),
+                _c("[0] [1] [2] [3]", of="actuator_motors.signal"),
+                _c("[0] [1] [2] [3]", 1e-3, 1000.0, of="actuator_outputs.output"),
             ),
             "battery_voltage": (_c("battery_status.voltage_v"),),
             "setpoint.position": (
-                _c(_three("trajectory_setpoint.position")),
-                _c(" ".join(f"vehicle_local_position_setpoint.{axis}" for axis in "xyz")),
+                _c("[0] [1] [2]", of="trajectory_setpoint.position"),
+                _c("x y z", of="vehicle_local_position_setpoint."),
             ),
         },
         frames.px4(),
     ),
     "crazyflie": Layout(  # the log variables of the firmware, as the uSD deck writes them
         {
-            "position": (
-                _c("stateEstimate.x stateEstimate.y stateEstimate.z"),
-                _c("stateEstimateZ.x stateEstimateZ.y stateEstimateZ.z", 1e-3),
-            ),
-            "quaternion": (
-                _c("stateEstimate.qx stateEstimate.qy stateEstimate.qz stateEstimate.qw"),
-                _c("stateEstimateZ.qx stateEstimateZ.qy stateEstimateZ.qz stateEstimateZ.qw"),
-            ),
+            "position": (_c("x y z", of="stateEstimate."), _c("x y z", 1e-3, of="stateEstimateZ.")),
+            "quaternion": (_c("qx qy qz qw", of="stateEstimate."), _c("qx qy qz qw", of="stateEstimateZ.")),
             "euler": tuple(  # the firmware counts pitch the other way round
-                _c(f"{group}.roll {group}.pitch {group}.yaw", (DEGREE, -DEGREE, DEGREE))
-                for group in ("stateEstimate", "stabilizer")
+                _c("roll pitch yaw", (DEGREE, -DEGREE, DEGREE), of=group) for group in ("stateEstimate.", "stabilizer.")
             ),
-            "velocity": (
-                _c("stateEstimate.vx stateEstimate.vy stateEstimate.vz"),
-                _c("stateEstimateZ.vx stateEstimateZ.vy stateEstimateZ.vz", 1e-3),
-            ),
+            "velocity": (_c("vx vy vz", of="stateEstimate."), _c("vx vy vz", 1e-3, of="stateEstimateZ.")),
             "angular_velocity": (
-                _c("gyro.x gyro.y gyro.z", DEGREE),
-                _c("stateEstimateZ.rateRoll stateEstimateZ.ratePitch stateEstimateZ.rateYaw", (1e-3, -1e-3, 1e-3)),
+                _c("x y z", DEGREE, of="gyro."),
+                _c("rateRoll ratePitch rateYaw", (1e-3, -1e-3, 1e-3), of="stateEstimateZ."),
             ),
-            "acceleration": (_c("acc.x acc.y acc.z", G),),
-            "motor_command": (_c("motor.m1 motor.m2 motor.m3 motor.m4", 1 / 65535),),
+            "acceleration": (_c("x y z", G, of="acc."),),
+            "motor_command": (_c("m1 m2 m3 m4", 1 / 65535, of="motor."),),
             "battery_voltage": (_c("pm.vbat"),),
-            "setpoint.position": (_c("ctrltarget.x ctrltarget.y ctrltarget.z"),),
+            "setpoint.position": (_c("x y z", of="ctrltarget."),),
             "setpoint.yaw": (_c("ctrltarget.yaw", DEGREE),),
         },
         frames.crazyflie(),
@@ -185,8 +185,7 @@ LAYOUTS = {
 
 
 def choose(columns: str | Layout | Mapping[str, object], default: Layout | None) -> Layout:
-    """The layout for what a caller names: a preset, a layout, or a mapping, which goes over the default if there is
-    one."""
+    """The layout for what a caller names: a preset, a layout, or a mapping, which replaces entries of a default."""
     if isinstance(columns, Layout):
         return columns
     if isinstance(columns, str):
@@ -199,45 +198,38 @@ def choose(columns: str | Layout | Mapping[str, object], default: Layout | None)
             f"names of columns; got {shown(columns)}."
         )
     chosen = {quantity: (_as_columns(quantity, names),) for quantity, names in columns.items()}
-    time = chosen.pop("time", (Columns(("time",)),))[0]
-    required = frozenset(chosen)
-    if default is None:
-        return Layout(chosen, onboard=BY_IMU, time=time, required=required)
-    if "quaternion" in chosen or "euler" in chosen:
-        default_columns = {q: c for q, c in default.columns.items() if q not in ("quaternion", "euler")}
-    else:
-        default_columns = dict(default.columns)
-    time = time if "time" in columns else default.time
-    return replace(default, columns=default_columns | chosen, time=time, required=required)
+    time = chosen.pop("time", None)
+    default = default or Layout({}, onboard=BY_IMU)
+    kept = dict(default.columns)
+    if "quaternion" in chosen or "euler" in chosen:  # the caller names the attitude: not that of the preset, too
+        kept = {quantity: choices for quantity, choices in kept.items() if quantity not in ("quaternion", "euler")}
+    return replace(default, columns=kept | chosen, time=time[0] if time else default.time, required=frozenset(chosen))
 
 
 def _as_columns(quantity: str, names: object) -> Columns:
-    if not isinstance(names, Columns | str) and not (isinstance(names, Sequence) and not isinstance(names, bytes)):
-        raise UserTypeError(
-            f"columns: {shown(quantity)} takes the name of a column, a list of them, or Columns; got {shown(names)}."
-        )
-    columns = names if isinstance(names, Columns) else Columns(names)  # type: ignore[arg-type]
-    _check_quantity(quantity, columns)
-    return columns
+    if not isinstance(names, Columns):
+        if not isinstance(names, Sequence) or isinstance(names, bytes):
+            raise UserTypeError(
+                f"columns: {shown(quantity)} takes the name of a column, a list of them, or Columns; got "
+                f"{shown(names)}."
+            )
+        names = Columns(tuple(names) if not isinstance(names, str) else (names,))
+    _check_quantity(quantity, names)
+    return names
 
 
 def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Signal]:
-    """Each quantity of the layout that the streams have, in our units, frames and orders; NaN beyond ``LARGEST``.
-
-    Raises:
-        MissingColumns: the streams lack a quantity that every log needs, or a column of a mapping.
-        UnreadableLog: the columns of a quantity stand in streams of different clocks.
-    """
+    """Each quantity of the layout that the streams have, in our units, frames and orders; NaN beyond ``LARGEST``."""
     owner = {column: stream for stream in reversed(streams) for column in stream.columns}
     found = {}
     for quantity, choices in layout.columns.items():
         choice = next((c for c in choices if all(column in owner for column in c.names)), None)
-        if choice is None and quantity in layout.required:
-            missing = sorted({column for c in choices for column in c.names} - owner.keys())
-            raise MissingColumns(
-                f"{name} has no column {', '.join(missing)}, named for {quantity}. {_columns_there(owner)}"
-            )
         if choice is None:
+            if quantity in layout.required:
+                missing = sorted({column for c in choices for column in c.names} - owner.keys())
+                raise MissingColumns(
+                    f"{name} has no column {', '.join(missing)}, named for {quantity}. {_columns_there(owner)}"
+                )
             continue
         stream = owner[choice.names[0]]
         if any(owner[column] is not stream for column in choice.names):
@@ -249,13 +241,16 @@ def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Si
             values = np.stack([np.asarray(stream.columns[column], float) for column in choice.names], -1)
             values = (values - choice.offset) * choice.scale
         values[~(np.abs(values) < LARGEST)] = np.nan
-        values = _translate(quantity, values, layout.convention)
+        setpoint = quantity.removeprefix("setpoint.")
+        _, alike = QUANTITIES.get(quantity, (0, setpoint if setpoint in _TRANSLATED else None))
+        if alike and not (alike == "motors" and layout.convention.motors is None):
+            values = layout.convention.back({alike: values})[alike]
         found[quantity] = Signal(quantity, choice.names, stream.time, values)
     if "quaternion" in found:
         found.pop("euler", None)
     if "velocity" in found:
         found.pop("velocity_body", None)
-    for quantities in NEEDED:
+    for quantities in _NEEDED:
         if not found.keys() & set(quantities):
             asked = [column for q in quantities for choice in layout.columns.get(q, ()) for column in choice.names]
             raise MissingColumns(
@@ -266,40 +261,17 @@ def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Si
 
 
 def match(header: Sequence[str], name: str) -> Layout:
-    """The preset for the columns of a CSV file.
-
-    Raises:
-        MissingColumns: none knows them.
-    """
+    """The preset for the columns of a CSV file."""
     for layout in LAYOUTS.values():
         if {*layout.time.names, *layout.columns["position"][0].names} <= set(header):
             return layout
     raise MissingColumns(f"No preset knows the columns of {name}. {_columns_there(header)}")
 
 
-def _columns_there(names: Sequence[str] | Mapping[str, Stream]) -> str:
+def _columns_there(names: Iterable[str]) -> str:
     there = sorted(names)
     more = f" and {len(there) - 40} more" if len(there) > 40 else ""
     return (
         'Name them: columns={"time": "t", "position": ["x", "y", "z"], ...}. '
         f"There are: {', '.join(there[:40]) or 'none'}{more}."
     )
-
-
-def _translate(quantity: str, values: Array, convention: frames.Convention) -> Array:
-    """From the frames and orders of a convention into ours."""
-    alike = {
-        "acceleration": "angular_velocity",  # a vector of the body
-        "velocity_body": "angular_velocity",
-        "motor_command": "motors",
-        "setpoint.position": "position",
-        "setpoint.velocity": "velocity",
-        "setpoint.quaternion": "quaternion",
-        "setpoint.angular_velocity": "angular_velocity",
-    }
-    name = alike.get(quantity, quantity)
-    if name not in ("position", "velocity", "quaternion", "angular_velocity", "motors"):
-        return values
-    if name == "motors" and convention.motors is None:
-        return values
-    return convention.back({name: values})[name]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -12,14 +13,7 @@ from pydantic import Field
 
 from torchrl_quad.deploy.frames import Convention
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
-from torchrl_quad.identification.attitude import body_rates, continuous, from_euler, rotate, slope
-from torchrl_quad.identification.checks import (
-    check_motors,
-    check_quaternion,
-    check_rates,
-    check_specific_force,
-    check_velocity,
-)
+from torchrl_quad.identification import checks
 from torchrl_quad.identification.errors import (
     GapsTooLarge,
     LogError,
@@ -29,14 +23,30 @@ from torchrl_quad.identification.errors import (
     UnreadableLog,
     WrongUnit,
 )
-from torchrl_quad.identification.layouts import SIZES, Columns, Layout, gather
+from torchrl_quad.identification.layouts import QUANTITIES, Columns, Layout, gather
 from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
+from torchrl_quad.identification.signals import (
+    LARGEST,
+    Array,
+    Mask,
+    Signal,
+    Stream,
+    body_rates,
+    clean,
+    covered,
+    frozen,
+    resample,
+    slope,
+)
 from torchrl_quad.identification.sources import read_streams
-from torchrl_quad.identification.streams import LARGEST, Array, Signal, Stream, clean, covered, frozen, resample
 from torchrl_quad.options import NonNegative, checked
+from torchrl_quad.rotations import continuous, from_euler, rotate
 
 _LONGEST = 3000  # letters of an error: it lists up to 60 columns of a file
 LEAST_STEP, MAX_STEPS = 1e-3, 1_000_000  # [s] of a log, and how many: 17 minutes at 1 kHz, half a gigabyte
+_SHAPES = {name: (size,) for name, (size, _) in QUANTITIES.items() if name not in ("euler", "velocity_body")}
+_SHAPES |= {"time": (), "battery_voltage": ()}  # of the fields that a fit reads, after (T,)
+_ONBOARD = sorted({*QUANTITIES, "setpoint"} - {"euler", "velocity_body"})
 
 
 @checked
@@ -63,10 +73,8 @@ class FlightLog:
     notes: tuple[str, ...]  #: what was found and done, a sentence each
 
     def __post_init__(self) -> None:
-        shapes = {"time": (), "position": (3,), "quaternion": (4,), "velocity": (3,), "angular_velocity": (3,)}
-        shapes |= {"acceleration": (3,), "motor_command": (4,), "battery_voltage": ()}
         length = np.shape(self.time)[:1]
-        for field, shape in shapes.items():
+        for field, shape in _SHAPES.items():
             value = getattr(self, field)
             if value is None and field in ("acceleration", "battery_voltage"):
                 continue
@@ -119,8 +127,8 @@ def read_log(
                        "acceleration": Columns(("ax", "ay", "az"), scale=9.80665)})
         print(log)
 
-    Bags need rosbags: ``pip install '.[logs]'`` in a clone. Files are read in time and memory proportional to their
-    size, and refused by name beyond the limits of ``docs/flight_logs.md``.
+    Bags need rosbags: ``pip install '.[logs]'`` in a clone. Time and memory are proportional to the size of the file;
+    ``docs/flight_logs.md`` has the limits.
 
     Args:
         path: a file, or the folder of a ROS 2 bag. Its first bytes say of what kind it is.
@@ -143,63 +151,25 @@ def read_log(
     if not (convention is None or isinstance(convention, Convention)):
         raise UserTypeError(f"convention must be one of torchrl_quad.deploy.frames, or None; got {shown(convention)}.")
     path = Path(path)
-    try:
+    with _naming(path):
         streams, layout, notes = read_streams(path, columns)
         layout = layout if convention is None else replace(layout, convention=convention)
         fields = layout.onboard if onboard is None else tuple(onboard)
-        _check_onboard(fields)
-        return _flight(path, streams, layout, notes, fields, dt, clearance, max_gap, min_duration)
-    except LogError as error:
-        said = str(error) if path.name in str(error) else f"{path.name}: {error}"
-        said = " ".join("".join(x if x.isprintable() else " " for x in said).split())  # names may hold anything
-        raise type(error)(said if len(said) <= _LONGEST else f"{said[:_LONGEST]} ...") from error
-
-
-def _check_onboard(fields: Sequence[str]) -> None:
-    known = sorted({*SIZES, "setpoint"} - {"euler", "velocity_body"})
-    for field in fields:
-        if field not in known:
-            raise UserValueError(f"onboard: unknown field {shown(field)}. Choose from: {', '.join(known)}.")
-
-
-def _flight(
-    path: Path,
-    streams: Sequence[Stream],
-    layout: Layout,
-    notes: list[str],
-    fields: tuple[str, ...],
-    dt: float | None,
-    clearance: float,
-    max_gap: float,
-    min_duration: float,
-) -> FlightLog:
-    signals = _signals(layout, streams, path.name, notes)
-    main = [s for q, s in signals.items() if q != "battery_voltage" and not q.startswith("setpoint.")]
-    attitude = signals.get("quaternion") or signals["euler"]
-    step = dt or max(round(attitude.step, 5), LEAST_STEP)
-    if not 0.0 < attitude.step < 0.5:
-        raise WrongUnit(
-            f"{path.name}: the clock steps by {attitude.step:.4g} s, which is no flight. Is it in milliseconds? Then "
-            'write columns={"time": Columns(("t",), scale=1e-3), ...}.'
-        )
-    start, stop = max(s.time[0] for s in main), min(s.time[-1] for s in main)
-    if stop - start < 20.0 * step:
-        raise NoFlight(
-            f"{path.name} is no flight: its streams share {max(stop - start, 0.0):.2f} s. Give a longer log, or name "
-            "columns that were recorded at the same time."
-        )
-    if stop - start > MAX_STEPS * step:
-        _refuse_length(path.name, main, stop - start, step)
-    grid = start + step * np.arange(int((stop - start) / step + 1e-6) + 1)
-    valid = _cover(main, grid, step, max_gap, notes)
-    at = _at(signals, grid, step)
-    on, _ = motors_on(at["motor_command"], step, path.name)
-    sound = on & valid & ~broken(at, on, step)[0]
-    moving = sound if sound.sum() > 10 else on
-    check_velocity(at, signals, step, moving)
-    check_specific_force(at, signals, moving)
-    notes.append(check_rates(at, signals, step, moving))
-    segments, found = find_pieces(at, valid, step, path.name, clearance, min_duration)
+        for field in fields:
+            if field not in _ONBOARD:
+                raise UserValueError(f"onboard: unknown field {shown(field)}. Choose from: {', '.join(_ONBOARD)}.")
+        signals = _signals(layout, streams, path.name, notes)
+        main = [s for q, s in signals.items() if not _is_optional(q)]
+        grid, step = _grid(signals, main, dt, path.name)
+        valid = _cover(main, grid, step, max_gap, notes)
+        at = _at(signals, grid, step)
+        on, _ = motors_on(at["motor_command"], step, path.name)
+        sound = on & valid & ~broken(at, on, step)[0]
+        moving = sound if sound.sum() > 10 else on
+        checks.check_velocity(at, signals, step, moving)
+        checks.check_specific_force(at, signals, moving)
+        notes.append(checks.check_rates(at, signals, step, moving))
+        segments, found = find_pieces(at, valid, step, path.name, clearance, min_duration)
     setpoint = {q.removeprefix("setpoint."): x for q, x in at.items() if q.startswith("setpoint.")}
     present = {q.partition(".")[0] for q in at}
     if "battery_voltage" not in at:
@@ -221,63 +191,72 @@ def _flight(
     )
 
 
-def _signals(layout: Layout, streams: Sequence, name: str, notes: list[str]) -> dict[str, Signal]:
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Put errors of a log in one line that names its file."""
+    try:
+        yield
+    except LogError as error:
+        said = str(error) if path.name in str(error) else f"{path.name}: {error}"
+        said = " ".join("".join(x if x.isprintable() else " " for x in said).split())  # names may hold anything
+        raise type(error)(said if len(said) <= _LONGEST else f"{said[:_LONGEST]} ...") from error
+
+
+def _is_optional(quantity: str) -> bool:
+    return quantity == "battery_voltage" or quantity.startswith("setpoint.")
+
+
+def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[str]) -> dict[str, Signal]:
     """Each quantity at its own rate, finite, in order of time, and in range."""
     signals = {}
     for quantity, signal in gather(layout, streams, name).items():
         if quantity == "battery_voltage" and not (signal.values > 0.0).any():
             continue  # autopilots say 0 where no battery is measured
         if quantity == "quaternion":
-            lost = check_quaternion(clean(signal)[0])
-            notes += [lost] if lost else []
+            notes += checks.check_quaternion(clean(signal)[0])
             norm = np.linalg.norm(signal.values, axis=-1, keepdims=True)
             unit = np.where(np.abs(norm - 1.0) < 0.05, signal.values / np.where(norm > 0.0, norm, 1.0), np.nan)
             signal = replace(signal, values=unit)
-        optional = quantity == "battery_voltage" or quantity.startswith("setpoint.")
-        if optional and np.isfinite(signal.values).all(-1).sum() < 2:
+        if _is_optional(quantity) and np.isfinite(signal.values).all(-1).sum() < 2:
             notes.append(f"{signal} holds no finite samples: left out")
             continue
-        signals[quantity], note = clean(signal)
-        notes += [note] if note else []
-    note = check_motors(signals["motor_command"])
-    notes += [note] if note else []
+        signals[quantity], dropped = clean(signal)
+        notes += dropped
+    notes += checks.check_motors(signals["motor_command"])
     return signals
 
 
-def as_logs(log: FlightLog | Sequence[FlightLog], whose: str) -> list[FlightLog]:
-    """One flight or several, as a list.
-
-    Raises:
-        UserTypeError: it is anything else.
-    """
-    logs = [log] if isinstance(log, FlightLog) else list(log) if isinstance(log, Sequence) else [log]
-    for one in logs:
-        if not isinstance(one, FlightLog):
-            raise UserTypeError(
-                f"{whose}: log must be a flight as read_log(path) gives it, or a list of them; got {shown(one)}."
-            )
-        if not one.segments:
-            raise TooShort(f"{whose}: {one.name} has no piece in flight.")
-    if not logs:
-        raise TooLittleFlight(f"{whose} needs at least one flight: read_log(path) gives it.")
-    return logs
-
-
-def _refuse_length(name: str, main: Sequence[Signal], span: float, step: float) -> None:
-    """Raise the error of a clock that jumps ahead, or of a log that is too long; before it is put on a grid."""
-    signal = max(main, key=lambda s: np.diff(s.time).max())
-    k = int(np.diff(signal.time).argmax())
-    begin, end = signal.time[k : k + 2]
-    said = f"{name} spans {span:.4g} s, {span / step:.3g} steps of {step:g} s; the most is {MAX_STEPS:,}"
-    if end - begin < 0.1 * span:
-        raise UnreadableLog(f"{said}. Cut it into shorter logs, or give a larger dt.")
-    raise GapsTooLarge(
-        f"{said}. The clock of {signal} jumps from {begin:.6g} to {end:.6g} s at sample {k + 1}. Cut the file there "
-        "and read the parts."
-    )
+def _grid(signals: Mapping[str, Signal], main: Sequence[Signal], dt: float | None, name: str) -> tuple[Array, float]:
+    """The times that all streams share, in uniform steps, and the step [s]."""
+    attitude = signals.get("quaternion") or signals["euler"]
+    step = dt or max(round(attitude.step, 5), LEAST_STEP)
+    if not 0.0 < attitude.step < 0.5:
+        raise WrongUnit(
+            f"{name}: the clock steps by {attitude.step:.4g} s, which is no flight. Is it in milliseconds? Then "
+            'write columns={"time": Columns(("t",), scale=1e-3), ...}.'
+        )
+    start, stop = max(s.time[0] for s in main), min(s.time[-1] for s in main)
+    span = stop - start
+    if span < 20.0 * step:
+        raise NoFlight(
+            f"{name} is no flight: its streams share {max(span, 0.0):.2f} s. Give a longer log, or name "
+            "columns that were recorded at the same time."
+        )
+    if span > MAX_STEPS * step:  # a clock that jumps ahead, or a long log: seen before anything is put on a grid
+        said = f"{name} spans {span:.4g} s, {span / step:.3g} steps of {step:g} s; the maximum is {MAX_STEPS:,}"
+        signal = max(main, key=lambda s: np.diff(s.time).max())
+        k = int(np.diff(signal.time).argmax())
+        begin, end = signal.time[k : k + 2]
+        if end - begin < 0.1 * span:
+            raise UnreadableLog(f"{said}. Cut it into shorter logs, or give a larger dt.")
+        raise GapsTooLarge(
+            f"{said}. The clock of {signal} jumps from {begin:.6g} to {end:.6g} s at sample {k + 1}. Cut the file "
+            "there and read the parts."
+        )
+    return start + step * np.arange(int(span / step + 1e-6) + 1), step
 
 
-def _cover(main: Sequence[Signal], grid: Array, step: float, max_gap: float, notes: list[str]) -> np.ndarray:
+def _cover(main: Sequence[Signal], grid: Array, step: float, max_gap: float, notes: list[str]) -> Mask:
     """Which times lie in no gap of any stream; gaps, and streams that are slower than the log, are noted."""
     valid = np.ones(len(grid), bool)
     told: dict[tuple[int, float], list[str]] = {}
@@ -313,3 +292,18 @@ def _at(signals: Mapping[str, Signal], grid: Array, step: float) -> dict[str, Ar
     if "angular_velocity" not in at:
         at["angular_velocity"] = body_rates(at["quaternion"], step)
     return at
+
+
+def as_logs(log: FlightLog | Sequence[FlightLog], whose: str) -> list[FlightLog]:
+    """One flight or several, as a list."""
+    logs = [log] if isinstance(log, FlightLog) else list(log) if isinstance(log, Sequence) else [log]
+    for one in logs:
+        if not isinstance(one, FlightLog):
+            raise UserTypeError(
+                f"{whose}: log must be a flight as read_log(path) gives it, or a list of them; got {shown(one)}."
+            )
+        if not one.segments:
+            raise TooShort(f"{whose}: {one.name} has no piece in flight.")
+    if not logs:
+        raise TooLittleFlight(f"{whose} needs at least one flight: read_log(path) gives it.")
+    return logs

@@ -6,23 +6,17 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from torchrl_quad.identification.errors import GapsTooLarge, NoFlight, WrongFrame
-from torchrl_quad.identification.streams import Array
+from torchrl_quad.identification.signals import Array, Mask, runs
 
-Mask = NDArray[np.bool_]
 OFF = 0.02  # mean command of motors that stand
 _CHUNK = 20_000  # samples whose medians are taken together
 REST = 0.2  # [s] and [m/s]: how long and how slowly a drone stands
 
 
 def motors_on(motors: Array, dt: float, name: str) -> tuple[Mask, Mask]:
-    """When the motors carry the drone, and when they stand or idle for longer than a moment.
-
-    Raises:
-        NoFlight: they never turn.
-    """
+    """When the motors carry the drone, and when they stand or idle for longer than a moment."""
     level = motors.mean(-1)
     full = float(np.percentile(level, 95))
     if full < OFF:
@@ -35,22 +29,12 @@ def motors_on(motors: Array, dt: float, name: str) -> tuple[Mask, Mask]:
 
 
 def find_pieces(
-    at: Mapping[str, Array],
-    valid: Mask,
-    dt: float,
-    name: str,
-    clearance: float,
-    min_duration: float,
+    at: Mapping[str, Array], valid: Mask, dt: float, name: str, clearance: float, min_duration: float
 ) -> tuple[tuple[tuple[int, int], ...], list[str]]:
     """Pieces (start, stop) in flight without gaps, and notes.
 
     The drone stands where its motors idle and it does not move. It flies where its motors run and it is more than
     ``clearance`` above the place where it stood, or will stand next.
-
-    Raises:
-        NoFlight: it never does.
-        WrongFrame: it takes off downwards.
-        GapsTooLarge: it does, but never for ``min_duration`` without a gap.
     """
     carried, idle = motors_on(at["motor_command"], dt, name)
     z = at["position"][:, 2]
@@ -64,9 +48,9 @@ def find_pieces(
         )
     cut, notes = broken(at, flying, dt)
     airborne = flying & ~cut
-    pieces = _runs(airborne & valid, min_duration, dt)
+    pieces = tuple((int(start), int(stop)) for start, stop in runs(airborne & valid, min_duration, dt))
     if not pieces:
-        if _runs(airborne, min_duration, dt):
+        if len(runs(airborne, min_duration, dt)):
             raise GapsTooLarge(
                 f"{name}: gaps leave no piece of {min_duration:g} s of its {airborne.sum() * dt:.1f} s in flight. Give "
                 "a log with fewer gaps, a larger max_gap, or a smaller min_duration."
@@ -95,22 +79,18 @@ def find_pieces(
 
 def _near_ground(z: Array, resting: Mask, clearance: float, name: str) -> Mask:
     """From each stand until the drone has risen by ``clearance``, back from the next one likewise, and in between
-    whenever it is that near to the lower of the two.
-
-    Raises:
-        WrongFrame: it leaves every stand downwards.
-    """
+    whenever it is that near to the lower of the two."""
     low = resting.copy()
-    stands = _runs(resting, 0.0, 1.0)
+    stands = runs(resting)
     heights = [float(np.median(z[start:stop])) for start, stop in stands]
     begins, ends = [0, *(stop for _, stop in stands)], [*(start for start, _ in stands), len(z)]
     away = []
     for k, (begin, end) in enumerate(zip(begins, ends, strict=True)):
-        beside = heights[max(k - 1, 0) : k + 1]
+        around = heights[max(k - 1, 0) : k + 1]
         part = z[begin:end]
-        if not beside or not len(part):
+        if not around or not len(part):
             continue
-        low[begin:end] = part < min(beside) + clearance
+        low[begin:end] = part < min(around) + clearance
         stood = [(heights[k - 1], 1)] if k else []
         stood += [(heights[k], -1)] if k < len(stands) else []
         for height, order in stood:
@@ -149,7 +129,7 @@ def broken(at: Mapping[str, Array], flying: Mask, dt: float) -> tuple[Mask, list
         spike = np.linalg.norm(x - np.concatenate(middle), axis=-1)
         limit = max(least, 10.0 * 1.4826 * float(np.median(spike[flying])))
         end = 0
-        for start, stop in _runs(flying & (spike > limit), 0.0, dt):
+        for start, stop in runs(flying & (spike > limit)):
             if start >= end:
                 notes.append(f"{what}, of {spike[start:stop].max():.2g}{unit}, at {start * dt:.2f} s: cut out")
             end = stop + round(after / dt)
@@ -157,14 +137,8 @@ def broken(at: Mapping[str, Array], flying: Mask, dt: float) -> tuple[Mask, list
     return cut, notes
 
 
-def _runs(mask: Mask, shortest: float, dt: float) -> tuple[tuple[int, int], ...]:
-    """Where the mask holds without a break, as (start, stop), for ``shortest`` [s] or longer."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))).reshape(-1, 2)
-    return tuple((int(a), int(b)) for a, b in edges if (b - a) * dt >= shortest - 1e-9)
-
-
 def _long(mask: Mask, shortest: float, dt: float) -> Mask:
     kept = np.zeros_like(mask)
-    for start, stop in _runs(mask, shortest, dt):
+    for start, stop in runs(mask, shortest, dt):
         kept[start:stop] = True
     return kept

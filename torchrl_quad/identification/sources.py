@@ -1,4 +1,4 @@
-"""Files of every kind as streams: CSV, PX4's ULog, ROS bags, and the Crazyflie's uSD log."""
+"""Files of every kind as streams: CSV here, and PX4's ULog, ROS bags, and the Crazyflie's uSD log elsewhere."""
 
 from __future__ import annotations
 
@@ -10,33 +10,30 @@ import itertools
 import os
 import zlib
 from array import array
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
 from torchrl_quad.identification.bags import MAGIC, read_bag
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
 from torchrl_quad.identification.layouts import LAYOUTS, Layout, choose, match
-from torchrl_quad.identification.streams import Stream, open_plain
+from torchrl_quad.identification.signals import MAX_COLUMNS, Array, Stream, open_plain, too_many
 from torchrl_quad.identification.ulog import read_ulog
 from torchrl_quad.identification.usd import read_usd
 
 Asked = str | Layout | Mapping[str, object] | None
+Read = tuple[list[Stream], Layout, list[str]]
 # Of a file, which may be packed, and of what it unpacks to. All is read in time and memory proportional to its size.
 MAX_BYTES, MAX_UNPACKED = 2 * 10**9, 500 * 10**6
-MAX_LINE, MAX_COLUMNS, MAX_ROWS = 4 * 10**6, 100_000, 5 * 10**6  # of a CSV file: bytes, names, samples
+MAX_LINE, MAX_ROWS = 4 * 10**6, 5 * 10**6  # bytes and lines of a CSV file
+_CUT = "Cut it into shorter logs."
+_READERS = {b"ULog\x01\x12\x35": (read_ulog, "px4"), b"\xbc": (read_usd, "crazyflie")}  # by the first bytes
 
 
-def read_streams(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list[str]]:
-    """The streams of a file, what is where in it, and notes. The first bytes say of what kind it is.
-
-    Raises:
-        UnreadableLog: the file is empty, broken, too large, no plain file, or of no known kind.
-        MissingColumns: no preset knows its columns.
-    """
+def read_streams(path: Path, columns: Asked) -> Read:
+    """The streams of a file, what is where in it, and notes. Its first bytes tell the kind of file."""
     if not path.exists():
         raise UnreadableLog(f"{path} does not exist. Give the path of a log.")
     if path.is_dir():
@@ -47,9 +44,8 @@ def read_streams(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list
         start = file.peek(16)[:16]
         if start.startswith(MAGIC):
             return read_bag(path, columns)
-        size = os.fstat(file.fileno()).st_size
-        if size > MAX_BYTES:
-            raise UnreadableLog(f"{path.name} has {size:,} bytes; the most is {MAX_BYTES:,}. Cut it into shorter logs.")
+        if os.fstat(file.fileno()).st_size > MAX_BYTES:
+            raise too_many(path.name, MAX_BYTES, "bytes", _CUT)
         if not start.startswith(b"\x1f\x8b"):
             return _read(file, path.name, columns, MAX_BYTES)
         try:
@@ -59,13 +55,9 @@ def read_streams(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list
             raise UnreadableLog(f"{path.name} is a broken gz file: {error}. Copy it again.") from error
 
 
-def _read(file: BinaryIO, name: str, columns: Asked, most: int) -> tuple[list[Stream], Layout, list[str]]:
-    readers: dict[bytes, tuple[Callable[..., tuple[list[Stream], list[str]]], str]] = {
-        b"ULog\x01\x12\x35": (read_ulog, "px4"),
-        b"\xbc": (read_usd, "crazyflie"),
-    }
-    start = file.peek(8192)  # type: ignore[attr-defined]
-    for magic, (reader, preset) in readers.items():
+def _read(file: io.BufferedReader, name: str, columns: Asked, most: int) -> Read:
+    start = file.peek(8192)
+    for magic, (reader, preset) in _READERS.items():
         if start.startswith(magic):
             layout = LAYOUTS[preset] if columns is None else choose(columns, LAYOUTS[preset])
             data = b"".join(_counted(iter(lambda: file.read(1 << 20), b""), name, most))
@@ -86,14 +78,12 @@ def _counted(parts: Iterator[bytes], name: str, most: int) -> Iterator[bytes]:
     for part in parts:
         total += len(part)
         if total > most:
-            raise UnreadableLog(
-                f"{name} unpacks to more than {most:,} bytes; that is the most. Cut it into shorter logs."
-            )
+            raise too_many(name, most, "bytes when it is unpacked", _CUT)
         yield part
 
 
-def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> tuple[list[Stream], Layout, list[str]]:
-    """Of a table, only the columns that are asked for become numbers; cells that are none become NaN."""
+def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
+    """Only the columns that are asked for become numbers; cells that are none become NaN."""
     rows = _rows(lines, name)
     first = next(rows, "").removeprefix("\ufeff")
     if not first:
@@ -101,46 +91,42 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> tuple[list[S
     mark = max(",;\t", key=first.count)
     header = [part.strip().strip('"') for part in first.split(mark)]
     if len(header) > MAX_COLUMNS:
-        raise UnreadableLog(f"{name} has {len(header):,} columns; the most is {MAX_COLUMNS:,}. Leave some out.")
-    repeated = {column for column, count in collections.Counter(header).items() if count > 1}
+        raise too_many(name, MAX_COLUMNS, "columns", "Leave some out.")
     samples = list(itertools.islice(rows, 2))
-    if len(samples) < 2 or samples[0].count(mark) + 1 != len(header):
-        cells = samples[0].count(mark) + 1 if samples else 0
-        raise UnreadableLog(
-            f"{name} has rows of {cells} cells under {len(header)} names, or fewer than two. Give a CSV file whose "
-            "first row names the columns, and whose others are samples."
-        )
-    _cells(samples[1], mark, len(header), name, 1)
+    if len(samples) < 2:
+        raise UnreadableLog(f"{name} has fewer than two samples below its header. Give the log of a flight.")
+    for k, row in enumerate(samples):  # before anything is said of its columns: it may be no table
+        _cells(row, mark, len(header), name, k)
     if columns is None:
         layout = match(header, name)
     else:  # a mapping without a position changes a preset; one with it describes the whole file
         partial = isinstance(columns, Mapping) and "position" not in columns
         layout = choose(columns, match(header, name) if partial else None)
-    asked = {*layout.time.names, *(n for choices in layout.columns.values() for c in choices for n in c.names)}
-    if layout.time.names[0] not in header:
+    (clock,) = layout.time.names
+    if clock not in header:
         raise MissingColumns(
-            f"{name} has no column {layout.time.names[0]} of the time. There are: {', '.join(header[:60])}. "
+            f"{name} has no column {clock} of the time. There are: {', '.join(header[:60])}. "
             'Name it: columns={"time": ...}.'
         )
-    if asked & repeated:
-        raise UnreadableLog(
-            f"{name} has several columns of one name: {', '.join(sorted(asked & repeated))}. Rename them."
-        )
+    asked = layout.names | {clock}
+    repeated = sorted(column for column, count in collections.Counter(header).items() if count > 1 and column in asked)
+    if repeated:
+        raise UnreadableLog(f"{name} has several columns of one name: {', '.join(repeated)}. Rename them.")
     place = {column: k for k, column in enumerate(header) if column in asked}
     table = _numbers(itertools.chain(samples, rows), mark, len(header), list(place.values()), name)
-    values = dict.fromkeys(header, np.broadcast_to(np.nan, len(table)))  # nobody reads the others
+    values = dict.fromkeys(header, np.broadcast_to(np.nan, len(table)))  # the others are never read
     values |= dict(zip(place, table.T, strict=True))
-    time = (values[layout.time.names[0]] - np.asarray(layout.time.offset)) * np.asarray(layout.time.scale)
+    time = (values[clock] - np.asarray(layout.time.offset)) * np.asarray(layout.time.scale)
     return [Stream("csv", time, values)], layout, []
 
 
 def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
     """The rows of a table as text, without comments and empty ones."""
     for k, line in enumerate(lines):
-        if k > MAX_ROWS:
-            raise UnreadableLog(f"{name} has more than {MAX_ROWS:,} lines; that is the most. Cut it into shorter logs.")
+        if k >= MAX_ROWS:
+            raise too_many(name, MAX_ROWS, "lines", _CUT)
         if len(line) > MAX_LINE:
-            raise UnreadableLog(f"{name}: line {k + 1} has more than {MAX_LINE:,} bytes; that is the most.")
+            raise too_many(f"{name}: line {k + 1}", MAX_LINE, "bytes", "Export it as CSV again.")
         try:
             text = line.decode()
         except UnicodeDecodeError as error:
@@ -152,7 +138,7 @@ def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
             yield text
 
 
-def _numbers(rows: Iterator[str], mark: str, width: int, places: list[int], name: str) -> np.ndarray:
+def _numbers(rows: Iterator[str], mark: str, width: int, places: list[int], name: str) -> Array:
     """Some columns of a table (N, len(places))."""
     flat, pick = array("d"), itemgetter(*places, places[0])  # of one place alone it would give no tuple
     for k, row in enumerate(rows):

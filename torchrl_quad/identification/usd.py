@@ -8,31 +8,26 @@ id, time (version 1: 32 bits, ms; version 2: 64 bits, us) and values. The last f
 
 from __future__ import annotations
 
-import itertools
 import re
 import struct
 import zlib
 from array import array
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from torchrl_quad.errors import shown
 from torchrl_quad.identification.errors import UnreadableLog
-from torchrl_quad.identification.streams import Array, Stream
-
-MAX_COLUMNS, MAX_EVENTS = 100_000, 20 * 10**6  # columns of all kinds of events together
+from torchrl_quad.identification.signals import MAX_COLUMNS, MAX_RECORDS, Array, Stream, too_many
 
 _TICKS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}
 _VARIABLE = re.compile(r"(.+)\(([bBhHiIqQfd?])\)")
 
 
 def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
-    """A stream for each kind of event.
-
-    Raises:
-        UnreadableLog: the file has another version or too many variables or events, or its header is cut off.
-    """
+    """A stream for each kind of event."""
     notes = []
     body = data[:-4]
     if zlib.crc32(body) != int.from_bytes(data[-4:], "little"):
@@ -43,13 +38,14 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
         version, kinds = struct.unpack_from("<HH", body, 1)
         if version not in _TICKS:
             raise UnreadableLog(f"{name} is a uSD log of version {version}; 1 and 2 are known. Export it as CSV.")
+        tick, unit = _TICKS[version]
         records, names, at, columns = {}, {}, 5, 0
         for _ in range(kinds):
             (kind,) = struct.unpack_from("<H", body, at)
             names[kind], at = _text(body, at + 2)
             (count,) = struct.unpack_from("<H", body, at)
             at += 2
-            fields = [("id", "<u2"), ("tick", _TICKS[version][0])]
+            fields: list[tuple[str, Any]] = [("id", "<u2"), ("tick", tick)]
             for _ in range(count):
                 variable, at = _text(body, at)
                 found = _VARIABLE.fullmatch(variable)
@@ -57,34 +53,40 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
                     raise UnreadableLog(f"{name} has a variable of unknown type, {shown(variable)}. Export it as CSV.")
                 columns += 1
                 if columns > MAX_COLUMNS:
-                    raise UnreadableLog(f"{name} has more than {MAX_COLUMNS:,} variables; that is the most.")
+                    raise too_many(name, MAX_COLUMNS, "variables", "Log fewer.")
                 fields.append((found[1], np.dtype(found[2]).newbyteorder("<")))
             records[kind] = np.dtype(fields)
+    except UnreadableLog:
+        raise
     except (struct.error, ValueError) as error:
-        if isinstance(error, UnreadableLog):
-            raise
         raise UnreadableLog(f"{name} begins like a uSD log, but its header is cut off. Copy it again.") from error
-    events, left = _events(body, at, records, name)
+    starts, left = _events(body, at, {kind: record.itemsize for kind, record in records.items()}, name)
     if left:
         notes.append(f"the last {left} bytes of the uSD log were not read: they are no whole events")
     streams = []
-    for kind, rows in events.items():
+    for kind, record in records.items():
+        rows = pick(body, starts[kind], record)
         with np.errstate(invalid="ignore"):  # NaN of some patterns warn
-            values = {field: rows[field].astype(float) for field in records[kind].names[2:]}
+            values = {field: rows[field].astype(float) for field in record.names[2:]}
         if "stateEstimateZ.quat" in values and rows["stateEstimateZ.quat"].dtype.kind in "iu":
             q = decompress_quaternions(rows["stateEstimateZ.quat"])
             values |= {f"stateEstimateZ.q{axis}": q[:, k] for k, axis in enumerate("xyzw")}
-        streams.append(Stream(names[kind], rows["tick"] * _TICKS[version][1], values))
+        streams.append(Stream(names[kind], rows["tick"] * unit, values))
     return streams, notes
 
 
-def _events(body: bytes, at: int, records: dict[int, np.dtype], name: str) -> tuple[dict[int, np.ndarray], int]:
-    """The events of each kind, and how many bytes at the end are no event."""
-    starts = {kind: array("Q") for kind in records}
-    sizes = {kind: record.itemsize for kind, record in records.items()}
-    for count in itertools.count():
-        if count > MAX_EVENTS:
-            raise UnreadableLog(f"{name} has more than {MAX_EVENTS:,} events; that is the most. Log fewer.")
+def pick(data: bytes, starts: array, record: np.dtype) -> NDArray[np.void]:
+    """The records (N) of one kind that begin at some places of the data."""
+    if not starts:
+        return np.empty(0, record)
+    windows = sliding_window_view(np.frombuffer(data, np.uint8), record.itemsize)
+    return windows[np.frombuffer(starts, np.uint64)].view(record)[:, 0]
+
+
+def _events(body: bytes, at: int, sizes: dict[int, int], name: str) -> tuple[dict[int, array], int]:
+    """Where the events of each kind begin, and how many bytes at the end are no event."""
+    starts = {kind: array("Q") for kind in sizes}
+    for _ in range(MAX_RECORDS):
         if at + 2 > len(body):
             break
         kind = body[at] | body[at + 1] << 8
@@ -92,17 +94,12 @@ def _events(body: bytes, at: int, records: dict[int, np.dtype], name: str) -> tu
             break
         starts[kind].append(at)
         at += sizes[kind]
-    data = np.frombuffer(body, np.uint8)
-    rows = {}
-    for kind, begin in starts.items():
-        rows[kind] = np.empty(0, records[kind])
-        if begin:
-            picked = sliding_window_view(data, sizes[kind])[np.frombuffer(begin, np.uint64)]
-            rows[kind] = picked.view(records[kind])[:, 0]
-    return rows, len(body) - at
+    else:
+        raise too_many(name, MAX_RECORDS, "events", "Log fewer.")
+    return starts, len(body) - at
 
 
-def decompress_quaternions(compressed: np.ndarray) -> Array:
+def decompress_quaternions(compressed: NDArray[np.integer]) -> Array:
     """Quaternions (N, 4), x y z w, of ``stateEstimateZ.quat`` (``quatcompress.h``): the top two bits name the largest
     component, which is positive; the others follow in ten bits each, a sign and a share of sqrt(1/2) of nine bits."""
     code = np.asarray(compressed).astype(np.uint64) & np.uint64(0xFFFFFFFF)

@@ -1,4 +1,4 @@
-"""What a file holds before it is a flight: streams of columns, each with its own clock."""
+"""Streams and signals: what a file holds before it is a flight, each with its own clock."""
 
 from __future__ import annotations
 
@@ -13,24 +13,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.identification.errors import ClockJumpsBack, NotFiniteLog, UnreadableLog
+from torchrl_quad.rotations import conjugate, multiply
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 LARGEST = 1e9  # of a quantity, in SI units; only damage makes larger ones
+MAX_COLUMNS = 100_000  # of a table, and of all messages of a ULog or a uSD log together
+MAX_RECORDS = 20 * 10**6  # messages of a ULog or a bag, events of a uSD log
 
 
 def open_plain(path: Path) -> BinaryIO:
-    """A plain file, open for reading.
-
-    Raises:
-        UnreadableLog: it is a pipe, a socket or a device, which is not opened: to read one may never end.
-    """
+    """A plain file, open for reading. A pipe, a socket or a device is not opened: to read one may never end."""
     if stat.S_ISREG(path.stat().st_mode):
-        flags = getattr(os, "O_NONBLOCK", 0)  # if it is replaced by a pipe just now, opening does not wait
+        flags = getattr(os, "O_NONBLOCK", 0)  # if a pipe replaces it just now, opening does not wait
         file = open(path, "rb", opener=lambda name, given: os.open(name, given | flags))  # noqa: SIM115
         if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             return file
         file.close()
     raise UnreadableLog(f"{path.name} is no plain file, but a pipe, a socket or a device. Give the path of a log.")
+
+
+def too_many(name: str, most: int, what: str, remedy: str) -> UnreadableLog:
+    """The error of a file that is beyond a limit."""
+    return UnreadableLog(f"{name} has more than {most:,} {what}, the maximum. {remedy}")
 
 
 @dataclass(frozen=True)
@@ -60,13 +65,8 @@ class Signal:
         return f"{self.field} ({', '.join(self.columns)})"
 
 
-def clean(signal: Signal) -> tuple[Signal, str | None]:
-    """Without samples that are not finite or repeat a time, and what was dropped.
-
-    Raises:
-        ClockJumpsBack: the clock runs backwards.
-        NotFiniteLog: fewer than two samples are finite.
-    """
+def clean(signal: Signal) -> tuple[Signal, list[str]]:
+    """Without samples that are not finite or repeat a time, and notes of what was dropped."""
     time, values = signal.time, signal.values
     finite = np.isfinite(values).all(-1) & (np.abs(time) < 1e15)
     if finite.sum() < 2:  # of tables that join several rates, most rows of the slower ones are empty
@@ -84,20 +84,20 @@ def clean(signal: Signal) -> tuple[Signal, str | None]:
             "name the right time column."
         )
     new = np.concatenate(([True], np.diff(time) > 0.0))
-    lost, repeated = int((~finite).sum()), int((~new).sum())
-    note = []
-    if lost:
-        note.append(f"{lost} samples of {signal} are not finite, or beyond {LARGEST:g}; they count as missing")
-    if repeated:
-        note.append(f"{repeated} samples of {signal} repeat the time of the sample before, and were dropped")
-    return Signal(signal.field, signal.columns, time[new], values[new]), "; ".join(note) or None
+    notes = []
+    if not finite.all():
+        lost = (~finite).sum()
+        notes.append(f"{lost} samples of {signal} are not finite, or beyond {LARGEST:g}; they count as missing")
+    if not new.all():
+        notes.append(f"{(~new).sum()} samples of {signal} repeat the time of the sample before, and were dropped")
+    return Signal(signal.field, signal.columns, time[new], values[new]), notes
 
 
 def resample(signal: Signal, grid: Array, dt: float, hold: bool = False) -> Array:
     """The signal at the times of a uniform grid (T, size).
 
     Slower signals are interpolated linearly, or held. Faster ones are averaged over a step that is centred at each
-    time, which lets nothing alias and delays nothing.
+    time, so that nothing aliases and nothing is delayed.
     """
     t, x = signal.time, signal.values
     if hold:
@@ -105,19 +105,19 @@ def resample(signal: Signal, grid: Array, dt: float, hold: bool = False) -> Arra
     if signal.step > 0.67 * dt:
         return np.stack([np.interp(grid, t, column) for column in x.T], -1)
     area = np.concatenate((np.zeros_like(x[:1]), np.cumsum((x[1:] + x[:-1]) * np.diff(t)[:, None] / 2.0, 0)))
+
+    def integral(at: Array) -> Array:
+        """Of the linear interpolation, from t[0] to each time."""
+        k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+        share = (at - t[k])[:, None]
+        slope = (x[k + 1] - x[k]) / (t[k + 1] - t[k])[:, None]
+        return area[k] + share * (x[k] + slope * share / 2.0)
+
     low, high = np.clip(grid - dt / 2.0, t[0], t[-1]), np.clip(grid + dt / 2.0, t[0], t[-1])
-    return (_integral(high, t, x, area) - _integral(low, t, x, area)) / (high - low)[:, None]
+    return (integral(high) - integral(low)) / (high - low)[:, None]
 
 
-def _integral(at: Array, t: Array, x: Array, area: Array) -> Array:
-    """The integral of the linear interpolation from t[0] to each time."""
-    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    share = (at - t[k])[:, None]
-    slope = (x[k + 1] - x[k]) / (t[k + 1] - t[k])[:, None]
-    return area[k] + share * (x[k] + slope * share / 2.0)
-
-
-def covered(signal: Signal, grid: Array, max_gap: float) -> tuple[NDArray[np.bool_], Array]:
+def covered(signal: Signal, grid: Array, max_gap: float) -> tuple[Mask, Array]:
     """Which times of the grid lie in no gap of the signal, and the lengths of its gaps [s]."""
     spacing = np.diff(signal.time)
     gap = spacing > max(max_gap, 3.0 * signal.step)
@@ -127,11 +127,10 @@ def covered(signal: Signal, grid: Array, max_gap: float) -> tuple[NDArray[np.boo
     return ~inside, spacing[gap]
 
 
-def frozen(signal: Signal, grid: Array, max_gap: float) -> tuple[NDArray[np.bool_], Array]:
+def frozen(signal: Signal, grid: Array, max_gap: float) -> tuple[Mask, Array]:
     """Which times of the grid lie where the signal repeats itself digit by digit for longer than ``max_gap``, and for
     how long [s]: a tracker that lost the drone. A signal that is held between slower samples is not frozen."""
-    same = (np.diff(signal.values, axis=0) == 0.0).all(-1)
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], same.astype(np.int8), [0])))).reshape(-1, 2)
+    edges = runs((np.diff(signal.values, axis=0) == 0.0).all(-1))
     lengths = signal.time[edges[:, 1]] - signal.time[edges[:, 0]]
     usual = float(np.median(lengths)) if len(lengths) > 0.05 * len(signal.time) else 0.0
     long = lengths > max(max_gap, 3.0 * usual)
@@ -140,3 +139,33 @@ def frozen(signal: Signal, grid: Array, max_gap: float) -> tuple[NDArray[np.bool
     np.add.at(changes, np.searchsorted(grid, ends[:, 0] + 1e-9, side="right"), 1)
     np.add.at(changes, np.searchsorted(grid, ends[:, 1] - 1e-9), -1)
     return np.cumsum(changes[:-1]) > 0, lengths[long]
+
+
+def runs(mask: Mask, shortest: float = 0.0, dt: float = 1.0) -> NDArray[np.int_]:
+    """Where the mask holds without a break for ``shortest`` [s] or longer, as pairs (start, stop) in rows (N, 2)."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))).reshape(-1, 2)
+    return edges[(edges[:, 1] - edges[:, 0]) * dt >= shortest - 1e-9]
+
+
+def slope(x: Array, dt: float, span: float = 0.04) -> Array:
+    """The rate of change (T, n): at each sample the slope of the line through its neighbours within ``span`` [s]."""
+    half = min(max(1, round(span / dt)), (len(x) - 1) // 2)
+    k = np.arange(-half, half + 1)
+    padded = np.concatenate((2.0 * x[0] - x[half:0:-1], x, 2.0 * x[-1] - x[-2 : -half - 2 : -1]))
+    return _convolved(padded, -k / (k @ k * dt))
+
+
+def smooth(x: Array, dt: float, span: float = 0.1) -> Array:
+    """The mean of the samples within ``span / 2`` [s] of each (T, n)."""
+    half = min(max(0, round(span / dt / 2.0)), (len(x) - 1) // 2)
+    padded = np.pad(x, ((half, half), (0, 0)), mode="edge")
+    return _convolved(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)))
+
+
+def body_rates(q: Array, dt: float) -> Array:
+    """Angular velocity in the body frame (T, 3) [rad/s]: twice the vector part of q^-1 dq/dt."""
+    return 2.0 * multiply(conjugate(q), slope(q, dt))[:, 1:]
+
+
+def _convolved(x: Array, kernel: Array) -> Array:
+    return np.stack([np.convolve(column, kernel, "valid") for column in x.T], -1)

@@ -184,11 +184,11 @@ def test_drones_that_are_nowhere_are_left_out_and_the_view_follows_the_others():
 
 @pytest.mark.parametrize("task", ["racing", "tracking"])
 def test_the_view_holds_the_markers_whatever_the_drones_do(task, monkeypatch):
-    from torchrl_quad.render import frames
+    from torchrl_quad.render import video
 
     scenes = []
     monkeypatch.setattr(
-        frames, "Scene", lambda *a, scene=frames.Scene, **k: scenes.append(scene(*a, **k)) or scenes[-1]
+        video, "View", lambda *a, scene=video.View, **k: scenes.append(scene(*a, **k)) or scenes[-1]
     )
     env = make_env(task, num_envs=1)
     env.reset()

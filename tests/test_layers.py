@@ -33,7 +33,7 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "identification": {"deploy.frames", "dynamics", "files", "render.canvas", "rotations"},
 }
 # Imports within a function: of what needs an optional package, and of gymnasium's ids, which name all tasks.
-EXCEPTIONS = {("torchrl_quad.envs.base", "torchrl_quad.render.frames"), ("torchrl_quad.envs.registry", "torchrl_quad")}
+EXCEPTIONS = {("torchrl_quad.envs.base", "torchrl_quad.render.video"), ("torchrl_quad.envs.registry", "torchrl_quad")}
 
 TORCHRL = {"torch", "torchrl", "tensordict"}
 LIBRARIES = {

@@ -1,5 +1,6 @@
 """Figures, films and learning curves."""
 
+import pickle
 import re
 
 import imageio_ffmpeg
@@ -12,8 +13,16 @@ from torchrl.envs import RewardSum, TransformedEnv
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, envs, make_actor, make_env
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric
-from torchrl_quad.render import animate_flight, frames, plot_episode, plot_flight, write_replay
-from torchrl_quad.render.frames import Scene
+from torchrl_quad.render import (
+    animate_flight,
+    plot_episode,
+    plot_flight,
+    plot_from_above,
+    plot_learning_curve,
+    video,
+    write_replay,
+)
+from torchrl_quad.render.video import View
 
 TASKS = ["hovering", "landing", "racing", "tracking"]
 
@@ -64,24 +73,23 @@ def image(path):
 
 
 @pytest.fixture
-def saved(monkeypatch):
-    """The figures that have been saved, in order."""
-    figures = []
+def views(monkeypatch):
+    """The views of films, and what each frame of them was drawn from."""
 
-    def savefig(self, path, save=Figure.savefig, **options):
-        figures.append(self)
-        save(self, path, **options)
+    class Recorded(View):
+        drawn = []
 
-    monkeypatch.setattr(Figure, "savefig", savefig)
-    return figures
+        def __init__(self, points, num_drones, size, markers, image=None):
+            super().__init__(points, num_drones, size, markers, image)
+            self.markers = markers
 
+        def draw(self, *args, **options):
+            self.drawn.append((self, args, options))
+            return super().draw(*args, **options)
 
-@pytest.fixture
-def scenes(monkeypatch):
-    """The markers of each film."""
-    scenes = []
-    monkeypatch.setattr(frames, "Scene", lambda *args, **more: scenes.append(args[-1]) or Scene(*args, **more))
-    return scenes
+    monkeypatch.setattr(video, "View", Recorded)
+    Recorded.drawn.clear()
+    return Recorded.drawn
 
 
 def lines(axis):
@@ -99,11 +107,10 @@ def flown(flight):
 # -- pictures and films ------------------------------------------------------------------------------------------------
 
 
-def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(saved, crashing, tmp_path):
+def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(crashing):
     flight = crashing(HoveringEnv(num_envs=3, max_episode_steps=40), 60)
     assert flight["next", "terminated"][1].any()
-    plot_flight(flight, tmp_path / "flight.png")
-    space, over_time = saved[0].axes
+    space, over_time = plot_flight(flight).axes
     for path, line, expected in zip(space.lines, over_time.lines, flown(flight), strict=True):
         np.testing.assert_array_equal(np.stack(path.get_data_3d(), -1), expected)
         distance = (expected - flight["state", "target"][0, 0]).norm(dim=-1)
@@ -112,13 +119,12 @@ def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(sa
 
 
 @pytest.mark.parametrize("task", ["landing", "racing", "tracking", "wandering"])
-def test_without_the_environment_targets_are_those_of_the_first_episodes(task, saved, scenes, tmp_path):
+def test_without_the_environment_targets_are_those_of_the_first_episodes(task, views, tmp_path):
     options = {"num_envs": 2, "max_episode_steps": 30}
     env = Wandering(**options) if task == "wandering" else make_env(task, **options)
     flight = env.rollout(70, break_when_any_done=False)
-    plot_flight(flight, tmp_path / "flight.png")
+    space, over_time = plot_flight(flight).axes
     animate_flight(flight, tmp_path / "flight.gif")
-    space, over_time = saved[0].axes
     assert over_time.get_ylabel() == "distance to the target [m]"
     if task == "tracking":
         (line,) = [line for line in space.lines if line.get_label() == "target"]
@@ -131,18 +137,18 @@ def test_without_the_environment_targets_are_those_of_the_first_episodes(task, s
         expected = [episode[:n] for episode, n in zip(flight["next", "state", "target"], (30, 30), strict=True)]
         expected = torch.cat((flight["state", "target"][:, 0], *expected)).unique(dim=0)
         np.testing.assert_allclose(shown, expected, atol=6e-4)
-    (still,) = (x for x in (scenes[0].places, scenes[0].curve) if x is not None)
+    markers = views[0][0].markers
+    (still,) = (x for x in (markers.places, markers.curve) if x is not None)
     np.testing.assert_array_equal(still, shown)
 
 
 @pytest.mark.parametrize("transformed", [False, True])
-def test_the_environment_provides_the_control_step_the_markers_and_the_units(transformed, saved, scenes, tmp_path):
+def test_the_environment_provides_the_control_step_the_markers_and_the_units(transformed, views, tmp_path):
     env = make_env("racing", num_envs=2, max_episode_steps=20, control_dt=0.04)
     flight = env.rollout(20, break_when_any_done=False)
     named = TransformedEnv(env, RewardSum()) if transformed else env
-    plot_flight(flight, tmp_path / "flight.png", env=named)
+    space, over_time = plot_flight(flight, env=named).axes
     animate_flight(flight, tmp_path / "flight.gif", env=named)
-    space, over_time = saved[0].axes
     assert over_time.get_ylabel() == "gates passed"
     assert over_time.lines[0].get_xdata()[-1] == pytest.approx(0.8)
     (marks,) = [marks for marks in space.collections if marks.get_label() == "gate"]
@@ -150,75 +156,62 @@ def test_the_environment_provides_the_control_step_the_markers_and_the_units(tra
     np.testing.assert_allclose(rims[:, :-1].mean(1), env.gates, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(rims - env.gates[:, None].numpy(), axis=-1), 0.3, atol=1e-5)
     assert [line.get_ydata()[0] for line in over_time.lines if line.get_label() == "success: 8"] == [8]
-    assert torch.equal(scenes[0].gates, env.gates)
+    assert torch.equal(views[0][0].markers.gates, env.gates)
     with Image.open(tmp_path / "flight.gif") as film:
         assert sum(film.info["duration"] for _ in map(film.seek, range(film.n_frames))) == pytest.approx(840, abs=50)
 
 
-def test_a_film_keeps_step_with_the_clock_and_shows_the_end(tmp_path, monkeypatch):
-    shown = []
-    monkeypatch.setattr(
-        Scene, "draw", lambda self, *args, draw=Scene.draw, **kw: shown.append(args) or draw(self, *args, **kw)
-    )
+def test_a_film_keeps_step_with_the_clock_and_shows_the_end(tmp_path, views):
     flight = HoveringEnv(num_envs=1, control_dt=0.005).rollout(100)
     for suffix in ("mp4", "gif"):
         animate_flight(flight, tmp_path / f"flight.{suffix}", control_dt=0.005)
     with Image.open(tmp_path / "flight.gif") as film:
         starts = np.cumsum([0] + [film.info["duration"] for _ in map(film.seek, range(film.n_frames))])
     np.testing.assert_allclose(starts[:-1], [*range(0, 500, 65), 500], atol=5)  # [ms], of 13 control steps
-    torch.testing.assert_close(shown[-1][0], flight["next", "state", "position"][:, -1])
+    torch.testing.assert_close(views[-1][1][0], flight["next", "state", "position"][:, -1])
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "flight.mp4"))
     assert frames == len(starts) - 1 and seconds == pytest.approx(0.065 * frames, abs=0.01)
     animate_flight(flight, tmp_path / "flight.gif", control_dt=0.005, max_seconds=0.25)
-    torch.testing.assert_close(shown[-1][0], flight["next", "state", "position"][:, 49])
+    torch.testing.assert_close(views[-1][1][0], flight["next", "state", "position"][:, 49])
 
 
-def test_a_film_of_two_flights_shows_them_side_by_side_in_one_view(tmp_path, monkeypatch):
-    shown = []
-    monkeypatch.setattr(
-        Scene,
-        "draw",
-        lambda self, *args, draw=Scene.draw, **kw: shown.append((self, args, kw)) or draw(self, *args, **kw),
-    )
+def test_a_film_of_two_flights_shows_them_side_by_side_in_one_view(tmp_path, views):
     one, other = (HoveringEnv(num_envs=2, seed=seed).rollout(12) for seed in (0, 1))
     animate_flight(one, tmp_path / "flight.gif", beside=other, labels=("left", "right"), size=120)
     with Image.open(tmp_path / "flight.gif") as film:
         assert film.size == (240, 120)
         picture = np.asarray(film.convert("RGB"))
     assert np.abs(picture[:, :120].astype(int) - picture[:, 120:]).max() > 50
-    (left, drones, words), (right, others, _) = shown[-2:]
+    (left, drones, words), (right, others, _) = views[-2:]
     torch.testing.assert_close(drones[0], one["next", "state", "position"][:, -1])
     torch.testing.assert_close(others[0], other["next", "state", "position"][:, -1])
     assert torch.equal(left.low, right.low) and words["text"] == "0.2 s  left"
 
 
 @pytest.mark.parametrize(("value", "drones"), [(torch.nan, [0]), (torch.inf, [0, 1])])
-def test_positions_that_are_not_finite_are_left_out_of_every_picture(value, drones, saved, tmp_path):
+def test_positions_that_are_not_finite_are_left_out_of_every_picture(value, drones, tmp_path):
     flight = HoveringEnv(num_envs=2).rollout(8, break_when_any_done=False)
     for position in (flight["state", "position"], flight["next", "state", "position"]):
         position[drones] = value
-    plot_flight(flight, tmp_path / "flight.png")
-    plot_episode(flight, tmp_path / "episode.png")
     animate_flight(flight, tmp_path / "flight.gif")
-    for figure in saved:
+    for figure in (plot_flight(flight), plot_episode(flight)):
         space = figure.axes[0]
         limits = np.array([space.get_xlim(), space.get_ylim(), space.get_zlim()])
         assert np.ptp(limits, axis=1).max() < 8
 
 
 @pytest.mark.parametrize("shape", [(1,), (2, 3)])
-def test_a_target_that_is_no_position_is_not_drawn(shape, saved, tmp_path):
+def test_a_target_that_is_no_position_is_not_drawn(shape, tmp_path):
     class Own(Climbing):
         def initial_state(self, n):
             return super().initial_state(n) | {"target": torch.ones(n, *shape)}
 
     env = Own(num_envs=2, max_episode_steps=3)
     flight = env.rollout(8, break_when_any_done=False)
-    plot_flight(flight, tmp_path / "flight.png", env=env)
-    plot_episode(flight, tmp_path / "episode.png", env=env)
     animate_flight(flight, tmp_path / "flight.gif", env=env)
-    write_replay(flight, tmp_path / "replay.html", env=env)
-    assert saved[0].axes[1].get_ylabel() == "reward" and set(lines(saved[1].axes[2])) == {"reward"}
+    write_replay(flight, env=env)
+    assert plot_flight(flight, env=env).axes[1].get_ylabel() == "reward"
+    assert set(lines(plot_episode(flight, env=env).axes[2])) == {"reward"}
     td = env.rollout(2)[:, -1]
     before = env.render()
     env.reset(td.set("_reset", torch.tensor([[True], [False]])), set_state=False)
@@ -229,15 +222,13 @@ def test_a_target_that_is_no_position_is_not_drawn(shape, saved, tmp_path):
     ("cls", "given", "name"),
     [(Climbing, True, "reward"), (Measured, False, "vertical speed"), (Measured, True, "climb rate [cm/s]")],
 )
-def test_a_task_without_targets_shows_its_metrics_or_its_reward(cls, given, name, saved, tmp_path):
+def test_a_task_without_targets_shows_its_metrics_or_its_reward(cls, given, name, tmp_path):
     env = cls(num_envs=2, max_episode_steps=20)
     flight = env.rollout(20, break_when_any_done=False)
     options = {"env": env} if given else {}
-    plot_flight(flight, tmp_path / "flight.png", **options)
-    plot_episode(flight, tmp_path / "episode.svg", **options)
     animate_flight(flight, tmp_path / "flight.gif", **options)
-    assert saved[0].axes[1].get_ylabel() == name
-    ((shown, line),) = lines(saved[1].axes[2]).items()
+    assert plot_flight(flight, **options).axes[1].get_ylabel() == name
+    ((shown, line),) = lines(plot_episode(flight, tmp_path / "episode.svg", **options).axes[2]).items()
     assert shown == name
     scale = 100.0 if "cm" in name else 1.0
     np.testing.assert_allclose(line[1:, 1], scale * flight["next", "reward"][0, :, 0], rtol=1e-6)
@@ -248,11 +239,10 @@ def test_a_task_without_targets_shows_its_metrics_or_its_reward(cls, given, name
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_an_episode_of_every_task_is_drawn_with_what_flew(task, saved, tmp_path):
+def test_an_episode_of_every_task_is_drawn_with_what_flew(task, tmp_path):
     env = make_env(task, num_envs=3, max_episode_steps=40)
     flight, _ = differentiable_rollout(env, make_actor(env), None, 100)  # with its graph, and three episodes
-    plot_episode(flight, tmp_path / "episode.pdf", env=env, env_index=1)
-    space, _, error, action, rotors = saved[0].axes
+    space, _, error, action, rotors = plot_episode(flight, tmp_path / "episode.pdf", env=env, env_index=1).axes
     first = flight[1, :40]
     first = first[: first["next", "done"][:, 0].tolist().index(True) + 1]
     time = 0.02 * torch.arange(len(first) + 1)
@@ -279,20 +269,20 @@ def test_an_episode_of_every_task_is_drawn_with_what_flew(task, saved, tmp_path)
 
 
 @pytest.mark.parametrize("task", envs.TASKS)
-def test_an_episode_of_one_step_is_drawn(task, saved, tmp_path):
+def test_an_episode_of_one_step_is_drawn(task):
     env = make_env(task, num_envs=1, max_episode_steps=1)
-    plot_episode(env.rollout(1, break_when_any_done=False), tmp_path / "episode.png", env=env)
-    assert saved[0].axes[-1].get_xlim() == (0.0, 0.02)
+    figure = plot_episode(env.rollout(1, break_when_any_done=False), env=env)
+    assert figure.axes[-1].get_xlim() == (0.0, 0.02)
 
 
-def test_without_rotors_in_the_state_there_is_no_panel_of_them(saved, tmp_path):
+def test_without_rotors_in_the_state_there_is_no_panel_of_them():
     flight = HoveringEnv(num_envs=1).rollout(3)
     flight = flight.exclude(("state", "rotor_speed"), ("next", "state", "rotor_speed"))
-    plot_episode(flight, tmp_path / "episode.png")
-    assert saved[0].axes[-1].get_ylabel() == "action" and saved[0].axes[-1].get_xlabel() == "time [s]"
+    last = plot_episode(flight).axes[-1]
+    assert last.get_ylabel() == "action" and last.get_xlabel() == "time [s]"
 
 
-def test_the_gates_of_an_episode_are_numbered_and_passing_them_is_marked(saved, tmp_path):
+def test_the_gates_of_an_episode_are_numbered_and_passing_them_is_marked():
     env = make_env("racing", num_envs=2, max_episode_steps=100)
     td = env.reset()
     gate = env.gates[td["state", "gate"][0, 0]]
@@ -303,8 +293,7 @@ def test_the_gates_of_an_episode_are_numbered_and_passing_them_is_marked(saved, 
         auto_reset=False, break_when_any_done=False,
     )  # fmt: skip
     step = flight["next", "state", "gate_passed"][0, :, 0].tolist().index(True)
-    plot_episode(flight, tmp_path / "episode.png", env=env)
-    space, _, *panels = saved[0].axes
+    space, _, *panels = plot_episode(flight, env=env).axes
     assert [int(text.get_text()) for text in space.texts] == [1, 2, 3, 4]  # also those that it does not reach
     for panel in panels:
         (mark,) = [line for line in panel.lines if line.get_linestyle() == ":"]
@@ -320,3 +309,24 @@ def test_the_fonts_of_a_figure_are_embedded_as_truetype_and_it_is_as_wide_as_two
     width, _ = (float(x) / 72 for x in re.search(rb"/MediaBox \[\s*0 0 ([\d.]+) ([\d.]+)", pdf).groups())
     assert width == pytest.approx(7.16, abs=0.01)
     assert image(tmp_path / "episode.png").shape[1] == 2148  # 300 dots per inch
+
+
+# -- notebooks ---------------------------------------------------------------------------------------------------------
+
+
+def test_without_a_path_a_figure_is_returned_and_shows_itself_in_a_notebook(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    env = make_env("forest", num_envs=2)
+    flight = env.rollout(5, break_when_any_done=False)
+    (tmp_path / "metrics.csv").write_text("steps,time/seconds,eval/return\n100,1.0,5.0\n")
+    figures = [draw(flight, env=env) for draw in (plot_flight, plot_episode, plot_from_above)]
+    for figure in (*figures, plot_learning_curve("metrics.csv")):
+        assert isinstance(figure, Figure) and figure._repr_png_().startswith(b"\x89PNG")
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
+    copied = pickle.loads(pickle.dumps(figure))
+    assert copied._repr_png_() == figure._repr_png_()
+
+
+def test_a_path_without_a_suffix_gets_that_of_a_png(tmp_path):
+    plot_flight(HoveringEnv(num_envs=1).rollout(3), tmp_path / "flight")
+    assert image(tmp_path / "flight.png").shape == (598, 1430, 3)

@@ -10,7 +10,7 @@ from small_runs import SMALL
 
 from torchrl_quad import HoveringEnv
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, write_replay
-from torchrl_quad.render.frames import NoFfmpeg
+from torchrl_quad.render.video import NoFfmpeg
 from torchrl_quad.training import drawing
 
 FILES = {animate_flight: "flight.gif"}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -13,11 +15,20 @@ from torchrl_quad.envs.markers import Markers
 from torchrl_quad.errors import MissingPackage
 from torchrl_quad.files import replacing
 
-INK, BLUE, RED = "#222222", "#2f6db5", "#c8452f"
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d import Axes3D
+
+INK, BLUE, RED, GREEN = "#222222", "#2f6db5", "#c8452f", "#3a7d4f"
 
 
-def make_figure(**options: Any) -> Any:
-    """Make a matplotlib figure that needs no screen and leaves the user's backend alone."""
+def make_figure(**options: Any) -> Figure:
+    """Make a matplotlib figure that needs no screen, leaves the user's backend alone, and shows itself in a notebook.
+
+    Args:
+        **options: of ``matplotlib.figure.Figure``.
+    """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -25,14 +36,23 @@ def make_figure(**options: Any) -> Any:
         raise MissingPackage("Pictures need matplotlib: pip install '.[render]' in a clone.") from error
     figure = Figure(**options)
     FigureCanvasAgg(figure)
+    vars(figure)["_repr_png_"] = partial(_png, figure)  # notebooks show only figures of pyplot without it
     return figure
 
 
-def save(figure: Any, path: str | Path, **options: Any) -> None:
-    """Write a figure, complete or not at all; a path without a suffix gets .png."""
-    path = Path(path)
-    with replacing(path if path.suffix else path.with_suffix(".png")) as temporary:
-        figure.savefig(temporary, **options)
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=100)
+    return buffer.getvalue()
+
+
+def save(figure: Figure, path: str | Path | None, **options: Any) -> Figure:
+    """Return a figure, and write it if there is a path, complete or not at all; without a suffix it gets .png."""
+    if path is not None:
+        path = Path(path)
+        with replacing(path if path.suffix else path.with_suffix(".png")) as temporary:
+            figure.savefig(temporary, **options)
+    return figure
 
 
 def bounds(*points: Tensor) -> tuple[Tensor, Tensor]:
@@ -57,7 +77,12 @@ def box(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     return bottom + lift, high + more + lift
 
 
-def set_box(space: Any, low: Tensor, high: Tensor, zoom: float) -> None:
+def add_space(figure: Figure, place: tuple[float, float, float, float], **options: Any) -> Axes3D:
+    """Add three-dimensional axes at a place: left, bottom, width and height as shares of the figure."""
+    return cast("Axes3D", figure.add_axes(place, projection="3d", **options))
+
+
+def set_box(space: Axes3D, low: Tensor, high: Tensor, zoom: float) -> None:
     """Limit three-dimensional axes to the box from low to high (3), in one scale and with few ticks."""
     from matplotlib.ticker import MaxNLocator
 
@@ -70,7 +95,7 @@ def set_box(space: Any, low: Tensor, high: Tensor, zoom: float) -> None:
         space.set(**{f"{name}lim": limits, f"{name}label": f"{name} [m]"})
 
 
-def set_scale(axis: Any, log: bool) -> None:
+def set_scale(axis: Axes, log: bool) -> None:
     """Make the vertical axis linear or logarithmic, with plain numbers at its ticks."""
     axis.set_yscale("log" if log else "linear")
     if log:
@@ -81,12 +106,8 @@ def set_scale(axis: Any, log: bool) -> None:
     axis.yaxis.set_major_formatter("{x:g}")
 
 
-def draw_markers(space: Any, markers: Markers, size: float = 12.0) -> None:
-    """Draw what a task shows beside its drones into three-dimensional axes, with names for a legend.
-
-    Args:
-        size: of the marks at targets [points].
-    """
+def draw_markers(space: Axes3D, markers: Markers, size: float = 12.0) -> None:
+    """Draw markers into three-dimensional axes, with names for a legend; ``size`` is of the stars [points]."""
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     for shape in markers.shapes:

@@ -1,20 +1,28 @@
-"""Draw flights as figures."""
+"""Draw flights and learning curves as figures. Without a path a figure is returned only, and a notebook shows it."""
 
 from __future__ import annotations
 
+import csv
 import itertools
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_quad.envs.metrics import first_episode
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, describe_metric
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.render.canvas import (
     BLUE,
+    GREEN,
     INK,
     RED,
+    add_space,
     bounds,
     box,
     draw_markers,
@@ -24,8 +32,13 @@ from torchrl_quad.render.canvas import (
     set_box,
     set_scale,
 )
-from torchrl_quad.render.flights import Flight, check_rollout, state_keys
-from torchrl_quad.render.obstacles import with_obstacles
+from torchrl_quad.render.flights import Flight, box_shape, state_keys, with_obstacles
+from torchrl_quad.vision import Primitives
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d import Axes3D
 
 _PAPER = {  # for figures as wide as a page of two columns
     "font.size": 8,
@@ -45,19 +58,20 @@ _PAPER = {  # for figures as wide as a page of two columns
 }
 _WIDTH = 7.16  # [inches], of a page of two columns
 _BESIDE = {"left": 0.54, "right": 0.99, "top": 0.94, "bottom": 0.12, "hspace": 0.5}  # shares of a page
-_ABOVE = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.02), "ncols": 4}  # a legend
+_ABOVE: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.02), "ncols": 4}  # a legend
 _COLORS = INK, BLUE, RED, "#d99a1c"
+_PANELS = 4  # of a learning curve
 
 
 def plot_flight(
     rollout: TensorDictBase,
-    path: str | Path,
+    path: str | Path | None = None,
     *,
     env: EnvBase | None = None,
     num_envs: int = 12,
     control_dt: float = 0.02,
     title: str | None = None,
-) -> None:
+) -> Figure:
     """Draw the first episodes of a flight: their paths in space, and over time how well they go.
 
     The second panel shows the metric that the task names in its markers, else the distance to the target, and for a
@@ -65,31 +79,32 @@ def plot_flight(
     task, if the markers name it.
 
     Args:
-        rollout: (num_envs, time), of any task.
-        path: the picture to write, PNG, PDF or SVG by its suffix.
+        rollout: (num_envs, time), of any task, with or without its graph.
+        path: the picture to write, PNG, PDF or SVG by its suffix; None for none.
         env: the environment that flew, also under transforms. It provides the control step, the markers, and the units
             of metrics; without it, the picture shows the targets in the rollout.
-        num_envs: how many environments to draw, at most.
+        num_envs: the maximum number of environments to draw.
         control_dt: control step [s]; used only without ``env``.
         title: of the picture; by default the name of the environment and the number of flights.
 
     Raises:
+        ImportError: matplotlib is missing.
         TypeError: ``env`` is not a quadrotor environment.
         ValueError: the rollout has another shape, lacks the position or the reward, or ``num_envs`` is less than 1.
     """
     flight = Flight("plot_flight", rollout, env, control_dt, [*state_keys("position"), ("next", "reward")], num_envs)
-    position = flight.state("position")
+    position = flight.position
     label, log, values, success = flight.progress()
 
-    figure = make_figure(figsize=(11, 4.6))
-    space = figure.add_axes((0.0, 0.02, 0.46, 0.9), projection="3d")
+    figure = make_figure(figsize=(11, 4.6), dpi=130)
+    space = add_space(figure, (0.0, 0.02, 0.46, 0.9))
     over_time = figure.add_axes((0.55, 0.12, 0.43, 0.77))
     for i, color in enumerate(drone_colors(len(flight))):
         flown = slice(int(flight.steps[i]) + 1)
         space.plot(*position[i, flown].T.numpy(), color=color, linewidth=1.2)
         space.scatter(*position[i, 0], color=color, s=14)
         over_time.plot(flight.times[flown], values[i, flown], color=color, linewidth=1.2)
-    alike = len(flight) == 1 or not getattr(getattr(flight.env, "scene", None), "is_random", False)
+    alike = len(flight) == 1 or not flight.has_own_obstacles
     markers = with_obstacles(flight.markers, flight.solids(0) if alike else None)
     draw_markers(space, markers)
     set_box(space, *box(*bounds(position, *markers.points())), zoom=0.9)
@@ -104,51 +119,43 @@ def plot_flight(
         over_time.axhline(success, color=RED, linestyle="--", linewidth=1.0, label=f"success: {near}{success:g}")
         over_time.legend(loc="best", frameon=False)
     figure.suptitle(flight.title if title is None else title, x=0.04, y=0.965, ha="left", fontsize=13)
-    save(figure, path, dpi=130)
+    return save(figure, path)
 
 
 def plot_episode(
     rollout: TensorDictBase,
-    path: str | Path,
+    path: str | Path | None = None,
     *,
     env: EnvBase | None = None,
     env_index: int = 0,
     control_dt: float = 0.02,
-) -> None:
+) -> Figure:
     """Draw the first episode of one drone as a figure for a paper, as wide as a page of two columns (7.16 inches).
 
     Shows its path in space, coloured by speed, with the task's markers and numbers at its gates. Shows over time the
     distance to the target with the metrics that are lengths (without targets: all metrics, or the reward), the actions,
     and the rotor speeds if the state holds them. Dotted lines mark the times at which the drone passes gates, a dashed
-    line the distance from which a state fulfils the task, if the markers name it.
+    line the distance from which a state fulfils the task, if the markers name it. PDF and SVG embed their fonts, PNG
+    has 300 dots per inch.
 
     Args:
-        rollout: (num_envs, time), of any task, with or without its graph.
-        path: the figure to write: PDF or SVG with embedded fonts, or PNG with 300 dots per inch, by its suffix.
-        env: the environment that flew, also under transforms. It provides the control step, the markers, and the units
-            of metrics; without it, the figure shows the targets in the rollout.
+        rollout, path, env, control_dt: as in :func:`plot_flight`.
         env_index: which environment.
-        control_dt: control step [s]; used only without ``env``.
 
     Raises:
-        TypeError: ``env`` is not a quadrotor environment.
+        ImportError, TypeError: as in :func:`plot_flight`.
         ValueError: the rollout has another shape, lacks position, velocity, action or reward, or matplotlib does not
             know the suffix.
         IndexError: there is no such environment.
     """
     keys = [*state_keys("position", "velocity"), ("action",), ("next", "reward")]
-    check_rollout("plot_episode", rollout, env, keys)
-    if not -len(rollout) <= env_index < len(rollout):
-        raise IndexError(f"plot_episode: env_index={env_index}, and the rollout has {len(rollout)} environments.")
-    episode = rollout[[env_index]]
-    episode = episode[:, : int(first_episode(episode).sum())]
-    flight = Flight("plot_episode", episode, env, control_dt, keys)
+    flight = Flight("plot_episode", rollout, env, control_dt, keys, env_index=env_index)
     figure = make_figure(figsize=(_WIDTH, 3.4))
     from matplotlib import rc_context
     from matplotlib.ticker import MaxNLocator
 
     with rc_context(_PAPER):
-        space = figure.add_axes((0.0, 0.2, 0.44, 0.8), projection="3d", computed_zorder=False)
+        space = add_space(figure, (0.0, 0.2, 0.44, 0.8), computed_zorder=False)
         _draw_path(space, figure.add_axes((0.09, 0.12, 0.26, 0.02)), flight)
         rotor_speed = flight.state("rotor_speed")
         axes = figure.subplots(2 if rotor_speed is None else 3, 1, sharex=True, gridspec_kw=_BESIDE)
@@ -159,10 +166,11 @@ def plot_episode(
             axes[0].axhline(near, color=RED, linestyle="--", linewidth=0.6, label=f"success: below {near:g}")
             axes[0].legend(**_ABOVE)
         set_scale(axes[0], log)
-        actions = flight.rollout["action"][0].T.numpy()
+        actions = cast("Tensor", flight.entry("action"))[0].T.numpy()
         actions = np.concatenate((actions, actions[:, -1:]), 1)  # each lasts until the next instant
-        actions = dict(zip(flight.action_names, actions, strict=True))
-        _draw_lines(axes[1], times, actions, "action", drawstyle="steps-post")
+        _draw_lines(
+            axes[1], times, dict(zip(flight.action_names, actions, strict=True)), "action", drawstyle="steps-post"
+        )
         if rotor_speed is not None:
             speeds = {f"rotor {i + 1}": x for i, x in enumerate(rotor_speed[0].T.numpy())}
             _draw_lines(axes[2], times, speeds, "rotor speed\n[rad/s]")
@@ -173,16 +181,15 @@ def plot_episode(
         axes[-1].set(xlabel="time [s]", xlim=(0, times[-1]))
         for axis in axes[1:]:
             axis.yaxis.set_major_locator(MaxNLocator(4))
-        save(figure, path)
+        return save(figure, path)
 
 
-def _draw_path(space: Any, below: Any, flight: Flight) -> None:
+def _draw_path(space: Axes3D, below: Axes, flight: Flight) -> None:
     """Draw the path of an episode in space, coloured by speed, with the markers around it."""
     from matplotlib.patheffects import withStroke
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-    points = [flight.state("position")]
-    position, speed = points[0][0].numpy(), flight.state("velocity")[0].norm(dim=-1).numpy()
+    position, speed = flight.position[0].numpy(), flight.speed[0].numpy()
     path = Line3DCollection(np.stack((position[:-1], position[1:]), 1), cmap="viridis", linewidth=1.5, zorder=5)
     path.set_array(0.5 * (speed[:-1] + speed[1:]))
     space.add_collection(path)
@@ -190,19 +197,179 @@ def _draw_path(space: Any, below: Any, flight: Flight) -> None:
     markers = with_obstacles(flight.markers, flight.solids(0))
     if markers.gates is not None:
         halo = [withStroke(linewidth=2, foreground="white")]
-        for i, centre in enumerate(markers.gates.tolist(), 1):
-            space.text(*centre, f"   {i}", color=RED, zorder=11, path_effects=halo)
+        for i, (x, y, z) in enumerate(markers.gates.tolist(), 1):
+            space.text(x, y, z, f"   {i}", color=RED, zorder=11, path_effects=halo)
     draw_markers(space, markers)
-    set_box(space, *box(*bounds(*points, *markers.points())), zoom=0.86)
+    set_box(space, *box(*bounds(flight.position, *markers.points())), zoom=0.86)
     bar = space.figure.colorbar(path, cax=below, orientation="horizontal")
     bar.set_label("speed [m/s]")
     bar.outline.set_linewidth(0.6)
 
 
-def _draw_lines(axis: Any, time: np.ndarray, lines: dict[str, np.ndarray], label: str, **style: Any) -> None:
+def _draw_lines(axis: Axes, time: np.ndarray, lines: dict[str, np.ndarray], label: str, **style: Any) -> None:
     """Draw lines by name over time, with a legend above."""
     for (name, x), color in zip(lines.items(), itertools.cycle(_COLORS), strict=False):
         axis.plot(time, x, color=color, label=name, linewidth=0.9, **style)
     axis.set_ylabel(label)
     axis.yaxis.set_label_coords(-0.13, 0.5, transform=axis.transAxes)  # in line with those of the other panels
     axis.legend(**_ABOVE)
+
+
+# -- from above --------------------------------------------------------------------------------------------------------
+
+
+def plot_from_above(
+    rollout: TensorDictBase,
+    path: str | Path | None = None,
+    *,
+    env: EnvBase,
+    num_envs: int = 4,
+    title: str | None = None,
+) -> Figure:
+    """Draw the first episodes of a flight from above: obstacles, and the paths between them, coloured by speed.
+
+    Environments with obstacles of their own get a panel each; those that share them, one for all. A cross marks a
+    crash, a ring the start. Only what stands between the least and the greatest height of the flight is drawn.
+
+    Args:
+        rollout, path, env, num_envs, title: as in :func:`plot_flight`, of a task with a scene.
+
+    Raises:
+        ImportError, TypeError: as in :func:`plot_flight`.
+        ValueError: the environment has no scene; the rollout has another shape, lacks position or velocity; or
+            ``num_envs`` is less than 1.
+    """
+    flight = Flight("plot_from_above", rollout, env, 0.02, state_keys("position", "velocity"), num_envs)
+    if flight.solids(0) is None:
+        raise UserValueError(
+            f"plot_from_above draws obstacles, and this {type(flight.env).__name__} has none: build it with a scene, "
+            "or draw its flights with plot_flight."
+        )
+    position, speed = flight.position, flight.speed
+    groups = [[i] for i in range(len(flight))] if flight.has_own_obstacles else [list(range(len(flight)))]
+    points = position.nan_to_num().flatten(0, 1)
+    low, high = points.amin(0), points.amax(0)
+    sides = (high - low)[:2].clamp_min(2.0) + 4.0
+    middle, width = 0.5 * (low + high)[:2], 10.0
+    left, bottom, right, top = torch.cat((middle - 0.5 * sides, middle + 0.5 * sides)).tolist()
+    height = min(0.6 + len(groups) * (0.88 * width * (sides[1] / sides[0]).item() + 0.2), 14.0)
+    figure = make_figure(figsize=(width, height), dpi=130, layout="constrained")
+    from matplotlib.collections import LineCollection
+
+    axes = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
+    fastest, crash = speed.nan_to_num().amax().item(), flight.rollout.get(("next", "crash"), None)
+    for axis, group in zip(axes, groups, strict=True):
+        _draw_sections(axis, flight.solids(group[0]), low[2].item(), high[2].item())
+        for i in group:
+            flown = position[i, : int(flight.steps[i]) + 1, :2].numpy()
+            line = LineCollection(list(itertools.pairwise(flown)), cmap="viridis", linewidth=1.8)
+            line.set_array(speed[i, : len(flown) - 1].numpy())
+            line.set_clim(0.0, fastest)
+            axis.add_collection(line)
+            axis.plot(*flown[0], marker="o", color=INK, markersize=5, fillstyle="none")
+            if crash is not None and crash[i, : int(flight.steps[i])].any():
+                axis.plot(*flown[-1], marker="x", color=RED, markersize=9, markeredgewidth=2)
+        axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", ylabel="y [m]")
+    axes[-1].set_xlabel("x [m]")
+    figure.suptitle(flight.title if title is None else title, x=0.02, ha="left", fontsize=12)
+    figure.colorbar(axes[-1].collections[-1], ax=list(axes), label="speed [m/s]", shrink=0.6, pad=0.01, aspect=30)
+    return save(figure, path)
+
+
+def _draw_sections(axis: Axes, solids: Primitives | None, low: float, high: float) -> None:
+    """Draw what stands between two heights [m] from above."""
+    from matplotlib.patches import Circle, Polygon
+
+    if solids is None:
+        return
+    style: dict[str, Any] = {"facecolor": GREEN, "alpha": 0.6, "edgecolor": "none"}
+    round_ones = [(x, y, z - r, z + r, r) for x, y, z, r in solids.spheres[0].tolist()]
+    round_ones += [(x, y, z, z + height, r) for x, y, z, r, height in solids.cylinders[0].tolist()]
+    for x, y, bottom, top, radius in round_ones:
+        if bottom < high and top > low:
+            axis.add_patch(Circle((x, y), radius, **style))
+    for x in solids.boxes[0].detach().cpu().float():
+        corners = box_shape(x).points
+        if corners[:, 2].min() < high and corners[:, 2].max() > low:
+            centre = corners[:, :2].mean(0)
+            around = torch.atan2(*(corners[:, :2] - centre).flip(-1).T).argsort()
+            axis.add_patch(Polygon(corners[around, :2].numpy(), **style))
+    for x, y, z, distance in solids.planes[0].tolist():
+        if abs(z) < 0.99:
+            foot = distance * x, distance * y
+            axis.axline(foot, (foot[0] - y, foot[1] + x), color=GREEN, linewidth=3)
+
+
+# -- learning curves ---------------------------------------------------------------------------------------------------
+
+
+def plot_learning_curve(
+    csv_path: str | Path, path: str | Path | None = None, *, metrics: Mapping[str, Metric] = EPISODE_METRICS
+) -> Figure:
+    """Draw the evaluations of a training run over training time, with the control steps at the top.
+
+    Draws up to four of the columns ``eval/NAME``: first those that ``metrics`` describes, in its order, then the
+    others.
+
+    Args:
+        csv_path: the CSV file; it has the columns ``time/seconds`` [s] and ``steps``, and one row per evaluation.
+        path: as in :func:`plot_flight`.
+        metrics: labels, units and scales by name, such as ``env.metric_info``.
+
+    Raises:
+        ValueError: the file has no row, or lacks a column.
+    """
+    with open(csv_path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    if not rows:
+        raise UserValueError(f"plot_learning_curve: {csv_path} has no row yet; a run writes one at each evaluation.")
+    evaluated = [name.removeprefix("eval/") for name in rows[0] if name.startswith("eval/")]
+    names = [*(name for name in metrics if name in evaluated), *(name for name in evaluated if name not in metrics)]
+    names = names[:_PANELS]
+    if not names or not {"time/seconds", "steps"} <= rows[0].keys():
+        raise UserValueError(
+            f"plot_learning_curve needs the columns time/seconds, steps, and at least one eval/NAME, such as "
+            f"eval/return; {csv_path} has {', '.join(rows[0])}."
+        )
+
+    def column(name: str) -> np.ndarray:
+        return np.array([float(row[name] or "nan") for row in rows])  # a cell may be empty
+
+    seconds = column("time/seconds")
+    known_seconds, known_steps = _knots(seconds, column("steps"))
+    figure = make_figure(figsize=(3.4 * len(names), 3.2), dpi=130, layout="constrained")
+    from matplotlib.ticker import EngFormatter, MaxNLocator
+
+    axes = figure.subplots(1, len(names), squeeze=False)
+    for axis, name in zip(axes[0], names, strict=True):
+        metric = describe_metric(name, metrics)
+        values = metric.scale * column(f"eval/{name}")
+        axis.plot(seconds, values, color=BLUE, marker="o", markersize=3, linewidth=1.4)
+        axis.set(xlabel="training time [s]", ylabel=metric.axis_label + (", median" if metric.median else ""))
+        axis.grid(alpha=0.3)
+        if metric.log:
+            set_scale(axis, log=True)
+        if len(known_steps) > 1:
+            to_steps = partial(np.interp, xp=known_seconds, fp=known_steps)
+            to_seconds = partial(np.interp, xp=known_steps, fp=known_seconds)
+            upper = axis.secondary_xaxis("top", functions=(to_steps, to_seconds))
+            upper.set_xlabel("control steps", color=INK)
+            upper.xaxis.set_major_locator(MaxNLocator(5))
+            upper.xaxis.set_major_formatter(EngFormatter(sep=""))
+    return save(figure, path)
+
+
+def _knots(seconds: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of seconds and steps between which to interpolate, both increasing, from (0, 0) and beyond both ends.
+
+    A constant rate would not do: an iteration that compiles takes far longer than the others.
+    """
+    pairs = [(0.0, 0.0)]
+    for pair in zip(seconds, steps, strict=True):
+        if pair[0] > pairs[-1][0] and pair[1] > pairs[-1][1]:
+            pairs.append(pair)
+    knots = np.array(pairs)
+    if len(knots) > 1:  # the axes have margins: continue at the rates of both ends
+        first, last = (knots[-1, 0] / step[0] * step for step in (knots[1] - knots[0], knots[-1] - knots[-2]))
+        knots = np.concatenate((knots[:1] - first, knots, knots[-1:] + last))
+    return knots[:, 0], knots[:, 1]

@@ -1,22 +1,32 @@
-"""Read a rollout as pictures show it: first episodes, targets, and how well they go."""
+"""Read a rollout as pictures show it: first episodes, targets, obstacles, and how well they go."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 from torchrl.envs import EnvBase
 
 from torchrl_quad.data.unwrap import base_env
-from torchrl_quad.dynamics import FlightController
-from torchrl_quad.envs.markers import Markers, visible_state
-from torchrl_quad.envs.metrics import describe_metric, first_episode
+from torchrl_quad.dynamics import FlightController, quaternion
+from torchrl_quad.envs.markers import Markers, Shape
+from torchrl_quad.envs.metrics import Metric, describe_metric, first_episode
+from torchrl_quad.envs.scenes import ELSEWHERE
 from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.render.canvas import GREEN
 from torchrl_quad.vision import Primitives
+
+if TYPE_CHECKING:
+    from torchrl_quad.envs import QuadrotorEnv
+
+_WALL = 5.0  # [m], half of the sides of the square that stands for an endless wall
 
 
 class Flight:
@@ -29,10 +39,12 @@ class Flight:
         control_dt: control step [s], used without ``env``.
         needed: keys of the rollout without which nothing can be drawn.
         num_envs: how many environments to keep; None for all.
+        env_index: the one environment to keep, up to the end of its first episode.
 
     Raises:
         TypeError: ``env`` is not a quadrotor environment.
         ValueError: the rollout has another shape or lacks a key, or ``num_envs`` is less than 1.
+        IndexError: there is no such environment.
     """
 
     def __init__(
@@ -41,19 +53,43 @@ class Flight:
         rollout: TensorDictBase,
         env: EnvBase | None,
         control_dt: float,
-        needed: list[tuple[str, ...]],
+        needed: Sequence[tuple[str, ...]],
         num_envs: int | None = None,
+        env_index: int | None = None,
     ) -> None:
-        check_rollout(who, rollout, env, needed, num_envs)
-        self.rollout: TensorDictBase = rollout[:num_envs].detach().cpu()
-        self.env = None if env is None else base_env(env)
-        self.control_dt = control_dt if env is None else self.env.control_dt
-        self.metric_info = {} if env is None else self.env.metric_info
-        self.steps = self._count_steps()  # of each first episode (num_envs)
+        if env is not None and not (isinstance(env, EnvBase) and hasattr(env, "markers")):
+            raise UserTypeError(
+                f"{who}: env must be the quadrotor environment that flew, with or without transforms, or None; got "
+                f"{type(env).__name__}."
+            )
+        if rollout.dim() != 2 or 0 in rollout.shape:
+            raise UserValueError(
+                f"{who} needs a rollout of batch size (num_envs, time), such as env.rollout(...) returns; got "
+                f"{tuple(rollout.shape)}. For one drone, write rollout.unsqueeze(0)."
+            )
+        if num_envs is not None and num_envs < 1:
+            raise UserValueError(f"{who}: num_envs must be at least 1, got {num_envs}.")
+        keys = rollout.keys(include_nested=True)
+        if missing := [str(key) for key in needed if key not in keys]:
+            raise UserValueError(
+                f"{who}: the rollout lacks {', '.join(missing)}. Pass it whole, as env.rollout(...) and "
+                "differentiable_rollout(...) return it."
+            )
+        if env_index is not None:
+            if not -len(rollout) <= env_index < len(rollout):
+                raise IndexError(f"{who}: env_index={env_index}, and the rollout has {len(rollout)} environments.")
+            rollout = cast("TensorDictBase", rollout[[env_index]])
+            rollout = cast("TensorDictBase", rollout[:, : int(first_episode(rollout).sum())])
+        self.rollout = cast("TensorDictBase", rollout[:num_envs].detach().cpu())
+        self.env = None if env is None else cast("QuadrotorEnv", base_env(env))
+        self.control_dt = control_dt if self.env is None else self.env.control_dt
+        self.metric_info: Mapping[str, Metric] = {} if self.env is None else self.env.metric_info
+        self.steps = torch.full(self.rollout.shape[:1], self.rollout.shape[1])  # of each first episode (num_envs)
+        if ("next", "done") in keys:
+            self.steps = first_episode(self.rollout).sum((1, 2))
         self.target = self.state("target")
-        self.named = Markers() if env is None else self.env.markers()  # by the task
-        self.markers = self.named
-        self._add_targets()
+        self.named = Markers() if self.env is None else self.env.markers()  # by the task
+        self.markers = self._with_targets()
 
     def __len__(self) -> int:
         return len(self.rollout)
@@ -69,52 +105,72 @@ class Flight:
         """The instants [s] of states (time + 1), the first at the start."""
         return self.control_dt * np.arange(self.rollout.shape[1] + 1)
 
+    def entry(self, *key: str) -> Tensor | None:
+        """An entry of the rollout, if it holds it."""
+        return cast("Tensor | None", self.rollout.get(key, None))
+
+    def entries(self, *key: str) -> dict[str, Tensor]:
+        """The entries of the rollout below a key, by name; none if it holds none."""
+        return dict(cast("Mapping[str, Tensor]", self.rollout.get(key, {})).items())
+
     def state(self, name: str) -> Tensor | None:
         """An entry of the state (num_envs, time + 1, k): at the start of the first episode, and after each step.
 
         After the end of the episode it keeps its last value. It is NaN where it is infinite, and at the start if the
         rollout does not hold the start. None if there is no such entry, or if the target is not a position.
         """
-        ends = self.rollout["next", "state"]
-        if name not in ends or (name == "target" and name not in visible_state(ends)):
+        ends, starts = self.entry("next", "state", name), self.entry("state", name)
+        if ends is None or (name == "target" and ends.shape != self.rollout["next", "state", "position"].shape):
             return None
-        value = ends[name].float()
-        start = self.rollout.get(("state", name), torch.full_like(value, math.nan))[:, :1]
+        ends = ends.float()
+        start = torch.full_like(ends[:, :1], math.nan) if starts is None else starts[:, :1].float()
         instants = torch.arange(self.rollout.shape[1] + 1).minimum(self.steps[:, None])
-        value = torch.cat((start.float(), value), 1).take_along_dim(instants.unsqueeze(-1), 1)
+        value = torch.cat((start, ends), 1).take_along_dim(instants.unsqueeze(-1), 1)
         return value.nan_to_num(math.nan, math.nan, math.nan)
+
+    @property
+    def position(self) -> Tensor:
+        """The positions (num_envs, time + 1, 3) [m], as :meth:`state`; every picture needs them."""
+        return cast("Tensor", self.state("position"))
+
+    @property
+    def speed(self) -> Tensor:
+        """The speed (num_envs, time + 1) [m/s], as :meth:`state`, where the rollout holds the velocity."""
+        return cast("Tensor", self.state("velocity")).norm(dim=-1)
+
+    @property
+    def has_own_obstacles(self) -> bool:
+        """Whether each environment has other obstacles."""
+        scene = None if self.env is None else self.env.scene
+        return scene is not None and scene.is_random
 
     def solids(self, i: int) -> Primitives | None:
         """The obstacles in the first episode of an environment, if there are any."""
-        scene = getattr(self.env, "scene", None)
-        if scene is None:
+        if self.env is None or self.env.scene is None:
             return None
-        drawn = self.rollout["next", "state"].get("scene", {})
-        return scene.solids({("scene", kind): x[i : i + 1, 0].to(self.env.device) for kind, x in drawn.items()})
+        device = self.env.device
+        drawn = self.entries("next", "state", "scene")
+        return self.env.scene.solids({("scene", kind): x[i : i + 1, 0].to(device) for kind, x in drawn.items()})
 
     @property
     def depth(self) -> Tensor | None:
         """What the cameras showed (num_envs, time + 1, height, width) [m], as :meth:`state`, if they did."""
-        seen = self.rollout.get(("next", "depth"), None)
-        if seen is None:
+        images, first = self.entry("next", "depth"), self.entry("depth")
+        if images is None:
             return None
-        seen = torch.cat((self.rollout.get("depth", seen)[:, :1], seen), 1).squeeze(2)
-        instants = torch.arange(seen.shape[1]).minimum(self.steps[:, None])
-        return seen[torch.arange(len(seen))[:, None], instants].float()
+        images = torch.cat(((images if first is None else first)[:, :1], images), 1).squeeze(2)
+        instants = torch.arange(images.shape[1]).minimum(self.steps[:, None])
+        return images[torch.arange(len(images))[:, None], instants].float()
 
     @property
     def distance(self) -> np.ndarray | None:
         """The distance to the target (num_envs, time + 1) [m], if there is one."""
-        return None if self.target is None else (self.state("position") - self.target).norm(dim=-1).numpy()
+        return None if self.target is None else (self.position - self.target).norm(dim=-1).numpy()
 
     def outputs(self) -> dict[str, np.ndarray]:
         """The metrics of every step, or without any the reward, by name (num_envs, time + 1), NaN at the start."""
-        ends = self.rollout["next"]
-        values = dict(ends.get("metrics", {}).items()) or {"reward": ends["reward"]}
-        return {
-            name: torch.nn.functional.pad(x.squeeze(-1).float(), (1, 0), value=math.nan).numpy()
-            for name, x in values.items()
-        }
+        values = self.entries("next", "metrics") or {"reward": cast("Tensor", self.entry("next", "reward"))}
+        return {name: pad(x.squeeze(-1).float(), (1, 0), value=math.nan).numpy() for name, x in values.items()}
 
     def progress(self) -> tuple[str, bool, np.ndarray, float | None]:
         """What best shows how the flight goes: the label of its axis, whether that is logarithmic, values, and success.
@@ -122,13 +178,15 @@ class Flight:
         That is the metric that the task names, else the distance to the target, else the first metric or the reward.
         Success is the value from which a state fulfils the task, if the task says so.
         """
-        outputs, name = self.outputs(), self.markers.progress
-        if name not in outputs and self.target is not None:
-            return f"distance to the {self.markers.target} [m]", self.log_distance, self.distance, self.near_enough
-        known = name in outputs
-        name = name if known else next(iter(outputs))
+        outputs, distance = self.outputs(), self.distance
+        name = self.markers.progress
+        if (name is None or name not in outputs) and distance is not None:
+            return f"distance to the {self.markers.target} [m]", self.log_distance, distance, self.near_enough
+        success = self.markers.success if name in outputs else None
+        if name is None or name not in outputs:
+            name = next(iter(outputs))
         metric = describe_metric(name, self.metric_info)
-        success = metric.scale * self.markers.success if known and self.markers.success is not None else None
+        success = None if success is None else metric.scale * success
         return metric.axis_label, metric.log, metric.scale * outputs[name], success
 
     def progress_lines(self) -> tuple[str, bool, dict[str, np.ndarray]]:
@@ -138,9 +196,8 @@ class Flight:
         reward.
         """
         outputs = {describe_metric(name, self.metric_info): x for name, x in self.outputs().items()}
-        if self.target is None:
+        if (distance := self.distance) is None:
             return "", False, {metric.axis_label: metric.scale * x for metric, x in outputs.items()}
-        distance = self.distance
         lines = {f"to the {self.markers.target}": distance}
         for metric, x in outputs.items():
             if metric.is_length and not np.allclose(x[:, 1:], distance[:, 1:], atol=1e-5, equal_nan=True):
@@ -166,29 +223,20 @@ class Flight:
 
     def gate_index(self) -> Tensor | None:
         """The index of the gate that each drone flies to (num_envs, time + 1), if the targets are gates."""
-        if self.markers.gates is None or self.target is None:
+        if self.named.gates is None or self.target is None:
             return None
-        gap, index = (self.target.unsqueeze(-2) - self.markers.gates).norm(dim=-1).min(-1)
+        gap, index = (self.target.unsqueeze(-2) - self.named.gates).norm(dim=-1).min(-1)
         return index if gap.nan_to_num(0.0).max() < 1e-3 else None
 
-    def _count_steps(self) -> Tensor:
-        if ("next", "done") not in self.rollout.keys(include_nested=True):
-            return torch.full(self.rollout.shape[:1], self.rollout.shape[1])
-        return first_episode(self.rollout).sum((1, 2))
-
-    def _add_targets(self) -> None:
-        """Show where the targets of these episodes have been, if the task shows nothing of them."""
-        markers = self.markers
-        if self.target is None or markers.places is not None or markers.curve is not None:
-            return
-        if self.gate_index() is not None:
-            return
-        moving = (self.target.diff(dim=1).abs() > 0).any(-1).sum()
+    def _with_targets(self) -> Markers:
+        """The markers of the task; if it shows no targets, with where those of these episodes have been."""
+        named, target = self.named, self.target
+        if target is None or named.places is not None or named.curve is not None or self.gate_index() is not None:
+            return named
+        moving = (target.diff(dim=1).abs() > 0).any(-1).sum()
         if 2 * moving > self.steps.sum():
-            known = {"curve": self.target[self.steps.argmax()]}
-        else:
-            known = {"places": self.target.flatten(0, 1).mul(1e3).round().div(1e3).unique(dim=0)}
-        self.markers = dataclasses.replace(markers, **known)
+            return dataclasses.replace(named, curve=target[self.steps.argmax()])
+        return dataclasses.replace(named, places=target.flatten(0, 1).mul(1e3).round().div(1e3).unique(dim=0))
 
 
 def state_keys(*names: str) -> list[tuple[str, ...]]:
@@ -196,30 +244,45 @@ def state_keys(*names: str) -> list[tuple[str, ...]]:
     return [*((*prefix, "state", name) for prefix in ((), ("next",)) for name in names), ("next", "done")]
 
 
-def check_rollout(
-    who: str,
-    rollout: TensorDictBase,
-    env: EnvBase | None,
-    needed: list[tuple[str, ...]],
-    num_envs: int | None = None,
-) -> None:
-    """Refuse what cannot be drawn; arguments and errors are those of :class:`Flight`."""
-    if env is not None and not (isinstance(env, EnvBase) and hasattr(env, "markers")):
-        raise UserTypeError(
-            f"{who}: env must be the quadrotor environment that flew, with or without transforms, or None; got "
-            f"{type(env).__name__}."
-        )
-    if rollout.dim() != 2 or 0 in rollout.shape:
-        raise UserValueError(
-            f"{who} needs a rollout of batch size (num_envs, time), such as env.rollout(...) returns; got "
-            f"{tuple(rollout.shape)}. For one drone, write rollout.unsqueeze(0)."
-        )
-    if num_envs is not None and num_envs < 1:
-        raise UserValueError(f"{who}: num_envs must be at least 1, got {num_envs}.")
-    keys = rollout.keys(include_nested=True)
-    missing = [key for key in needed if key not in keys]
-    if missing:
-        raise UserValueError(
-            f"{who}: the rollout lacks {', '.join(map(str, missing))}. Pass it whole, as env.rollout(...) and "
-            "differentiable_rollout(...) return it."
-        )
+# -- obstacles ---------------------------------------------------------------------------------------------------------
+
+
+def obstacle_shapes(solids: Primitives | None) -> list[Shape]:
+    """The obstacles of one scene as one surface; nothing for the ground, and for what has been left out."""
+    if solids is None:
+        return []
+    meshes = [Shape.sphere(x[:3], x[3]) for x in solids.spheres[0].tolist()]
+    meshes += [Shape.cylinder(x[:3], x[3], x[4]) for x in solids.cylinders[0].tolist()]
+    meshes += [box_shape(x) for x in solids.boxes[0].detach().cpu().float()]
+    for x in solids.planes[0].detach().cpu().float():
+        if x[2].abs() < 0.99:  # a wall: the ground is not drawn
+            across = torch.tensor([-x[1], x[0], 0.0]) / x[:2].norm()
+            up = torch.linalg.cross(x[:3], across)
+            corners = [a * across + b * up for a, b in ((-1, 0), (1, 0), (1, 1), (-1, 1))]
+            points = torch.stack([x[3] * x[:3] + _WALL * c for c in corners])
+            meshes.append(Shape(points, torch.tensor([(0, 1, 2), (0, 2, 3)])))
+    first, points, faces = 0, [], []
+    for mesh in meshes:
+        if mesh.faces is not None and mesh.points[:, 2].min() > 0.5 * ELSEWHERE:
+            points.append(mesh.points)
+            faces.append(mesh.faces + first)
+            first += len(mesh.points)
+    return [Shape(torch.cat(points), torch.cat(faces), color=GREEN, opacity=0.6)] if points else []
+
+
+def box_shape(box: Tensor) -> Shape:
+    """A box of a scene: centre (3), half of its sides (3) and attitude (4)."""
+    shape = Shape.box(-box[3:6], box[3:6])
+    points = box[:3] + quaternion.rotate(box[6:].expand(len(shape.points), 4), shape.points)
+    return Shape(points, shape.faces)
+
+
+def with_obstacles(markers: Markers, solids: Primitives | None) -> Markers:
+    """Markers with the obstacles of a scene, if there are any."""
+    return dataclasses.replace(markers, shapes=[*markers.shapes, *obstacle_shapes(solids)])
+
+
+def depth_image(depth: Tensor, far: float) -> Tensor:
+    """A depth image (height, width) [m] from 0 to 1, the nearer the brighter; 0 also where nothing was measured."""
+    near = 1.0 - (depth.float().clamp_min(1e-3).log() - math.log(0.3)) / (math.log(far) - math.log(0.3))
+    return torch.where(depth > 0.0, near.clamp(0.0, 1.0), 0.0)

@@ -377,7 +377,7 @@ function show() {
 // What the camera of the drone that is followed saw, or else of the first: the nearer the brighter.
 function showImage() {
   if (!images) return;
-  const { width, height } = flight.images, canvas = element("eye"), context = canvas.getContext("2d");
+  const { width, height } = flight.images, canvas = element("depth"), context = canvas.getContext("2d");
   const first = ((chosen ?? 0) * frames + Math.floor(frame)) * width * height;
   const picture = context.createImageData(width, height);
   for (let k = 0; k < width * height; k++) {
@@ -434,7 +434,7 @@ function options(id, values, label, value, change) {
   });
 }
 
-if (images) Object.assign(element("eye"), { width: flight.images.width, height: flight.images.height, hidden: false });
+if (images) Object.assign(element("depth"), { width: flight.images.width, height: flight.images.height, hidden: false });
 const sizes = [1, 2, 3, 5, 10, 20, 50];
 size = sizes.find((factor) => 2 * arm * factor > 0.05 * extent) ?? 50;
 element("time").max = frames - 1;

@@ -7,9 +7,10 @@ import html
 import json
 import math
 import re
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -22,39 +23,54 @@ from torchrl_quad.dynamics.rotors import Rotors
 from torchrl_quad.envs.metrics import at_episode_end
 from torchrl_quad.errors import MissingPackage, UserValueError
 from torchrl_quad.files import replacing
-from torchrl_quad.render.flights import Flight
-from torchrl_quad.render.obstacles import depth_image, obstacle_shapes
+from torchrl_quad.render.flights import Flight, depth_image, obstacle_shapes
 
 _X_FRAME = [[0.053, 0.053], [-0.053, 0.053], [-0.053, -0.053], [0.053, -0.053]]  # [m], of a drone that is not known
+_Panel = tuple[str, dict[str, Tensor], dict[str, Any]]  # a label, lines (num_envs, time + 1) by name, how to draw them
+
+
+@dataclass(frozen=True, repr=False)
+class Replay:
+    """A page that plays a flight. A notebook shows it below the cell.
+
+    Args:
+        html: the page.
+    """
+
+    html: str
+
+    def __repr__(self) -> str:
+        return f"Replay({len(self.html) / 1e6:.1f} MB)"
+
+    def _repr_html_(self) -> str:
+        return f'<iframe srcdoc="{html.escape(self.html)}" style="width: 100%; height: 640px; border: 0"></iframe>'
 
 
 def write_replay(
     rollout: TensorDictBase,
-    path: str | Path,
+    path: str | Path | None = None,
     *,
     env: EnvBase | None = None,
     num_envs: int = 12,
     control_dt: float = 0.02,
     title: str | None = None,
-) -> None:
-    """Write the first episodes of a flight as an HTML page to play, pause, scrub and turn in a browser.
+) -> Replay:
+    """Make the first episodes of a flight an HTML page to play, pause, scrub and turn in a browser or a notebook.
 
     The page shows the drones with attitude and rotor thrust, trails, and the task's markers; the obstacles of the
-    environment that is followed, or of the first, and beside the flight what its camera saw; and over time the reward
-    terms, the actions, the speed, and the distance to the target (or the height). It is one file of about 5 MB, most
-    of it plotly.js, and needs no network. A drone stays where its episode ended, and the page says how it ended:
-    "success" if the last state fulfils the task.
+    environment that is followed, or of the first, with its depth images; and over time the reward terms, the actions,
+    the speed, and the distance to the target (or the height). It is one file of about 5 MB, most of it plotly.js, and
+    needs no network. A drone stays where its episode ended, and the page says how it ended: "success" if the last state
+    fulfils the task.
 
     Args:
         rollout: (num_envs, time), of any task. It must hold ``("next", "state", "position")`` and ``("next", "state",
             "quaternion")``; the page leaves out whatever else is missing.
-        path: the HTML file to write, whole or not at all.
+        path: the HTML file to write; None for none.
         env: the environment that flew, also under transforms. It provides the control step, the markers, the positions
             of the rotors, and their thrust in newtons. Without it, the page shows an X frame and the squared speed of
             each rotor.
-        num_envs: how many environments to show, at most.
-        control_dt: control step [s]; used only without ``env``.
-        title: of the page; by default the name of the environment and the number of flights.
+        num_envs, control_dt, title: as in :func:`plot_flight`.
 
     Raises:
         ImportError: plotly is not installed.
@@ -62,134 +78,132 @@ def write_replay(
         ValueError: the rollout is not (num_envs, time), or has no position or quaternion; ``num_envs`` is less than 1;
             or ``env`` has individual drones, for fewer environments than the page shows.
     """
-    plotlyjs = _plotlyjs()
+    try:
+        from plotly.offline import get_plotlyjs
+    except ImportError as error:
+        raise MissingPackage("Replays need plotly: pip install '.[render]' in a clone.") from error
     needed = [("next", "state", name) for name in ("position", "quaternion")]
     flight = Flight("write_replay", rollout, env, control_dt, needed, num_envs)
-    page = {
-        "title": html.escape(flight.title if title is None else title),
-        "flight": json.dumps(_content(flight)).replace("<", "\\u003c"),  # "<" could close the script
+    replay = page_of(json.dumps(_content(flight)), flight.title if title is None else title, get_plotlyjs())
+    if path is not None:
+        with replacing(path) as temporary:
+            temporary.write_text(replay.html, encoding="utf-8")
+    return replay
+
+
+def page_of(content: str, title: str, plotlyjs: str) -> Replay:
+    """The page of a flight, from its content as JSON."""
+    parts = {
+        "title": html.escape(title),
+        "flight": content.replace("<", "\\u003c"),  # "<" could close the script
         "plotly": plotlyjs,
         "script": _asset("replay.js"),
     }
     # In one pass, so that what has been filled in is not searched again.
-    text = re.sub(r"\{\{(\w+)\}\}", lambda match: page[match[1]], _asset("replay.html"))
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    return Replay(re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _asset("replay.html")))
 
 
 def _content(flight: Flight) -> dict[str, Any]:
     """The data of the page. Frame 0 is the start of the first step, frame k the state after the k-th step."""
     rollout, steps = flight.rollout, flight.steps
-    n, time = rollout.shape
     starts = all(("state", name) in rollout.keys(True) for name in ("position", "quaternion"))
     first = 0 if starts else 1  # frame
 
-    def state(name: str) -> Tensor | None:
-        """An entry of the state (num_envs, frames, k), if there is one."""
-        value = flight.state(name)
-        return None if value is None else value[:, first:]
+    def frames(values: Tensor | None) -> Tensor | None:
+        return None if values is None else values[:, first:]
 
-    position, target, velocity, rotor_speed = map(state, ("position", "target", "velocity", "rotor_speed"))
-    rotors, lift = _rotors(flight, rotor_speed)
-    content = {
-        "environments": n,
-        "frames": time + 1 - first,
+    rotors, lift = _rotors(flight, frames(flight.state("rotor_speed")))
+    gate, markers = flight.gate_index(), flight.named
+    over = torch.arange(rollout.shape[1] + 1) > steps[:, None]  # panels show nothing after the end of the episode
+    return {
+        "environments": len(flight),
+        "frames": rollout.shape[1] + 1 - first,
         "start": first * flight.control_dt,
         "control_dt": flight.control_dt,
         "ended": (steps - first).tolist(),
         "endings": _endings(rollout),
         "knows_drone": flight.env is not None,
         "rotors": _encoded(rotors),
-        "position": _encoded(position),
-        "quaternion": _encoded(state("quaternion")),
-        "lift": None if lift is None else _encoded(lift),
-        "target": None if target is None else _encoded(target),
-    }
-    markers = flight.named
-    content |= {
-        "gates": None if markers.gates is None else _encoded(markers.rings()),
-        "gate": None if (gate := flight.gate_index()) is None else _encoded(gate[:, first:].float()),
-        "places": None if markers.places is None else _encoded(markers.places),
-        "curve": None if markers.curve is None else _encoded(markers.curve),
+        "position": _encoded(frames(flight.position)),
+        "quaternion": _encoded(frames(flight.state("quaternion"))),
+        "lift": _encoded(lift),
+        "target": _encoded(frames(flight.target)),
+        "gates": _encoded(markers.rings()),
+        "gate": _encoded(frames(gate)),
+        "places": _encoded(markers.places),
+        "curve": _encoded(markers.curve),
         "shapes": [
             {
                 "points": _encoded(shape.points),
-                "faces": None if shape.faces is None else _encoded(shape.faces.float()),
+                "faces": _encoded(shape.faces),
                 **{key: getattr(shape, key) for key in ("name", "color", "opacity")},
             }
             for shape in markers.shapes
         ],
         "obstacles": _obstacles(flight),
         "images": _images(flight, first),
+        "panels": [
+            {
+                "label": label,
+                "names": list(lines),
+                "values": _encoded(torch.stack([x.masked_fill(over, math.nan) for x in lines.values()], -1)[:, first:]),
+                **options,
+            }
+            for label, lines, options in _panels(flight)
+        ],
     }
 
-    series = _rewards_and_actions(flight)
-    if velocity is not None:
-        series.append(("speed [m/s]", {"speed": flight.state("velocity").norm(dim=-1)}, {}))
-    if target is not None:
-        distance = torch.from_numpy(flight.distance)
-        options = {"log": flight.log_distance, "success": flight.near_enough}
-        series.append((f"distance to the {markers.target} [m]", {"distance": distance}, options))
-    else:
-        series.append(("height [m]", {"height": flight.state("position")[..., 2]}, {}))
-    ended = torch.arange(time + 1) > steps[:, None]  # panels show nothing after the end of the episode
-    panels = [
-        {
-            "label": label,
-            "names": list(lines),
-            "values": _encoded(torch.stack([x.masked_fill(ended, math.nan)[:, first:] for x in lines.values()], -1)),
-            **options,
-        }
-        for label, lines, options in series
-    ]
-    return {**content, "panels": panels}
 
-
-def _obstacles(flight: Flight) -> list[dict[str, str]]:
-    """The obstacles of each environment, of the first alone where all share them; none without a scene."""
-    scene = getattr(flight.env, "scene", None)
-    if scene is None:
+def _obstacles(flight: Flight) -> list[dict[str, str | None]]:
+    """The obstacles of each environment, or of the first if all share them; none without a scene."""
+    if flight.solids(0) is None:
         return []
     found = []
-    for i in range(len(flight) if scene.is_random else 1):
+    for i in range(len(flight) if flight.has_own_obstacles else 1):
         shapes = obstacle_shapes(flight.solids(i))
-        points, faces = (shapes[0].points, shapes[0].faces.float()) if shapes else (torch.zeros(0, 3),) * 2
+        points, faces = (shapes[0].points, shapes[0].faces) if shapes else (torch.zeros(0, 3),) * 2
         found.append({"points": _encoded(points), "faces": _encoded(faces)})
     return found
 
 
 def _images(flight: Flight, first: int) -> dict[str, Any] | None:
     """What the cameras showed, as bytes from far to near."""
-    depth = flight.depth
-    if depth is None:
+    if (depth := flight.depth) is None:
         return None
-    camera = getattr(flight.env, "camera", None)
+    camera = None if flight.env is None else flight.env.camera
     far = depth.amax().clamp_min(1.0).item() if camera is None else camera.range
     pixels = (255.0 * depth_image(depth[:, first:], far)).round().to(torch.uint8)
     data = base64.b64encode(pixels.contiguous().numpy().tobytes()).decode("ascii")
     return {"height": depth.shape[-2], "width": depth.shape[-1], "data": data}
 
 
-def _rewards_and_actions(flight: Flight) -> list[tuple[str, dict[str, Tensor], dict[str, Any]]]:
-    """The labels of the first panels, their lines (num_envs, time + 1) by name, and how to draw them."""
+def _panels(flight: Flight) -> list[_Panel]:
+    """What to show over time: rewards, actions, the speed, and the distance to the target or the height."""
     rollout, panels = flight.rollout, []
     nothing = torch.full((len(rollout), 1), math.nan)
-    terms = {name: x[..., 0] for name, x in rollout.get(("next", "reward_terms"), {}).items()}
-    if ("next", "reward") in rollout.keys(True):
-        terms = {"sum" if terms else "reward": rollout["next", "reward"][..., 0], **terms}
+    terms = flight.entries("next", "reward_terms")
+    if (reward := flight.entry("next", "reward")) is not None:
+        terms = {"sum" if terms else "reward": reward, **terms}
     elif terms:
-        terms = {"sum": sum(terms.values()), **terms}
+        terms = {"sum": torch.stack(list(terms.values())).sum(0), **terms}
     if terms:
-        lines = {name: torch.cat((nothing, x.float()), 1) for name, x in terms.items()}
+        lines = {name: torch.cat((nothing, x[..., 0].float()), 1) for name, x in terms.items()}
         panels.append(("reward", lines, {"peaks": True}))
-    if "action" in rollout:
-        action = rollout["action"].float()
+    if (action := flight.entry("action")) is not None:
         over = torch.arange(rollout.shape[1]) >= flight.steps[:, None]
         lines = {
             name: torch.cat((x.masked_fill(over, math.nan), nothing), 1)
-            for name, x in zip(flight.action_names, action.unbind(-1), strict=True)
+            for name, x in zip(flight.action_names, action.float().unbind(-1), strict=True)
         }
         panels.append(("action [-1, 1]", lines, {"held": True}))
+    if flight.state("velocity") is not None:
+        panels.append(("speed [m/s]", {"speed": flight.speed}, {}))
+    if (distance := flight.distance) is not None:
+        options = {"log": flight.log_distance, "success": flight.near_enough}
+        label = f"distance to the {flight.named.target} [m]"
+        panels.append((label, {"distance": torch.from_numpy(distance)}, options))
+    else:
+        panels.append(("height [m]", {"height": flight.position[..., 2]}, {}))
     return panels
 
 
@@ -221,9 +235,8 @@ def _rotors(flight: Flight, speed: Tensor | None) -> tuple[Tensor, Tensor | None
     """
     n = len(flight)
     if flight.env is None:
-        positions = torch.tensor(_X_FRAME).expand(n, 4, 2)
-        squared = None if speed is None else speed.square()
-        return positions, None if speed is None else 2.0 * squared / squared.nan_to_num().amax().clamp_min(1e-12)
+        lift = None if speed is None else 2.0 * speed.square() / speed.nan_to_num().square().amax().clamp_min(1e-12)
+        return torch.tensor(_X_FRAME).expand(n, 4, 2), lift
     fields = {}
     for name, value in flight.env.params.fields().items():
         randomised = flight.rollout.get(("next", "state", "drone", name), None)
@@ -238,23 +251,15 @@ def _rotors(flight: Flight, speed: Tensor | None) -> tuple[Tensor, Tensor | None
             value = value[:n]
         shape = value.shape[-QuadrotorParams.dim(name) :]
         fields[name] = value.detach().cpu().float().reshape(-1, 1, *shape)
-    params = RawParams(**fields)  # each (num_envs or 1, 1, ...)
+    params = cast("QuadrotorParams", RawParams(**fields))  # each (num_envs or 1, 1, ...)
     lift = None if speed is None else Rotors(params).thrust(speed) * 4.0 / (params.mass * params.gravity)
     return params.rotor_positions[:, 0].expand(n, 4, 2), lift
 
 
-def _encoded(value: Tensor) -> str:
+def _encoded(value: Tensor | None) -> str | None:
     """Numbers as base64 of little-endian float32."""
-    return base64.b64encode(value.contiguous().numpy().astype("<f4").tobytes()).decode("ascii")
+    return None if value is None else base64.b64encode(value.contiguous().numpy().astype("<f4").tobytes()).decode()
 
 
 def _asset(name: str) -> str:
-    return (resources.files(__package__) / name).read_text(encoding="utf-8")
-
-
-def _plotlyjs() -> str:
-    try:
-        from plotly.offline import get_plotlyjs
-    except ImportError as error:
-        raise MissingPackage("Replays need plotly: pip install '.[render]' in a clone.") from error
-    return get_plotlyjs()
+    return (resources.files("torchrl_quad.render") / name).read_text(encoding="utf-8")

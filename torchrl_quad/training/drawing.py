@@ -25,27 +25,17 @@ from torchrl_quad.deploy.transfer import fly
 from torchrl_quad.errors import UserError
 from torchrl_quad.files import check_file
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, write_replay
-from torchrl_quad.render.frames import NoFfmpeg, find_ffmpeg
+from torchrl_quad.render.video import NoFfmpeg
 
 EXPLAINED = (UserError, OSError, ImportError, MemoryError)
 
 
 def draw_flight(flight: TensorDictBase, path: Path, env: EnvBase, title: str) -> None:
-    """Draw a flight as a picture and as a film: ``path`` with .png and, see :func:`film_of`, .mp4 or .gif."""
+    """Draw a flight as a picture and as a film: ``path`` with .png, and .mp4 or, where no ffmpeg works, .gif."""
     picture = path.with_suffix(".png")
     with _or_without(picture):
         plot_flight(flight, picture, env=env, title=title)
     _film(path, flight, env=env, sharp={"fps": 25, "size": 560})
-
-
-def film_of(path: Path) -> Path:
-    """The film to draw beside a picture: .mp4, or .gif where no ffmpeg works, which a line on stderr then says."""
-    try:
-        find_ffmpeg()
-    except NoFfmpeg as error:
-        _warn(f"{path.with_suffix('.gif')} takes the place of an MP4. {error}")
-        return path.with_suffix(".gif")
-    return path.with_suffix(".mp4")
 
 
 def publish_flight(flight: TensorDictBase, figure: Path, page: Path, env: EnvBase, title: str) -> None:
@@ -79,17 +69,14 @@ def draw_learning_curve(metrics: Path, path: Path, env: EnvBase) -> None:
 def _film(path: Path, flight: TensorDictBase, sharp: dict[str, Any] | None = None, **options: Any) -> None:
     """Film a flight, in an MP4 ``sharp``; no older film of the other suffix is left beside it."""
     mp4, gif = path.with_suffix(".mp4"), path.with_suffix(".gif")
-    film = film_of(path)
-    with _or_without(film, mp4, gif):
+    with _or_without(mp4, mp4, gif):
         try:
-            if film == mp4:
-                animate_flight(flight, mp4, **options, **(sharp or {}))
-        except NoFfmpeg as error:  # it works, and has failed all the same
+            animate_flight(flight, mp4, **options, **(sharp or {}))
+            gif.unlink(missing_ok=True)
+        except NoFfmpeg as error:  # a line on stderr says why
             _warn(f"{gif} takes the place of an MP4. {error}")
-            film = gif
-        if film == gif:
             animate_flight(flight, gif, **options)
-        (mp4 if film == gif else gif).unlink(missing_ok=True)
+            mp4.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

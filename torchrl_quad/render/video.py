@@ -1,0 +1,298 @@
+"""Draw drones as arrays of pixels: films, and the frames of ``env.render()``."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import numbers
+import os
+import subprocess
+import tempfile
+import weakref
+from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_quad.dynamics import quaternion
+from torchrl_quad.envs.markers import Markers
+from torchrl_quad.errors import MissingPackage, UserValueError, one_line
+from torchrl_quad.files import replacing
+from torchrl_quad.render.canvas import (
+    INK,
+    RED,
+    add_space,
+    bounds,
+    box,
+    draw_markers,
+    drone_colors,
+    make_figure,
+    set_box,
+)
+from torchrl_quad.render.flights import Flight, depth_image, state_keys, with_obstacles
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from mpl_toolkits.mplot3d.art3d import Line3D
+
+    from torchrl_quad.envs import QuadrotorEnv
+
+_INCHES = 4.2
+_REINSTALL = "pip install --force-reinstall --no-deps imageio-ffmpeg"
+_ARMS = torch.tensor([[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [0.0, 0.0, 0.0], [1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]])
+
+
+class NoFfmpeg(MissingPackage):
+    """Films cannot be written as MP4 here."""
+
+
+class View:
+    """A view for many frames of the same drones; it draws axes and markers only once.
+
+    Args:
+        points: (*, 3) [m]; the finite ones, and the ground below, are in view.
+        num_drones: how many drones a frame shows.
+        size: width and height of a frame [pixels].
+        markers: what to draw beside the drones.
+        image: the height and width of a camera's images [pixels], if a frame shows one.
+    """
+
+    def __init__(
+        self, points: Tensor, num_drones: int, size: int, markers: Markers, image: Sequence[int] | None = None
+    ) -> None:
+        low, high = bounds(points, *markers.points())
+        low[2].clamp_(max=0.0)
+        self.low, self.high = box(low, high)
+        self.arms = (0.04 * (self.high - self.low).amax()).float() * _ARMS
+
+        self.figure = make_figure(figsize=(_INCHES, _INCHES), dpi=(size + 0.01) / _INCHES)  # it rounds down to pixels
+        self.canvas: FigureCanvasAgg = self.figure.canvas  # pyrefly: ignore[bad-assignment]  as make_figure sets it
+        space = add_space(self.figure, (0.0, 0.02, 0.96, 0.98))
+        set_box(space, self.low, self.high, zoom=0.82)
+        draw_markers(space, markers, size=8)
+
+        def line(**style: Any) -> Line3D:  # drawn onto the axes in each frame
+            return cast("Line3D", space.plot([], [], [], animated=True, **style)[0])
+
+        colors = drone_colors(num_drones)
+        self.drones = [line(color=color, linewidth=2.5) for color in colors]
+        self.trails = [line(color=color, linewidth=1, alpha=0.5) for color in colors]
+        self.targets = line(color=RED, marker="*", markersize=8, linestyle="none")
+        self.image = None
+        if image is not None:
+            inset = self.figure.add_axes((0.66, 0.76, 0.32, 0.22), xticks=[], yticks=[])
+            self.image = inset.imshow(np.zeros(tuple(image)), cmap="magma", vmin=0.0, vmax=1.0, animated=True)
+        self.text = space.text2D(0.04, 0.94, "", transform=space.transAxes, color=INK, animated=True)
+        self.canvas.draw()
+        self.background = self.canvas.copy_from_bbox(self.figure.bbox)
+
+    def draw(
+        self,
+        position: Tensor,
+        attitude: Tensor,
+        target: Tensor | None = None,
+        trails: Iterable[Tensor] = (),
+        text: str = "",
+        image: Tensor | None = None,
+    ) -> np.ndarray:
+        """Draw a frame (size, size, 3), uint8.
+
+        Args:
+            position: of the drones (num_drones, 3) [m].
+            attitude: their quaternions (num_drones, 4).
+            target: of each drone (num_drones, 3) [m].
+            trails: the line (*, 3) [m] that each drone has flown.
+            text: for the corner.
+            image: of a camera (height, width), from 0 to 1.
+        """
+        arms = self.arms.to(position.dtype).expand(len(position), -1, -1)
+        bodies = position.unsqueeze(1) + quaternion.rotate(attitude.unsqueeze(1), arms)
+        for drone, body in zip(self.drones, bodies, strict=True):
+            drone.set_data_3d(*_numpy(body).T)
+        for line, trail in zip(self.trails, trails, strict=False):
+            line.set_data_3d(*_numpy(trail).T)
+        if target is not None:
+            self.targets.set_data_3d(*_numpy(target).T)
+        self.text.set_text(text)
+        self.canvas.restore_region(self.background)
+        artists: list[Artist] = [*self.trails, self.targets, *self.drones, self.text]
+        if self.image is not None and image is not None:
+            self.image.set_data(_numpy(image))
+            artists.append(self.image)
+        for artist in artists:
+            self.figure.draw_artist(artist)
+        return np.array(self.canvas.buffer_rgba())[..., :3].copy()
+
+
+def animate_flight(
+    rollout: TensorDictBase,
+    path: str | Path,
+    *,
+    env: EnvBase | None = None,
+    num_envs: int = 6,
+    control_dt: float = 0.02,
+    fps: int = 15,
+    max_seconds: float = 12.0,
+    size: int = 336,
+    beside: TensorDictBase | None = None,
+    labels: tuple[str, str] = ("", ""),
+) -> None:
+    """Film the first episodes of a flight in real time: drones with trails, their targets, and the task's markers.
+
+    A task with a camera shows the first drone's depth image, the nearer the brighter. Where each episode has obstacles
+    of its own, the film shows only the first environment.
+
+    Args:
+        rollout, env, num_envs, control_dt: as in :func:`plot_flight`.
+        path: the film to write: GIF, or MP4 (H.264) with ``imageio-ffmpeg`` of the extra ``render``, by its suffix.
+        fps: frames per second, at least; up to 50, and rounded up so that a frame lasts whole control steps.
+        max_seconds: the maximum length of the film.
+        size: width and height [pixels], rounded up to an even number.
+        beside: another flight of the same task, (num_envs, time), to film to the right of the first, in the same view.
+        labels: a word for each of the two, in their corners.
+
+    Raises:
+        ImportError: matplotlib is missing; or no ffmpeg works, for an MP4: ``NoFfmpeg``.
+        TypeError: ``env`` is not a quadrotor environment.
+        ValueError: the rollout has another shape or lacks the position or the quaternion, a number is not positive, or
+            the suffix is another.
+    """
+    write = {".gif": _write_gif, ".mp4": _write_mp4}.get(Path(path).suffix.lower())
+    if write is None:
+        raise UserValueError(f"animate_flight writes .gif and .mp4, got {Path(path).name}.")
+    for name, value in (("control_dt", control_dt), ("fps", fps), ("max_seconds", max_seconds), ("size", size)):
+        if not value > 0:
+            raise UserValueError(f"animate_flight: {name} must be positive, got {value!r}.")
+    needed = state_keys("position", "quaternion")
+    both = [rollout] if beside is None else [rollout, beside]
+    flights = [Flight("animate_flight", x, env, control_dt, needed, num_envs) for x in both]
+    if flights[0].has_own_obstacles:
+        flights = [Flight("animate_flight", x, env, control_dt, needed, 1) for x in both]
+    control_dt, camera = flights[0].control_dt, None if flights[0].env is None else flights[0].env.camera
+    last = min(max(round(max_seconds / control_dt), 1), *(x.shape[1] for x in both))  # step
+    everywhere = torch.cat([flight.position[:, : last + 1].flatten(0, 1) for flight in flights])
+    trail = max(round(1.0 / control_dt), 1)
+    stride = max(int(1.0 / (min(fps, 50) * control_dt) + 1e-6), 1)
+    instants = np.append(np.arange(0, last, stride), last)
+
+    def pictures(flight: Flight, label: str) -> Iterator[np.ndarray]:
+        images = None if flight.depth is None else depth_image(flight.depth[0], camera.range if camera else 10.0)
+        markers = with_obstacles(flight.markers, flight.solids(0))
+        pixels = None if images is None else images.shape[1:]
+        view = View(everywhere, len(flight), size + size % 2, markers, pixels)
+        attitude = cast("Tensor", flight.state("quaternion"))
+        position, target = flight.position, flight.target
+        for t in instants:
+            yield view.draw(
+                position[:, t],
+                attitude[:, t],
+                None if target is None else target[:, t],
+                trails=position[:, max(t - trail, 0) : t + 1],
+                text=f"{control_dt * t:.1f} s  {label}".rstrip(),
+                image=None if images is None else images[t],
+            )
+
+    films = [pictures(flight, label) for flight, label in zip(flights, labels, strict=False)]
+    frames = (np.concatenate(parts, 1) for parts in zip(*films, strict=True))
+    with replacing(path) as temporary:
+        write(temporary, frames, control_dt * np.append(instants, instants[-1] + stride))
+
+
+def _write_gif(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> None:
+    """Write frames, each shown from its time [s] to the next; the last of the times is the end."""
+    from PIL import Image
+
+    # A GIF counts in 10 ms: rounded instants keep step with the clock where rounded intervals would not.
+    durations = 10 * np.diff(np.round(100 * times))
+    first, *rest = map(Image.fromarray, frames)
+    first.save(path, save_all=True, append_images=rest, duration=durations.tolist(), loop=0)
+
+
+def _write_mp4(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> None:
+    """The same in equal intervals: the last frame, of the end, may come later than its time by less than one."""
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+    except ImportError as error:
+        raise NoFfmpeg("Films in MP4 need imageio-ffmpeg: pip install '.[render]' in a clone.") from error
+    first, rate = next(frames), Fraction(1.0 / (times[-1] - times[-2])).limit_denominator()
+    source = f"-f rawvideo -pix_fmt rgb24 -s {first.shape[1]}x{first.shape[0]} -r {rate} -i -".split()
+    target = ["-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-movflags", "+faststart", "-f", "mp4"]
+    exe, whole = "ffmpeg", False
+    with tempfile.TemporaryFile() as log:
+        try:
+            exe = get_ffmpeg_exe()
+            command = [exe, "-y", "-v", "error", *source, *target, f"file:{path.absolute()}"]
+            process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log)
+        except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: imageio-ffmpeg finds none
+            raise NoFfmpeg(_broken(exe, one_line(error))) from error
+        with contextlib.suppress(BrokenPipeError):  # it has ended before the film
+            with process:
+                for frame in itertools.chain([first], frames):
+                    cast("IO[bytes]", process.stdin).write(frame.tobytes())
+            whole = True
+        if not whole or process.returncode or not (path.exists() and path.stat().st_size):
+            log.seek(0)
+            said = one_line(log.readline(200).decode(errors="replace"))
+            raise NoFfmpeg(_broken(exe, f"exit status {process.returncode}{': ' * bool(said)}{said}"))
+
+
+def _broken(exe: str, why: str) -> str:
+    mend = "unset IMAGEIO_FFMPEG_EXE" if os.environ.get("IMAGEIO_FFMPEG_EXE") else _REINSTALL
+    return f"Films in MP4 need an ffmpeg that writes H.264, and {exe} does not ({why}). Write a GIF, or {mend}."
+
+
+# The views of each environment, by number of drones, size and obstacles. They are kept outside the environment, which
+# can be copied and sent to other processes.
+_views: weakref.WeakKeyDictionary[EnvBase, dict[tuple[int, int, bytes], View]] = weakref.WeakKeyDictionary()
+
+
+def draw_frame(env: QuadrotorEnv, drones: Sequence[int] | None, size: int) -> np.ndarray:
+    """Draw an environment as it is; see :meth:`~torchrl_quad.envs.QuadrotorEnv.render`."""
+    if not env.render_state:
+        raise UserValueError("render() draws the state after the last reset or step. Call env.reset() first.")
+    count = 1 if env.scene is not None and env.scene.is_random else 6
+    chosen = list(range(min(env.num_envs, count)) if drones is None else drones)
+    if not chosen or not all(isinstance(i, numbers.Integral) and 0 <= i < env.num_envs for i in chosen):
+        raise UserValueError(
+            f"render: drones are indices from 0 to {env.num_envs - 1}, at least one, such as drones=[0]; got {chosen}."
+        )
+    if size < 100:
+        raise UserValueError(f"render: size must be at least 100 pixels, got {size}.")
+    state = {key: x for key, x in env.render_state.items() if isinstance(key, str)}
+    shown = {key: x[chosen].cpu() for key, x in state.items()}
+    obstacles = {key: x[chosen[:1]] for key, x in env.render_state.items() if not isinstance(key, str)}
+    solids = None if env.scene is None else env.scene.solids(obstacles)
+    image = None
+    if env.camera is not None and solids is not None:
+        depth = env.camera.depth(solids, state["position"][chosen[:1]], state["quaternion"][chosen[:1]])
+        image = depth_image(depth[0, 0], env.camera.range)
+    views = _views.setdefault(env, {})
+    # Another episode may have other obstacles.
+    kind = len(chosen), size, b"".join(_numpy(x).tobytes() for x in obstacles.values())
+    view = views.get(kind)
+    if view is None:  # half a metre of room around all drones, their targets and the markers
+        points = [x for key, x in state.items() if key != "quaternion"]
+        low, high = bounds(*points, *env.markers().points())
+        low, high = low - torch.tensor([0.5, 0.5, 0.0]), high + 0.5
+    else:  # a side that has become too near moves out by half of the view, so that it need not at every step
+        points = [x for key, x in shown.items() if key != "quaternion"]
+        low, high = bounds(*points, view.low, view.high)
+        room = 0.5 * (view.high - view.low)
+        low, high = low - room * (low < view.low), high + room * (high > view.high)
+    if view is None or (low < view.low).any() or (high > view.high).any():
+        if obstacles:
+            views.clear()  # of episodes that are over
+        markers, pixels = with_obstacles(env.markers(), solids), None if image is None else image.shape
+        views[kind] = view = View(torch.stack((low, high)), len(chosen), size, markers, pixels)
+    return view.draw(shown["position"], shown["quaternion"], shown.get("target"), image=image)
+
+
+def _numpy(x: Tensor) -> np.ndarray:
+    return x.numpy(force=True)

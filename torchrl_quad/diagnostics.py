@@ -15,12 +15,11 @@ from torch.autograd.graph import GradientEdge
 from torchrl.envs import EnvBase
 
 from torchrl_quad.data import differentiable_rollout
-from torchrl_quad.data.unwrap import require_env
+from torchrl_quad.data.unwrap import check_env, check_tensordict
 from torchrl_quad.errors import UserTypeError, UserValueError, WrongState, shown
 from torchrl_quad.objectives.action_gradients import sources_of_steps
-from torchrl_quad.objectives.calls import require_tensordict
+from torchrl_quad.objectives.calls import discounts
 from torchrl_quad.objectives.pathwise import PathwiseLoss
-from torchrl_quad.objectives.segments import discounts
 from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, check_value, checked
 
 Inputs = nn.Module | Tensor | Iterable[Tensor]
@@ -109,7 +108,7 @@ def audit_reward(
         TypeError: the rollout is no tensordict, or the inputs are no tensors.
         RuntimeError: the rollout has lost its graph.
     """
-    require_tensordict("audit_reward", rollout)
+    check_tensordict("audit_reward", rollout)
     for key in (terms_key, reward_key, done_key):
         if key not in rollout:
             raise UserValueError(
@@ -263,7 +262,7 @@ def gradient_by_horizon(
     horizons = {
         check_value("horizons", horizon, Horizon, "They are numbers of control steps."): None for horizon in horizons
     }
-    require_env(env)
+    check_env(env)
     start = env.reset() if start is None else start
     return {
         horizon: gradient_statistics(loss, differentiable_rollout(env, actor, start, horizon)[0], max_envs=max_envs)

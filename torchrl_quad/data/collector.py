@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_quad.data.rollout import differentiable_rollout, require_actor, require_exploration
-from torchrl_quad.data.unwrap import base_env, require_env
+from torchrl_quad.data.unwrap import base_env, check_env
 from torchrl_quad.data.visited_states import restart
 from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.options import Field, Fraction, checked
@@ -63,7 +63,7 @@ class DifferentiableCollector(BaseCollector):
     ) -> None:
         super().__init__()
         self.env: EnvBase = env if isinstance(env, EnvBase) or not _needs_nothing(env) else env()
-        require_env(self.env)
+        check_env(self.env)
         require_actor(policy, "policy")
         require_exploration(exploration_type)
         self.policy, self.exploration_type, self.restart_fraction = policy, exploration_type, restart_fraction

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ObservationNorm
 
-from torchrl_quad.data.unwrap import base_env, require_env
+from torchrl_quad.data.unwrap import base_env, check_env
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.options import Entry, Positive, checked
 
@@ -44,7 +44,7 @@ class ObservationNormalizer(ObservationNorm):
     """
 
     def __init__(self, env: EnvBase, key: Entry = "observation", *, min_scale: Positive = 0.01) -> None:
-        require_env(env)
+        check_env(env)
         if key not in env.observation_spec.keys(True, True):
             raise UserValueError(
                 f"The environment does not observe {key!r}. Choose from: "

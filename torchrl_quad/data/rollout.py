@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.normalizer import NormalizedPolicy, ObservationNormalizer
-from torchrl_quad.data.unwrap import base_env, memory_keys, require_env, require_whole_state
+from torchrl_quad.data.unwrap import base_env, check_env, check_whole_state, memory_keys
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.options import Horizon, checked
 
@@ -50,7 +50,7 @@ def differentiable_rollout(
             that nobody writes, or a transform overwrites or leaves out a part of the state.
         TypeError: ``env`` is no environment, the actor is not a TensorDictModule, or the carry is not a tensordict.
     """
-    require_env(env)
+    check_env(env)
     require_exploration(exploration_type)
     require_actor(actor, "actor")
     if not (carry is None or isinstance(carry, TensorDictBase)):
@@ -58,7 +58,7 @@ def differentiable_rollout(
             f"carry must be the tensordict to start from, or None to reset the environment; got {type(carry).__name__}."
         )
     try:
-        require_whole_state(env)
+        check_whole_state(env)
         carry = env.reset() if carry is None else carry.copy()
         _require_start(env, actor, carry)
         if carry.numel() * horizon > 1_000_000:

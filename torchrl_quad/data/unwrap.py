@@ -1,21 +1,45 @@
-"""What lies under an environment's transforms, and in a policy's memory."""
+"""What lies under an environment's transforms and in a policy's memory, and entries with their types."""
 
+from typing import Any, cast
+
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.data import Composite
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from torchrl_quad.errors import UserTypeError, UserValueError
 
 
-def require_env(env: EnvBase) -> None:
-    """Refuse what is no environment.
+def leaf(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """An entry that is a tensor, as type checkers cannot know."""
+    return cast(Tensor, tensordict.get(key))
 
-    Raises:
-        TypeError: it is none.
-    """
+
+def group(tensordict: TensorDictBase, key: NestedKey) -> TensorDictBase:
+    """An entry that is a tensordict, as type checkers cannot know."""
+    return cast(TensorDictBase, tensordict.get(key))
+
+
+def observed(env: EnvBase) -> Composite:
+    """The spec of what an environment observes, with its type."""
+    return cast(Composite, env.observation_spec)
+
+
+def check_env(env: EnvBase) -> None:
+    """Raise a UserTypeError for what is no environment."""
     if not isinstance(env, EnvBase):
         raise UserTypeError(
             f"env must be a TorchRL environment, such as make_env('hovering', num_envs=64); got {type(env).__name__}."
+        )
+
+
+def check_tensordict(name: str, rollout: Any) -> None:
+    """Raise a UserTypeError for what is no tensordict; ``name`` is what needs one."""
+    if not isinstance(rollout, TensorDictBase):
+        raise UserTypeError(
+            f"{name} needs a rollout, the tensordict that differentiable_rollout returns; got {type(rollout).__name__}."
         )
 
 
@@ -26,15 +50,14 @@ def base_env(env: EnvBase) -> EnvBase:
     return env
 
 
-def require_whole_state(env: EnvBase) -> None:
-    """Refuse transforms that change the state from which the next step starts.
+def check_whole_state(env: EnvBase) -> None:
+    """Raise a UserValueError for transforms that change the state from which the next step starts.
 
-    Raises:
-        ValueError: a transform leaves out a part of it, or overwrites one and does not undo that before the step.
+    No transform may leave out a part of it, or overwrite one without undoing that before the step.
     """
     base = base_env(env)
     state = set(map(unravel_key, base.state_keys))
-    lost = state & {*base.observation_spec.keys(True, True)} - {*env.observation_spec.keys(True, True)}
+    lost = state & {*observed(base).keys(True, True)} - {*observed(env).keys(True, True)}
     if lost:
         raise UserValueError(
             f"A transform leaves out {min(lost, key=str)!r}, and every step would start where the first one did. No "

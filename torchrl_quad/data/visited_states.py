@@ -15,7 +15,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
 from torchrl_quad.data.rollout import require_actor
-from torchrl_quad.data.unwrap import base_env, memory_keys, require_env
+from torchrl_quad.data.unwrap import base_env, check_env, memory_keys
 from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
 from torchrl_quad.options import Device, Entries, Fraction, Seed, Size, checked
 
@@ -57,7 +57,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         seed: Seed = 0,
     ) -> None:
         if env is not None:
-            require_env(env)
+            check_env(env)
         if actor is not None:
             require_actor(actor, "actor")
         generator = torch.Generator(device=device).manual_seed(seed)
@@ -122,7 +122,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             ValueError: the fraction is not in [0, 1], or the environment's states differ in kind from the buffer's.
             RuntimeError: the buffer is empty.
         """
-        require_env(env)
+        check_env(env)
         mixed, visited, pick = self._mixed(_fresh(env, self.state_keys), fraction)
         start = env.reset(mixed, set_state=True)
         for key, x in visited.select(*self.memory_keys).items(True, True):
@@ -147,7 +147,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             ValueError: the fraction is not in [0, 1]; (in use) as :meth:`initial_state`.
             RuntimeError: (in use) the buffer is empty.
         """
-        require_env(env)
+        check_env(env)
         base = base_env(env)
         if not _draws_starts(base):
             raise UserTypeError(
@@ -304,7 +304,7 @@ def restart(env: EnvBase, carry: TensorDictBase, fraction: Fraction) -> TensorDi
         ValueError: the fraction is not in [0, 1], or the carry lacks an entry of the state or has another batch size.
         TypeError: ``env`` is no environment, or the carry is no tensordict.
     """
-    require_env(env)
+    check_env(env)
     if not isinstance(carry, TensorDictBase):
         raise UserTypeError(f"carry must be the tensordict that a rollout ended with; got {type(carry).__name__}.")
     keys = _state_keys(env)

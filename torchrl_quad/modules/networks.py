@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
-from torchrl_quad.data.unwrap import base_env, require_env
+from torchrl_quad.data.unwrap import base_env, check_env
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead
 from torchrl_quad.modules.plain import CorrelatedActor, Critic, Network, TanhGaussianActor
@@ -166,7 +166,7 @@ def make_qvalue(
 
 def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[Bounded, Tensor]:
     """The spec of one action, and what the mean of the first actions is before the tanh, (k); checked for ``name``."""
-    require_env(env)
+    check_env(env)
     spec = env.action_spec_unbatched
     if not isinstance(spec, Bounded):
         raise UserValueError(f"{name} needs an action with bounds, a Bounded spec; got {type(spec).__name__}.")
@@ -255,7 +255,7 @@ def network_of(
     more: int = 0,
 ) -> Network:
     """A network on entries of an environment; it reads ``more`` numbers first, which are none of these entries."""
-    require_env(env)
+    check_env(env)
     specs = [_spec(env, key) for key in in_keys]
     own = len(in_keys) - (action_scale is not None)  # without the action of a critic
     scales = list(input_scale) if isinstance(input_scale, Sequence) else [input_scale] * own

@@ -15,7 +15,7 @@ from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, TanhNor
 from torchrl.modules.models.utils import SquashDims
 from torchrl.modules.tensordict_module.rnn import GRU
 
-from torchrl_quad.data.unwrap import require_env
+from torchrl_quad.data.unwrap import check_env
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead
 from torchrl_quad.modules.networks import (
@@ -98,7 +98,7 @@ def make_visual_actor(
         ValueError: the environment has no such image; or as for :func:`~torchrl_quad.make_actor`.
         TypeError: ``env`` is no environment.
     """
-    require_env(env)
+    check_env(env)
     known = dict(env.observation_spec.items(True, True))
     if image_key not in known or known[image_key].ndim != len(env.batch_size) + 3:
         raise UserValueError(

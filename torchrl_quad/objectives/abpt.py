@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
@@ -11,10 +11,10 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.objectives.calls import sample_action
+from torchrl_quad.objectives.calls import sample_action, segments, step_in_segment, total
 from torchrl_quad.objectives.critic import PathwiseCriticLoss
-from torchrl_quad.objectives.segments import segments, step_in_segment
 from torchrl_quad.options import Copies, Field
 
 
@@ -23,29 +23,38 @@ class ABPTLoss(PathwiseCriticLoss):
 
     For each segment of a rollout, J = (J_N + J_0) / 2 with
 
-    - J_N, the discounted rewards plus gamma^n Q(s_n, a_n), which is exact where the reward is differentiable;
+    - J_N, the discounted rewards plus gamma^n Q(s_n, a_n), which is exact if the reward is differentiable;
     - J_0 = Q(s_0, a_0), the critic's estimate of the whole reward, differentiable or not.
 
-    Q is the least of the critics. The policy samples a_n, and the actions in the critics' targets, anew. Q keeps its
-    gradient in state and action and has none in the critics' parameters. With one of the two returns switched off the
-    other has weight 1.
+    Q is the least of the critics; it keeps its gradient in state and action and has none in the critics' parameters.
+    a_n, and the actions in the critics' targets, are sampled from the policy again.
+
+    .. code-block:: python
+
+        from torchrl_quad import ABPTLoss, HoveringEnv, differentiable_rollout, make_actor, make_qvalue
+
+        env = HoveringEnv(num_envs=8)
+        actor = make_actor(env)
+        loss = ABPTLoss(actor, make_qvalue(env))
+        rollout, carry = differentiable_rollout(env, actor, None, 16)
+        losses = loss(rollout)
+        (losses["loss_actor"] + losses["loss_qvalue"]).backward()
 
     Args:
         actor_network: the policy that flew the rollout.
         qvalue_network: the critic Q(s, a), which writes ``state_action_value`` (see ``set_keys``).
-        num_qvalue_nets: the critics made from it, each initialised anew, whose smallest value counts.
+        num_qvalue_nets: the critics made from it, each initialised independently, whose smallest value counts.
         n_step_return: whether J includes J_N, the rewards of the horizon and the value of its end.
         zero_step_return: whether J includes J_0, the critic's estimate at the start.
         simulated_steps: control steps that the return of the start flies through the simulator before it asks the
-            critic. The return of a segment's start is then sum_(t<k) gamma^t r_t + gamma^k V(s_k), with V(s) = Q(s, a)
-            and a sampled anew. Its gradient in a_0 is the simulator's, where that of Q(s_0, a_0) is the critic's, which
-            may be noise. With an action delay of d steps a_0 moves nothing before step d + 1: take 1 + d or more. A
-            segment that ends sooner ends J_0 there.
+            critic: J_0 is then sum_(t<k) gamma^t r_t + gamma^k V(s_k), with V(s) = Q(s, a) and a sampled. Its gradient
+            in a_0 is the simulator's, not the critic's, which may be noise. With an action delay of d steps a_0 moves
+            nothing before step d + 1: take 1 + d or more. J_0 ends with its segment at the latest.
         delay_qvalue: whether the critics have target networks, updated with :class:`torchrl.objectives.SoftUpdate`.
         **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
 
     Raises:
-        ValueError: both returns are switched off, or an option has the wrong type or is out of its range.
+        ValueError: both returns are switched off.
     """
 
     @dataclass
@@ -54,7 +63,6 @@ class ABPTLoss(PathwiseCriticLoss):
 
         state_action_value: NestedKey = "state_action_value"
 
-    tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     critic_name = "qvalue_network"
     critic_loss_key = "loss_qvalue"
@@ -87,74 +95,53 @@ class ABPTLoss(PathwiseCriticLoss):
         self.n_step_return, self.zero_step_return = n_step_return, zero_step_return
         switched = {"n_step_return": n_step_return, "zero_step_return": zero_step_return}
         self.out_keys = [*self.out_keys, *(name for name, on in switched.items() if on)]
-        self.convert_to_functional(
-            qvalue_network,
-            "qvalue_network",
-            expand_dim=num_qvalue_nets,
-            create_target_params=delay_qvalue,
-        )
+        copies = {"expand_dim": num_qvalue_nets, "create_target_params": delay_qvalue}
+        self.convert_to_functional(qvalue_network, "qvalue_network", **copies)
 
     def loss_qvalue(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The critics' loss (paper, equation 16), summed over critics.
-
-        Args:
-            tensordict: a rollout (*, horizon), or samples (n) of one with its targets.
-
-        Returns:
-            the loss, and its metadata by name.
-        """
+        """The critics' loss (paper, equation 16), summed over critics, and its metadata; takes what SHAC's does."""
         return self._critic_loss(tensordict)
 
     def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """The terms whose sum is J: half of ``n_step_return`` and of ``zero_step_return``, or the whole of one alone.
-
-        Args:
-            tensordict: a rollout (*, horizon) that carries its graph.
-
-        Returns:
-            the terms by name, each (*,), with their graphs.
-        """
-        self._require_rollout(tensordict)
+        """The terms whose sum is J, each (*,): half ``n_step_return`` and half ``zero_step_return``, or one of them."""
+        self._check_rollout(tensordict)
         parts = {}
         if self.n_step_return:
-            parts["n_step_return"] = sum(super().objective_parts(tensordict).values())
+            parts["n_step_return"] = total(super().objective_parts(tensordict).values())
         if self.zero_step_return:
             parts["zero_step_return"] = self._zero_step_return(tensordict)
         return {name: part / len(parts) for name, part in parts.items()}
 
     def _objective(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         parts = self.objective_parts(tensordict)
-        return sum(parts.values()), {name: len(parts) * part.detach().mean() for name, part in parts.items()}
+        return total(parts.values()), {name: len(parts) * part.detach().mean() for name, part in parts.items()}
 
     def _zero_step_return(self, tensordict: TensorDictBase) -> Tensor:
         """Q(s_0, a_0) of each segment, or the return of its first ``simulated_steps``, summed over segments: (*)."""
         if self.simulated_steps:
-            reward = tensordict.get(("next", self.tensor_keys.reward))
-            self._require_graph(reward, ("next", self.tensor_keys.reward))
             is_first, last = self._simulated(tensordict)
-            rewards = (self._discounts(tensordict) * reward * is_first).sum((-2, -1))
+            rewards = (self._discounts(tensordict) * self._reward(tensordict) * is_first).sum((-2, -1))
             return rewards + self._discounted_value(tensordict, last)
-        action = tensordict.get(self.tensor_keys.action)
-        self._require_graph(action, self.tensor_keys.action)
-        start, _ = segments(tensordict.get(("next", self.tensor_keys.done)))
-        first = tensordict.select(*self.qvalue_network.in_keys)[start.squeeze(-1)]
+        self._check_graph(leaf(tensordict, self.tensor_keys.action), self.tensor_keys.action)
+        start, _ = segments(self._next(tensordict, "done"))
+        first = cast(TensorDictBase, tensordict.select(*self.qvalue_network.in_keys)[start.squeeze(-1)])
         value = self._critics(first).amin(0)
         return torch.zeros_like(start, dtype=value.dtype).masked_scatter(start, value).sum((-2, -1))
 
     def _simulated(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """The first ``simulated_steps`` of each segment, and the last of these, bool (*, horizon, 1)."""
-        done = tensordict.get(("next", self.tensor_keys.done))
+        done = self._next(tensordict, "done")
         index, (_, end) = step_in_segment(done), segments(done)
         is_first = index < self.simulated_steps
         return is_first, is_first & (end | (index == self.simulated_steps - 1))
 
-    def _require_rollout(self, tensordict: TensorDictBase) -> None:
+    def _check_rollout(self, tensordict: TensorDictBase) -> None:
         actor, key = self.actor_network, self.tensor_keys.action
         if key not in actor.out_keys:
             raise UserValueError(
                 f"ABPTLoss samples {key!r} of its actor_network, which writes {', '.join(map(str, actor.out_keys))}."
             )
-        super()._require_rollout(tensordict)
+        super()._check_rollout(tensordict)
 
     def _beside_actions(self, tensordict: TensorDictBase) -> Tensor | float:
         fixed, parts = tensordict.detach(), []
@@ -162,7 +149,7 @@ class ABPTLoss(PathwiseCriticLoss):
             parts.append(self._terminal_value(fixed))
         if self.zero_step_return and self.simulated_steps:
             parts.append(self._discounted_value(fixed, self._simulated(fixed)[1]))
-        return sum(parts) / (self.n_step_return + self.zero_step_return)
+        return total(parts) / (self.n_step_return + self.zero_step_return)
 
     def _value(self, tensordict: TensorDictBase, *, target: bool) -> Tensor:
         states = tensordict.select(*self._critic_inputs())

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.action_gradients import median_length
-from torchrl_quad.objectives.calls import refuse_fixed
+from torchrl_quad.objectives.calls import with_fixed
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Copies, Field, Horizon
 
@@ -23,19 +23,25 @@ class AHACLoss(SHACLoss):
 
     Where the dynamics are stiff the adjoint, the gradient of the objective in each action, grows backwards through the
     horizon. Its ``stiffness`` is the root mean square of the lengths of these gradients over all environments and
-    steps, in units of their median: 1 to 2 where all are alike, and large where a few explode. :meth:`adapt_horizon`
-    holds it at a bound by a Lagrange multiplier phi on a horizon of N steps:
+    steps, in units of their median: 1 to 2 if all are alike, and large if a few explode. :meth:`adapt_horizon` holds it
+    at a bound by a Lagrange multiplier phi on a horizon of N steps:
 
         phi <- phi + 0.2 (clip(stiffness / max_stiffness - 1, -1, 1) - phi),    N <- N exp(-horizon_lr phi)
 
     The least of two critics without target networks is the value at the end of the horizon, and that of their targets.
+    Georgiev et al. average over the horizon.
 
     .. code-block:: python
 
-        rollout, carry = differentiable_rollout(env, actor, carry, loss.horizon)
-        loss_actor, metadata = loss.loss_actor(rollout)
-        ...
-        loss.adapt_horizon(metadata["stiffness"])
+        from torchrl_quad import AHACLoss, HoveringEnv, differentiable_rollout, make_actor, make_value
+
+        env = HoveringEnv(num_envs=8)
+        actor = make_actor(env)
+        loss = AHACLoss(actor, make_value(env), horizon=16)
+        rollout, carry = differentiable_rollout(env, actor, None, loss.horizon)
+        losses = loss(rollout)
+        (losses["loss_actor"] + losses["loss_value"]).backward()
+        loss.adapt_horizon(losses["stiffness"])
 
     Args:
         actor_network: the policy that flew the rollout, as :func:`~torchrl_quad.make_actor` builds it.
@@ -43,18 +49,15 @@ class AHACLoss(SHACLoss):
         horizon: control steps of the first rollout.
         min_horizon: the shortest horizon; null for a quarter of the first.
         max_horizon: the longest horizon; null for twice the first.
-        max_stiffness: where the action gradients grow beyond it along a horizon, the horizon gets shorter; 1.5 to 5
-            are usual.
+        max_stiffness: the bound on the growth of action gradients along a horizon, beyond which it gets shorter; 1.5 to
+            5 are usual.
         horizon_lr: the share by which the horizon may change in an iteration.
-        num_value_nets: the critics made from ``value_network``, each initialised anew, whose smallest value counts.
-        terminal_gradient: whether the terminal value keeps its gradient in the state, as for :class:`SHACLoss`.
-        average_over_horizon: whether the objective is divided by the number of steps of the rollout, as Georgiev et
-            al. do.
-        **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
+        num_value_nets: the critics made from ``value_network``, each initialised independently.
+        **kwargs: ``terminal_gradient`` and ``average_over_horizon`` of :class:`SHACLoss`, and those of
+            :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
 
     Raises:
-        ValueError: the horizon is not between its bounds, an option has the wrong type or is out of its range, or the
-            policy is another one.
+        ValueError: the horizon is not between its bounds, or the policy writes no ``loc`` and ``scale``.
     """
 
     measured_of_actions = ["stiffness"]
@@ -70,25 +73,14 @@ class AHACLoss(SHACLoss):
         max_stiffness: Annotated[float, Field(gt=1, le=1e30)] = 2.0,
         horizon_lr: Below1 = 0.1,
         num_value_nets: Copies = 2,
-        terminal_gradient: bool = True,
-        average_over_horizon: bool = False,
         **kwargs: Any,
     ) -> None:
         low = max(horizon // 4, 1) if min_horizon is None else min_horizon
         high = 2 * horizon if max_horizon is None else max_horizon
         if not low <= horizon <= high:
             raise UserValueError(f"horizon={horizon} must lie between min_horizon={low} and max_horizon={high}.")
-        refuse_fixed(self, kwargs, ("target_bootstrap", "delay_value"))
-        super().__init__(
-            actor_network,
-            value_network,
-            num_value_nets=num_value_nets,
-            terminal_gradient=terminal_gradient,
-            average_over_horizon=average_over_horizon,
-            target_bootstrap=False,
-            delay_value=False,
-            **kwargs,
-        )
+        options = with_fixed(self, kwargs, target_bootstrap=False, delay_value=False)
+        super().__init__(actor_network, value_network, num_value_nets=num_value_nets, **options)
         if not {"loc", "scale"} <= set(self.actor_network.out_keys):
             raise UserValueError(
                 "AHACLoss needs a policy as make_actor builds it, which writes loc and scale; this one writes "
@@ -107,12 +99,11 @@ class AHACLoss(SHACLoss):
 
     @torch.no_grad()
     def adapt_horizon(self, stiffness: Tensor) -> None:
-        """Shorten the horizon where the stiffness is above its bound, and make it longer where it is below.
+        """Shorten the horizon if the stiffness is above its bound, and lengthen it if it is below.
 
         Args:
-            stiffness: as ``loss_actor`` measured it, a scalar. The mean of several processes keeps their horizons
-                alike. Infinity, where a gradient is not finite, shortens the
-                horizon; NaN, where no action had a gradient, changes nothing.
+            stiffness: as ``loss_actor`` measured it, a scalar; of several processes their mean. Infinity, which stands
+                for a gradient that is not finite, shortens the horizon; NaN, for no gradient at all, changes nothing.
         """
         if stiffness.isnan():
             return

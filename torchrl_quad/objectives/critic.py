@@ -10,10 +10,10 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.utils import ValueEstimators
 
+from torchrl_quad.data.unwrap import check_tensordict, group
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.objectives.calls import predict, require_tensordict, takes_rollout
+from torchrl_quad.objectives.calls import predict, segments, takes_rollout
 from torchrl_quad.objectives.pathwise import PathwiseLoss
-from torchrl_quad.objectives.segments import segments
 
 
 class PathwiseCriticLoss(PathwiseLoss):
@@ -28,7 +28,6 @@ class PathwiseCriticLoss(PathwiseLoss):
 
         value_target: NestedKey = "value_target"
 
-    tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     default_value_estimator = ValueEstimators.TDLambda
     supported_value_estimators = (ValueEstimators.TD0, ValueEstimators.TDLambda)
@@ -48,38 +47,28 @@ class PathwiseCriticLoss(PathwiseLoss):
         return TensorDict({**losses, **metadata, **critic_metadata}, [])
 
     def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """The terms whose sum is J: the discounted ``rewards`` of the segments, and their ``terminal_value``.
-
-        Args:
-            tensordict: a rollout (*, horizon) that carries its graph.
-
-        Returns:
-            the terms by name, each (*,), with their graphs.
-        """
+        """The terms whose sum is J, each (*,): discounted ``rewards`` of the segments, and their ``terminal_value``."""
         return {**super().objective_parts(tensordict), "terminal_value": self._terminal_value(tensordict)}
 
     def write_value_target(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the TD(lambda) target of each step (paper, equations 17 and 18) into a rollout, and return it.
 
         Each step's next value comes from the target network. A truncated step bootstraps, a terminated one does not,
-        and the horizon's last step bootstraps unless it terminated. The critic's loss uses the entry where it exists,
-        so that several critic steps share one set of targets, and computes it otherwise.
+        and the horizon's last step bootstraps unless it terminated. The critic's loss reads the targets if they are
+        there, so that several critic steps share them, and computes them otherwise.
 
         Args:
-            tensordict: a rollout (*, horizon); its graph is not needed.
-
-        Returns:
-            the same rollout, with the targets (*, horizon, 1) under the tensor key ``value_target``.
+            tensordict: a rollout (*, horizon); its graph is not needed. The targets (*, horizon, 1) are written under
+                the tensor key ``value_target``.
         """
-        self._require_rollout(tensordict)
+        self._check_rollout(tensordict)
         data = tensordict.detach()
         with torch.no_grad():
-            next_value = self._value(data.get("next"), target=True)
-            terminated = data.get(("next", self.tensor_keys.terminated))
-            next_value = torch.where(terminated, 0.0, next_value)  # also where the last state was not finite
+            next_value = self._value(group(data, "next"), target=True)
+            # A terminated state may not be finite, nor its value.
+            next_value = torch.where(self._next(data, "terminated"), 0.0, next_value)
             target = self.value_estimator.value_estimate(data, next_value=next_value)
-        tensordict.set(self.tensor_keys.value_target, target)
-        return tensordict
+        return tensordict.set(self.tensor_keys.value_target, target)
 
     def _critics(self, tensordict: TensorDictBase, *, target: bool = False, learning: bool = False) -> Tensor:
         """The prediction of each critic or of its target: (critics, *, 1).
@@ -102,7 +91,7 @@ class PathwiseCriticLoss(PathwiseLoss):
         return self._critics(tensordict, target=target).amin(0)
 
     def _critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        require_tensordict(type(self).__name__, tensordict)
+        check_tensordict(self._name, tensordict)
         key = self.tensor_keys.value_target
         missing = [name for name in getattr(self, self.critic_name).in_keys if name not in tensordict]
         if missing:
@@ -127,14 +116,14 @@ class PathwiseCriticLoss(PathwiseLoss):
 
     def _terminal_value(self, tensordict: TensorDictBase) -> Tensor:
         """gamma^n V(s_n) of each segment that did not terminate, summed over the segments: (*)."""
-        _, end = segments(tensordict.get(("next", self.tensor_keys.done)))
+        _, end = segments(self._next(tensordict, "done"))
         return self._discounted_value(tensordict, end)
 
     def _discounted_value(self, tensordict: TensorDictBase, after: Tensor) -> Tensor:
         """gamma^(t+1) V(s_(t+1)) after steps (*, horizon, 1), but for those that terminated, summed over steps: (*)."""
-        where = after & ~tensordict.get(("next", self.tensor_keys.terminated))
-        next_state = tensordict.get("next").select(*self._critic_inputs(), strict=False)[where.squeeze(-1)]
-        discount = self.value_estimator.gamma * self._discounts(tensordict)
+        where = after & ~self._next(tensordict, "terminated")
+        next_state = group(tensordict, "next").select(*self._critic_inputs(), strict=False)[where.squeeze(-1)]
+        discount = self._gamma * self._discounts(tensordict)
         if next_state.shape[0] == 0:  # a recurrent policy refuses an empty batch
             return torch.zeros_like(discount).sum((-2, -1))
         value = self._value(next_state, target=self.target_bootstrap)
@@ -146,14 +135,14 @@ class PathwiseCriticLoss(PathwiseLoss):
         names = set(actor.in_keys) - set(actor.out_keys) | set(getattr(self, self.critic_name).in_keys)
         return names - {self.tensor_keys.action}
 
-    def _require_rollout(self, tensordict: TensorDictBase) -> None:
+    def _check_rollout(self, tensordict: TensorDictBase) -> None:
         critic, key = getattr(self, self.critic_name), getattr(self.tensor_keys, self.prediction_key)
         if key not in critic.out_keys:
             raise UserValueError(
                 f"{type(self).__name__} reads {key!r} of its {self.critic_name}, which writes "
                 f"{', '.join(map(str, critic.out_keys))}. Give another network, or set_keys({self.prediction_key}=...)."
             )
-        super()._require_rollout(tensordict)
+        super()._check_rollout(tensordict)
 
     def _network_in_keys(self) -> set[NestedKey]:
         inputs = self._critic_inputs()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,45 +16,38 @@ from torch.distributions import Normal, kl_divergence
 from torch.distributions.transforms import TanhTransform
 from torchrl.objectives.utils import ValueEstimators
 
+from torchrl_quad.data.unwrap import check_tensordict, group, leaf
 from torchrl_quad.errors import UserValueError, WrongState
-from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again, location_gradient
-from torchrl_quad.objectives.calls import require_function, require_tensordict, takes_rollout
-from torchrl_quad.objectives.segments import discounts, segments
+from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again, plain_of
+from torchrl_quad.objectives.calls import check_function, discounts, segments, takes_rollout
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Coefficient, Field, Positive, Share
 
 
 class HybridLoss(SHACLoss):
-    r"""PPO with the derivative of the simulator as a control variate: each gradient where it is good.
+    r"""PPO with the derivative of the simulator as a control variate, as Q-Prop (Gu et al. 2017) has a critic's.
 
-    The simulator's derivative gives p_t, the gradient of an action's own lambda-return in the mean of that action.
-    The flight itself gives A_t, the advantage of the same action. If p_t is right, then A_t is p_t . (u_t - loc_t) plus
-    what does not depend on this action, where u_t is the action before the tanh. The loss therefore regresses A on
-    p . (u - loc). The slope is the ``pathwise_weight`` b: near 1 where the critic's advantage and the derivative agree.
-    Both read the same critic, so b does not show where that critic is wrong. It is a running mean over rollouts,
-    clamped to [0, 1]. The pathwise term of the loss is
-
-        - b mean_t p_t . loc(s_t)
-
-    and the clipped surrogate of PPO takes the rest of the advantage, A'_t = A_t - b p_t . (u_t - loc_t). What the
-    pathwise term adds in expectation is what the surrogate loses, whatever b is, as long as p_t does not depend on the
-    noise of its own step. This is the control variate of Q-Prop (Gu et al. 2017), with the derivative of a simulated
-    flight in place of a critic's.
-
-    With ``entropy_coeff`` the surrogate gets that multiple of the policy's entropy in each state, as PPO has it.
-
-    The lambda-return of p_t bootstraps with V at every step, and each p_t is not discounted from the start of the
-    horizon. With noise that is correlated in time, an action's noise goes on in later actions, and
-    p_t + c p_(t+1) + c^2 p_(t+2) + ... takes the place of p_t, as it does in A_t: c = rho gamma lambda,
-    with the lambda of the advantage.
+    p_t is the gradient of an action's own lambda-return in the mean of that action, by the simulator, and A_t the
+    advantage of the same action. If p_t is right, A_t is p_t . (u_t - loc_t) plus what does not depend on this action,
+    where u_t is the action before the tanh. The slope of A over p . (u - loc), a running mean over rollouts in [0, 1],
+    is the ``pathwise_weight`` b. It does not show errors of the critic, which both read. The pathwise term of the loss
+    is -b mean_t p_t . loc(s_t), and the clipped surrogate of PPO takes the rest of the advantage,
+    A'_t = A_t - b p_t . (u_t - loc_t). In expectation the two add up to the same for every b, as long as p_t does not
+    depend on the noise of its own step. p_t bootstraps with V at every step, and is not discounted from the start of
+    the horizon. With noise that is correlated in time p_t + c p_(t+1) + c^2 p_(t+2) + ... replaces p_t, with
+    c = rho gamma lambda of the advantage.
 
     One rollout serves several epochs of minibatches: :meth:`write_targets` reads the graph once.
 
     .. code-block:: python
 
-        rollout, carry = differentiable_rollout(env, actor, carry, 32)
-        data = loss.write_targets(rollout)
-        for batch in minibatches(data):
+        from torchrl_quad import HoveringEnv, HybridLoss, differentiable_rollout, make_actor, make_value
+
+        env = HoveringEnv(num_envs=8)
+        actor = make_actor(env)
+        loss = HybridLoss(actor, make_value(env))
+        rollout, carry = differentiable_rollout(env, actor, None, 16)
+        for batch in loss.write_targets(rollout).reshape(-1).split(32):  # several times, shuffled
             losses = loss(batch)
             (losses["loss_actor"] + losses["loss_value"]).backward()
 
@@ -72,29 +65,22 @@ class HybridLoss(SHACLoss):
         reduction: mean, sum or none, over samples.
 
     Raises:
-        ValueError: an option has the wrong type or is out of its range; (in use) as for every pathwise loss.
         NotImplementedError: (in use) the policy is another one than ``make_actor`` builds.
     """
 
     @dataclass
     class _AcceptedKeys(SHACLoss._AcceptedKeys):
-        """As for SHAC, and the keys under which :meth:`HybridLoss.write_targets` writes.
+        """As for SHAC, and the keys of what :meth:`HybridLoss.write_targets` writes.
 
-        ``advantage`` is A' and ``location_gradient`` b p, both divided by the standard deviation of A; ``latent`` is
-        the action before the tanh.
+        ``advantage`` is A' and ``location_gradient`` b p, both divided by the standard deviation of A; ``latent`` is u.
         """
 
         advantage: NestedKey = "advantage"
         location_gradient: NestedKey = "location_gradient"
         latent: NestedKey = "latent"
 
-    tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    out_keys = [
-        *("loss_actor", "loss_value", "pathwise_weight", "kl"),
-        *("pred_value", "target_value", "explained_variance"),
-    ]
-
+    out_keys = ["loss_actor", "loss_value", "pathwise_weight", "kl", "pred_value", "target_value", "explained_variance"]
     supported_value_estimators = (ValueEstimators.TDLambda,)
     pathwise_weight: Tensor
 
@@ -111,9 +97,14 @@ class HybridLoss(SHACLoss):
         average: Callable[[Tensor], Tensor] | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
-        require_function("average", average)
-        options = {"clip_action_gradient": clip_action_gradient, "reduction": reduction}
-        super().__init__(actor_network, value_network, delay_value=False, **options)
+        check_function("average", average)
+        super().__init__(
+            actor_network,
+            value_network,
+            delay_value=False,
+            clip_action_gradient=clip_action_gradient,
+            reduction=reduction,
+        )
         self.gradient_lmbda, self.clip_epsilon, self.entropy_coeff = gradient_lmbda, clip_epsilon, entropy_coeff
         self.decay, self.average = decay, average
         self.out_keys = [name for name in self.out_keys if name != "clipped"]  # minibatches clip no gradient
@@ -127,33 +118,27 @@ class HybridLoss(SHACLoss):
 
     @takes_rollout
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """The losses and their metadata, the ``out_keys``.
-
-        Args:
-            tensordict: samples (*) of what :meth:`write_targets` returned, or a rollout (*, horizon) with its graph.
-        """
+        """The losses and their metadata, the ``out_keys``, of samples (*) with targets or of a rollout (*, horizon)."""
         return super().forward(self._with_targets(tensordict))
 
     def write_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Differentiate a rollout (*, horizon), update the weight, and write what the minibatches read.
 
         Returns:
-            the rollout without its graph, and with ``advantage``, ``location_gradient``, ``latent`` and
-            ``value_target``, each under its tensor key.
+            the rollout without its graph, with ``advantage``, ``location_gradient``, ``latent`` and ``value_target``
+            under their tensor keys.
         """
-        self._require_rollout(tensordict)
+        self._check_rollout(tensordict)
         if not torch.is_grad_enabled():
             raise WrongState("write_targets differentiates the rollout: call it with gradients enabled.")
-        keys = self.tensor_keys
-        grad = self._own_gradient(tensordict)
+        keys, grad = self.tensor_keys, self._own_gradient(tensordict)
         data = self.write_value_target(tensordict.detach())
-        done, discount = data.get(("next", keys.done)), self.value_estimator.gamma * self.value_estimator.lmbda
-        grad, latent = location_gradient(self.actor_network, self.actor_network_params, data, grad, done, discount)
+        grad, latent = self._in_location(data, grad)
         with torch.no_grad():
-            advantage = data.get(keys.value_target) - self._value(data, target=False)
+            advantage = leaf(data, keys.value_target) - self._value(data, target=False)
             deviation = advantage.std().clamp_min(1e-12)
             advantage, grad = (advantage - advantage.mean()) / deviation, grad / deviation
-            predicted = (grad * (latent - data.get("loc"))).sum(-1, keepdim=True)
+            predicted = (grad * (latent - leaf(data, "loc"))).sum(-1, keepdim=True)
             weight = self._regress(advantage, predicted)
         data.set(keys.advantage, advantage - weight * (predicted - predicted.mean()))
         data.set(keys.location_gradient, weight * grad)
@@ -161,28 +146,27 @@ class HybridLoss(SHACLoss):
         return data
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The actor's loss, and its metadata: the weight, KL(policy that flew || policy), and the entropy if it counts.
-
-        Args:
-            tensordict: as for :meth:`forward`.
-        """
+        """The actor's loss of what :meth:`forward` takes, and the weight, KL(policy that flew || policy), entropy."""
         keys, tensordict = self.tensor_keys, self._with_targets(tensordict)
-        new, old = self._distributions(tensordict)
-        advantage = tensordict.get(keys.advantage)
-        ratio = self._ratio(new, old, tensordict)
+        new = Normal(*distribution_again(self.actor_network, self.actor_network_params, tensordict))
+        old = Normal(leaf(tensordict, "loc"), leaf(tensordict, "scale"))
+        advantage, latent = leaf(tensordict, keys.advantage), leaf(tensordict, keys.latent)
+        ratio = (new.log_prob(latent) - old.log_prob(latent)).sum(-1, keepdim=True).exp()
         clipped = ratio.clamp(1.0 - self.clip_epsilon, 1.0 + self.clip_epsilon)
         score = torch.minimum(ratio * advantage, clipped * advantage).squeeze(-1)
-        pathwise = (tensordict.get(keys.location_gradient) * (new.loc - old.loc)).sum(-1)
+        pathwise = (leaf(tensordict, keys.location_gradient) * (new.loc - old.loc)).sum(-1)
         kl = kl_divergence(old, new).sum(-1).mean().detach()
         objective, metadata = score + pathwise, {"pathwise_weight": self.pathwise_weight.clamp(0.0, 1.0), "kl": kl}
         if self.entropy_coeff:
-            entropy = self._policy_entropy(new)
+            # Of tanh(u), which has no closed form: estimated by one u in each state.
+            jacobian = TanhTransform().log_abs_det_jacobian(new.rsample(), None)
+            entropy = (new.entropy() + jacobian).sum(-1)
             objective = objective + self.entropy_coeff * entropy
             metadata["entropy"] = entropy.detach().mean()
         return self._reduce_loss(-objective), metadata
 
     def _with_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
-        require_tensordict(type(self).__name__, tensordict)
+        check_tensordict(self._name, tensordict)
         keys = self.tensor_keys
         lost = [key for key in (keys.advantage, keys.location_gradient, keys.latent) if key not in tensordict]
         if lost and not {keys.location_gradient, keys.latent} <= set(lost):  # an advantage alone is somebody else's
@@ -194,24 +178,41 @@ class HybridLoss(SHACLoss):
 
     def _own_gradient(self, tensordict: TensorDictBase) -> Tensor:
         """The gradient of each action's own lambda-return in that action: (*, horizon, k)."""
-        keys, estimator = self.tensor_keys, self.value_estimator
-        done, terminated = (tensordict.get(("next", key)) for key in (keys.done, keys.terminated))
-        reward = tensordict.get(("next", keys.reward))
-        self._require_graph(reward, ("next", keys.reward))
-        gamma = estimator.gamma.to(reward.dtype)
-        self._require_precision(gamma.item() * self.gradient_lmbda, reward)
-        goes_on = tensordict.get("next").select(*self._critic_inputs())[~terminated.squeeze(-1)]
-        value = self._value(goes_on, target=False).to(reward.dtype)
+        reward, terminated = self._reward(tensordict), self._next(tensordict, "terminated")
+        gamma = self._gamma.to(reward.dtype)
+        self._check_horizon(gamma.item() * self.gradient_lmbda, reward)
+        goes_on = group(tensordict, "next").select(*self._critic_inputs())[~terminated.squeeze(-1)]
+        value = self._value(cast(TensorDictBase, goes_on), target=False).to(reward.dtype)
+        done = self._next(tensordict, "done")
         _, end = segments(done)
         bootstrap = torch.where(end, 1.0, 1.0 - self.gradient_lmbda).to(reward.dtype)
         bootstrap = bootstrap * torch.zeros_like(reward).masked_scatter(~terminated, value)
         discount = discounts(done, gamma * self.gradient_lmbda)
         objective = (discount * (reward + gamma * bootstrap)).sum()
-        grad = action_gradient(objective, tensordict.get(keys.action)) / discount
+        grad = action_gradient(objective, leaf(tensordict, self.tensor_keys.action)) / discount
         return grad if self.clip is None else self.clip(grad)[0]
 
-    def _require_precision(self, discount: float, reward: Tensor) -> None:
-        """Refuse a horizon at whose end the discount is too small to divide by."""
+    def _in_location(self, data: TensorDictBase, grad: Tensor) -> tuple[Tensor, Tensor]:
+        """The gradient in the mean before the tanh, from that in the action, and the action before the tanh."""
+        with self.actor_network_params.to_module(self.actor_network):
+            plain = plain_of(self.actor_network)
+            xi = plain.drawn_again(data)[:, : plain.size].view_as(grad)
+            scale = leaf(data, "scale").detach()
+            loc = leaf(data, "loc").detach().requires_grad_()
+            with torch.enable_grad():
+                (grad,) = torch.autograd.grad((plain.action(loc, scale, xi) * grad).sum(), loc)
+        if plain.rho is not None:
+            # Noise goes on in later actions of the episode: the gradient is that in its new part, divided by the scale.
+            decay = plain.rho * (self._gamma * cast(Tensor, self.value_estimator.lmbda))
+            in_noise, steps, done = torch.zeros_like(grad[..., 0, :]), [], self._next(data, "done")
+            for g, s, end in zip(*(x.unbind(-2)[::-1] for x in (grad, scale, done)), strict=True):
+                in_noise = g * s + decay * torch.where(end, 0.0, in_noise)
+                steps.append(in_noise / s)
+            grad = torch.stack(steps[::-1], -2)
+        return grad, (loc + scale * xi).detach()
+
+    def _check_horizon(self, discount: float, reward: Tensor) -> None:
+        """Raise a UserValueError for a horizon at whose end the discount is too small to divide by."""
         least = 1e6 * torch.finfo(reward.dtype).tiny
         longest = 1 + int(math.log(least) / math.log(discount)) if 0 < discount < 1 else 1
         if discount < 1 and reward.shape[-2] > longest:
@@ -223,8 +224,8 @@ class HybridLoss(SHACLoss):
     def _regress(self, advantage: Tensor, predicted: Tensor) -> Tensor:
         """Update the weight with the slope of the advantages over what was predicted, each (*, horizon, 1).
 
-        Both are centred in each step of the horizon, and over the steps of a single flight: before the critic knows
-        anything, an advantage says first of all how many steps are left.
+        Both are centred in each step of the horizon, since an advantage depends on the steps that are left as long as
+        the critic knows little; those of a single flight over its steps.
         """
         batch = tuple(i for i, size in enumerate(advantage.shape[:-2]) if size > 1) or (-2,)
         advantage, predicted = (x - x.mean(batch, keepdim=True) for x in (advantage, predicted))
@@ -236,19 +237,3 @@ class HybridLoss(SHACLoss):
         slope = torch.where(slope.isfinite(), slope, running)
         running.copy_(torch.where(running.isnan(), slope, torch.lerp(slope, running, self.decay)))
         return running.nan_to_num(0.0).clamp(0.0, 1.0)
-
-    def _distributions(self, tensordict: TensorDictBase) -> tuple[Normal, Normal]:
-        """The normal distribution of the policy as it is, and as it flew."""
-        new = distribution_again(self.actor_network, self.actor_network_params, tensordict)
-        old = tensordict.get("loc"), tensordict.get("scale")
-        return Normal(*new), Normal(*old)
-
-    def _policy_entropy(self, policy: Normal) -> Tensor:
-        """The entropy of tanh(u), estimated by one u of a policy in each state: (*)."""
-        latent = policy.rsample()
-        return (policy.entropy() + TanhTransform().log_abs_det_jacobian(latent, None)).sum(-1)
-
-    def _ratio(self, new: Normal, old: Normal, tensordict: TensorDictBase) -> Tensor:
-        """The ratio of the probabilities of the action that was flown: (*, 1)."""
-        latent = tensordict.get(self.tensor_keys.latent)
-        return (new.log_prob(latent) - old.log_prob(latent)).sum(-1, keepdim=True).exp()

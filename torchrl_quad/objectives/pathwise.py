@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -15,10 +15,10 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import ValueEstimators, default_value_kwargs, dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_quad.data.unwrap import check_tensordict, leaf
 from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, WrongState, shown
 from torchrl_quad.objectives.action_gradients import MedianClip, act_again, action_gradient
-from torchrl_quad.objectives.calls import require_tensordict, takes_rollout
-from torchrl_quad.objectives.segments import discounts
+from torchrl_quad.objectives.calls import discounts, takes_rollout, total
 from torchrl_quad.options import Coefficient, Device, Entry, Fraction, Positive, Scale, between, check_value, checked
 
 MOST_WEIGHTS = 100_000_000  # of all copies of a critic; more fit into no memory that trains on a horizon
@@ -29,23 +29,21 @@ class PathwiseLoss(LossModule):
     """Base of the losses that differentiate the return of a rollout through the environment's own dynamics.
 
     A rollout is a tensordict of batch size (*, horizon) that still carries its graph. An episode that ends inside the
-    horizon splits it into segments. Each segment has its own discounted return, which starts at discount 1. The
-    objective J of a rollout sums over its segments, and the loss is -J, averaged over environments.
-
-    ``make_value_estimator(gamma=...)`` sets the discount, 0.99 without it.
+    horizon splits it into segments, whose discounts start at 1. The objective J of a rollout sums over its segments,
+    and the loss is -J, averaged over environments. ``make_value_estimator(gamma=...)`` sets the discount, 0.99 by
+    default.
 
     Args:
         actor_network: the policy that flew the rollout.
         alpha: the coefficient of the entropy bonus: a number, 0 for none, or auto to hold the entropy at its target.
-            The bonus is alpha * mean over the steps of -log pi(a|s). It needs the log-probability in the
-            rollout (an actor built with ``return_log_prob=True``), since a tanh-Gaussian has no closed entropy. "auto"
-            suits noise that is learned: with a fixed one the entropy may never reach its target, and alpha only grows.
+            The bonus is alpha * mean over the steps of -log pi(a|s), from the log-probability in the rollout (an actor
+            built with ``return_log_prob=True``). "auto" suits learned noise: with a fixed one the entropy may never
+            reach its target, and alpha keeps growing.
         target_entropy: where alpha=auto holds the entropy: a number, or auto for minus the number of action entries.
         alpha_init: what alpha=auto starts from.
         clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for no
-            bound. That of each single action, of one drone in one step, is shortened before the policy learns from it:
-            1 to 5 keep tumbling drones from outweighing all others. Needs a policy of ``make_actor``. An entropy bonus
-            then counts at fixed states.
+            bound. 1 to 5 keep tumbling drones from outweighing all others. Needs a policy of ``make_actor``. An entropy
+            bonus then counts at fixed states.
         reduction: mean or sum over environments (over samples for a critic), or none.
 
     Raises:
@@ -56,7 +54,7 @@ class PathwiseLoss(LossModule):
     """
 
     @dataclass
-    class _AcceptedKeys:
+    class _AcceptedKeys:  # pyrefly: ignore[bad-override]  # as in every loss of TorchRL
         """The tensordict keys that ``set_keys`` can change; reward, done and terminated are read under "next"."""
 
         action: NestedKey = "action"
@@ -70,7 +68,7 @@ class PathwiseLoss(LossModule):
                 aggregated = composite_lp_aggregate(nowarn=True)
                 self.sample_log_prob = "sample_log_prob" if aggregated else "action_log_prob"
 
-    tensor_keys: _AcceptedKeys
+    tensor_keys: Any  # each loss has its own
     default_keys = _AcceptedKeys
     # Only its discount is used here: a return over the whole segment is the TD(1) return.
     default_value_estimator = ValueEstimators.TD1
@@ -103,7 +101,6 @@ class PathwiseLoss(LossModule):
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
         super().__init__()
-        self._in_keys = None
         self.reduction = reduction
         self.convert_to_functional(actor_network, "actor_network")
         number = {"device": self._default_device, "dtype": self._precision}
@@ -120,7 +117,7 @@ class PathwiseLoss(LossModule):
         self.out_keys = [*self.out_keys, *self.measured_of_actions, *of_entropy]
 
     def convert_to_functional(self, module: TensorDictModule, module_name: str, *args: Any, **kwargs: Any) -> None:
-        """As TorchRL's, and refuse anything but a TensorDictModule, or so many copies that they fit into no memory."""
+        """As TorchRL's, for a TensorDictModule alone, and no more copies than fit into memory."""
         if not isinstance(module, TensorDictModuleBase):
             raise UserTypeError(
                 f"{module_name} must be a TensorDictModule, got {type(module).__name__}. Wrap a plain module: "
@@ -138,27 +135,21 @@ class PathwiseLoss(LossModule):
     # -- keys and parameters -------------------------------------------------------------------------------------------
 
     @property
-    def in_keys(self) -> list[NestedKey]:
+    def in_keys(self) -> list[NestedKey]:  # pyrefly: ignore[bad-override-param-name]  # of a setter of TorchRL's
         """The keys of a rollout that :meth:`forward` reads; others do no harm."""
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            names = {keys.action, *self._network_in_keys()}
-            names |= {("next", key) for key in (keys.reward, keys.done, keys.terminated)}
-            if self.has_entropy_bonus:
-                names.add(keys.sample_log_prob)
-            if self.measured_of_actions:
-                names |= {"loc", "scale", *(set(self.actor_network.out_keys) & {"noise", "noise_before"})}
-            self._in_keys = sorted((unravel_key(name) for name in names), key=str)
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+        keys = self.tensor_keys
+        names = {keys.action, *self._network_in_keys()}
+        names |= {("next", key) for key in (keys.reward, keys.done, keys.terminated)}
+        if self.has_entropy_bonus:
+            names.add(keys.sample_log_prob)
+        if self.measured_of_actions:
+            names |= {"loc", "scale", *(set(self.actor_network.out_keys) & {"noise", "noise_before"})}
+        return sorted((unravel_key(name) for name in names), key=str)
 
     @property
     def alpha(self) -> Tensor:
         """The present entropy coefficient, without gradient."""
-        return self.log_alpha.detach().exp() if self.automatic_alpha else self.fixed_alpha
+        return self.log_alpha.detach().exp() if self.automatic_alpha else cast(Tensor, self.fixed_alpha)
 
     @property
     def _precision(self) -> torch.dtype:
@@ -178,37 +169,30 @@ class PathwiseLoss(LossModule):
         vectorized: bool | None = None,
         device: Device | None = None,
         **more: Any,
-    ) -> PathwiseLoss:
+    ) -> Self:
         """Choose the return estimator and its parameters.
 
-        TD(lambda) runs in its loop form. The vectorised one is wrong under torch.compile, and slower on many
+        TD(lambda) runs in its loop form: the vectorised one is wrong under torch.compile, and slower on many
         environments (torchrl 0.14).
 
         Args:
             value_type: one of ``supported_value_estimators``, or an estimator of TorchRL; by default that of the loss.
             gamma: the discount of future rewards per control step; 0.99 is usual.
             lmbda: the lambda of the TD(lambda) targets; 0.95 is usual.
-            average_rewards: as for TorchRL's estimator.
-            differentiable: as there.
-            vectorized: as there, of TD(lambda).
-            device: as there.
-            **more: what an estimator of TorchRL takes that is given as a class.
-
-        Returns:
-            the loss itself.
+            average_rewards, differentiable, vectorized, device: as for TorchRL's estimator.
+            **more: of an estimator that is given as a class.
 
         Raises:
             NotImplementedError: the loss does not support the estimator.
-            ValueError: gamma or lmbda is not in [0, 1].
-            TypeError: the estimator takes no such argument, as those of one step and of whole returns take no lambda.
+            TypeError: the estimator takes no such argument; only TD(lambda) takes a lambda.
         """
         value_type = self.default_value_estimator if value_type is None else value_type
         options = {"gamma": gamma, "lmbda": lmbda, "average_rewards": average_rewards, "device": device}
         options |= {"differentiable": differentiable, "vectorized": vectorized}
-        given = {name: x for name, x in options.items() if x is not None}
+        given: dict[str, Any] = {name: x for name, x in options.items() if x is not None}
         is_class = isinstance(value_type, type) and issubclass(value_type, ValueEstimatorBase)
         if is_class or isinstance(value_type, ValueEstimatorBase):
-            return super().make_value_estimator(value_type, **given, **more)
+            return super().make_value_estimator(cast(Any, value_type), **given, **more)
         supported = {x.name.lower(): x for x in self.supported_value_estimators}
         chosen = supported.get(value_type.lower()) if isinstance(value_type, str) else value_type
         if not isinstance(chosen, ValueEstimators) or chosen not in self.supported_value_estimators:
@@ -216,14 +200,15 @@ class PathwiseLoss(LossModule):
                 f"{shown(value_type)} is not implemented for loss {type(self).__name__}. Choose from: "
                 f"{', '.join(supported)}."
             )
-        has_lambda = chosen is ValueEstimators.TDLambda
-        if unknown := {*more, *(set() if has_lambda else {"lmbda", "vectorized"} & set(given))}:
-            known = sorted(set(options) - (set() if has_lambda else {"lmbda", "vectorized"}))
+        of_lambda = {"lmbda", "vectorized"}
+        known = set(options) if chosen is ValueEstimators.TDLambda else set(options) - of_lambda
+        if unknown := {*more, *given} - known:
             raise UserTypeError(
                 f"{type(self).__name__} estimates its returns by {chosen.name}, which takes no {min(unknown)!r}. "
-                f"Choose from: {', '.join(known)}."
+                f"Choose from: {', '.join(sorted(known))}."
             )
-        given = {"vectorized": False} | given if has_lambda else given
+        if chosen is ValueEstimators.TDLambda:
+            given = {"vectorized": False, **given}
         estimator = dispatch_value_estimator(
             self, chosen, supported=self.supported_value_estimators, value_network=None, **given
         )
@@ -243,11 +228,7 @@ class PathwiseLoss(LossModule):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def set_keys(self, **keys: NestedKey | None) -> None:
-        """Read entries of a rollout under other names; None means the name that TorchRL uses.
-
-        Raises:
-            ValueError: the loss reads no such entry, or a name is not a string or a tuple of strings.
-        """
+        """Read entries of a rollout under other names; None means the name that TorchRL uses."""
         known = vars(self.tensor_keys)
         for name, key in keys.items():
             if name not in known:
@@ -256,7 +237,6 @@ class PathwiseLoss(LossModule):
         super().set_keys(**keys)
 
     def _forward_value_estimator_keys(self, **_: Any) -> None:
-        self._in_keys = None
         if self._value_estimator is not None:
             keys = self.tensor_keys
             self._value_estimator.set_keys(reward=keys.reward, done=keys.done, terminated=keys.terminated)
@@ -273,22 +253,16 @@ class PathwiseLoss(LossModule):
         return TensorDict({"loss_actor": loss, **metadata}, [])
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The actor's loss: -J of the rollout minus the entropy bonus, reduced over environments.
-
-        Args:
-            tensordict: a rollout (*, horizon) that carries its graph.
-
-        Returns:
-            the loss, and its metadata by name; with an automatic alpha this includes ``loss_alpha``.
-        """
+        """The actor's loss of a rollout (*, horizon) with its graph, -J minus the entropy bonus, and its metadata."""
         objective, metadata = self._objective(tensordict)
         if self.measured_of_actions and not torch.is_grad_enabled():
             metadata |= dict.fromkeys(self.measured_of_actions, torch.full_like(self.alpha, math.nan))
         elif self.measured_of_actions:
-            action = tensordict.get(self.tensor_keys.action)
+            action = leaf(tensordict, self.tensor_keys.action)
             grad, measured = self._measure(action_gradient(objective.sum(), action))
             written = act_again(self.actor_network, self.actor_network_params, tensordict)
             learned = (grad * written[self.tensor_keys.action]).sum((-2, -1)) + self._beside_actions(tensordict)
+            # The value is J's; the gradient that of ``learned``.
             objective = objective.detach() + learned - learned.detach()
             tensordict, metadata = tensordict.copy().update(written), metadata | measured
         if self.has_entropy_bonus:
@@ -301,32 +275,41 @@ class PathwiseLoss(LossModule):
         return self._reduce_loss(-objective), metadata
 
     def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """The terms whose sum is J: ``rewards``, those of each segment, discounted. The entropy bonus is not part of J.
-
-        Args:
-            tensordict: a rollout (*, horizon) that carries its graph.
-
-        Returns:
-            the terms by name, each (*,), with their graphs.
-        """
-        self._require_rollout(tensordict)
-        reward = tensordict.get(("next", self.tensor_keys.reward))
-        self._require_graph(reward, ("next", self.tensor_keys.reward))
-        return {"rewards": (self._discounts(tensordict) * reward).sum((-2, -1))}
+        """The terms whose sum is J, without the entropy bonus, each (*,) with its graph: the discounted ``rewards``."""
+        self._check_rollout(tensordict)
+        return {"rewards": (self._discounts(tensordict) * self._reward(tensordict)).sum((-2, -1))}
 
     def _objective(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """J of each environment, (*), and its metadata."""
-        objective = sum(self.objective_parts(tensordict).values())
+        objective = total(self.objective_parts(tensordict).values())
         return objective, {"n_step_return": objective.detach().mean()}
 
     def _beside_actions(self, tensordict: TensorDictBase) -> Tensor | float:
-        """What of J depends on the policy beside the actions that were flown, at fixed states: (*)."""
+        """What of J depends on the policy at fixed states, apart from the actions that were flown: (*)."""
         return 0.0
+
+    def _next(self, tensordict: TensorDictBase, name: str) -> Tensor:
+        """The reward, done or terminated of each step: (*, horizon, 1)."""
+        return leaf(tensordict, ("next", getattr(self.tensor_keys, name)))
+
+    def _reward(self, tensordict: TensorDictBase) -> Tensor:
+        """The reward of each step, which has to have a gradient."""
+        reward = self._next(tensordict, "reward")
+        self._check_graph(reward, ("next", self.tensor_keys.reward))
+        return reward
+
+    @property
+    def _name(self) -> str:
+        return str(type(self).__name__)
+
+    @property
+    def _gamma(self) -> Tensor:
+        return cast(Tensor, self.value_estimator.gamma)
 
     def _discounts(self, tensordict: TensorDictBase) -> Tensor:
         """The discount of each step in its segment: (*, horizon, 1)."""
-        gamma = self.value_estimator.gamma.to(tensordict.get(("next", self.tensor_keys.reward)).dtype)
-        return discounts(tensordict.get(("next", self.tensor_keys.done)), gamma)
+        gamma = self._gamma.to(self._next(tensordict, "reward").dtype)
+        return discounts(self._next(tensordict, "done"), gamma)
 
     def _measure(self, grad: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """From the gradients in the actions (*, horizon, k) those to learn from, and what is measured of them."""
@@ -354,12 +337,12 @@ class PathwiseLoss(LossModule):
 
     def _target_entropy(self, tensordict: TensorDictBase) -> float:
         if self.target_entropy == "auto":
-            return -float(tensordict.get(self.tensor_keys.action).shape[-1])
+            return -float(leaf(tensordict, self.tensor_keys.action).shape[-1])
         return float(self.target_entropy)
 
-    def _require_rollout(self, tensordict: TensorDictBase) -> None:
-        name = type(self).__name__
-        require_tensordict(name, tensordict)
+    def _check_rollout(self, tensordict: TensorDictBase) -> None:
+        name = self._name
+        check_tensordict(name, tensordict)
         shape = tuple(tensordict.batch_size)
         names = tensordict.names
         # Only the names of its dimensions distinguish a single flight from a batch of single steps.
@@ -382,17 +365,17 @@ class PathwiseLoss(LossModule):
             )
         for what in ("reward", "done", "terminated"):
             key = ("next", getattr(self.tensor_keys, what))
-            entry = tensordict.get(key)
+            entry = leaf(tensordict, key)
             if (got := tuple(entry.shape)) != (*shape, 1):
                 raise UserValueError(f"{name} needs {key!r} of shape {(*shape, 1)} in this rollout; got {got}.")
             if not (entry.is_floating_point() if what == "reward" else entry.dtype == torch.bool):
                 kind = "floating-point numbers" if what == "reward" else "bool"
                 raise UserValueError(f"{name} needs {key!r} as {kind}; got {entry.dtype}.")
-        device, own = tensordict.get(("next", self.tensor_keys.reward)).device, self._default_device
+        device, own = self._next(tensordict, "reward").device, self._default_device
         if own not in (None, device):
             raise UserValueError(f"{name} is on {own}, and the rollout on {device}: loss.to({str(device)!r}) moves it.")
 
-    def _require_graph(self, value: Tensor, key: NestedKey) -> None:
+    def _check_graph(self, value: Tensor, key: NestedKey) -> None:
         if torch.is_grad_enabled() and not value.requires_grad:
             raise WrongState(
                 f"{type(self).__name__} differentiates through the rollout, but {key!r} carries no gradient. "

@@ -8,7 +8,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from torchrl_quad.objectives.calls import refuse_fixed
+from torchrl_quad.data.unwrap import leaf
+from torchrl_quad.objectives.calls import with_fixed
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Copies, Scale, between
 
@@ -16,28 +17,33 @@ from torchrl_quad.options import Copies, Scale, between
 class SAPOLoss(SHACLoss):
     """Soft analytic policy optimization (Xing et al. 2025, arXiv:2412.12089): short-horizon actor-critic with entropy.
 
-    The objective of a segment is sum_t gamma^t (r_t + alpha H_t) + gamma^n V(s_n). The critics learn the same soft
-    return, so that the entropy counts beyond the horizon, too. H_t = (h_t + |h*|) / (2 |h*|) measures the entropy
-    h_t = -log pi(a_t|s_t) against its target h* < 0: it is 0 at h*, and 1 at -h*, whatever the size of the action.
+    The objective of a segment is sum_t gamma^t (r_t + alpha H_t) + gamma^n V(s_n), and the critics learn the same soft
+    return. H_t = (h_t + |h*|) / (2 |h*|) measures the entropy h_t = -log pi(a_t|s_t) against its target h* < 0: it is 0
+    at h*, and 1 at -h*, for any number of action entries. The critics have no target networks. Their targets take the
+    least of them, and the actor climbs their mean. Xing et al. average over the horizon.
 
-    The critics have no target networks. Their targets take the least of them, and the actor climbs their mean.
+    .. code-block:: python
+
+        from torchrl_quad import HoveringEnv, SAPOLoss, differentiable_rollout, make_actor, make_value
+
+        env = HoveringEnv(num_envs=8)
+        actor = make_actor(env, return_log_prob=True)
+        loss = SAPOLoss(actor, make_value(env))
+        rollout, carry = differentiable_rollout(env, actor, None, 16)
+        losses = loss(rollout)
+        (losses["loss_actor"] + losses["loss_value"] + losses["loss_alpha"]).backward()
 
     Args:
         actor_network: the policy that flew the rollout, with log-probabilities (``return_log_prob=True``).
         value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
-        num_value_nets: the critics made from it, each initialised anew.
+        num_value_nets: the critics made from it, each initialised independently.
         alpha: the coefficient of the entropy: a positive number, or auto to hold the entropy at its target; without
             entropy take SHACLoss.
         alpha_init: what alpha=auto starts from.
         target_entropy: where alpha=auto holds the entropy: a negative number, or auto for minus half the number of
             action entries. The entropy is measured in its size.
-        terminal_gradient: whether the terminal value keeps its gradient in the state, as for :class:`SHACLoss`.
-        average_over_horizon: whether the objective is divided by the number of steps of the rollout, as Xing et al.
-            do.
-        **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
-
-    Raises:
-        ValueError: an option has the wrong type or is out of its range.
+        **kwargs: ``terminal_gradient`` and ``average_over_horizon`` of :class:`SHACLoss`, and those of
+            :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
     """
 
     def __init__(
@@ -49,35 +55,19 @@ class SAPOLoss(SHACLoss):
         alpha: Scale | Literal["auto"] = "auto",
         alpha_init: Scale = 1.0,
         target_entropy: Annotated[float, between(-1e6, -1e-3)] | Literal["auto"] = "auto",
-        terminal_gradient: bool = True,
-        average_over_horizon: bool = False,
         **kwargs: Any,
     ) -> None:
-        refuse_fixed(self, kwargs, ("target_bootstrap", "delay_value"))
-        super().__init__(
-            actor_network,
-            value_network,
-            num_value_nets=num_value_nets,
-            alpha=alpha,
-            alpha_init=alpha_init,
-            target_entropy=target_entropy,
-            terminal_gradient=terminal_gradient,
-            average_over_horizon=average_over_horizon,
-            target_bootstrap=False,
-            delay_value=False,
-            **kwargs,
-        )
+        own: dict[str, Any] = {"alpha": alpha, "alpha_init": alpha_init, "target_entropy": target_entropy}
+        own |= with_fixed(self, kwargs, target_bootstrap=False, delay_value=False)
+        super().__init__(actor_network, value_network, num_value_nets=num_value_nets, **own)
 
     def write_value_target(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the TD(lambda) target of each step's soft return into a rollout, and return it.
-
-        As :meth:`PathwiseCriticLoss.write_value_target`, with the reward r_t + alpha H_t.
-        """
-        self._require_rollout(tensordict)
+        """As :meth:`PathwiseCriticLoss.write_value_target`, with the soft reward r_t + alpha H_t."""
+        self._check_rollout(tensordict)
         soft, key = tensordict.detach(), ("next", self.tensor_keys.reward)
-        soft.set(key, soft.get(key) + self.alpha * self._normalized_entropy(soft))
-        target = super().write_value_target(soft).get(self.tensor_keys.value_target)
-        return tensordict.set(self.tensor_keys.value_target, target)
+        soft.set(key, leaf(soft, key) + self.alpha * self._normalized_entropy(soft))
+        target = self.tensor_keys.value_target
+        return tensordict.set(target, leaf(super().write_value_target(soft), target))
 
     def _entropy_bonus(self, tensordict: TensorDictBase) -> Tensor:
         """Alpha times the normalised entropy of each step, discounted as its reward is: (*)."""

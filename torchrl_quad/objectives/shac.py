@@ -19,24 +19,30 @@ class SHACLoss(PathwiseCriticLoss):
     """Short-horizon actor-critic (Xu et al. 2022, arXiv:2204.07137).
 
     The objective of a segment is its discounted rewards plus gamma^n V(s_n). The terminal value keeps its gradient in
-    the state and has none in the critic. The critic regresses to TD(lambda) targets of a target network.
+    the state and has none in the critic, which regresses to TD(lambda) targets of a target network. Xu et al. take V
+    from the target critic and divide by the number of steps: ``target_bootstrap=True, average_over_horizon=True``.
 
-    By default it deviates from Xu et al. in two ways: V is the critic itself, and the objective is a sum over steps.
-    Theirs takes V from the target critic and divides by the number of steps; for theirs write
-    ``SHACLoss(actor, value, target_bootstrap=True, average_over_horizon=True)``.
+    .. code-block:: python
+
+        from torchrl_quad import HoveringEnv, SHACLoss, differentiable_rollout, make_actor, make_value
+
+        env = HoveringEnv(num_envs=8)
+        actor = make_actor(env)
+        loss = SHACLoss(actor, make_value(env))
+        rollout, carry = differentiable_rollout(env, actor, None, 16)
+        losses = loss(rollout)
+        (losses["loss_actor"] + losses["loss_value"]).backward()
 
     Args:
         actor_network: the policy that flew the rollout.
         value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
         terminal_gradient: whether the terminal value keeps its gradient in the state. False cuts it, as the code
-            published with the paper does. The actor then climbs the rewards of the horizon alone, as with BPTT.
-        target_bootstrap: whether the terminal value is the target critic's, as with Xu et al. False takes it from the
-            critic itself; with ``delay_value=False`` the two are one.
-        average_over_horizon: whether the objective is divided by the number of steps of the rollout, as Xu et al. do.
-            The entropy
-            bonus is a mean over steps either way.
-        num_value_nets: the critics made from it, each initialised anew, whose smallest value counts; 1 takes it as it
-            is.
+            published with the paper does: the actor then climbs the rewards of the horizon alone, as with BPTT.
+        target_bootstrap: whether the terminal value is the target critic's. False takes it from the critic itself.
+        average_over_horizon: whether the objective is divided by the number of steps of the rollout. The entropy bonus
+            is a mean over steps either way.
+        num_value_nets: the critics made from ``value_network``, whose smallest value counts. Several are each
+            initialised independently; a single one is taken as it is.
         delay_value: whether the critic has a target network, to be updated with :class:`torchrl.objectives.SoftUpdate`.
         **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
     """
@@ -47,7 +53,6 @@ class SHACLoss(PathwiseCriticLoss):
 
         value: NestedKey = "state_value"
 
-    tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     critic_name = "value_network"
     critic_loss_key = "loss_value"
@@ -75,30 +80,16 @@ class SHACLoss(PathwiseCriticLoss):
         self.average_over_horizon = average_over_horizon
         copies = None if num_value_nets == 1 else num_value_nets
         self.convert_to_functional(value_network, "value_network", expand_dim=copies, create_target_params=delay_value)
-        critic = self.value_network
-        if self.tensor_keys.action in critic.in_keys and self.tensor_keys.value in critic.out_keys:
+        critic, keys = self.value_network, self.tensor_keys
+        if keys.action in critic.in_keys and getattr(keys, self.prediction_key) in critic.out_keys:
             raise UserValueError(f"{type(self).__name__} needs a V(s), which reads no action: make_value builds one.")
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The critic's loss (paper, equation 16).
-
-        Args:
-            tensordict: a rollout (*, horizon), or samples (n) of one with its targets.
-
-        Returns:
-            the loss, and its metadata by name.
-        """
+        """The critic's loss (paper, equation 16) and its metadata, of a rollout, or of samples (n) with targets."""
         return self._critic_loss(tensordict)
 
     def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """The terms whose sum is J: the discounted ``rewards`` of the segments, and their ``terminal_value``.
-
-        Args:
-            tensordict: a rollout (*, horizon) that carries its graph.
-
-        Returns:
-            the terms by name, each (*,), with their graphs.
-        """
+        """The terms whose sum is J, each (*,): discounted ``rewards`` of the segments, and their ``terminal_value``."""
         steps = tensordict.shape[-1] if self.average_over_horizon else 1
         return {name: part / steps for name, part in super().objective_parts(tensordict).items()}
 

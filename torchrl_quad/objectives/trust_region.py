@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -11,8 +12,9 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 
+from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.errors import UserTypeError, UserValueError
-from torchrl_quad.objectives.calls import require_function
+from torchrl_quad.objectives.calls import check_function
 from torchrl_quad.options import NonNegative, Positive, checked
 
 
@@ -20,10 +22,9 @@ from torchrl_quad.options import NonNegative, Positive, checked
 class TrustRegion:
     """Shortens an update that would move a Gaussian policy beyond a bound on the Kullback-Leibler divergence.
 
-    A gradient through a simulator can be so coherent that one step of Adam at a usual rate makes another policy. The
-    divergence KL(before || after) is summed over the entries of the action and averaged over the states of a rollout.
-    For short steps it grows with the square of the step, so a step that is too long is shortened by the root of its
-    excess until it keeps the bound. An update to numbers that are not finite is undone.
+    The divergence KL(before || after) is summed over the entries of the action and averaged over the states of a
+    rollout. For short steps it grows with the square of the step, so a step that is too long is shortened by the root
+    of its excess until it keeps the bound. An update to numbers that are not finite is undone.
 
     .. code-block:: python
 
@@ -35,16 +36,15 @@ class TrustRegion:
         actor: the policy, which writes ``loc`` and ``scale`` as those of :func:`~torchrl_quad.make_actor` do. The bound
             is on these normal distributions, before the tanh.
         max_kl: the largest divergence of an update, 0.01 to 0.1 are usual; null for no bound, which measures nothing.
-        min_scale: the divergence is that of distributions of at least this standard deviation. A gradient through a
-            simulator takes the noise away, and a policy without noise could not move at all within a bound.
+        min_scale: the least standard deviation that the divergence is computed with. A policy whose noise the gradient
+            has taken away could otherwise not move at all within a bound.
         average: of a scalar over the processes that train together, if there are several.
 
     Attributes:
         metrics: ``kl``, the divergence of the last update before it was shortened; empty without a bound.
 
     Raises:
-        ValueError: an option has the wrong type or is out of its range; (in use) the rollout has no ``loc`` and
-            ``scale``.
+        ValueError: (in use) the rollout has no ``loc`` and ``scale``.
         TypeError: the actor is no such policy.
     """
 
@@ -61,7 +61,7 @@ class TrustRegion:
                 f"actor must be a policy as make_actor builds it, which writes loc and scale; got "
                 f"{type(actor).__name__}."
             )
-        require_function("average", average)
+        check_function("average", average)
         self.actor, self.max_kl, self.min_scale, self.average = actor, max_kl, min_scale, average
         self.metrics: dict[str, Tensor] = {}
 
@@ -73,7 +73,7 @@ class TrustRegion:
             return
         if not isinstance(rollout, TensorDictBase) or "loc" not in rollout or "scale" not in rollout:
             raise UserValueError("TrustRegion reads loc and scale, which are not in the rollout. Give what was flown.")
-        parameters = list(self.actor.parameters())
+        parameters: list[Tensor] = list(self.actor.parameters())
         before = [x.detach().clone() for x in parameters]
         yield
         with torch.no_grad():
@@ -84,7 +84,7 @@ class TrustRegion:
                     return
                 if not kl.isfinite():
                     break
-                torch._foreach_lerp_(parameters, before, 1.0 - (self.max_kl / kl.item()) ** 0.5)
+                torch._foreach_lerp_(parameters, before, 1.0 - (self.max_kl / float(kl)) ** 0.5)
                 kl = self._mean_divergence(rollout)
             torch._foreach_copy_(parameters, before)
 
@@ -94,6 +94,9 @@ class TrustRegion:
 
     def divergence(self, rollout: TensorDictBase) -> Tensor:
         """KL(policy that flew the rollout || policy as it is now), a scalar."""
-        now = self.actor.get_dist_params(rollout.select(*self.actor.in_keys).detach())
-        old, new = (Normal(td["loc"].detach(), td["scale"].detach().clamp_min(self.min_scale)) for td in (rollout, now))
+        now = cast(TensorDictBase, self.actor.get_dist_params(rollout.select(*self.actor.in_keys).detach()))
+        old, new = (
+            Normal(leaf(td, "loc").detach(), leaf(td, "scale").detach().clamp_min(self.min_scale))
+            for td in (rollout, now)
+        )
         return kl_divergence(old, new).sum(-1).mean()

@@ -306,11 +306,23 @@ def test_disturbances_of_one_s_own_fly_in_every_task_and_are_restored_with_the_s
         assert torch.equal(again[key], state[key][:, 12:15])
 
 
+@pytest.mark.parametrize("drift", [GyroBias, f"{__name__}.GyroBias", {"_target_": f"{__name__}.GyroBias"}])
+def test_a_disturbance_may_be_given_by_its_class_or_its_path_alone_or_in_a_list(drift):
+    for given in (drift, [drift]):
+        env = HoveringEnv(num_envs=2, disturbances=given)
+        assert "gyro_bias" in env.reset()["state"].keys()  # noqa: SIM118, a tensordict
+    with pytest.raises(TypeError, match="GyroBias.* takes no arguments"):
+        HoveringEnv(num_envs=1, disturbances={"_target_": f"{__name__}.GyroBias", "size": 3})
+
+
 def test_what_is_not_a_disturbance_is_refused():
-    with pytest.raises(TypeError, match="disturbances must be a list of Disturbance, got GyroBias"):
-        HoveringEnv(num_envs=1, disturbances=GyroBias())
-    with pytest.raises(TypeError, match="disturbances: each must be a Disturbance, got GyroBiases"):
-        HoveringEnv(num_envs=1, disturbances=[type("GyroBiases", (), {})()])
+    for wrong, message in ((3.0, "must be a list of Disturbance, got float"), ([3.0], "each must .* got float")):
+        with pytest.raises(TypeError, match=f"disturbances:? {message}"):
+            HoveringEnv(num_envs=1, disturbances=wrong)
+    with pytest.raises(TypeError, match="disturbances: each must be a Disturbance, .* got type"):
+        HoveringEnv(num_envs=1, disturbances=HoveringEnv)
+    with pytest.raises(ValueError, match="disturbance 'disturbed.Gyro': Python finds no module 'disturbed'"):
+        HoveringEnv(num_envs=1, disturbances="disturbed.Gyro")
     sag = own()[1]
     with pytest.raises(ValueError, match=r"Entry \('drone', 'thrust_map'\) changes no parameter of the drone"):
         HoveringEnv(num_envs=1, disturbances=[sag], dynamics="point_mass")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import torch
@@ -11,39 +11,22 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams, load_drone
-from torchrl_quad.dynamics.integrators import Integrator
-from torchrl_quad.dynamics.interface import PhysicsStep
+from torchrl_quad.dynamics import QuadrotorParams, load_drone
+from torchrl_quad.dynamics.model import PhysicsStep
+from torchrl_quad.dynamics.rigid_body import Integrator
 from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compiler, nested
 from torchrl_quad.engine.simulation import State
-from torchrl_quad.envs import checked_task, checks
-from torchrl_quad.envs.checks import Weights
+from torchrl_quad.envs import config, guard
 from torchrl_quad.envs.markers import merge_reset, visible_state
-from torchrl_quad.envs.options import (
-    CameraOption,
-    ControlOption,
-    DisturbancesOption,
-    DroneOption,
-    DynamicsOption,
-    NoiseOption,
-    RandomizeOption,
-    SceneOption,
-    StartOption,
-    WindOption,
-    choose_disturbances,
-    require_room,
-)
 from torchrl_quad.envs.randomness import Randomness
-from torchrl_quad.envs.specs import describe, set_specs
-from torchrl_quad.envs.step import ControlStep, draw_start, sample_state
-from torchrl_quad.envs.task import Task
+from torchrl_quad.envs.scenes import MountedCamera
+from torchrl_quad.envs.step import ControlStep, sample_state
+from torchrl_quad.envs.task import Task, check_task
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, accepted, between, check_value, checked
 
 FloatType = Annotated[
-    Any,
-    accepted(
-        lambda x: isinstance(x, torch.dtype) and x in (torch.float32, torch.float64), "torch.float32 or torch.float64"
-    ),
+    Any, accepted(lambda x: x is torch.float32 or x is torch.float64, "torch.float32 or torch.float64")
 ]
 ControlPeriod = Annotated[float, between(1e-6, 1.0)]
 
@@ -54,7 +37,7 @@ class _Built(type(EnvBase)):
     def __call__(cls, *args: Any, **kwargs: Any) -> Any:
         if "compile" in kwargs:
             kwargs["compile"] = check_value("compile", kwargs["compile"], bool | dict[str, Any] | None)
-            checks.check_compilation(kwargs["compile"] if isinstance(kwargs["compile"], dict) else {})
+            config.check_compilation(kwargs["compile"] if isinstance(kwargs["compile"], dict) else {})
         return super().__call__(*args, **kwargs)
 
 
@@ -66,8 +49,8 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
     every entry of ``"next"`` to the actions, to the state, and to ``env.params``. A task subclasses this and defines
     what :class:`~torchrl_quad.envs.Task` asks for, as :class:`~torchrl_quad.envs.HoveringEnv` does.
 
-    Beside ``"observation"`` and ``"state"`` a step writes ``"success"``, ``"crash"``, ``("reward_terms", name)``, whose
-    sum is the reward, and ``("metrics", name)``, what the task measures, without gradient.
+    A step also writes ``"success"``, ``"crash"``, ``("reward_terms", name)``, whose sum is the reward, and
+    ``("metrics", name)``, what the task measures, without gradient.
 
     ``env.params`` is the drone that flies; ``env.params = env.params.replace(mass=0.5)`` changes it, and a parameter
     that requires grad can be fitted. ``env.nominal`` is the drone that its controller believes in.
@@ -76,33 +59,32 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         num_envs: number of drones that fly in parallel.
         device: of all tensors, such as "cpu" or "cuda".
         dtype: torch.float32 or torch.float64.
-        seed: of the environment's own random generator, from 0; None takes another one each time. One seed gives one
+        seed: of the environment's own random generator, from 0; None takes a new one each time. One seed gives one
             flight: give each of several copies its own, as in ParallelEnv.
         drone: name of a preset, path of a YAML file, mapping, or :class:`~torchrl_quad.QuadrotorParams`.
         dynamics: "quadrotor", or "point_mass", whose thrust and body rates follow the action at once.
         control: what an action (4) in [-1, 1] commands: "rates" (thrust, body rates), "attitude" (thrust, roll, pitch,
             yaw rate), "rotor_thrusts", "velocity" (and yaw rate), or a mapping with limits, such as {mode: velocity,
             max_speed: 5.0}. See ``docs/actions.md``.
-        dt: the physics step, 1e-6 to 0.1 s. In a shorter one a drone at 1 m/s does not move in single precision; with a
-            longer one the rate loop of no drone that ships is stable.
+        dt: the physics step, 1e-6 to 0.1 s.
         control_dt: the control step, 1e-6 to 1 s, 1 to 200 times dt. Hovering is judged by its last second.
         action_delay: control steps from a command to its effect, 0 to 1000; 1 is usual.
-        integrator: how the rigid body moves on in a physics step.
+        integrator: of the rigid body in a physics step.
         max_episode_steps: control steps after which an episode is truncated.
-        observe_last_action: whether the commands that are still on their way are appended to the observation. Off in
-            the paper.
+        observe_last_action: whether the commands on their way are appended to the observation; off in the paper.
         observation_noise: white noise: a mapping, or :class:`~torchrl_quad.envs.disturbances.Sensors`.
         observation_delay: control steps by which the observation of the drone lags behind, 0 to 1000.
         weights: other weights of reward terms, by name, each within a million: ``{"velocity": 0.0}``.
         event_discount: the discount per control step by which the time of an event counts, above 0, at most 1; None
             for no gradient in it.
-        randomize: another drone in each episode; see :class:`~torchrl_quad.envs.disturbances.DroneRandomization`.
-        wind: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.Wind`, or one of these.
-        random_start: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.RandomStart`, or one of these.
-        disturbances: disturbances of your own; see :class:`~torchrl_quad.envs.disturbances.Disturbance`.
+        randomize: draws a drone for each episode; see :class:`~torchrl_quad.envs.disturbances.DroneRandomization`.
+        wind: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.Wind`, or an instance.
+        random_start: a mapping with fields of :class:`~torchrl_quad.envs.disturbances.RandomStart`, or an instance.
+        disturbances: your own, a list; see :class:`~torchrl_quad.envs.disturbances.Disturbance`. Each is an instance, a
+            class, or as on a command line a path, "mypackage.GyroBias", or {_target_: mypackage.GyroBias, spread: 0.1}.
         scene: obstacles, which drones crash into: a mapping or a YAML file; see :class:`~torchrl_quad.Scene`.
-        camera: adds ``"depth"`` (num_envs, 1, height, width) [m] to what a policy sees: a
-            :class:`~torchrl_quad.DepthCamera`, or a mapping of its fields. Without a scene it sees the ground z = 0.
+        camera: adds ``"depth"`` (num_envs, 1, height, width) [m] to what a policy may read: a
+            :class:`~torchrl_quad.DepthCamera`, or a mapping of its fields. Without a scene it shows the ground z = 0.
         compile: compile the step and its first derivative: half a minute the first time; see ``docs/performance.md``.
 
     Raises:
@@ -111,7 +93,6 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
     """
 
     batch_locked, _supports_set_state = True, True
-    __repr__ = describe
 
     def __init__(
         self,
@@ -120,61 +101,70 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         device: Device = "cpu",
         dtype: FloatType = torch.float32,
         seed: Seed | None = 0,
-        drone: DroneOption = "visfly",
-        dynamics: DynamicsOption = "quadrotor",
-        control: ControlOption = "rates",
+        drone: config.DroneOption = "visfly",
+        dynamics: config.DynamicsOption = "quadrotor",
+        control: config.ControlOption = "rates",
         dt: PhysicsStep = 0.005,
         control_dt: ControlPeriod = 0.02,
         action_delay: Delay = 1,
         integrator: Integrator = "semi_implicit_euler",
         max_episode_steps: Size = 256,
         observe_last_action: bool = False,
-        observation_noise: NoiseOption = None,
+        observation_noise: config.NoiseOption = None,
         observation_delay: Delay = 0,
-        weights: Weights = None,
+        weights: config.WeightsOption = None,
         event_discount: Share | None = None,
-        randomize: RandomizeOption = None,
-        wind: WindOption = None,
-        random_start: StartOption = None,
-        disturbances: DisturbancesOption = (),
-        scene: SceneOption = None,
-        camera: CameraOption = None,
+        randomize: config.RandomizeOption = None,
+        wind: config.WindOption = None,
+        random_start: config.StartOption = None,
+        disturbances: config.DisturbancesOption = (),
+        scene: config.SceneOption = None,
+        camera: config.CameraOption = None,
     ) -> None:
-        options = checks.timing(dynamics, control, dt, control_dt, action_delay, integrator, observe_last_action)
+        self.config = config.EnvConfig(
+            dynamics=dynamics, control=control, dt=dt, control_dt=control_dt, action_delay=action_delay,
+            integrator=integrator, observe_last_action=observe_last_action, random_start=random_start,
+            randomize=randomize, wind=wind, observation_noise=observation_noise, observation_delay=observation_delay,
+            disturbances=config.as_disturbances(disturbances), scene=scene, camera=camera,
+        )  # fmt: skip
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.num_envs, self.dtype, self.control_dt, self.action_delay = num_envs, dtype, control_dt, action_delay
         self.max_episode_steps, self.observe_last_action = max_episode_steps, observe_last_action
-        self.event_discount, self.control, self._drone = event_discount, control, drone
-        self.initial_state_source: Callable[[int], TensorDictBase] | None = None
+        self.event_discount, self.control, self.initial_state_source = event_discount, control, None
+        self._drone = str(drone) if isinstance(drone, str | Path) else "own"
         params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone, dtype)
-        params = checks.checked_params(params.to(device=self.device, dtype=dtype), num_envs)
-        self._make_dynamics = functools.partial(DYNAMICS[dynamics], **options)
-        self.dynamics: Dynamics = self._make_dynamics(params)
+        params = params.to(device=self.device, dtype=dtype)
+        config.check_params(params, num_envs)
+        self.weights = config.check_weights({**self.weights, **(weights or {})}, self.weights)
+        self._place(params)
         self._params = params if params.requires_grad else self.nominal
-        self.weights = checks.checked_weights({**self.weights, **(weights or {})}, self.weights)
-        self._place_weights()
-        self._make_disturbances = functools.partial(
-            choose_disturbances, random_start=random_start, randomize=randomize, wind=wind,
-            observation_noise=observation_noise, observation_delay=observation_delay, more=disturbances,
-            scene=scene, camera=camera,
-        )  # fmt: skip
-        self.disturbances = self._make_disturbances(self.nominal, self.dynamics.plant_fields)
-        require_room(self)
-        self.randomness = Randomness(self.device, dtype)
+        config.check_memory(self)
         self.randomness.seed(seed)
         self.set_up()
         self.task_entries = [key for key in self.initial_state(num_envs) if key not in self.dynamics.sizes]
         state = sample_state(self, num_envs)
-        checked_task.check_task(self, state)
+        check_task(self, state)
         self._connect(state)
-        set_specs(self)
+        for name, spec in self.control_step.specs().items():
+            setattr(self, name, spec)
         self.set_seed(seed)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "__init__" in vars(cls):
             checked(cls)
-        cls.__signature__ = checks.full_signature(cls, EnvBase)
+        cls.__signature__ = config.full_signature(cls, EnvBase)
+
+    def __repr__(self) -> str:
+        if not hasattr(self, "control_step"):
+            return f"{type(self).__name__}(not built)"
+        changed = "" if self.params is self.nominal else " with other parameters"
+        more = f", disturbances={'+'.join(self.disturbances)}" if self.disturbances else ""
+        return (
+            f"{type(self).__name__}(num_envs={self.num_envs}, drone={self._drone!r}{changed}, "
+            f"control_dt={self.control_dt:g} s, max_episode_steps={self.max_episode_steps}{more}, "
+            f"device={self.device}, dtype={self.dtype}, compiled={self.is_compiled})"
+        )
 
     # -- what its users may set and ask --------------------------------------------------------------------------------
 
@@ -189,14 +179,18 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
 
     def set_params(self, params: QuadrotorParams) -> None:
         """Set :attr:`params`, also through a TransformedEnv, where an assignment would not reach this environment."""
-        params = checks.checked_params(params, self.num_envs)
+        config.check_params(params, self.num_envs)
         fits = all(x.dtype == self.dtype and x.device == self.device for x in params.fields().values())
         self._params = params if fits else params.to(device=self.device, dtype=self.dtype)
 
     def set_initial_state_source(self, source: Callable[[int], TensorDictBase] | None) -> None:
         """Choose where resets start, also through a TransformedEnv: ``source(n)`` returns n complete states, the
         content of ``td["state"]``; None means the task's own starts."""
-        checks.check_source(source)
+        if not (source is None or callable(source)):
+            raise UserValueError(
+                "initial_state_source must be a function from a number n to n states, or None for the task's own "
+                f"starts; got {type(source).__name__}."
+            )
         self.initial_state_source = source
         self.randomness.forget_starts()
 
@@ -209,7 +203,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         """Everything random in this environment, to resume from later; torch can save it."""
         return self.randomness.state()
 
-    def set_random_state(self, state: dict[str, Any]) -> None:
+    def set_random_state(self, state: Mapping[str, Any]) -> None:
         """Resume from what :meth:`random_state` returned."""
         self.randomness.set_state(state)
 
@@ -221,13 +215,13 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
     def compile(self, **kwargs: Any) -> QuadrotorEnv:
         """Compile the control step and its derivative; the keywords go to torch.compile. Under transforms, compile the
         environment inside, ``TransformedEnv(HoveringEnv(compile=True), ...)``: TransformedEnv's own takes minutes."""
-        checks.check_compilation(kwargs)
+        config.check_compilation(kwargs)
         kwargs.pop("warmup", None)  # TorchRL's option for steps whose input changes its layout: ours never does
         return self._run(kwargs if has_compiler() else None)
 
     def flies_inside(self, policy: Any) -> bool:
         """Whether :meth:`rollout` flies a policy inside the compiled step, which is fastest, or calls it before each
-        step. It knows of no transforms: under them, but for an ObservationNormalizer alone, policies are called."""
+        step. It ignores transforms: under them, but for an ObservationNormalizer alone, policies are called."""
         return flies_inside(self._stepper, policy)
 
     def eager(self) -> QuadrotorEnv:
@@ -236,16 +230,13 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
 
     @checked
     def to(self, device: Device) -> QuadrotorEnv:
-        """Move the environment to a device, where its random generator starts again from its seed."""
+        """Move the environment to a device, where its random generator restarts from its seed."""
         if torch.device(device) == self.device:
             return self
         super().to(device)
-        follows = self.params is self.nominal
-        self.dynamics = self._make_dynamics(self.nominal.to(device=self.device))
-        self._params = self.nominal if follows else self.params.to(device=self.device)
-        self._place_weights()
-        self.disturbances = self._make_disturbances(self.nominal, self.dynamics.plant_fields)
-        self.randomness = Randomness(self.device, self.dtype)
+        flying = None if self.params is self.nominal else self.params.to(device=self.device)
+        self._place(self.nominal.to(device=self.device))
+        self._params = self.nominal if flying is None else flying
         self.set_up()
         safe_state = {key: x.to(self.device) for key, x in self.control_step.safe_state.items()}
         self._connect(safe_state, self._stepper.options)
@@ -262,11 +253,21 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         Raises:
             ValueError: there is no state yet, as before the first reset; or an argument is out of its range.
         """
-        from torchrl_quad.render.frames import draw_frame  # matplotlib is needed only here
+        from torchrl_quad.render.video import draw_frame  # matplotlib is needed only here
 
         return draw_frame(self, drones, size)
 
     # -- TorchRL's side ------------------------------------------------------------------------------------------------
+
+    def _place(self, nominal: QuadrotorParams) -> None:
+        """Build what holds tensors on the device and in the precision of the environment."""
+        self.weights = {
+            name: x.reshape(()).to(self.device, self.dtype) if isinstance(x, Tensor) else x
+            for name, x in self.weights.items()
+        }
+        self.dynamics = self.config.build_dynamics(nominal)
+        self.disturbances = self.config.build_disturbances(self.dynamics)
+        self.randomness = Randomness(self.device, self.dtype)
 
     def _connect(self, safe_state: State, options: dict[str, Any] | None = None) -> None:
         """Join what belongs together on one device: the step, what runs it, and its random numbers."""
@@ -274,26 +275,25 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         self._run(options)
         sizes = {name: x.noise_size for name, x in self.disturbances.items()}
         self.randomness.noise_shapes = {name: (self.num_envs, size) for name, size in sizes.items() if size}
-        self.randomness.draw_start = functools.partial(draw_start, self)
+        self.randomness.draw_start = self.control_step.draw_start
         self.render_state: State = {}  # positions, quaternions and targets, for render()
-
-    def _place_weights(self) -> None:
-        """Bring weights that are tensors to the device and the precision of the environment."""
-        self.weights = {
-            name: x.reshape(()).to(self.device, self.dtype) if isinstance(x, Tensor) else x
-            for name, x in self.weights.items()
-        }
 
     def _run(self, options: dict[str, Any] | None) -> QuadrotorEnv:
         """Run steps compiled with these options, eager for None; and the camera, which starts use, too, likewise."""
         self._stepper = Stepper(self.control_step, options)
-        if "camera" in self.disturbances:
-            self.disturbances["camera"].is_compiled = self.is_compiled
+        if isinstance(camera := self.disturbances.get("camera"), MountedCamera):
+            camera.is_compiled = self.is_compiled
         return self
 
     def reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool | None = None, **options: Any) -> Any:
         """As TorchRL's; of a mask and a state in one tensordict, ``set_state`` says which of them counts."""
-        checks.require_clear_reset(tensordict, set_state, **options)
+        is_said = set_state is not None or options.get("select_reset_only") or tensordict is None
+        # Of the two TorchRL 0.14 takes the state, and 0.15 the mask.
+        if not is_said and "_reset" in tensordict and "state" in tensordict:
+            raise UserValueError(
+                'reset: the tensordict has a mask in "_reset" and a state. For fresh starts in the environments of the '
+                "mask write env.reset(tensordict, set_state=False); to set them to this state, set_state=True."
+            )
         return super().reset(tensordict, set_state=set_state, **options)
 
     def _set_seed(self, seed: int | None) -> None:
@@ -303,21 +303,21 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if set_state:
-            source, given = "reset(..., set_state=True)", tensordict is not None and "state" in tensordict
-            checks.require(given, f'{source} needs a tensordict with the state to set in "state"; got none.')
-            entries = self.control_step.reset(checks.restore_state(self, tensordict.get("state"), source, mask))
+            source = "reset(..., set_state=True)"
+            if tensordict is None or "state" not in tensordict:
+                raise UserValueError(f'{source} needs a tensordict with the state to set in "state"; got none.')
+            entries = self.control_step.reset(self.control_step.restore(tensordict.get("state"), source, mask))
         else:
             entries = self.randomness.starts(None if mask is None else mask.reshape(-1))
         self._keep_for_render(entries["state"], mask)
         return TensorDict(entries, self.batch_size, self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict.get("action", None)
-        checks.check_action(action, self.control_step.safe_state["position"])
-        state = checks.read_state(tensordict.get("state", None), self.control_step.safe_state, "step")
-        state, valid = self.control_step.guard(state)
+        action, step = tensordict.get("action", None), self.control_step
+        step.check_action(action)
+        state, valid = step.guard(guard.read_state(tensordict.get("state", None), step.safe_state, "step"))
         state, outputs = self._stepper.step(state, valid, action, self.randomness.noise())
-        checks.require_finite(action)
+        guard.check_finite(action)
         self._keep_for_render(state)
         return TensorDict({"state": nested(state), **outputs}, self.batch_size, self.device)
 
@@ -327,22 +327,22 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         max_steps = check_value("max_steps", max_steps, Horizon)
         start, auto_reset = options.get("tensordict"), options.get("auto_reset", True)
         quick = callback is None and options.get("break_when_any_done") is False and auto_reset == (start is None)
-        # The engine knows nothing of a step of a subclass's own.
+        # The engine would pass over a step of a subclass's own.
         quick = quick and (type(self)._step, type(self)._reset) == (QuadrotorEnv._step, QuadrotorEnv._reset)
         if quick and set(options) <= {"break_when_any_done", "auto_reset", "tensordict"}:
             start = self.reset() if start is None else start
             if can_fly(self._stepper, policy, start):
-                state = checks.read_state(start.get("state"), self.control_step.safe_state, "rollout")
+                state = guard.read_state(start.get("state"), self.control_step.safe_state, "rollout")
                 rollout = fly(self._stepper, self.randomness, policy, state, start, max_steps)
-                checks.require_finite(rollout["action"])
+                guard.check_finite(rollout["action"])
                 self._keep_for_render(rollout.get(("next", "state"))[:, -1].clone())
                 return rollout
             options |= {"tensordict": start, "auto_reset": False}
         return super().rollout(max_steps, policy, callback, **options)
 
-    def _keep_for_render(self, state: State, mask: Tensor | None = None) -> None:
+    def _keep_for_render(self, state: Mapping[Any, Tensor], mask: Tensor | None = None) -> None:
         """Keep what render() draws, detached; with a mask, of the environments in it."""
         self.render_state = merge_reset(self.render_state, visible_state(state), mask)
 
 
-QuadrotorEnv.__signature__ = checks.full_signature(QuadrotorEnv, EnvBase)
+QuadrotorEnv.__signature__ = config.full_signature(QuadrotorEnv, EnvBase)

@@ -1,4 +1,4 @@
-"""Make any task harder, or more realistic: other drones, wind, sensors, starts, and disturbances of your own."""
+"""Make any task harder, or more realistic: random drones, wind, sensors, starts, and your own disturbances."""
 
 from __future__ import annotations
 
@@ -44,7 +44,10 @@ class Disturbance:
     An entry ``("drone", field)`` changes a parameter of the drone that flies, ``wind`` the air it flies in.
     """
 
-    noise_size = 0  #: standard normal numbers that each environment needs for ``advance``
+    @property
+    def noise_size(self) -> int:
+        """How many standard normal numbers each environment needs for ``advance``; a plain class attribute will do."""
+        return 0
 
     def start(self, random: Randomness, state: State) -> State:
         """The entries that it adds to the start of an episode, or changes there; it draws from ``random`` alone."""
@@ -55,16 +58,16 @@ class Disturbance:
         return {}
 
     def observe(self, state: State) -> State:
-        """The state as the policy sees it. Rewards, crashes and success use the true one."""
+        """The state as the policy observes it. Rewards, crashes and success use the true one."""
         return state
 
-    def complaints(self, state: State) -> dict[str, Tensor]:
+    def problems(self, state: State) -> dict[str, Tensor]:
         """What is wrong with a state to start from, in words, and where it is wrong, bool (n)."""
         return {}
 
 
 class DroneRandomization(Disturbance):
-    """Fly another drone in each episode: any of its parameters, drawn at reset.
+    """Fly another drone in each episode: any of its parameters is drawn at reset.
 
     A mapping, or a YAML file of one, from fields of :class:`~torchrl_quad.QuadrotorParams` to a distribution and its
     two numbers:
@@ -96,16 +99,13 @@ class DroneRandomization(Disturbance):
             if name not in plant_fields or name == "rotor_spin":
                 allowed = ", ".join(field for field in plant_fields if field != "rotor_spin")
                 raise UserValueError(f"{source}: unknown field {shown(name)}. Choose from: {allowed}.")
-            if not (
-                isinstance(distribution, Mapping)
-                and len(distribution) == 1
-                and set(distribution) <= set(_DISTRIBUTIONS)
-            ):
+            is_one = isinstance(distribution, Mapping) and len(distribution) == 1
+            if not (is_one and set(distribution) <= set(_DISTRIBUTIONS)):
                 choices = "; ".join(f"{key}: {numbers}" for key, numbers in _DISTRIBUTIONS.items())
                 raise UserValueError(
                     f"{source}: {name} needs one distribution of: {choices}; got {shown(distribution)}."
                 )
-            (kind, numbers) = next(iter(distribution.items()))
+            ((kind, numbers),) = distribution.items()
             has = f"{name} needs two numbers, {_DISTRIBUTIONS[kind]}"
             least, most = check_value(f"{source}: {kind}", numbers, _PAIR, f"{has}.")
             if most < (0.0 if kind == "normal" else least):
@@ -134,8 +134,8 @@ class DroneRandomization(Disturbance):
 
     def _value(self, name: str, unit: Tensor) -> Tensor:
         """From the range [-1, 1] to the one asked for."""
-        (kind, (first, second)) = next(iter(self.spec[name].items()))
-        first, second = float(first), float(second)
+        ((kind, numbers),) = self.spec[name].items()
+        first, second = map(float, numbers)
         if kind == "normal":
             return first + 3.0 * second * unit
         value = 0.5 * (first + second) + 0.5 * (second - first) * unit
@@ -151,7 +151,7 @@ class Wind(Disturbance):
 
     Args:
         mean: along x, y and z [m/s], world frame.
-        spread: by which the mean of an episode may differ to both sides, along x, y and z [m/s]; drawn at reset.
+        spread: by which the mean of an episode may differ to either side, along x, y and z [m/s]; drawn at reset.
         gust: standard deviation of the gusts [m/s]; five of them, the mean and the spread add up to 100 m/s at most.
         gust_time: the time after which a gust has decayed to 1/e, 0.001 to 1e6 s.
 
@@ -195,7 +195,7 @@ class Wind(Disturbance):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Sensors(Disturbance):
-    """Show the policy the drone late, and with white noise. Rewards, crashes and success use the true state.
+    """Delay what the policy observes of the drone, and add white noise. Rewards and ends of episodes use the truth.
 
     Entry of the state: ``measurements`` (delay + 1, 13), oldest first: position, quaternion, velocity and angular
     velocity, as measured.
@@ -234,13 +234,8 @@ class Sensors(Disturbance):
     def observe(self, state: State) -> State:
         """The state with the oldest measurement instead of the truth."""
         position, attitude, velocity, angular_velocity = state["measurements"][:, 0].split((3, 4, 3, 3), -1)
-        return {
-            **state,
-            "position": position,
-            "quaternion": attitude,
-            "velocity": velocity,
-            "angular_velocity": angular_velocity,
-        }
+        measured = {"position": position, "quaternion": attitude}
+        return {**state, **measured, "velocity": velocity, "angular_velocity": angular_velocity}
 
     def _measure(self, state: State, noise: Tensor | None) -> Tensor:
         position, attitude = state["position"], state["quaternion"]

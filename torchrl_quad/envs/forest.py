@@ -12,9 +12,9 @@ from torch.nn.functional import softplus
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
+from torchrl_quad.envs.config import CameraOption, SceneOption
 from torchrl_quad.envs.markers import Markers
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode
-from torchrl_quad.envs.options import CameraOption, SceneOption
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenes import ELSEWHERE, MAX_OBSTACLES, Scene, left_out
 from torchrl_quad.envs.terms import norm, outside
@@ -143,7 +143,7 @@ class ForestEnv(QuadrotorEnv):
         self.centre = self.tensor([0.5 * (self.length - self.before), 0.0, 0.0])
         self.extent = self.tensor([0.5 * (self.length + self.before) + 1.0, self.half_width])
         fixed, top = self.scene.touchable, self.ceiling
-        if not fixed.count:
+        if not fixed.total:
             return
         start = self.tensor([-self.run_up[0], 0.0, self.cruise_height])
         goal = self.tensor([self.length, 0.0, self.cruise_height])

@@ -1,40 +1,44 @@
-"""Keep broken environments from reaching the others: bounds for states, and a filter for gradients."""
+"""Keep broken states and actions from reaching other environments: bounds, a filter for gradients, and checks."""
 
 from __future__ import annotations
 
 import functools
 import operator
+from collections.abc import Mapping
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import Dynamics, QuadrotorParams
 from torchrl_quad.dynamics.parameters import LIMITS, RawParams
 from torchrl_quad.dynamics.vector import is_same, is_traced
-from torchrl_quad.engine.packing import like, looks_are_free
+from torchrl_quad.engine.packing import Key, like, looks_are_free
 from torchrl_quad.engine.simulation import State
+from torchrl_quad.errors import UserValueError
 
 # Beyond these the model means nothing, and its numbers or their derivatives may overflow.
 MAX_VALUE = 1e6  # of any entry of the state, in its unit
 MAX_SPEED = 300.0  # [m/s], also of the wind
 MAX_ANGULAR_VELOCITY = 100.0  # [rad/s]
 MAX_NORM_ERROR = 0.1  # of the quaternion's squared norm
+MAX_STEPS = 2**31  # since the start of an episode
 
 
 class Guard:
     """Replaces meaningless states: what is not finite, or beyond the bounds of the model.
 
-    The task's own entries stay as they are, unless they are the trouble. Selecting before the physics keeps gradients
-    clean: a gradient of zero never meets an infinite derivative.
+    The task's own entries are replaced only where they themselves are out of bounds. Selecting before the physics keeps
+    gradients clean: a gradient of zero never meets an infinite derivative.
 
     Args:
-        safe_state: takes over where a state is meaningless; the guard reads names and shapes from it, too.
-        dynamics: knows the bounds of its own entries.
+        safe_state: takes over where a state is meaningless; names and shapes are read from it, too.
+        dynamics: has the bounds of its own entries.
         task_entries: the names of the task's own entries.
     """
 
-    def __init__(self, safe_state: State, dynamics: Dynamics, task_entries: list[Any]) -> None:
+    def __init__(self, safe_state: State, dynamics: Dynamics, task_entries: list[Key]) -> None:
         self.safe_state, self.task_entries = safe_state, task_entries
         self.bounds = {key: _bounds(key, x, dynamics) for key, x in safe_state.items() if x.is_floating_point()}
         n = max(len(low) for low, _ in self.bounds.values())
@@ -44,8 +48,8 @@ class Guard:
     def __call__(self, state: State) -> tuple[State, Tensor]:
         """The state with safe entries where it is meaningless, and bool (n) that says where it was meaningful."""
         with torch.no_grad():
-            unit = self._is_unit(state["quaternion"])
-            if is_true(unit):  # then the usual case is quick to see: nothing is wrong, and nothing to be replaced
+            unit = _is_unit(state["quaternion"])
+            if is_true(unit):  # the usual case, quick to see: nothing is wrong, and nothing is replaced
                 values = torch.cat([state[key].flatten(1) for key in self.bounds], 1)
                 if is_same(values.clamp(self.low, self.high), values):  # NaN is not the same
                     return dict(state), unit
@@ -57,31 +61,30 @@ class Guard:
             safe[key] = torch.where(mine, state[key], self.safe_state[key])
         return safe, valid
 
-    def complaints(self, state: State) -> dict[str, Tensor]:
+    def problems(self, state: State) -> dict[str, Tensor]:
         """What is wrong with a state, in words, and where it is wrong, bool (n)."""
         found = {}
         for key, inside in self._inside(state).items():
             low, high = (x.min().item() for x in self.bounds[key])
             found[f"{key!r} must be finite and between {low:.4g} and {high:.4g}"] = ~inside.all(1)
-        found["'quaternion' must have unit norm"] = ~self._is_unit(state["quaternion"])
-        return found
+        return {**found, "'quaternion' must have unit norm": ~_is_unit(state["quaternion"])}
 
-    def _inside(self, state: State) -> dict[Any, Tensor]:
+    def _inside(self, state: State) -> dict[Key, Tensor]:
         values = {key: state[key].flatten(1) for key in self.bounds}
         return {key: (values[key] >= low) & (values[key] <= high) for key, (low, high) in self.bounds.items()}
 
-    @staticmethod
-    def _is_unit(q: Tensor) -> Tensor:
-        return (q.square().sum(1) - 1.0).abs() < MAX_NORM_ERROR
+
+def _is_unit(q: Tensor) -> Tensor:
+    return (q.square().sum(1) - 1.0).abs() < MAX_NORM_ERROR
 
 
-def _bounds(key: Any, x: Tensor, dynamics: Dynamics) -> tuple[Tensor, Tensor]:
+def _bounds(key: Key, x: Tensor, dynamics: Dynamics) -> tuple[Tensor, Tensor]:
     """What the entry must lie between, each (1 or n, k)."""
     if isinstance(key, tuple) and key[0] == "drone":
         low, high = LIMITS[key[1]]
     else:
         speeds = dict.fromkeys(("velocity", "wind", "mean_wind"), MAX_SPEED)
-        high = {"angular_velocity": MAX_ANGULAR_VELOCITY, **speeds, **dynamics.limits}.get(key, MAX_VALUE)
+        high = {"angular_velocity": MAX_ANGULAR_VELOCITY, **speeds, **dynamics.limits}.get(str(key), MAX_VALUE)
         low = -high
     low, high = (torch.as_tensor(bound, dtype=x.dtype, device=x.device).reshape(-1, 1) for bound in (low, high))
     width = x[0].numel()
@@ -95,10 +98,11 @@ class Containment:
     of the drone and the policy, and through them every other environment.
     """
 
-    def __init__(self) -> None:
-        self.valid: Tensor | None = None  # (n), known at the end of the step
+    valid: Tensor  #: where the step made sense, bool (n); known at its end
 
-    def enter(self, state: State, action: Tensor, params: QuadrotorParams) -> tuple[State, Tensor, Any]:
+    def enter(
+        self, state: State, action: Tensor, params: QuadrotorParams
+    ) -> tuple[State, Tensor, QuadrotorParams | RawParams]:
         """The same values, whose gradients come back from meaningful environments alone."""
         keys = [key for key, x in state.items() if x.requires_grad]
         if not (keys or action.requires_grad or params.requires_grad):
@@ -106,11 +110,11 @@ class Containment:
         action, *values = _Contain.apply(self, action, *(state[key] for key in keys))
         state = {**state, **dict(zip(keys, values, strict=True))}
         fields = {name: x for name, x in params.fields().items() if x.requires_grad}
-        if fields:
-            each = (x if x.dim() > params.dim(name) else x.unsqueeze(0) for name, x in fields.items())
-            each = _Contain.apply(self, *(x.expand(len(action), *x.shape[1:]) for x in each))
-            params = RawParams(**{**params.fields(), **dict(zip(fields, each, strict=True))})
-        return state, action, params
+        if not fields:
+            return state, action, params
+        each = (x if x.dim() > params.dim(name) else x.unsqueeze(0) for name, x in fields.items())
+        each = _Contain.apply(self, *(x.expand(len(action), *x.shape[1:]) for x in each))
+        return state, action, RawParams(**{**params.fields(), **dict(zip(fields, each, strict=True))})
 
 
 class _Contain(torch.autograd.Function):
@@ -127,5 +131,99 @@ class _Contain(torch.autograd.Function):
 
 
 def is_true(flags: Tensor) -> bool:
-    """Whether all flags are set, where a look at them is free; False where it is not."""
+    """Whether all flags are set, where reading them needs no device synchronisation; False elsewhere."""
     return looks_are_free(flags.device) and not is_traced() and bool(flags.all())
+
+
+# -- checks of states and actions --------------------------------------------------------------------------------------
+
+
+def read_state(state: object, safe_state: State, source: str) -> State:
+    """The entries of a state (a tensordict), if all are there with the right shape, precision and device."""
+    given = dict(as_tensordict(state, source).items())  # reading all names at once is quicker than one by one
+    entries = {key: state.get(key, None) if isinstance(key, tuple) else given.get(key) for key in safe_state}
+    for key, x in entries.items():
+        expected = safe_state[key]
+        if x is None or x.shape != expected.shape or x.dtype != expected.dtype or x.device != expected.device:
+            raise entry_error(entries, key, safe_state, source)
+    return entries
+
+
+def check_action(action: Tensor | None, example: Tensor) -> None:
+    """Check that an action is (n, 4), of the precision and on the device of an example (n, ...)."""
+    n, dtype, device = len(example), example.dtype, example.device
+    if action is None or action.shape != (n, 4):
+        got = "there is none" if action is None else f"got {tuple(action.shape)}"
+        raise UserValueError(
+            f"The action must have shape ({n}, 4), named in env.action_units, for each environment; {got}. A "
+            'policy writes it under "action", as make_actor(env) does.'
+        )
+    if action.device != device:
+        raise UserValueError(f"The action is on {action.device}, and the environment on {device}.")
+    if action.dtype != dtype:
+        raise UserValueError(
+            f"The action is {action.dtype}, and the environment flies in {dtype}. Convert the policy, "
+            f"policy.to({dtype}), or build the environment with dtype={action.dtype}."
+        )
+
+
+def check_finite(action: Tensor) -> None:
+    """Check that actions (n, 4), or (n, time, 4) of a horizon, are finite.
+
+    Raises:
+        ValueError: some are not, with their environments and the first step.
+    """
+    if is_traced():
+        return
+    finite = action.isfinite().all(-1)
+    if finite.all():
+        return
+    broken = ~finite if action.dim() == 3 else ~finite.unsqueeze(1)
+    at = f", first at step {broken.any(0).nonzero()[0].item()} of the rollout" if action.dim() == 3 else ""
+    raise UserValueError(
+        f"The action is not finite in environments {first_ten(broken.any(1))}{at}: the weights of the policy are "
+        "broken, or what it reads is. Look for NaN in both; if training made them, clip the norm of the gradient, and "
+        "skip updates whose gradient is not finite."
+    )
+
+
+def first_ten(flags: Tensor) -> str:
+    """The indices of the first flags (n) that are set, for a message."""
+    who = flags.nonzero().flatten().tolist()
+    return ", ".join(map(str, who[:10])) + (", ..." if len(who) > 10 else "")
+
+
+def as_tensordict(state: object, source: str) -> TensorDictBase:
+    """The state, if it is a tensordict."""
+    if isinstance(state, TensorDictBase):
+        return state
+    got = type(state).__name__
+    raise UserValueError(f'{source}: a state is a tensordict, such as env.reset()["state"]; got {got}.')
+
+
+def kind_of(x: Tensor) -> str:
+    """What the numbers of a tensor are, for a message."""
+    if x.dtype == torch.bool:
+        return "bool"
+    return "floating point" if x.is_floating_point() else "complex" if x.is_complex() else "whole numbers"
+
+
+def entry_error(entries: Mapping[Key, Tensor | None], key: Key, safe_state: State, source: str) -> UserValueError:
+    """What is wrong with an entry of a state, or what the state lacks."""
+    missing = [str(key) for key, x in entries.items() if x is None]
+    if missing:
+        return UserValueError(
+            f"{source}: the state lacks {', '.join(missing)}. A state is restored whole: take it from a tensordict of "
+            f"this environment, which holds {', '.join(map(str, safe_state))}. No transform may drop a part of it, as "
+            "ExcludeTransform would."
+        )
+    x, expected = entries[key], safe_state[key]
+    said = f"{source}: state {key!r}"
+    if x.shape != expected.shape:
+        return UserValueError(f"{said} has shape {tuple(x.shape)}, expected {tuple(expected.shape)}.")
+    if kind_of(x) != kind_of(expected):
+        return UserValueError(f"{said} must be {kind_of(expected)}, got {x.dtype}.")
+    return UserValueError(
+        f"{said} is {x.dtype} on {x.device}, and this environment {expected.dtype} on {expected.device}. Convert it: "
+        "env.reset(tensordict, set_state=True) does."
+    )

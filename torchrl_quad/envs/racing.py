@@ -15,7 +15,7 @@ from torchrl_quad.dynamics import presets
 from torchrl_quad.dynamics.presets import as_array
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
-from torchrl_quad.envs.checks import MAX_STEPS
+from torchrl_quad.envs.guard import MAX_STEPS
 from torchrl_quad.envs.markers import Markers
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode
 from torchrl_quad.envs.terms import (
@@ -187,8 +187,8 @@ class RacingEnv(QuadrotorEnv):
         return {"gate": Event(state["gate_passed"], time, self.weights["gate"])}
 
     def observe(self, state: State) -> Tensor:
-        gate = state["gate"][:, 0]
-        relative = [self.gates[k] - state["position"] for k in (gate, (gate + 1) % len(self.gates))]
+        gate = state["gate"][:, 0]  # any number, in environments that are not reset
+        relative = [self.gates[k % len(self.gates)] - state["position"] for k in (gate, gate + 1)]
         return torch.cat((*relative, *body_observation(state)), -1)
 
     def observation_bounds(self) -> Tensor:

@@ -1,4 +1,4 @@
-"""Everything random in an environment, so that one seed gives one flight, however it is flown."""
+"""Everything random in an environment: one seed gives one flight, step by step or horizon by horizon."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class Randomness:
 
     Noise is drawn for 32 steps at once. Starts are drawn for all environments at once, when the first of them needs
     one. The others keep theirs until their episode ends, for the rest of the 32 steps; one that ends again takes the
-    next draw. A step at a time and a horizon at a time draw alike.
+    next draw. Single steps and whole horizons draw alike.
 
-    An accelerator is never asked who needs a start. There the 32 steps have one draw of starts, made with their noise,
-    and an episode that ends again takes the start of the environment after its own.
+    On an accelerator, reading who needs a start would need a synchronisation. There the 32 steps have one draw of
+    starts, made with their noise, and an episode that ends again takes the start of the environment after its own.
 
     Args:
         device: of the generator and of all it draws.
@@ -37,7 +37,7 @@ class Randomness:
         self.forget()
 
     def seed(self, seed: int | None) -> None:
-        """Begin anew from a seed; None takes one from the operating system."""
+        """Restart from a seed; None takes one from the operating system."""
         if seed is None:
             self.generator.seed()
         else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import inspect
 import re
 from importlib.metadata import EntryPoint, entry_points
@@ -16,6 +15,7 @@ from torchrl_quad.envs.landing import LandingEnv
 from torchrl_quad.envs.racing import RacingEnv
 from torchrl_quad.envs.tracking import TrackingEnv
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
+from torchrl_quad.options import imported
 
 GROUP = "torchrl_quad.tasks"  # the group of entry points by which an installed package offers its tasks
 
@@ -107,27 +107,6 @@ def _offered() -> dict[str, list[EntryPoint]]:
     for point in entry_points(group=GROUP):
         offers.setdefault(point.name, []).append(point)
     return offers
-
-
-def imported(path: str, what: str = "task") -> Any:
-    """What a path leads to, such as "mypackage.WindowEnv"; its module is imported.
-
-    Raises:
-        ValueError: there is no such module, or it has nothing of that name.
-    """
-    module, _, name = path.rpartition(".")
-    try:
-        found = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # the module is there, and needs one that is not
-        raise UserValueError(
-            f"{what} {path!r}: Python finds no module {error.name!r}. Put its folder on PYTHONPATH, or install its "
-            "package."
-        ) from None
-    if not hasattr(found, name):
-        raise UserValueError(f"{what} {path!r}: the module {module!r} ({found.__file__}) has no {name!r}.")
-    return getattr(found, name)
 
 
 def _require_task(cls: Any, source: str) -> type[QuadrotorEnv]:

@@ -1,4 +1,4 @@
-"""Obstacles in a task: fixed ones, and others that each episode draws anew."""
+"""Obstacles in a task, fixed or drawn for each episode, and the camera among them."""
 
 from __future__ import annotations
 
@@ -8,31 +8,32 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import QuadrotorParams, presets, quaternion
-from torchrl_quad.dynamics.presets import is_number
+from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine import looks_are_free
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import between, build, check_value, checked
-from torchrl_quad.vision import Primitives, closest_approach, nearest
+from torchrl_quad.vision import DepthCamera, Primitives, closest_approach, nearest
 from torchrl_quad.vision.primitives import SIZES, distances, join
 
 TRIES = 20  # how often an obstacle that stands in a start is drawn again before it is left out
-ELSEWHERE = -1e4  # [m], the height of what is left out: nobody sees it, nobody meets it
+ELSEWHERE = -1e4  # [m], the height of what is left out: outside every flight and every image
 MAX_OBSTACLES = 1_000
 SMALLEST = 1e-3  # [m], of an obstacle: what single precision resolves at a distance of ten kilometres
+TOLERANCE = 1e-3  # [m], by which a state may lie nearer to an obstacle than a flight would have left it
 Obstacles = Sequence[Mapping[str, Any]]
 Count = Annotated[int, between(1, MAX_OBSTACLES)]
 Clearance = Annotated[float, between(0.0, 100.0)]
 Radius = Annotated[float, between(1e-3, 10.0)]
-TOLERANCE = 1e-3  # [m], by which a state may lie nearer to an obstacle than a flight would have left it
 
-# The fields of an obstacle by kind, with the number of their entries; a random one has ranges of them.
+# The fields of an obstacle by kind, with the number of their entries; the first is where it stands.
 _FIELDS = {
     "spheres": {"centre": 3, "radius": 1},
     "cylinders": {"base": 3, "radius": 1, "height": 1},
@@ -40,6 +41,7 @@ _FIELDS = {
     "walls": {"point": 3, "normal": 3},
 }
 _OPTIONAL = {"yaw", "quaternion"}
+_LENGTHS = ("radius", "height", "size")
 
 
 @checked
@@ -56,14 +58,14 @@ class Scene(Disturbance):
           - {count: 20, low: [-5, -5, 0], high: [5, 5, 0], radius: [0.1, 0.3], height: 4}
         boxes: [{centre: [0, 2, 0.5], size: [1, 1, 1], yaw: 0.5}]      # or quaternion: [w, x, y, z], to world
 
-    An entry with a ``count`` stands for so many obstacles, which each episode draws anew: the centre, or base, evenly
-    from ``low`` to ``high``, and a field with two values evenly between them. They keep clear of where the drone
+    An entry with a ``count`` stands for so many obstacles, which each episode draws: the centre, or base, uniformly
+    from ``low`` to ``high``, and a field with two values uniformly between them. They keep clear of where the drone
     starts, and of its ``target`` if the state has one. One that finds no place in 20 tries is left out.
 
-    State added: ``("scene", kind)`` for kinds with random obstacles, as :class:`~torchrl_quad.vision.Primitives` has
-    them; ``collided`` (1), whether the drone came closer to a surface than its radius in this step, anywhere on the
-    straight way that it flew. It then has crashed. What happens at the ground is the matter of the task: it is seen,
-    and counts as the nearest surface, and touching it is no collision.
+    State added: ``("scene", kind)`` for kinds with random obstacles, as in :class:`~torchrl_quad.vision.Primitives`;
+    ``collided`` (1), whether the drone came closer to a surface than its radius in this step, anywhere on the straight
+    way that it flew. It then has crashed. The ground is in images and counts as the nearest surface, but touching it is
+    no collision: that is up to the task.
 
     Args:
         ground: whether there is the plane z = 0.
@@ -71,7 +73,7 @@ class Scene(Disturbance):
         cylinders: a list of mappings with base, radius and height.
         boxes: a list of mappings with centre, size, and yaw or quaternion.
         walls: a list of mappings with point and normal, all fixed.
-        clearance: the least way from the drone's surface to random obstacles at its start, and at its target, 0 to
+        clearance: the least distance from the drone's surface to random obstacles at its start, and at its target, 0 to
             100 m.
         drone_radius: of the sphere around the drone's centre that must not touch anything, 0.001 to 10 m; by default
             that of a sphere around the propellers, as large as they can be without touching each other.
@@ -82,6 +84,9 @@ class Scene(Disturbance):
     """
 
     is_drawn_elsewhere = False  #: whether a subclass draws obstacles that its arguments do not name
+    constants: Primitives  #: the fixed obstacles, in the precision and on the device of a drone
+    touchable: Primitives  #: the same without the ground
+    radius: float  #: of the drone [m]
 
     def __init__(
         self,
@@ -100,11 +105,14 @@ class Scene(Disturbance):
         self.random: dict[str, list[dict[str, Any]]] = {kind: [] for kind in SIZES}
         if ground:
             self.fixed["planes"].append([0.0, 0.0, 1.0, 0.0])
-        for kind, entries in {"spheres": spheres, "cylinders": cylinders, "boxes": boxes, "walls": walls}.items():
-            self._read(kind, entries)
+        for kind, obstacles in {"spheres": spheres, "cylinders": cylinders, "boxes": boxes, "walls": walls}.items():
+            for obstacle in obstacles:
+                self._read(kind, obstacle)
         count = sum(len(x) for x in self.fixed.values()) + sum(x["count"] for y in self.random.values() for x in y)
-        self._require(count <= MAX_OBSTACLES, f"{count:,} obstacles are too many; {MAX_OBSTACLES:,} are the most.")
-        self._require(count > 0 or self.is_drawn_elsewhere, "a scene needs an obstacle or the ground: give it one.")
+        if count > MAX_OBSTACLES:
+            raise UserValueError(f"{count:,} obstacles are too many; the maximum is {MAX_OBSTACLES:,}.")
+        if not (count or self.is_drawn_elsewhere):
+            raise UserValueError("a scene needs an obstacle or the ground: give it one.")
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -112,7 +120,7 @@ class Scene(Disturbance):
             checked(cls)
 
     @classmethod
-    def of(cls, spec: Scene | str | Path | Mapping) -> Scene:
+    def of(cls, spec: Scene | str | Path | Mapping[str, Any]) -> Scene:
         """The scene that a mapping or a YAML file describes, or the scene itself."""
         if isinstance(spec, Scene):
             return spec
@@ -151,15 +159,16 @@ class Scene(Disturbance):
         return drawn
 
     def start(self, random: Randomness, state: State) -> State:
-        """Draw the obstacles, and see that no drone starts within one."""
-        drawn = {("scene", kind): x for kind, x in self.draw(random, state).items()}
+        """Draw the obstacles, and check that no drone starts within one."""
+        drawn: State = {("scene", kind): x for kind, x in self.draw(random, state).items()}
         state = {**state, **drawn}
         if looks_are_free(random.device):
-            for complaint, where in self._inside(state).items():
+            for problem, where in self._too_close(state).items():
                 if where.any():
+                    place = [round(x, 2) for x in state["position"][where][0].tolist()]
                     raise UserValueError(
-                        f"{self.source}: {complaint}, and drones would start there, such as at "
-                        f"{[round(x, 2) for x in state['position'][where][0].tolist()]} m. Move one of them."
+                        f"{self.source}: {problem}, and drones would start there, such as at {place} m. Move one of "
+                        "them."
                     )
         return {**drawn, "collided": torch.zeros_like(state["position"][:, :1], dtype=torch.bool)}
 
@@ -183,111 +192,73 @@ class Scene(Disturbance):
     def collided(self, before: State, state: State) -> Tensor:
         """Whether the drone touches an obstacle on the straight way from one state to the next, bool (n, 1)."""
         solids = self.solids(state, ground=False)
-        if not solids.count:
+        if not solids.total:
             return torch.zeros_like(state["collided"])
         return closest_approach(solids, before["position"], state["position"]) < self.radius
 
-    def complaints(self, state: State) -> dict[str, Tensor]:
+    def problems(self, state: State) -> dict[str, Tensor]:
         """What is wrong with a state to start from, in words, and where, bool (n)."""
-        wrong = self._inside(state)
-        for kind, (first, last) in {"spheres": (3, 4), "cylinders": (3, 5), "boxes": (3, 6)}.items():
-            x = state.get(("scene", kind))
-            if x is not None:
+        wrong = self._too_close(state)
+        for kind, first, last in (("spheres", 3, 4), ("cylinders", 3, 5), ("boxes", 3, 6)):
+            if (x := state.get(("scene", kind))) is not None:
                 small = (x[..., first:last] <= 0.0).flatten(1).any(1)
                 wrong[f"('scene', {kind!r}) must have sizes above 0"] = small
-        for kind, first in {"boxes": 6, "planes": 0}.items():  # an attitude, and a normal
-            x = state.get(("scene", kind))
-            if x is not None:
-                length = x[..., first : first + (4 if kind == "boxes" else 3)].square().sum(-1)
+        for kind, first, last in (("boxes", 6, 10), ("planes", 0, 3)):  # an attitude, and a normal
+            if (x := state.get(("scene", kind))) is not None:
+                length = x[..., first:last].square().sum(-1)
                 wrong[f"('scene', {kind!r}) must be turned by unit vectors"] = ((length - 1.0).abs() > 1e-2).any(1)
         return wrong
 
-    def _inside(self, state: State) -> dict[str, Tensor]:
-        """Which drones start within an obstacle."""
+    def _too_close(self, state: State) -> dict[str, Tensor]:
         solids = self.solids(state, ground=False)
-        if not solids.count:
+        if not solids.total:
             return {}
         inside = nearest(solids, state["position"])[0] < self.radius - TOLERANCE
         return {f"an obstacle stands within {self.radius:.3g} m of 'position', the radius of the drone": inside[:, 0]}
 
     # -- reading -------------------------------------------------------------------------------------------------------
 
-    def _read(self, kind: str, entries: Any) -> None:
-        fields, solids = _FIELDS[kind], "planes" if kind == "walls" else kind
-        place = next(iter(fields))
-        for entry in entries:
-            is_random = "count" in entry and kind != "walls"
-            sizes = {"count": 0, "low": 3, "high": 3} if is_random else {}
-            sizes |= {name: size for name, size in fields.items() if not (is_random and name in (place, "quaternion"))}
-            unknown = sorted(str(key) for key in entry if key not in sizes)
-            missing = [key for key in sizes if key not in entry and key not in _OPTIONAL]
-            what = f"{kind}: an obstacle has {', '.join(sizes)}"
-            self._require(not unknown, f"{what}; unknown: {shown(', '.join(unknown))}.")
-            self._require(not missing, f"{what}; missing: {', '.join(missing)}.")
-            count = check_value(f"{kind}: count", entry.get("count", 1), Count)
-            read = {
-                name: self._range(f"{kind}: {name}", entry[name], size, is_random and name not in ("low", "high"))
-                for name, size in sizes.items()
-                if name in entry and name != "count"
+    def _read(self, kind: str, obstacle: Mapping[str, Any]) -> None:
+        """Add an obstacle to the fixed or to the random ones."""
+        fields, solids = dict(_FIELDS[kind]), "planes" if kind == "walls" else kind
+        is_random = "count" in obstacle and kind != "walls"
+        if is_random:
+            place = next(iter(fields))
+            fields = {"count": 0, "low": 3, "high": 3} | {
+                name: size for name, size in fields.items() if name not in (place, "quaternion")
             }
-            for name in ("radius", "height", "size"):
-                least = min(read[name][0]) if name in read else 1.0
-                said = f"{kind}: {name} must be at least {SMALLEST:g} m, got {shown(entry.get(name))}."
-                self._require(least >= SMALLEST, said)
-            if is_random:
-                low, high = read["low"][0], read["high"][0]
-                ordered = all(a <= b for a, b in zip(low, high, strict=True))
-                self._require(ordered, f"{kind}: low must not be above high along any axis, got {low} and {high}.")
-                self.random[solids].append({"count": count, **read})
-            else:
-                self.fixed[solids].append(self._numbers(kind, {name: low for name, (low, _) in read.items()}))
-
-    def _range(self, name: str, value: Any, size: int, may_vary: bool) -> tuple[list[float], list[float]]:
-        """The least and the greatest value of a field, each a list of so many numbers."""
-
-        def numbers(x: Any) -> list[float] | None:
-            x = [x] if size == 1 and is_number(x) else x
-            is_right = isinstance(x, Sequence) and len(x) == size and all(is_number(y) and abs(y) < 1e4 for y in x)
-            return [float(y) for y in x] if is_right else None
-
-        one = numbers(value)
-        if one is not None:
-            return one, one
-        is_pair = may_vary and isinstance(value, Sequence) and len(value) == 2
-        low, high = (numbers(x) for x in value) if is_pair else (None, None)
-        ordered = low is not None and high is not None and all(a <= b for a, b in zip(low, high, strict=True))
-        entries = "a number within 10,000" if size == 1 else f"{size} numbers within 10,000"
-        more = f", or the least and the greatest of {'it' if size == 1 else 'them'}" if may_vary else ""
-        self._require(ordered, f"{name} must be {entries}{more}; got {shown(value)}.")
-        return low, high
-
-    def _numbers(self, kind: str, entry: dict[str, list[float]]) -> list[float]:
-        """The numbers of a fixed solid."""
-        if kind == "boxes":
-            self._require(not {"yaw", "quaternion"} <= set(entry), "boxes: give a yaw or a quaternion, not both.")
-            yaw = entry.get("yaw", [0.0])[0]
-            turned = entry.get("quaternion", [math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)])
-            norm = math.sqrt(sum(x * x for x in turned))
-            self._require(norm > 1e-6, f"boxes: quaternion must have unit norm, got {shown(turned)}.")
-            return [*entry["centre"], *(0.5 * x for x in entry["size"]), *(x / norm for x in turned)]
-        if kind == "walls":
-            length = math.sqrt(sum(x * x for x in entry["normal"]))
-            self._require(length > 1e-6, f"walls: normal must be a direction, got {entry['normal']!r}.")
-            normal = [x / length for x in entry["normal"]]
-            return [*normal, sum(x * y for x, y in zip(normal, entry["point"], strict=True))]
-        return [x for name in _FIELDS[kind] for x in entry[name]]
-
-    def _require(self, condition: bool, message: str) -> None:
-        if not condition:
-            raise UserValueError(message)
+        what = f"{kind}: an obstacle has {', '.join(fields)}"
+        if unknown := sorted(str(key) for key in obstacle if key not in fields):
+            raise UserValueError(f"{what}; unknown: {shown(', '.join(unknown))}.")
+        if missing := [key for key in fields if key not in obstacle and key not in _OPTIONAL]:
+            raise UserValueError(f"{what}; missing: {', '.join(missing)}.")
+        ranges = {
+            name: _range(f"{kind}: {name}", obstacle[name], size, is_random and name not in ("low", "high"))
+            for name, size in fields.items()
+            if name in obstacle and name != "count"
+        }
+        for name in _LENGTHS:
+            if name in ranges and min(ranges[name][0]) < SMALLEST:
+                raise UserValueError(
+                    f"{kind}: {name} must be at least {SMALLEST:g} m, got {shown(obstacle.get(name))}."
+                )
+        if not is_random:
+            self.fixed[solids].append(_numbers(kind, {name: low for name, (low, _) in ranges.items()}))
+            return
+        low, high = ranges["low"][0], ranges["high"][0]
+        if any(a > b for a, b in zip(low, high, strict=True)):
+            raise UserValueError(f"{kind}: low must not be above high along any axis, got {low} and {high}.")
+        self.random[solids].append({"count": check_value(f"{kind}: count", obstacle["count"], Count), **ranges})
 
     def _draw_clear(self, random: Randomness, kind: str, group: dict[str, Any], points: Tensor) -> Tensor:
         """The obstacles (n, count, ...) of a group; none stands at the points (n, k, 3)."""
+        n = len(points)
+        none = {name: points.new_zeros((n, 0, size)) for name, size in SIZES.items()}
         drawn = blocked = None
         for _ in range(TRIES):
-            new = _draw(random, kind, group, len(points))
+            new = _draw(random, kind, group, n)
             drawn = new if drawn is None else torch.where(blocked.unsqueeze(-1), new, drawn)
-            alone = Primitives(*(drawn if name == kind else x[:, :0] for name, x in _none(points).items()))
+            alone = Primitives(**{**none, kind: drawn})
             blocked = (distances(alone, points) < self.radius + self.clearance).any(1)
             if looks_are_free(points.device) and not blocked.any():
                 return drawn
@@ -303,26 +274,115 @@ def left_out(solids: Tensor, who: Tensor) -> Tensor:
 def drone_radius(params: QuadrotorParams) -> float:
     """The radius of a sphere around a drone and its propellers, as large as they can be without touching [m]."""
     rotors = params.rotor_positions.detach().reshape(-1, 4, 2)[0]
-    apart = torch.pdist(rotors).min() if len(rotors) > 1 else rotors.new_zeros(())
-    return (rotors.norm(dim=-1).max() + 0.5 * apart).item()
+    return (rotors.norm(dim=-1).max() + 0.5 * torch.pdist(rotors).min()).item()
+
+
+def _range(name: str, value: Any, size: int, may_vary: bool) -> tuple[list[float], list[float]]:
+    """The least and the greatest value of a field, each a list of so many numbers."""
+    one = [(size,), ()] if size == 1 else [(size,)]
+    pair = [(2, size), (2,)] if size == 1 else [(2, size)]
+    try:
+        found = presets.as_array(value)
+    except (ValueError, RecursionError):
+        found = np.array(np.nan)
+    if found.shape in (one + pair if may_vary else one) and (abs(found) < 1e4).all():
+        low, high = np.broadcast_to(found.reshape(-1, size), (2, size)).tolist()
+        if all(a <= b for a, b in zip(low, high, strict=True)):
+            return low, high
+    wanted = "a number within 10,000" if size == 1 else f"{size} numbers within 10,000"
+    more = f", or the least and the greatest of {'it' if size == 1 else 'them'}" if may_vary else ""
+    raise UserValueError(f"{name} must be {wanted}{more}; got {shown(value)}.")
+
+
+def _numbers(kind: str, obstacle: dict[str, list[float]]) -> list[float]:
+    """The numbers of a fixed solid, as in Primitives."""
+    if kind == "boxes":
+        if {"yaw", "quaternion"} <= set(obstacle):
+            raise UserValueError("boxes: give a yaw or a quaternion, not both.")
+        (yaw,) = obstacle.get("yaw", [0.0])
+        attitude = obstacle.get("quaternion", [math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)])
+        norm = math.sqrt(sum(x * x for x in attitude))
+        if norm <= 1e-6:
+            raise UserValueError(f"boxes: quaternion must have unit norm, got {attitude}.")
+        return [*obstacle["centre"], *(0.5 * x for x in obstacle["size"]), *(x / norm for x in attitude)]
+    if kind == "walls":
+        length = math.sqrt(sum(x * x for x in obstacle["normal"]))
+        if length <= 1e-6:
+            raise UserValueError(f"walls: normal must be a direction, got {obstacle['normal']}.")
+        normal = [x / length for x in obstacle["normal"]]
+        return [*normal, sum(x * y for x, y in zip(normal, obstacle["point"], strict=True))]
+    return [x for name in _FIELDS[kind] for x in obstacle[name]]
 
 
 def _draw(random: Randomness, kind: str, group: dict[str, Any], n: int) -> Tensor:
     """The obstacles of a group, (n, count, ...), wherever they fall."""
-    count = group["count"]
 
-    def value(name: str) -> Tensor:
-        low, high = (random.tensor(x) for x in group[name])
-        return low + (high - low) * 0.5 * (random.uniform(n, count, len(low)) + 1.0)
+    def uniform(low: list[float], high: list[float]) -> Tensor:
+        least, most = random.tensor(low), random.tensor(high)
+        return least + (most - least) * 0.5 * (random.uniform(n, group["count"], len(low)) + 1.0)
 
-    low, high = (random.tensor(group[name][0]) for name in ("low", "high"))
-    place = low + (high - low) * 0.5 * (random.uniform(n, count, 3) + 1.0)
+    place = uniform(group["low"][0], group["high"][0])
     if kind != "boxes":
-        return torch.cat((place, *(value(name) for name in ("radius", "height") if name in group)), -1)
-    yaw = value("yaw") if "yaw" in group else torch.zeros_like(place[..., :1])
-    turned = quaternion.from_axis_angle(torch.cat((torch.zeros_like(place[..., :2]), yaw), -1))
-    return torch.cat((place, 0.5 * value("size"), turned), -1)
+        return torch.cat((place, *(uniform(*group[name]) for name in ("radius", "height") if name in group)), -1)
+    yaw = uniform(*group["yaw"]) if "yaw" in group else torch.zeros_like(place[..., :1])
+    attitude = quaternion.from_axis_angle(torch.cat((torch.zeros_like(place[..., :2]), yaw), -1))
+    return torch.cat((place, 0.5 * uniform(*group["size"]), attitude), -1)
 
 
-def _none(like: Tensor) -> dict[str, Tensor]:
-    return {kind: like.new_zeros((len(like), 0, size)) for kind, size in SIZES.items()}
+class MountedCamera(Disturbance):
+    """A camera on the drones of a task: when it takes images, when the policy gets them, and which ones it keeps.
+
+    Entry of the state where images are noisy, or older than the state: ``images`` (k, height, width) [m], oldest first.
+    """
+
+    def __init__(self, camera: DepthCamera, scene: Scene) -> None:
+        self.camera, self.scene = camera, scene
+        self.is_compiled = False  # whether the environment is, so that images of starts and steps agree bit for bit
+        self.kept = math.ceil(camera.delay / camera.rate) + 1
+        self.remembers = camera.is_noisy or camera.rate > 1 or camera.delay > 0
+        reach = math.sqrt(sum(x * x for x in camera.position))
+        if reach > scene.radius:
+            raise UserValueError(
+                f"camera: its position is {reach:.3g} m from the drone's centre, outside of the sphere of "
+                f"{scene.radius:.3g} m that must not touch anything, so the camera could be inside an obstacle. Move "
+                f"it, or give the scene a drone_radius of {math.ceil(100 * reach) / 100:g} m."
+            )
+
+    @property
+    def noise_size(self) -> int:
+        """A number for each pixel of a noisy camera."""
+        return self.camera.pixels if self.camera.is_noisy else 0
+
+    def start(self, random: Randomness, state: State) -> State:
+        """As if the first image had been there for long."""
+        if not self.remembers:
+            return {}
+        noise = random.normal(len(state["position"]), self.noise_size) if self.noise_size else None
+        return {"images": self._take(state, noise).expand(-1, self.kept, -1, -1).clone()}
+
+    def advance(self, state: State, noise: Tensor | None, dt: float) -> State:
+        """Take another image where it is time, and forget the oldest."""
+        if not self.remembers:
+            return {}
+        due = state["step"] % self.camera.rate == 0
+        if looks_are_free(due.device) and not is_traced() and not due.any():
+            return {}
+        images = torch.cat((state["images"][:, 1:], self._take(state, noise)), 1)
+        return {"images": torch.where(due[:, :, None, None], images, state["images"])}
+
+    def image(self, state: State) -> Tensor:
+        """What the policy gets, (n, 1, height, width) [m]."""
+        if not self.remembers:
+            return self._take(state, None)
+        images, step, rate = state["images"], state["step"], self.camera.rate
+        if self.kept == 1:
+            return images
+        shown = torch.div(step - self.camera.delay, rate, rounding_mode="floor").clamp_min(0)
+        newer = torch.div(step, rate, rounding_mode="floor") - shown  # images that are on their way
+        index = (self.kept - 1 - newer)[:, :, None, None].expand(-1, 1, *images.shape[2:])
+        return images.gather(1, index)
+
+    def _take(self, state: State, noise: Tensor | None) -> Tensor:
+        solids, fused = self.scene.solids(state), self.is_compiled
+        depth = self.camera.depth(solids, state["position"], state["quaternion"], fused=fused)
+        return depth if noise is None else self.camera.measure(depth, noise)

@@ -1,11 +1,13 @@
-"""The control step, for any task and any drone, defined in one place."""
+"""The control step of any task and any drone, the states that start it, and the specs of what it writes."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from torchrl_quad.dynamics import QuadrotorParams, quaternion
 from torchrl_quad.dynamics.parameters import RawParams
@@ -13,10 +15,21 @@ from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine import Transition, nested
 from torchrl_quad.engine.packing import like
 from torchrl_quad.engine.simulation import State
-from torchrl_quad.envs.checks import check_action, restore_state
-from torchrl_quad.envs.guard import MAX_VALUE, Containment, Guard, is_true
+from torchrl_quad.envs.guard import (
+    MAX_STEPS,
+    MAX_VALUE,
+    Containment,
+    Guard,
+    as_tensordict,
+    check_action,
+    entry_error,
+    first_ten,
+    is_true,
+    kind_of,
+)
 from torchrl_quad.envs.task import Task
 from torchrl_quad.envs.terms import time_terms
+from torchrl_quad.errors import UserValueError
 
 
 class ControlStep:
@@ -29,13 +42,13 @@ class ControlStep:
         safe_state: takes over where a state is meaningless.
     """
 
-    def __init__(self, env: Any, safe_state: State) -> None:
+    def __init__(self, env: Task, safe_state: State) -> None:
         self.env, self.dynamics, self.substeps = env, env.dynamics, env.dynamics.substeps
         self.safe_state, self.guard = safe_state, Guard(safe_state, env.dynamics, env.task_entries)
         self.task_advances = type(env).advance is not Task.advance
         self.event_names = list(env.events(safe_state, safe_state)) if env.event_discount is not None else []
-        eye = env.disturbances.get("camera")
-        self.constants = frozenset(("metrics",) if eye is None or eye.camera.differentiable else ("metrics", "depth"))
+        has_gradient = env.camera is None or env.camera.differentiable
+        self.constants = frozenset(("metrics",) if has_gradient else ("metrics", "depth"))
         self.drawn = [key[1] for key in safe_state if isinstance(key, tuple) and key[0] == "drone"]
 
     def __call__(self, state: State, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Transition:
@@ -62,26 +75,21 @@ class ControlStep:
         queue = state["action_queue"]
         return {**state, "action_queue": torch.cat((queue[:, 1:], action.unsqueeze(1)), 1)}, queue[:, 0], valid
 
-    def plant_params(self, params: QuadrotorParams | RawParams, state: State) -> Any:
+    def plant_params(self, params: QuadrotorParams | RawParams, state: State) -> QuadrotorParams | RawParams:
         """The parameters of the drones that fly: those given, with what each episode has drawn."""
         drawn = {name: state["drone", name] for name in self.drawn}
         if not drawn:
             return params
         return RawParams(**{**(params._asdict() if isinstance(params, RawParams) else params.fields()), **drawn})
 
-    def apply_disturbances(self, state: State, noise: dict[str, Tensor]) -> State:
-        """The state with what wind, sensors and so on have made of it in this step."""
-        for name, disturbance in self.env.disturbances.items():
-            state = {**state, **disturbance.advance(state, noise.get(name), self.env.control_dt)}
-        return state
-
     def judge(self, before: State, drone: State, valid: Tensor, noise: dict[str, Tensor]) -> Transition:
         """Where the step leads, from the state at its start and where the drone has flown."""
         env = self.env
         state = {**before, **drone, "step": before["step"] + 1}
-        if self.env.scene is not None:
-            state["collided"] = self.env.scene.collided(before, state)
-        state = self.apply_disturbances(state, noise)
+        if env.scene is not None:
+            state["collided"] = env.scene.collided(before, state)
+        for name, disturbance in env.disturbances.items():
+            state = {**state, **disturbance.advance(state, noise.get(name), env.control_dt)}
         state, meaningful = self.guard(state)
         valid = valid & meaningful
         keep, everywhere = valid.unsqueeze(1), is_true(valid)
@@ -112,30 +120,34 @@ class ControlStep:
     def event_terms(self, before: State, state: State, terms: State, terminated: Tensor) -> State:
         """The reward terms that carry the gradients in the times of events; their values are zero."""
         env = self.env
-        old = {key: before[key] if key in env.task_entries else x for key, x in state.items()}
-        old_terms = env.reward_terms({key: x.detach() for key, x in old.items()})
-        return time_terms(env.events(before, state), env.event_discount, terms, old_terms, terminated)
+        old = {key: (before[key] if key in env.task_entries else x).detach() for key, x in state.items()}
+        events, discount = env.events(before, state), env.event_discount
+        return time_terms(events, discount, terms, env.reward_terms(old), terminated)
 
     def measure(self, state: State) -> dict[str, Any]:
         """The outputs that any state has, also the first of an episode."""
+        env = self.env
         with torch.no_grad():
-            metrics = self.env.metrics(state)
-        eye = self.env.disturbances.get("camera")
-        seen = {} if eye is None else {"depth": eye.image(state)}
-        if self.env.scene is not None:  # for critics, which may know more than policies
-            distance, away = self.env.scene.nearest(state)
-            seen["obstacle"] = torch.cat((distance, quaternion.rotate_inverse(state["quaternion"], away)), -1)
-        return {"observation": self.observe(state), **seen, "metrics": metrics}
+            metrics = env.metrics(state)
+        outputs: dict[str, Any] = {"observation": self.observe(state)}
+        if "camera" in env.disturbances:
+            outputs["depth"] = env.disturbances["camera"].image(state)
+        if env.scene is not None:  # for critics, which may know more than policies
+            distance, away = env.scene.nearest(state)
+            outputs["obstacle"] = torch.cat((distance, quaternion.rotate_inverse(state["quaternion"], away)), -1)
+        return {**outputs, "metrics": metrics}
 
     def observe(self, state: State) -> Tensor:
-        """The observation (n, k) as the policy sees it: through sensors, with the commands on their way if wanted."""
-        seen = state
+        """The observation (n, k) that the policy gets: through sensors, with the commands on their way if wanted."""
+        measured = state
         for disturbance in self.env.disturbances.values():
-            seen = disturbance.observe(seen)
-        observation = self.env.observe(seen)
+            measured = disturbance.observe(measured)
+        observation = self.env.observe(measured)
         if not self.env.observe_last_action:
             return observation
         return torch.cat((observation, state["action_queue"].flatten(1)), -1)
+
+    # -- where it starts -----------------------------------------------------------------------------------------------
 
     def at_start(self, state: State) -> dict[str, Any]:
         """All outputs of the first state of an episode, nested; there is no reward yet."""
@@ -149,12 +161,44 @@ class ControlStep:
         """All entries that a reset to a state writes, nested."""
         return {"state": nested(state), **self.at_start(state)}
 
-    def complaints(self, state: State) -> dict[str, Tensor]:
-        """What is wrong with a state to start from, in words, and where it is wrong, bool (n)."""
-        wrong = self.guard.complaints(state)
+    def draw_start(self) -> dict[str, Any]:
+        """All entries that a reset of all environments writes, nested."""
+        env, source = self.env, self.env.initial_state_source
+        if source is None:
+            return self.reset(sample_state(env, env.num_envs))
+        return self.reset(self.restore(source(env.num_envs), "initial_state_source"))
+
+    def restore(self, state: object, source: str, mask: Tensor | None = None) -> State:
+        """A copy of a state to fly from, in the precision and on the device of the environment.
+
+        Args:
+            state: a tensordict with all entries of the state.
+            source: where the state comes from, for messages.
+            mask: which environments it is for, bool (n) or (n, 1); all for None. The others may hold anything.
+
+        Raises:
+            ValueError: an entry is missing, of another shape or kind, or outside of what can fly.
+        """
+        given = as_tensordict(state, source)
+        entries = {key: given.get(key, None) for key in self.safe_state}
+        for key, x in entries.items():
+            if x is None or x.shape != self.safe_state[key].shape or kind_of(x) != kind_of(self.safe_state[key]):
+                raise entry_error(entries, key, self.safe_state, source)
+        entries = {key: x.to(self.safe_state[key], copy=True) for key, x in entries.items()}
+        if is_traced():
+            return entries
+        wrong = self.guard.problems(entries)
         for disturbance in self.env.disturbances.values():
-            wrong |= disturbance.complaints(state)
-        return wrong
+            wrong |= disturbance.problems(entries)
+        for key, (low, high) in {"step": (0, MAX_STEPS), **self.env.state_bounds()}.items():
+            inside = (entries[key] >= low) & (entries[key] <= high)
+            wrong[f"{key!r} must lie between {low} and {high}"] = ~inside.flatten(1).all(1)
+        for problem, where in wrong.items():
+            where = where if mask is None else where & mask.flatten()
+            if where.any():
+                who = first_ten(where)
+                raise UserValueError(f"{source}: no drone can fly from the state of environments {who}: {problem}.")
+        return entries
 
     # -- for the engine ------------------------------------------------------------------------------------------------
 
@@ -165,13 +209,13 @@ class ControlStep:
         own = params is not self.env.nominal
         return tuple(getattr(params, name) for name in self.dynamics.plant_fields) if own else ()
 
-    def example(self) -> tuple[State, State]:
+    def example(self) -> tuple[State, dict[str, Any]]:
         """The safe state and outputs of it."""
         outputs = self.at_start(self.safe_state)
         return self.safe_state, {**outputs, "reward": outputs["observation"][:, :1]}
 
     def check_action(self, action: Tensor | None) -> None:
-        """Refuse an action of the wrong shape, precision or device."""
+        """Check the shape, precision and device of an action."""
         check_action(action, self.safe_state["position"])
 
     def begin(
@@ -201,8 +245,35 @@ class ControlStep:
         drone = {name: part.t() for name, part in zip(sizes, x.split(list(sizes.values())), strict=True)}
         return self.judge(before, drone, valid, noise)
 
+    # -- for TorchRL ---------------------------------------------------------------------------------------------------
 
-def sample_state(env: Any, n: int) -> State:
+    def specs(self) -> dict[str, TensorSpec]:
+        """The specs of the environment by name, read off what the step writes of the safe state."""
+        env, example = self.env, self.safe_state["position"]
+        n, device = example.shape[:1], example.device
+
+        def spec(x: Any) -> TensorSpec:
+            if isinstance(x, Mapping):
+                return Composite({key: spec(value) for key, value in x.items()}, shape=n, device=device)
+            if x.dtype == torch.bool and x.shape[1:] == (1,):
+                return Binary(1, x.shape, device=device, dtype=torch.bool)
+            return Unbounded(x.shape, device=device, dtype=x.dtype)
+
+        outputs = self.at_start(self.safe_state)
+        done = {name: outputs.pop(name) for name in ("done", "terminated", "truncated")}
+        outputs = {name: x for name, x in outputs.items() if not isinstance(x, Mapping) or x}
+        state = nested(self.safe_state)
+        return {
+            # A key that is in the state spec alone would never be carried on: it has to be in both.
+            "observation_spec": spec({**outputs, "state": state}),
+            "state_spec": spec({"state": state}),
+            "action_spec": Bounded(-1.0, 1.0, (env.num_envs, 4), device=device, dtype=example.dtype),
+            "reward_spec": Unbounded((env.num_envs, 1), device=device, dtype=example.dtype),
+            "done_spec": spec(done),
+        }
+
+
+def sample_state(env: Task, n: int) -> State:
     """Draw n states at the start of an episode: the task's start, disturbed, with commands to hover on their way."""
     state = env.initial_state(n)
     for disturbance in env.disturbances.values():
@@ -210,16 +281,8 @@ def sample_state(env: Any, n: int) -> State:
     if env.action_delay:
         hover = env.hover_action.expand(n, 4).unsqueeze(1)
         state["action_queue"] = hover.expand(n, env.action_delay, 4).clone()
-    state["step"] = torch.zeros(n, 1, dtype=torch.int64, device=env.device)
+    state["step"] = torch.zeros(n, 1, dtype=torch.int64, device=state["position"].device)
     return state
-
-
-def draw_start(env: Any) -> dict[str, Any]:
-    """All entries that a reset of all environments writes, nested."""
-    if env.initial_state_source is None:
-        return env.control_step.reset(sample_state(env, env.num_envs))
-    source = env.initial_state_source(env.num_envs)
-    return env.control_step.reset(restore_state(env, source, "initial_state_source"))
 
 
 def _rows(parameter: Tensor, name: str, n: int) -> Tensor:

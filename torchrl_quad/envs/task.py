@@ -1,21 +1,26 @@
-"""The interface for a task's author: what a task defines, and what it may use."""
+"""The interface for a task's author: what a task defines, what it may use, and the check of what it returns."""
 
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+import numbers
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import Dynamics, QuadrotorParams
+from torchrl_quad.engine.packing import Key
 from torchrl_quad.engine.simulation import State
+from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.markers import Markers
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, summarise_episodes
 from torchrl_quad.envs.randomness import Randomness
-from torchrl_quad.envs.scenes import Scene
+from torchrl_quad.envs.scenes import MountedCamera, Scene
 from torchrl_quad.envs.terms import Event
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.vision import DepthCamera
 
 
@@ -45,9 +50,19 @@ class Task(abc.ABC):
     and the entries that the task adds.
     """
 
+    num_envs: int  #: drones that fly in parallel
+    dtype: torch.dtype  #: floating-point type of all that flies
+    control_dt: float  #: [s]
+    max_episode_steps: int  #: control steps after which an episode is truncated
+    action_delay: int  #: control steps from a command to its effect
+    observe_last_action: bool  #: whether the commands on their way are observed
+    event_discount: float | None  #: discount per control step of the time of events
+    params: QuadrotorParams  #: the drone that flies
     dynamics: Dynamics  #: the model of the drone
     randomness: Randomness  #: the source of all random numbers
-    disturbances: Mapping[str, Any]  #: wind, sensors and so on by name; see :mod:`~torchrl_quad.envs.disturbances`
+    disturbances: Mapping[str, Disturbance]  #: by name; see :mod:`~torchrl_quad.envs.disturbances`
+    task_entries: list[Key]  #: the names of the task's own entries of the state
+    initial_state_source: Callable[[int], TensorDictBase] | None  #: where resets start, if not as the task says
 
     # -- what a task defines -------------------------------------------------------------------------------------------
 
@@ -92,7 +107,7 @@ class Task(abc.ABC):
         return {}
 
     def metrics(self, state: State) -> State:
-        """Measurements beside the reward, by name, each (num_envs, 1), without gradient."""
+        """Measurements in addition to the reward, by name, each (num_envs, 1), without gradient."""
         return {}
 
     def state_bounds(self) -> dict[Any, tuple[float, float]]:
@@ -100,14 +115,14 @@ class Task(abc.ABC):
         return {}
 
     def observation_bounds(self) -> Tensor | None:
-        """The greatest magnitude (k) of each entry of :meth:`observe` in a useful flight; None where nobody knows it.
+        """The greatest magnitude (k) of each entry of :meth:`observe` in a useful flight; None if unknown.
 
         gymnasium's observation spaces have these bounds, and its observations are clipped to them.
         """
         return None
 
     def markers(self) -> Markers:
-        """The things that pictures show beside the drones."""
+        """What pictures show in addition to the drones."""
         return Markers()
 
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
@@ -125,13 +140,14 @@ class Task(abc.ABC):
     @property
     def scene(self) -> Scene | None:
         """The obstacles, with the distance to them, if there are any."""
-        return self.disturbances.get("scene")
+        scene = self.disturbances.get("scene")
+        return scene if isinstance(scene, Scene) else None
 
     @property
     def camera(self) -> DepthCamera | None:
         """The depth camera, if there is one."""
-        eye = self.disturbances.get("camera")
-        return None if eye is None else eye.camera
+        mounted = self.disturbances.get("camera")
+        return mounted.camera if isinstance(mounted, MountedCamera) else None
 
     @property
     def nominal(self) -> QuadrotorParams:
@@ -172,3 +188,78 @@ class Task(abc.ABC):
     def integers(self, high: int, *shape: int) -> Tensor:
         """Uniform random integers in [0, high) from the environment's own generator."""
         return self.randomness.integers(high, *shape)
+
+
+def check_task(env: Task, state: State) -> None:
+    """Check that the methods of a task return what :class:`Task` says.
+
+    A tensor with more columns than it should have would shift all that lies behind it.
+    """
+    task, n = type(env).__name__, env.num_envs
+
+    def check(condition: bool, message: str) -> None:
+        if not condition:
+            raise UserValueError(f"{task}.{message}")
+
+    def kind(x: Any) -> str:
+        return f"{tuple(x.shape)}, {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
+
+    def check_tensor(method: str, x: Any, dtype: torch.dtype | None, columns: int | None = 1, hint: str = "") -> None:
+        is_right = isinstance(x, Tensor) and x.shape == (n, columns or x.shape[-1:].numel())
+        wanted = f"({n}, {columns or 'k'})" + ("" if dtype is None else f", {dtype}")
+        check(is_right and dtype in (None, x.dtype), f"{method} must be a tensor {wanted}; got {kind(x)}.{hint}")
+
+    def named(method: str, entries: Any) -> Mapping[Any, Any]:
+        is_mapping = isinstance(entries, Mapping)
+        check(is_mapping, f"{method} must be a mapping from names to tensors; got {type(entries).__name__}.")
+        return entries
+
+    taken = {"step", "action_queue", "collided", "drone", "scene"}
+    taken |= {key for x in env.disturbances.values() for key in x.start(env.randomness, state) if isinstance(key, str)}
+    for key in taken & set(env.task_entries):
+        check(False, f"initial_state: entry {key!r} is the environment's own; give yours another name.")
+    for key, x in state.items():
+        is_right = isinstance(x, Tensor) and x.dim() > 1 and len(x) == n
+        check(
+            is_right and x.dtype in (env.dtype, torch.int64, torch.bool),
+            f"initial_state: entry {key!r} must be a tensor ({n}, ...) of at least two dimensions, {env.dtype}, int64 "
+            f"or bool; got ({kind(x)}).",
+        )
+        fields = env.dynamics.plant_fields
+        if isinstance(key, tuple) and key[0] == "drone" and key[1] not in fields:
+            choices = ", ".join(fields)
+            raise UserValueError(f"Entry {key!r} changes no parameter of the drone. Choose from: {choices}.")
+    check_tensor("observe(state)", env.observe(state), env.dtype, None)
+    terms = named("reward_terms(state)", env.reward_terms(state))
+    for name, term in terms.items():
+        hint = " Sum a vector over its components: .sum(-1, keepdim=True)."
+        check_tensor(f"reward_terms(state)[{name!r}]", term, env.dtype, hint=hint)
+    for name, event in named("events(previous, state)", env.events(state, state)).items():
+        method = f"events(previous, state)[{name!r}]"
+        check(isinstance(event, Event), f"{method} must be an Event; got {type(event).__name__}.")
+        check_tensor(f"{method}.happened", event.happened, torch.bool)
+        check_tensor(f"{method}.time", event.time, env.dtype)
+        if not isinstance(event.amount, numbers.Real) and getattr(event.amount, "numel", lambda: 0)() != 1:
+            check_tensor(f"{method}.amount", event.amount, env.dtype)
+        check(
+            f"{name}_time" not in terms,
+            f"{method} gives the term '{name}_time', which the reward has already: rename one of them.",
+        )
+        is_term = event.term is None or event.term in terms
+        check(is_term, f"{method}.term must be one of {', '.join(terms)}, or None; got {event.term!r}.")
+    metrics = named("metrics(state)", env.metrics(state))
+    missing = sorted(env.metric_info.keys() - EPISODE_METRICS.keys() - metrics.keys())
+    adds_some = type(env).episode_metrics is not Task.episode_metrics  # which may give what metrics() lacks
+    check(adds_some or not missing, f"metrics(state) lacks {', '.join(missing)}, which metric_info describes.")
+    for name, metric in metrics.items():
+        check_tensor(f"metrics(state)[{name!r}]", metric, None)
+    for method in ("is_crash", "is_success"):
+        check_tensor(f"{method}(state)", getattr(env, method)(state), torch.bool)
+    advanced = named("advance(previous, state)", env.advance(state, dict(state)))
+    for key in env.task_entries:
+        got, wanted = kind(advanced.get(key)), kind(state[key])
+        check(
+            got == wanted,
+            f"advance must return the whole state, and {key!r} as initial_state gives it, ({wanted}); got ({got}). "
+            "Start from {**state, ...}.",
+        )

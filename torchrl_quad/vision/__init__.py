@@ -1,8 +1,7 @@
 """Obstacles: solids, the distance to them, and what a camera sees of them. Pure functions on plain tensors."""
 
 from torchrl_quad.vision.camera import DepthCamera
-from torchrl_quad.vision.primitives import Primitives, closest_approach, nearest
+from torchrl_quad.vision.primitives import Primitives, closest_approach, has_way, nearest
 from torchrl_quad.vision.rays import cast_rays
-from torchrl_quad.vision.ways import has_way
 
 __all__ = ["DepthCamera", "Primitives", "cast_rays", "closest_approach", "has_way", "nearest"]

@@ -46,7 +46,7 @@ LIBRARIES = {
     "modules": TORCHRL,
     "objectives": TORCHRL,
     "data": TORCHRL,
-    "deploy": TORCHRL | {"jsonschema", "numpy", "onnx", "onnxruntime", "mujoco", "rotorpy", "crazyflow", "jax"},
+    "deploy": TORCHRL | {"jsonschema", "numpy", "onnx", "onnxruntime", "onnxscript", "mujoco", "rotorpy", "crazyflow", "jax"},
     "rotations": {"numpy"},
     "errors": set(),
     "options": {"numpy", "pydantic", "torch"},

@@ -196,11 +196,10 @@ def test_a_picture_takes_the_place_of_nothing_but_a_picture(capsys, tmp_path):
 def test_a_transfer_without_a_film_still_gets_its_page(broken_ffmpeg, monkeypatch, capsys, tmp_path):
     env = HoveringEnv(num_envs=1)
     monkeypatch.setattr(drawing, "fly", lambda bundle, name, how, episodes: {"simulator": name})
-    monkeypatch.setattr(drawing, "as_rollout", lambda contract, flight: env.rollout(3))
-    monkeypatch.setattr(drawing, "environment", lambda contract: env)
+    monkeypatch.setattr(drawing, "as_rollout", lambda flight: env.rollout(3))
     broken_ffmpeg("killed later")
     (tmp_path / "transfer.mp4").touch()
-    bundle = SimpleNamespace(contract=None)
+    bundle = SimpleNamespace(contract={"control_dt": 0.02})
     drawing.draw_transfer(bundle, "mujoco", "contract", tmp_path / "transfer")
     assert {"transfer.gif", "transfer.html"} == {path.name for path in tmp_path.glob("transfer.*")}
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)

@@ -15,13 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_quad.deploy.tasks import RULES
 from torchrl_quad.errors import MissingPackage, UserError, UserValueError, shown
 
-VERSION = 3  # of the contract; raise it when a reader of the older one would misunderstand the new one
-FILES = ("README.md", "policy.c", "policy.h", "policy.onnx", "starts.npz", "vectors.npz")  # beside contract.json
+VERSION = 4  # of the contract; raise it when a reader of the older one would misunderstand the new one
+GRAPHS = ("policy", "observe", "advance", "judge", "episode")  # the ONNX files that a bundle may have
+OTHERS = ("README.md", "policy.c", "policy.h", "starts.npz", "vectors.npz")  # files beside these and contract.json
+MEASURED = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}  # what each state must have
+ENDS = ("crash", "success", "terminated", "truncated")  # how a state ends an episode
 MOST_PIXELS = 2**18  # of an image; 256 of them are in vectors.npz
-IN_BODY = "_in_body"  # ends the names of inputs that are vectors of the world frame, turned to the body frame
+Signature = dict[str, tuple[tuple[int, ...], str]]  # shapes, without batch and time, and dtypes by name
 
 
 class TamperedBundle(UserValueError):
@@ -78,9 +80,10 @@ def schema_table() -> str:
 def _fields(part: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
     for name, entry in part["properties"].items():
         yield prefix + name, entry
-        inside = entry.get("items", entry)
-        if "properties" in inside:
-            yield from _fields(inside, f"{prefix}{name}{'[]' if 'items' in entry else ''}.")
+        for key, between in (("properties", "."), ("items", "[]."), ("additionalProperties", ".*.")):
+            inside = entry if key == "properties" else entry.get(key)
+            if isinstance(inside, dict) and "properties" in inside:
+                yield from _fields(inside, f"{prefix}{name}{between}")
 
 
 def _range(entry: Mapping[str, Any]) -> str:
@@ -205,7 +208,7 @@ def _contradictions(contract: Mapping[str, Any]) -> Iterator[str]:
     """Where a contract that fits the schema contradicts itself."""
     drone, output, limits = contract["drone"], contract["output"], contract["limits"]
     thrust, rates, ratio = output["thrust"], output["body_rate"]["range"], drone["max_thrust_to_weight"]
-    dt, length, camera = contract["control_dt"], contract["action_delay"], contract["camera"]
+    dt, camera = contract["control_dt"], contract["camera"]
     yield from _contradictions_of_a_drone(drone, "drone", hovers=True)
     yield from _plant_problems(contract)
     equal = {
@@ -215,7 +218,6 @@ def _contradictions(contract: Mapping[str, Any]) -> Iterator[str]:
         **{f"output.body_rate.range[{i}][1]": (x[1], drone["max_body_rate"][i]) for i, x in enumerate(rates)},
         **{f"output.body_rate.range[{i}][0]": (x[0], -drone["max_body_rate"][i]) for i, x in enumerate(rates)},
         "output.hover_action[0] + 1": (output["hover_action"][0] + 1.0, 2.0 / ratio),
-        "action_queue.length": (contract["action_queue"]["length"], length),
         "limits.max_state_age": (limits["max_state_age"], (1 + contract["observation_delay"]) * dt),
     }
     if camera:
@@ -231,37 +233,73 @@ def _contradictions(contract: Mapping[str, Any]) -> Iterator[str]:
     steps = dt / contract["simulator"]["dt"]
     if not math.isclose(steps, max(round(steps), 1), rel_tol=1e-6):
         yield f"control_dt is {dt:g}, and must be a whole multiple of simulator.dt"
-    low, high = (contract["safety"]["position"][x] for x in ("low", "high"))
-    if not all(a < b for a, b in zip(low, high, strict=True)):
-        yield f"safety.position.low is {low}, and must be below high, {high}"
-    task = contract["task"]
-    if len(task.get("cosine", ())) != len(task.get("sine", ())):
-        yield "task.cosine and task.sine must have one length"
-    if not task.get("speeds", (0, 0))[0] <= task.get("speeds", (0, 0))[1]:
-        yield f"task.speeds is {task['speeds']}, and must rise"
-    yield from _contradictions_of_the_inputs(contract)
+    if set(contract["sha256"]) != {*files(contract)}:
+        yield f"sha256 must be of {', '.join(files(contract))}"
+    seen = contract["observation"]["seen"]
+    marks = [seen[x] for x in ("least", "p1", "p99", "greatest")]
+    if any(len(x) != contract["observation"]["size"] for x in marks):
+        yield f"observation.seen must hold lists of {contract['observation']['size']} numbers"
+    elif not all(a <= b for pair in itertools.pairwise(marks) for a, b in zip(*pair, strict=True)):
+        yield "observation.seen must rise from least to greatest"
+    yield from _contradictions_of_the_graphs(contract)
 
 
-def _contradictions_of_the_inputs(contract: Mapping[str, Any]) -> Iterator[str]:
-    task, queue = contract["task"], contract["action_queue"]
-    rule = RULES[task["rule"]](task | {"control_dt": contract["control_dt"]})
-    sizes = {name: len(x) for name, x in rule.inputs(np.zeros(3)).items()}
-    sizes |= {"quaternion": 4, "velocity": 3, "angular_velocity": 3, "up": 3, "action_queue": 4 * queue["length"]}
-    sizes |= {f"{name}{IN_BODY}": 3 for name in ("velocity", "up", *sizes) if sizes[name] == 3}
-    begin = 0
-    for i, entry in enumerate(contract["inputs"]):
-        size, seen = entry["stop"] - entry["start"], [entry["seen"][x] for x in ("least", "p1", "p99", "greatest")]
-        if entry["name"] not in sizes:
-            yield f"the policy reads {shown(entry['name'])}, and known are {', '.join(sizes)}"
-        elif entry["start"] != begin or size != sizes[entry["name"]]:
-            yield f"inputs[{i}] must go from {begin} to {begin + sizes[entry['name']]}"
-        begin = entry["stop"]
-        if any(len(x) != size for x in seen):
-            yield f"inputs[{i}].seen must hold lists of {size} numbers"
-        elif not all(a <= b for pair in itertools.pairwise(seen) for a, b in zip(*pair, strict=True)):
-            yield f"inputs[{i}].seen must rise from least to greatest"
-    if queue["observed"] != any(entry["name"] == "action_queue" for entry in contract["inputs"]):
-        yield f"action_queue.observed is {queue['observed']}, and the inputs say otherwise"
+def _contradictions_of_the_graphs(contract: Mapping[str, Any]) -> Iterator[str]:
+    """Where graphs read what nobody gives them, or write what nobody reads."""
+    task, graphs, floats = contract["task"], contract["graphs"], contract["task"]["dtype"]
+    judged = {"judge", "episode"} & graphs.keys()
+    if judged != (set() if task["unjudged"] else {"judge", "episode"}):
+        yield "graphs must have judge and episode, or task.unjudged say why not"
+        return
+    entries: Signature = {name: ((*x["shape"],), x["dtype"]) for name, x in task["entries"].items()}
+    changing: Signature = {name: ((size,), floats) for name, size in MEASURED.items()}
+    if contract["action_delay"]:
+        changing["action_queue"] = ((contract["action_delay"], 4), floats)
+    if taken := entries.keys() & {*changing, "step"}:
+        yield f"task.entries has {shown(min(taken))}, which is not the task's"
+    now = changing | entries | {"step": ((1,), "int64")}
+    before = {f"previous.{name}": x for name, x in (changing | entries).items()}
+    ends: Signature = dict.fromkeys(ENDS, ((1,), "bool"))
+    found = {name: tuple(signature(graph[side]) for side in ("reads", "writes")) for name, graph in graphs.items()}
+    metrics = {name: x for name, x in found.get("judge", ({}, {}))[1].items() if name.startswith("metrics.")}
+    flight = {f"{prefix}{name}": x for name, x in now.items() for prefix in ("state.", "next.state.")}
+    flight |= {f"next.{name}": x for name, x in (ends | metrics | {"done": ends["crash"]}).items()}
+    camera, memory = contract["camera"], contract["memory"]
+    policy: Signature = {"observation": ((contract["observation"]["size"],), "float32")}
+    policy |= {"depth": ((1, camera["height"], camera["width"]), "float32")} if camera else {}
+    policy |= {"memory": ((memory,), "float32")} if memory else {}
+    answer: Signature = {"action": ((4,), "float32")} | ({"next_memory": ((memory,), "float32")} if memory else {})
+    known = {
+        "policy": (policy, answer),
+        "observe": (now, {"observation": (policy["observation"][0], floats)}),
+        "advance": (before | changing | {"step": now["step"]}, entries),
+        "judge": (now, ends | metrics),
+        "episode": (flight | {"action": ((4,), floats)}, {name: ((), floats) for name in task["metrics"]}),
+    }
+    for graph, sides in found.items():
+        for side, own, others in zip(("reads", "writes"), sides, known[graph], strict=True):
+            for name in own:
+                if own[name] != others.get(name):
+                    wanted = "nothing of that name" if name not in others else shown(others[name])
+                    yield f"graphs.{graph}.{side}.{shown(name)[1:-1]} is {shown(own[name])}, and must be {wanted}"
+            if missing := others.keys() - own.keys() if graph != "advance" and side == "writes" else set():
+                yield f"graphs.{graph}.{side} lacks {shown(min(missing))}"
+        if not sides[0]:
+            yield f"graphs.{graph}.reads is empty"
+    if judged and not {"solved", "crash"} <= task["metrics"].keys():
+        yield "task.metrics lacks solved or crash"
+    if found["policy"][0] != policy:
+        yield f"graphs.policy.reads must have {', '.join(policy)}"
+
+
+def signature(tensors: Mapping[str, Any]) -> Signature:
+    """The shapes and types of what a graph reads or writes, by name."""
+    return {name: ((*x["shape"],), x["dtype"]) for name, x in tensors.items()}
+
+
+def files(contract: Mapping[str, Any]) -> tuple[str, ...]:
+    """The names of all files of a bundle but contract.json."""
+    return (*OTHERS, *(f"{name}.onnx" for name in GRAPHS if name in contract["graphs"]))
 
 
 def _contradictions_of_a_drone(drone: Mapping[str, Any], name: str, hovers: bool = False) -> Iterator[str]:

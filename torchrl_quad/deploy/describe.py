@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,21 +12,25 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_quad.deploy.contract import GRAPHS
 from torchrl_quad.deploy.simulators.vehicle import bandwidth, damping_ratio
+from torchrl_quad.deploy.tracing import Rules
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
-from torchrl_quad.envs import ForestEnv, HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv
+from torchrl_quad.envs import TASKS, QuadrotorEnv
 from torchrl_quad.envs.disturbances import DroneRandomization, Sensors, Wind
 from torchrl_quad.envs.metrics import describe_metric
 from torchrl_quad.errors import UserValueError
 
-MAX_HARMONICS = 64  # of a curve
-Inputs = list[tuple[str, int, str, str, float, str]]  # of each name, size, unit, frame, scale and meaning
-_BODY: Inputs = [
-    ("quaternion", 4, "1", "body to world", 10.0, "attitude (w, x, y, z), unit norm"),
-    ("velocity", 3, "m/s", "world", 1.0, "velocity"),
-    ("angular_velocity", 3, "rad/s", "body", 1.0, "body rates"),
-]
-_SIGN = (
+DTYPES = {1: "float32", 11: "float64", 7: "int64", 9: "bool"}  # by their numbers in ONNX
+UNITS = {  # unit and frame of what is measured and commanded
+    "position": {"unit": "m", "frame": "world"},
+    "quaternion": {"unit": "1", "frame": "body to world"},
+    "velocity": {"unit": "m/s", "frame": "world"},
+    "angular_velocity": {"unit": "rad/s", "frame": "body"},
+    "action_queue": {"unit": "1", "frame": "action"},
+    "depth": {"unit": "m"},
+}
+SIGN = (
     "q and -q are one attitude, and give different actions. The first quaternion of a flight has w >= 0; each further "
     "one has the sign that brings it nearer to the one before."
 )
@@ -40,176 +44,34 @@ def numbers(x: Any) -> Any:
     return float(str(x)) if x.dtype.kind == "f" else x.item()
 
 
-# -- tasks -------------------------------------------------------------------------------------------------------------
-
-
-def _hovering(env: HoveringEnv) -> dict[str, Any]:
-    return {
-        "rule": "target",
-        "target": list(env.target),
-        "success": f"an episode: mean distance below {env.success_radius} m over its last second, without a crash",
-        "criteria": {"radius": env.success_radius, "window": 1.0},
-        "box": _box(env.target, env.box_half_width, env.box_height),
-        "inputs": [("to_target", 3, "m", "world", 1.0, "target - position"), *_BODY],
-    }
-
-
-def _landing(env: LandingEnv) -> dict[str, Any]:
-    success = (
-        f"z <= {env.success_height} m, x and y within {env.success_radius} m of the target, speed <= "
-        f"{env.success_speed} m/s; then cut the motors"
-    )
-    return {
-        "rule": "target",
-        "target": list(env.target),
-        "success": success,
-        "criteria": {"height": env.success_height, "radius": env.success_radius, "speed": env.success_speed},
-        "box": _box(env.target, env.box_half_width, env.box_height),
-        "inputs": [("to_target", 3, "m", "world", 1.0, "target - position; the target lies on the ground"), *_BODY],
-    }
-
-
-def _tracking(env: TrackingEnv) -> dict[str, Any]:
-    about = f"next {env.lookahead} points of the curve - position, nearest first, {env.lookahead_interval} s apart"
-    return {
-        "rule": "curve",
-        "period": env.period,
-        "lookahead": env.lookahead,
-        "lookahead_interval": env.lookahead_interval,
-        **_harmonics(env),
-        "success": f"an episode: root mean square distance below {env.success_radius} m from {env.settling_time} s on, "
-        "without a crash",
-        "criteria": {"radius": env.success_radius, "settling_time": env.settling_time},
-        "box": _box(numbers(env.centre), numbers(env.half_width), env.ceiling),
-        "inputs": [("to_points", 3 * env.lookahead, "m", "world", 1.0, about), *_BODY],
-    }
-
-
-def _racing(env: RacingEnv) -> dict[str, Any]:
-    return {
-        "rule": "gates",
-        "gates": env.track["gates"],
-        "gate_radius": env.track["gate_radius"],
-        "success": f"an episode: {env.success_gates} gates passed, without a crash",
-        "criteria": {"gates": env.success_gates},
-        "box": _box(numbers(env.centre), numbers(env.half_width), env.ceiling),
-        "inputs": [
-            ("to_gate", 3, "m", "world", 1.0, "centre of the next gate - position"),
-            ("to_gate_after", 3, "m", "world", 1.0, "centre of the gate after that - position"),
-            *_BODY,
-        ],
-    }
-
-
-def _forest(env: ForestEnv) -> dict[str, Any]:
-    inputs: Inputs = [
-        ("up_in_body", 3, "1", "body", 10.0, "the world's z axis"),
-        (
-            "command_in_body",
-            3,
-            "m/s",
-            "body",
-            1.0,
-            "speed x way / max(length of way, 1 m), with way = target - position",
-        ),
-    ]
-    if env.observe_velocity:
-        inputs.insert(0, ("velocity_in_body", 3, "m/s", "body", 1.0, "velocity"))
-    return {
-        "rule": "course",
-        "target": [env.length + env.run_out, 0.0, env.cruise_height],
-        "speed": 0.5 * sum(env.speeds),
-        "speeds": list(map(float, env.speeds)),
-        "success": f"an episode: x >= {env.length} m, without having touched a tree or the ground",
-        "criteria": {"distance": env.length},
-        "box": _box(numbers(env.centre), numbers(env.extent), env.ceiling, env.scene.radius),
-        "inputs": inputs,
-    }
-
-
-_TASKS: dict[type[QuadrotorEnv], tuple[str, Callable[[Any], dict[str, Any]]]] = {
-    ForestEnv: ("forest", _forest),
-    HoveringEnv: ("hovering", _hovering),
-    LandingEnv: ("landing", _landing),
-    RacingEnv: ("racing", _racing),
-    TrackingEnv: ("tracking", _tracking),
-}
-
-
-def _box(centre: Any, half_width: Any, height: float, ground: float = 0.0) -> dict[str, list[float]]:
-    half = np.broadcast_to(half_width, 2)
-    low, high = ([float(np.round(c + s * h, 6)) for c, h in zip(centre, half, strict=False)] for s in (-1, 1))
-    return {"low": [*low, float(np.round(ground, 6))], "high": [*high, float(height)]}
-
-
-def _harmonics(env: TrackingEnv) -> dict[str, Any]:
-    """The curve of an environment as a sum of harmonics.
-
-    Raises:
-        ValueError: it needs too many of them.
-    """
-    n = 8 * MAX_HARMONICS
-    phase = torch.arange(n, dtype=torch.float64) * (2 * math.pi / n)
-    points = env.curve(phase.to(env.device, env.dtype)).double().cpu().numpy()
-    spectrum = np.fft.rfft(points, axis=0) / n
-    count = int(np.flatnonzero((np.abs(spectrum) > 1e-6).any(1)).max(initial=0))
-    spectrum[np.abs(spectrum) < 1e-7] = 0.0
-    if count > MAX_HARMONICS:
-        raise UserValueError(
-            f"export_policy: the curve has corners: it needs more than {MAX_HARMONICS} harmonics of above 1e-6 m. "
-            "Give TrackingEnv a smoother curve."
-        )
-    used = spectrum[1 : count + 1]
-    cosine, sine = (np.round(x, 9) + 0.0 for x in (2 * used.real, -2 * used.imag))
-    return {"offset": numbers(np.round(spectrum[0].real, 9)), "cosine": numbers(cosine), "sine": numbers(sine)}
-
-
 # -- the contract ------------------------------------------------------------------------------------------------------
 
 
-def describe(env: QuadrotorEnv, sees: bool = False, memory: int = 0) -> dict[str, Any]:
+def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, Any], memory: int, visual: bool) -> dict[str, Any]:
     """What a contract says of an environment, before anything has flown.
 
     Args:
         env: the environment.
-        sees: whether the policy reads the images of its camera.
+        rules: of its task.
+        models: the ONNX of all graphs by name.
         memory: numbers that the policy keeps.
+        visual: whether the policy reads the images of its camera.
 
     Raises:
-        ValueError: it is none of the tasks that a bundle can compute, or flies what a contract cannot say yet.
+        ValueError: it flies what a contract cannot say yet.
     """
-    kind = next((cls for cls in type(env).__mro__ if cls in _TASKS), None)
-    if kind is None:
-        raise UserValueError(
-            f"export_policy cannot say what {type(env).__name__} observes. It knows "
-            f"{', '.join(name for name, _ in _TASKS.values())}, and tasks that inherit from these."
-        )
     if env.control != "rates":
-        raise UserValueError(
-            f'export_policy exports thrust and body rates alone, control="rates"; got {env.control!r}.'
-        )
-    name, describe_task = _TASKS[kind]
-    task = describe_task(env)
-    box, layout = task.pop("box"), task.pop("inputs")
-    camera = env.camera if sees else None
-    if env.observe_last_action:
-        about = "commands on their way, oldest first, each (thrust, roll rate, pitch rate, yaw rate)"
-        layout.append(("action_queue", 4 * env.action_delay, "1", "action", 1.0, about))
+        raise UserValueError(f'export_policy exports only thrust and body rates, control="rates"; got {env.control!r}.')
+    camera = env.camera if visual else None
     nominal, sensors = _fields(env.nominal), env.disturbances.get("sensors", Sensors())
     weight = nominal["mass"] * nominal["gravity"]
     most = float(np.float32(nominal["max_thrust_to_weight"] * weight))
-    rates = nominal["max_body_rate"]
     return {
-        "task": {"name": name, "max_episode_steps": env.max_episode_steps, **task},
-        "inputs": _inputs(layout),
+        "task": _task(env, rules),
+        "graphs": {name: _graph(models[name]) for name in GRAPHS if name in models},
         "camera": None if camera is None else _camera(camera),
         "memory": memory,
-        "quaternion": {
-            "order": "wxyz",
-            "frame": "body (x forward, y left, z up) to world (z up)",
-            "sign": _SIGN if _BODY[0] in layout else "q and -q are one attitude, and give the same action.",
-        },
-        "action_queue": {"length": env.action_delay, "observed": env.observe_last_action},
+        "quaternion": {"order": "wxyz", "frame": "body (x forward, y left, z up) to world (z up)", "sign": SIGN},
         "output": {
             "order": ["thrust", "roll_rate", "pitch_rate", "yaw_rate"],
             "thrust": {
@@ -218,7 +80,11 @@ def describe(env: QuadrotorEnv, sees: bool = False, memory: int = 0) -> dict[str
                 "weight": numbers(np.float32(weight)),
                 "range_in_weights": [0.0, nominal["max_thrust_to_weight"]],
             },
-            "body_rate": {"unit": "rad/s", "frame": "body", "range": [[-rate, rate] for rate in rates]},
+            "body_rate": {
+                "unit": "rad/s",
+                "frame": "body",
+                "range": [[-rate, rate] for rate in nominal["max_body_rate"]],
+            },
             "hover_action": numbers(_single("hover_action", env.hover_action, 1)),
         },
         "control_dt": env.control_dt,
@@ -240,8 +106,46 @@ def describe(env: QuadrotorEnv, sees: bool = False, memory: int = 0) -> dict[str
             "quaternion_norm_error": 1e-3,
             "max_value": 1e6,
         },
-        "safety": {"position": box},
     }
+
+
+def _task(env: QuadrotorEnv, rules: Rules) -> dict[str, Any]:
+    cls, bounds = type(env), env.state_bounds()
+    entries = {}
+    for name, key in rules.entries.items():
+        x, ends = env.control_step.safe_state[key], bounds.get(key, (-math.inf, math.inf))
+        low, high = (float(end) if math.isfinite(end) else None for end in ends)
+        entries[name] = {
+            "shape": [*x.shape[1:]],
+            "dtype": str(x.dtype).removeprefix("torch."),
+            "low": low,
+            "high": high,
+        }
+    metrics = {}
+    for x in rules.graphs["episode"].graph.output if "episode" in rules.graphs else ():
+        about = describe_metric(x.name, env.metric_info)
+        metrics[x.name] = {name: getattr(about, name) for name in ("label", "unit", "scale", "median")}
+    return {
+        "name": next((name for name, known in TASKS.items() if known is cls), f"{cls.__module__}.{cls.__qualname__}"),
+        "about": next(iter((cls.__doc__ or "").strip().splitlines()), ""),
+        "max_episode_steps": env.max_episode_steps,
+        "dtype": str(env.dtype).removeprefix("torch."),
+        "entries": entries,
+        "metrics": metrics,
+        "unjudged": rules.unjudged,
+    }
+
+
+def _graph(model: Any) -> dict[str, Any]:
+    """What an ONNX model reads and writes."""
+    described = {}
+    for side, ends in (("reads", model.graph.input), ("writes", model.graph.output)):
+        described[side] = {}
+        for x in ends:
+            kind, unit = x.type.tensor_type, UNITS.get(x.name.rpartition(".")[2], {})
+            shape = [size.dim_value for size in kind.shape.dim if not size.dim_param]
+            described[side][x.name] = {"shape": shape, "dtype": DTYPES[kind.elem_type], **unit}
+    return described
 
 
 def _camera(camera: Any) -> dict[str, Any]:
@@ -249,15 +153,6 @@ def _camera(camera: Any) -> dict[str, Any]:
     fields = {k: v for k, v in vars(camera).items() if k not in ("pitch", "differentiable")}
     mount = numbers(camera.mount(torch.zeros((), dtype=torch.float64)) + 0.0)
     return fields | {"position": list(map(float, camera.position)), "quaternion": mount}
-
-
-def _inputs(layout: Inputs) -> list[dict[str, Any]]:
-    entries, start = [], 0
-    for name, size, unit, frame, scale, meaning in layout:
-        about = {"unit": unit, "frame": frame, "scale": scale, "meaning": meaning}
-        entries.append({"name": name, "start": start, "stop": start + size, **about})
-        start += size
-    return entries
 
 
 def _single(name: str, value: Tensor, dim: int) -> Tensor:
@@ -323,14 +218,11 @@ def _rate_loop(env: QuadrotorEnv, drone: Mapping[str, Any]) -> dict[str, Any] | 
 # -- what has flown ----------------------------------------------------------------------------------------------------
 
 
-def seen_ranges(inputs: list[dict[str, Any]], observation: np.ndarray) -> list[dict[str, Any]]:
-    """The inputs with the range of each entry in observations (n, k), in the unit of the input."""
-    found = []
-    for entry in inputs:
-        values = observation[:, entry["start"] : entry["stop"]] / np.float32(entry["scale"])
-        marks = np.percentile(values, (0, 1, 99, 100), axis=0).astype(np.float32)
-        found.append(entry | {"seen": dict(zip(("least", "p1", "p99", "greatest"), numbers(marks), strict=True))})
-    return found
+def seen_ranges(observation: np.ndarray) -> dict[str, Any]:
+    """The range of each entry in observations (n, k)."""
+    marks = np.percentile(observation, (0, 1, 99, 100), axis=0).astype(np.float32)
+    seen = dict(zip(("least", "p1", "p99", "greatest"), numbers(marks), strict=True))
+    return {"size": observation.shape[1], "seen": seen}
 
 
 def results(env: QuadrotorEnv, flight: TensorDictBase) -> dict[str, Any]:
@@ -342,10 +234,12 @@ def results(env: QuadrotorEnv, flight: TensorDictBase) -> dict[str, Any]:
     return summary
 
 
-def envelope(flight: TensorDictBase) -> dict[str, float]:
-    """The greatest speed, body rate and tilt in a flight."""
+def envelope(flight: TensorDictBase) -> dict[str, Any]:
+    """Where a flight has been: the range of its positions, its greatest speed, body rate and tilt."""
     state = flight["state"]
     _, x, y, _ = state["quaternion"].unbind(-1)
     tilt = torch.acos((1.0 - 2.0 * (x * x + y * y)).clamp(-1.0, 1.0))
     norms = {"max_speed": state["velocity"].norm(dim=-1), "max_body_rate": state["angular_velocity"].norm(dim=-1)}
-    return {name: numbers(x.max()) for name, x in {**norms, "max_tilt": tilt}.items()}
+    position = state["position"].flatten(0, 1)
+    ends = {"low": numbers(position.amin(0)), "high": numbers(position.amax(0))}
+    return ends | {name: numbers(x.max()) for name, x in {**norms, "max_tilt": tilt}.items()}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import itertools
 import json
 import os
 from collections.abc import Mapping
@@ -25,12 +24,15 @@ from torchrl_quad.data import ObservationNormalizer, base_env, differentiable_ro
 from torchrl_quad.data.normalizer import NormalizedPolicy
 from torchrl_quad.data.unwrap import memory_keys
 from torchrl_quad.deploy import contract as contracts
-from torchrl_quad.deploy.bundle import QUANTITIES, load_bundle
+from torchrl_quad.deploy.bundle import Bundle, load_bundle
+from torchrl_quad.deploy.contract import MEASURED
 from torchrl_quad.deploy.describe import describe, envelope, results, seen_ranges
 from torchrl_quad.deploy.folding import fold
+from torchrl_quad.deploy.judging import judge
 from torchrl_quad.deploy.network import write_c, write_onnx
 from torchrl_quad.deploy.page import write_page
-from torchrl_quad.deploy.tasks import PROGRESS, RULES, Rule, progress_of
+from torchrl_quad.deploy.reading import MOST_BYTES
+from torchrl_quad.deploy.tracing import Rules, trace
 from torchrl_quad.envs import QuadrotorEnv
 from torchrl_quad.errors import MissingPackage, UserValueError
 from torchrl_quad.files import check_folder, replacing_folder
@@ -43,7 +45,8 @@ MOST_NUMBERS = 10_000_000  # that a part of a flight observes; a forest is flown
 NEVER_JUDGED = (("depth",), ("state", "images"), ("state", "scene"))  # entries that take most of a flight's memory
 TOLERANCE = 1e-5  # of an action
 MEMORY_TOLERANCE = 1e-4  # of an action within an episode: rounding errors go on in the memory
-OBSERVATION_TOLERANCE = 1e-3  # of an entry of the observation: float32 adds up a phase less exactly than a bundle
+OBSERVATION_TOLERANCE = 1e-4  # of an entry of the observation
+METRIC_TOLERANCE = 1e-3  # of a metric of an episode, relative above 1
 
 
 def export_policy(
@@ -93,11 +96,13 @@ def export_policy(
             bundle, or files beside it.
         ImportError: onnx or onnxruntime is missing.
     """
-    try:
-        import onnx  # noqa: F401, asked for before anything flies
+    try:  # before anything flies
+        import onnx
         import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401, which torch.onnx needs
     except ImportError as error:
-        raise MissingPackage("export_policy needs onnx and onnxruntime: pip install onnx onnxruntime") from error
+        needed = "onnx onnxruntime onnxscript"
+        raise MissingPackage(f"export_policy needs {needed}: pip install {needed}") from error
     env, normalizer = _unwrapped(env, normalizer)
     place = Path(folder) if Path(folder).name not in ("", "..") else Path(folder).resolve()
     check_folder(place)
@@ -105,30 +110,32 @@ def export_policy(
     camera = env.camera
     network = fold(actor, normalizer, camera and (camera.height, camera.width))
     reads = network.reads
-    contract = {"version": contracts.VERSION}
-    contract |= describe(env, sees="depth" in reads, memory=reads.get("memory", (0,))[0])
-    (width,), size = reads["observation"], contract["inputs"][-1]["stop"]
-    shape = env.observation_spec["observation"].shape
-    if not width == size == shape[-1]:
-        raise UserValueError(
-            f"export_policy: the policy reads {width} numbers, the environment observes {shape[-1]}, and "
-            f"{type(env).__name__} is known to observe {size}."
-        )
+    (width,), shape = reads["observation"], env.observation_spec["observation"].shape
+    if width != shape[-1]:
+        raise UserValueError(f"export_policy: the policy reads {width} numbers, the environment observes {shape[-1]}.")
     policy = actor if normalizer is None else NormalizedPolicy(actor, normalizer)
     count, self_test = (IMAGES, SELF_TEST_IMAGES) if "depth" in reads else (VECTORS, SELF_TEST_VECTORS)
     flight = _fly(env, policy, count)
     vectors = _vectors(policy, env, flight.chosen)
-    visited = flight.whole["observation"].flatten(0, 1)
-    contract["inputs"] = seen_ranges(contract["inputs"], visited.float().cpu().numpy())
-    contract["safety"]["seen"] = envelope(flight.whole)
+    rules, written = trace(env, _states(env, flight.replayed)), write_onnx(network)
+    models = {"policy": onnx.load_from_string(written), **rules.graphs}
+    about = describe(env, rules, models, memory=reads.get("memory", (0,))[0], visual="depth" in reads)
+    contract = {"version": contracts.VERSION, **about}
+    contract["observation"] = seen_ranges(flight.whole["observation"].flatten(0, 1).float().cpu().numpy())
+    contract["envelope"] = envelope(flight.whole)
     contract["results"] = results(env, flight.whole)
     weights = b"".join(x.tobytes() for x in network.weights())
     package = {"package": _version(), "weights_sha256": contracts.sha256(weights)}
     contract["origin"] = package | dict(origin or {})
-    files = {"policy.onnx": write_onnx(network), "vectors.npz": _npz(vectors), "README.md": write_page(contract)}
-    files["starts.npz"] = _npz(_starts(flight.whole, contract["task"]["rule"]))
+    files = {f"{name}.onnx": x.SerializeToString(deterministic=True) for name, x in rules.graphs.items()}
+    files |= {
+        "policy.onnx": written,
+        "vectors.npz": _npz(vectors),
+        "README.md": write_page(contract, type(env).__doc__),
+    }
+    files["starts.npz"] = _npz(_starts(flight.whole, rules))
     files |= write_c(network, contract, {name: x[:: count // self_test] for name, x in vectors.items()})
-    contract["sha256"] = {name: contracts.sha256(files[name]) for name in contracts.FILES}
+    contract["sha256"] = {name: contracts.sha256(content) for name, content in files.items()}
     contract["digest"] = contracts.digest(contract)
     if problem := contracts.problem(contract):
         raise UserValueError(
@@ -141,7 +148,7 @@ def export_policy(
             with open(temporary / name, "wb") as file:
                 file.write(content)
                 os.fsync(file.fileno())
-        _require_the_same_flight(temporary, env, policy, flight.replayed)
+        _check_the_flight(temporary, env, policy, flight.replayed, rules)
     return Path(folder)
 
 
@@ -226,48 +233,54 @@ def _vectors(policy: TensorDictModuleBase, env: QuadrotorEnv, chosen: TensorDict
     return {name: x.float().cpu().numpy() for name, x in vectors.items()}
 
 
-def _starts(flight: TensorDictBase, rule: str) -> dict[str, np.ndarray]:
+def _starts(flight: TensorDictBase, rules: Rules) -> dict[str, np.ndarray]:
     """The first states of a flight (num_envs, ...), without what the environment drew beside them."""
-    names = [*QUANTITIES, *PROGRESS[rule]]
-    return {name: flight["state", name][:, 0].cpu().numpy() for name in names}
+    keys = dict(zip(MEASURED, MEASURED, strict=True)) | rules.entries
+    return {name: flight["state", key][:, 0].cpu().numpy() for name, key in keys.items()}
 
 
-def _require_the_same_flight(
-    folder: Path, env: QuadrotorEnv, policy: TensorDictModuleBase, flights: TensorDictBase
+def _states(env: QuadrotorEnv, flight: TensorDictBase) -> dict[Any, Tensor]:
+    """A few states of a flight, as many as the environment has not."""
+    n = 3 if env.num_envs != 3 else 4
+    return {key: flight["state", key].flatten(0, 1)[:n] for key in env.control_step.safe_state}
+
+
+def _check_the_flight(
+    folder: Path, env: QuadrotorEnv, policy: TensorDictModuleBase, flights: TensorDictBase, rules: Rules
 ) -> None:
     """Fly the bundle through the first episodes of flights, from what a drone knows.
 
-    Compare what it observes with what the environment did, and what it then does and remembers with what the policy
-    does, in the same order, with the same observations.
+    Compare what it observes with what the environment did, what it then does and remembers with what the policy does,
+    in the same order, with the same observations, and what it makes of the episode with the environment's own metrics.
     """
     bundle = load_bundle(folder)
     bundle.check(TOLERANCE)
+    task = type(env).__name__
     for flight in flights:
         done = flight["next", "done"].flatten()
         length = int(done.nonzero()[0]) + 1 if done.any() else len(done)
         episode = flight[:length]
-        seen = {key: episode["state", key] for key in env.control_step.safe_state}
+        true = {key: episode["state", key] for key in env.control_step.safe_state}
+        seen = true
         for disturbance in env.disturbances.values():
             seen = disturbance.observe(seen)
-        rule = bundle.contract["task"]["rule"]
-        bundle.reset(**progress_of(rule, {key: seen[key][0].cpu().numpy() for key in PROGRESS[rule]}))
-        states = {k: seen[k].cpu().numpy() for k in QUANTITIES}
+        states = {name: seen[name].cpu().numpy() for name in MEASURED}
         states |= {"depth": episode["depth"].cpu().numpy()} if bundle.contract["camera"] else {}
-        true = episode["state", "position"].cpu().numpy()
-        if not np.array_equal(true, states["position"]):
-            # The environment counts gates from there, a bundle from what it measures.
-            _go_by(bundle.rule, RULES[rule], true)
+        entries = {name: seen[key].cpu().numpy() for name, key in rules.entries.items()}
+        sees_truth = all(torch.equal(true[name], seen[name]) for name in MEASURED)
+        bundle.reset(**{name: x[0] for name, x in entries.items()})
         observed, acted = [], []
         for t in range(length):
+            if not sees_truth:  # from which the environment advances the task; a drone only knows what it measures
+                bundle._progress, bundle._step, bundle._before = {k: x[t][None] for k, x in entries.items()}, t, None
             bundle({name: x[t] for name, x in states.items()} | {"age": 0.0, "depth_age": 0.0})
             observed.append(bundle.observation)
             acted.append(bundle.action)
             gap = np.abs(bundle.observation - episode["observation"][t].float().cpu().numpy()).max()
             if not gap <= OBSERVATION_TOLERANCE:
                 raise UserValueError(
-                    f"export_policy: {type(env).__name__} observes something else than the contract says, by {gap:.3g} "
-                    f"in step {t}. A contract describes the package's own observations and rules; this environment has "
-                    "others."
+                    f"export_policy: the bundle observes something else than {task} does, by {gap:.3g} in step {t}. "
+                    "observe and advance must depend on the state and on constants, and change nothing."
                 )
         read = {key: episode[key] for key in policy.in_keys if key != "is_init"}
         read["observation"] = torch.from_numpy(np.stack(observed))
@@ -275,14 +288,28 @@ def _require_the_same_flight(
         gap = np.abs(np.stack(acted) - again).max()
         if not gap <= MEMORY_TOLERANCE:
             raise UserValueError(
-                f"export_policy: the bundle acts otherwise than the policy, by {gap:.3g} within an episode."
+                f"export_policy: the bundle acts differently from the policy, by {gap:.3g} within an episode."
             )
+    if rules.unjudged is None:
+        _check_the_judgement(bundle, env, flights, rules)
 
 
-def _go_by(rule: Rule, kind: type, positions: np.ndarray) -> None:
-    """Let a rule, and its copies, advance along positions (t, 3), whatever the bundle tells it."""
-    steps = itertools.pairwise(positions)
-    rule.__class__ = type(kind.__name__, (kind,), {"advance": lambda self, *_: kind.advance(self, *next(steps))})
+def _check_the_judgement(bundle: Bundle, env: QuadrotorEnv, flights: TensorDictBase, rules: Rules) -> None:
+    """Compare what the bundle's graphs make of flights with the metrics of the environment."""
+    flown = {"action": flights["action"].cpu().numpy()}
+    for name in MEASURED:
+        states = torch.cat((flights["state", name][:, :1], flights["next", "state", name]), 1)
+        flown[name] = states.cpu().numpy()
+    flown |= {name: flights["state", key][:, 0].cpu().numpy() for name, key in rules.entries.items()}
+    found, expected = judge(bundle, flown), env.episode_metrics(flights)
+    for name, values in found.items():
+        own = expected[name].cpu().numpy()
+        if not np.allclose(values, own, rtol=METRIC_TOLERANCE, atol=METRIC_TOLERANCE, equal_nan=True):
+            raise UserValueError(
+                f"export_policy: the bundle judges a flight differently from {type(env).__name__}: {name} is "
+                f"{values.tolist()} instead of {own.tolist()}. is_crash, is_success, advance, metrics and "
+                "episode_metrics must depend on the state and on constants, and change nothing."
+            )
 
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -308,7 +335,7 @@ def require_bundle(folder: Path) -> None:
     names = {path.name for path in found}
     if names and not (folder / "contract.json").is_file():
         raise FileExistsError(f"{folder} exists and is no bundle. Choose another folder, or empty this one.")
-    if others := sorted(names - (plain & {*contracts.FILES, "contract.json"})):
+    if others := sorted(names - (plain & {*MOST_BYTES})):
         raise FileExistsError(
             f"{folder} also holds {', '.join(others)}: an export replaces the folder, and would delete that. Move it "
             "away, or choose another folder."

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-OPSET, IR_VERSION = 20, 10  # onnxruntime reads both since 1.18
+from torchrl_quad.deploy.graphs import IR_VERSION, OPSET
 
 Array = NDArray[np.float32]
 
@@ -162,60 +162,6 @@ def write_onnx(network: Network) -> bytes:
     model = helper.make_model(graph, producer_name="torchrl_quad", ir_version=IR_VERSION, opset_imports=opset)
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString(deterministic=True)
-
-
-OPERATORS = {operator for operator, _ in ACTIVATIONS.values()} - {"SiLU"} | {"Clip", "Concat", "Conv", "Flatten"}
-OPERATORS |= {"GRU", "Gemm", "Max", "Mul", "Reciprocal", "Squeeze", "Unsqueeze"}
-
-
-def foreign_parts(content: bytes) -> str | None:
-    """What an ONNX file holds that :func:`write_onnx` never writes, if anything.
-
-    Loops would run for ever, and weights in other files would read any file of this computer. This reads the wire
-    format of protobuf, without onnx: a model has its graph as field 7, a graph its nodes as field 1, and a node its
-    operator as field 4, whose domain is field 7.
-    """
-    if b"location" in content:
-        return "keeps weights in another file"
-    try:
-        model = list(_fields(memoryview(content)))
-        if others := sorted({number for number, _ in model} - {*range(1, 9), 14}):
-            return f"has the fields {others[:9]} beside its graph"
-        parts = [part for number, graph in model if number == 7 for part in _fields(graph)]
-        nodes = [dict(_fields(node)) for number, node in parts if number == 1]
-        used = {b".".join(bytes(memoryview(node[i])) for i in (7, 4) if i in node) for node in nodes}
-    except (ValueError, KeyError, TypeError, IndexError):
-        return "is damaged: it is no ONNX"
-    if others := sorted(used - {name.encode() for name in OPERATORS}):
-        return f"computes {others[0][:40].decode(errors='replace')!r}, and no policy that was exported does"
-    return None
-
-
-def _fields(message: memoryview) -> Iterator[tuple[int, Any]]:
-    """The fields of a message of protobuf by number: whole numbers, and bytes."""
-    at = 0
-
-    def whole() -> int:
-        nonlocal at
-        value = 0
-        for i in range(10):
-            at += 1
-            value |= (message[at - 1] & 127) << 7 * i
-            if message[at - 1] < 128:
-                return value
-        raise ValueError("a number does not end")
-
-    for _ in range(1000):
-        if at == len(message):
-            return
-        number, kind = divmod(whole(), 8)
-        if kind == 0:
-            yield number, whole()
-            continue
-        size = whole() if kind == 2 else {1: 8, 5: 4}[kind]
-        yield number, message[at : at + size]
-        at += size
-    raise ValueError("it has more than 1000 fields, or ends within one")
 
 
 def _update_first(rows: Array) -> Array:

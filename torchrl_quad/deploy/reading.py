@@ -14,29 +14,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.contract import (
-    FILES,
+    GRAPHS,
+    MEASURED,
+    OTHERS,
     VERSION,
+    Signature,
     TamperedBundle,
     UnknownContract,
     check,
     digest,
+    files,
     sha256,
+    signature,
     writer,
 )
-from torchrl_quad.deploy.network import foreign_parts
-from torchrl_quad.deploy.tasks import PROGRESS
+from torchrl_quad.deploy.graphs import AGAIN, Graph, foreign_parts
 from torchrl_quad.errors import UserError, one_line, shown
 
-MOST_BYTES = {"contract.json": 2**20, **dict.fromkeys(FILES, 2**28)}  # fifty times what policies here take
-QUANTITIES = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}  # that each state must have
-AGAIN = "Export the policy again."
+MOST_BYTES = {"contract.json": 2**20, **dict.fromkeys((*OTHERS, *(f"{name}.onnx" for name in GRAPHS)), 2**28)}
 
 
 class Content(NamedTuple):
     """What a bundle flies with."""
 
     contract: dict[str, Any]
-    policy: bytes  #: ONNX
+    graphs: dict[str, Graph]
     vectors: dict[str, NDArray[Any]]
     starts: dict[str, NDArray[Any]]
 
@@ -63,32 +65,26 @@ def read(folder: Path) -> Content:
             f"written by {writer(contract)}: use that one, or export again."
         )
     try:
-        fits = digest(contract) == contract["digest"] and set(contract["sha256"]) == set(FILES)
-    except (ValueError, TypeError, KeyError, RecursionError):
+        fits = digest(contract) == contract["digest"]
+    except (ValueError, TypeError, RecursionError):
         fits = False
     if not fits:
         raise TamperedBundle(f"{path} was changed after the export: its checksum does not fit. {AGAIN}")
     check(contract, path)
-    files = {}
-    for name in FILES:
-        files[name] = _content(folder / name)
-        if sha256(files[name]) != contract["sha256"][name]:
+    content, graphs = {}, {}
+    for name in files(contract):
+        content[name] = _content(folder / name)
+        if sha256(content[name]) != contract["sha256"][name]:
             raise TamperedBundle(f"{folder / name} was changed after the export: its checksum does not fit. {AGAIN}")
-    if problem := foreign_parts(files["policy.onnx"]):
-        raise TamperedBundle(f"{folder / 'policy.onnx'} {problem}. {AGAIN}")
-    reads, writes = shapes_of(contract)
-    vectors = _arrays(folder / "vectors.npz", files["vectors.npz"], reads | writes, single=True)
-    starts = _starts(folder / "starts.npz", files["starts.npz"], contract)
-    return Content(contract, files["policy.onnx"], vectors, starts)
-
-
-def shapes_of(contract: Mapping[str, Any]) -> tuple[dict[str, tuple[int, ...]], dict[str, tuple[int, ...]]]:
-    """The shapes of what the network reads, and of what it writes, by name and without the batch."""
-    camera, memory = contract["camera"], contract["memory"]
-    reads: dict[str, tuple[int, ...]] = {"observation": (contract["inputs"][-1]["stop"],)}
-    reads |= {"depth": (1, camera["height"], camera["width"])} if camera else {}
-    reads |= {"memory": (memory,)} if memory else {}
-    return reads, {"action": (4,)} | ({"next_memory": (memory,)} if memory else {})
+    for name, about in contract["graphs"].items():
+        own = folder / f"{name}.onnx"
+        if problem := foreign_parts(own.name, content[own.name]):
+            raise TamperedBundle(f"{own} {problem}. {AGAIN}")
+        graphs[name] = Graph(own, content[own.name], about)
+    policy = contract["graphs"]["policy"]
+    expected = signature(policy["reads"]) | signature(policy["writes"])
+    vectors = _arrays(folder / "vectors.npz", content["vectors.npz"], expected)
+    return Content(contract, graphs, vectors, _starts(folder / "starts.npz", content["starts.npz"], contract))
 
 
 def _content(path: Path) -> bytes:
@@ -149,10 +145,8 @@ def _finite(text: str) -> float:
 # -- its arrays --------------------------------------------------------------------------------------------------------
 
 
-def _arrays(
-    path: Path, content: bytes, expected: Mapping[str, tuple[int, ...]], single: bool
-) -> dict[str, NDArray[Any]]:
-    """The arrays (n, ...) of a file, of these shapes without n, all finite, and if ``single`` of float32."""
+def _arrays(path: Path, content: bytes, expected: Signature) -> dict[str, NDArray[Any]]:
+    """The arrays (n, ...) of a file, of these shapes without n, all finite."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.infolist())
@@ -164,30 +158,32 @@ def _arrays(
     except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds for damaged files
         raise TamperedBundle(f"{path} is damaged: {one_line(error)}. {AGAIN}") from error
     count = len(arrays[next(iter(arrays))]) if arrays[next(iter(arrays))].ndim else 0
-    for name, shape in expected.items():
+    for name, (shape, dtype) in expected.items():
         x = arrays[name]
         if not count or x.shape != (count, *shape):
             wanted = ", ".join(map(str, ("n", *shape)))
             raise TamperedBundle(f"{path}: {name} has shape {x.shape}, and must have ({wanted}), n above 0. {AGAIN}")
-        if not ((x.dtype == np.float32 or (not single and x.dtype.kind in "fiu")) and np.isfinite(x).all()):
-            kind = "finite numbers in float32" if single else "finite numbers"
-            raise TamperedBundle(f"{path}: {name} must hold {kind}. {AGAIN}")
+        if x.dtype != dtype or not np.isfinite(x).all():
+            raise TamperedBundle(f"{path}: {name} must hold finite numbers in {dtype}. {AGAIN}")
     return arrays
 
 
 def _starts(path: Path, content: bytes, contract: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
     task, limits = contract["task"], contract["limits"]
-    progress = {name: (3,) if name == "target" else (1,) for name in PROGRESS[task["rule"]]}
-    starts = _arrays(path, content, {name: (size,) for name, size in QUANTITIES.items()} | progress, single=False)
+    expected = {name: ((size,), task["dtype"]) for name, size in MEASURED.items()} | signature(task["entries"])
+    starts = _arrays(path, content, expected)
     norm = np.linalg.norm(starts["quaternion"].astype(float), axis=1)
-    fits = {name: np.abs(x) <= limits["max_value"] for name, x in starts.items()}
+    fits = {name: np.abs(starts[name]) <= limits["max_value"] for name in MEASURED}
     fits["quaternion"] = np.abs(norm - 1.0) <= limits["quaternion_norm_error"]
-    if "gate" in fits:
-        fits["gate"] = np.isin(starts["gate"], np.arange(len(task["gates"])))
-    if "speed" in fits:
-        fits["speed"] &= starts["speed"] > 0
+    fits |= {name: within(starts[name], about) for name, about in task["entries"].items()}
     for name, fit in fits.items():
         if not fit.all():
             value = shown(starts[name][np.flatnonzero(~fit.reshape(len(norm), -1).all(1))[0]].tolist())
             raise TamperedBundle(f"{path}: no flight starts with the {name} {value}. {AGAIN}")
     return starts
+
+
+def within(values: NDArray[Any], about: Mapping[str, Any]) -> NDArray[np.bool_]:
+    """Which values of an entry of the task are between the bounds that the contract gives for it."""
+    low, high = (np.inf * sign if about[end] is None else about[end] for end, sign in (("low", -1), ("high", 1)))
+    return (values >= low) & (values <= high)

@@ -19,11 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.bundle import Bundle, load_bundle
-from torchrl_quad.deploy.contract import drone_problem, naming
-from torchrl_quad.deploy.judging import endings, judge
-from torchrl_quad.deploy.reading import QUANTITIES
+from torchrl_quad.deploy.contract import ENDS, MEASURED, drone_problem, naming
+from torchrl_quad.deploy.judging import Judge
 from torchrl_quad.deploy.simulators import make_simulator
-from torchrl_quad.deploy.tasks import PROGRESS, progress_of
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 
 Array = NDArray[np.float64]
@@ -84,13 +82,14 @@ def fly(
         episodes: of the starts, how many; by default all.
 
     Returns:
-        by name: the states (n, time + 1, ...), the first of which is the start, the last one repeated after the end of
-        an episode; ``action`` (n, time, 4); what :func:`~torchrl_quad.deploy.judging.judge` finds (n); ``simulator``,
-        name and version; ``faults``, the bundle's refusals by name.
+        by name: the states (n, time + 1, ...), with the task's entries, the first of which is the start, the last one
+        repeated after the end of an episode; ``action`` (n, time, 4); how states end the episode (n, time):
+        ``terminated``, ``truncated``, ``success`` and ``done``; ``metrics``, the contract's ``task.metrics`` (n) by
+        name; ``simulator``, name and version; ``faults``, the bundle's refusals by name.
 
     Raises:
-        ValueError: the policy sees, or flies through obstacles, which no simulator here has; or an argument is unknown
-            or out of its range.
+        ValueError: the policy reads images, or flies among obstacles, which no simulator here has; or an argument is
+            unknown or out of its range.
     """
     bundle = folder if isinstance(folder, Bundle) else load_bundle(folder, on_fault="hover")
     with naming(bundle.folder), np.errstate(all="ignore"):  # what a simulator cannot fly becomes NaN, and a crash
@@ -111,8 +110,8 @@ def _fly(
     n, steps = len(starts["position"]), contract["task"]["max_episode_steps"]
     if n * steps > MOST_STATES:
         raise UserValueError(f"{n} episodes of {steps} control steps do not fit into memory: give fewer, episodes=...")
-    world = make_simulator(simulator, contract, loop, mutant.motors)
-    world.reset({name: starts[name] for name in QUANTITIES})
+    world, judge = make_simulator(simulator, contract, loop, mutant.motors), Judge(bundle, starts)
+    world.reset({name: starts[name] for name in MEASURED})
     pilots = [_pilot(bundle, {k: x[i] for k, x in starts.items()}) for i in range(n)]
     delay = late + (contract["action_delay"] if mutant.delay is None else mutant.delay)
     queue = deque([np.tile(_hover(contract), (n, 1))] * delay)
@@ -122,28 +121,27 @@ def _fly(
     flight["action"] = np.tile(bundle.action.astype(float), (n, steps, 1))
     alive = np.arange(n)
     for t in range(1, steps + 1):
-        command = np.empty((len(alive), 4))
-        for k, i in enumerate(alive):
-            command[k] = _ask(pilots[i], {name: seen[0][name][k] for name in QUANTITIES}, mutant)
-            flight["action"][i, t - 1] = pilots[i].action
-        queue.append(command)
-        now = queue.popleft()
-        world.step(now[:, 0], now[:, 1:] * mutant.commanded)
-        state = world.state()
-        for name, x in state.items():
-            flight[name][alive, t:] = x[:, None]
-        seen.append(state)
-        on = ~np.logical_or(*endings(contract, state["position"], state["velocity"]))
+        if len(alive):
+            command = np.empty((len(alive), 4))
+            for k, i in enumerate(alive):
+                command[k] = _ask(pilots[i], {name: seen[0][name][k] for name in MEASURED}, mutant)
+                flight["action"][i, t - 1] = pilots[i].action
+            queue.append(command)
+            now = queue.popleft()
+            world.step(now[:, 0], now[:, 1:] * mutant.commanded)
+            state = world.state()
+            for name, x in state.items():
+                flight[name][alive, t:] = x[:, None]
+            seen.append(state)
+        on = ~judge.step(flight["action"][:, t - 1], {name: flight[name][:, t] for name in MEASURED})[alive]
         if not on.all():
             alive = alive[on]
             queue = deque(x[on] for x in queue)
             seen = deque(({k: x[on] for k, x in y.items()} for y in seen), seen.maxlen)
             world.keep(on)
-        if not len(alive):
-            break
-    flight |= {name: starts[name] for name in PROGRESS[contract["task"]["rule"]]}
     faults = sum((pilot.faults for pilot in pilots), Counter())
-    return {**flight, **judge(contract, flight), "simulator": world.version, "faults": dict(faults)}
+    found = {"metrics": judge.metrics(), "simulator": world.version, "faults": dict(faults)}
+    return flight | judge.flight() | found
 
 
 def other_drone(contract: Mapping[str, Any], scale: Mapping[str, float]) -> dict[str, Any]:
@@ -178,8 +176,8 @@ def _hover(contract: dict[str, Any]) -> Array:
 def _pilot(bundle: Bundle, start: dict[str, Any]) -> Bundle:
     """Another bundle of the same policy, with a flight and a memory of its own."""
     pilot = copy.copy(bundle)
-    pilot.rule, pilot.faults = copy.copy(bundle.rule), Counter()
-    pilot.reset(**progress_of(bundle.contract["task"]["rule"], start))
+    pilot.faults = Counter()
+    pilot.reset(**{name: start[name] for name in bundle.contract["task"]["entries"]})
     return pilot
 
 
@@ -192,3 +190,18 @@ def _ask(pilot: Bundle, state: dict[str, Array], mutant: Mutant) -> Array:
     seen["angular_velocity"] = state["angular_velocity"] * mutant.measured
     thrust, rates = pilot({**state, **seen})
     return np.array([thrust, *rates])
+
+
+def as_rollout(flight: Mapping[str, Any]) -> Any:
+    """What :func:`fly` returns as a rollout (n, time) for the package's pictures; this needs torch."""
+    import torch
+    from tensordict import TensorDict
+
+    n, time = flight["done"].shape
+    names = [*MEASURED, "rotor_speed", *(["target"] if "target" in flight else [])]
+    states = {name: torch.from_numpy(flight[name]).float() for name in names}
+    first = flight["done"].cumsum(1) - flight["done"] == 0  # what comes after the first episode has not flown
+    ends = {name: torch.from_numpy(flight[name] & first).unsqueeze(-1) for name in (*ENDS, "done")}
+    later = {"state": {name: x[:, 1:] for name, x in states.items()}, **ends}
+    action = torch.from_numpy(flight["action"]).float()
+    return TensorDict({"state": {k: x[:, :-1] for k, x in states.items()}, "action": action, "next": later}, [n, time])

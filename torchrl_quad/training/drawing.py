@@ -20,8 +20,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_quad.deploy import Bundle
-from torchrl_quad.deploy.replaying import as_rollout, environment
-from torchrl_quad.deploy.transfer import fly
+from torchrl_quad.deploy.transfer import as_rollout, fly
 from torchrl_quad.errors import UserError
 from torchrl_quad.files import check_file
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, write_replay
@@ -46,18 +45,20 @@ def publish_flight(flight: TensorDictBase, figure: Path, page: Path, env: EnvBas
         write_replay(flight, page, env=env, title=title)
 
 
-def draw_transfer(bundle: Bundle, simulator: str, loop: str, path: Path, drones: int = 4) -> None:
+def draw_transfer(
+    bundle: Bundle, simulator: str, loop: str, path: Path, env: EnvBase | None = None, drones: int = 4
+) -> None:
     """Film a bundle in our simulator and in another one, side by side, and write a page that plays both together."""
-    flights = [
-        fly(bundle, name, how, episodes=drones) for name, how in (("torchrl_quad", "contract"), (simulator, loop))
-    ]
-    ours, theirs = (as_rollout(bundle.contract, flight) for flight in flights)
-    env, labels = environment(bundle.contract), tuple(flight["simulator"] for flight in flights)
-    _film(path, ours, env=env, beside=theirs, labels=labels)
+    ways = (("torchrl_quad", "contract"), (simulator, loop))
+    flights = [fly(bundle, name, how, episodes=drones) for name, how in ways]
+    ours, theirs = map(as_rollout, flights)
+    labels = tuple(flight["simulator"] for flight in flights)
+    about = {"env": env, "control_dt": bundle.contract["control_dt"]}
+    _film(path, ours, beside=theirs, labels=labels, **about)
     title = f"drones 1 to {drones}: {labels[0]}; {drones + 1} to {2 * drones}, from the same starts: {labels[1]}"
     page = path.with_suffix(".html")
     with _or_without(page):
-        write_replay(torch.cat((ours, theirs)), page, env=env, title=title)
+        write_replay(torch.cat((ours, theirs)), page, title=title, **about)
 
 
 def draw_learning_curve(metrics: Path, path: Path, env: EnvBase) -> None:

@@ -70,22 +70,22 @@ def make_simulator(
         ValueError: it is unknown, has no such rate loop, or cannot show the policy of the contract what it needs.
         ImportError: it is not installed.
     """
-    require_open_air(contract)
+    check_open_air(contract)
     kind = simulator_class(name)
     if loop not in kind.loops:
         raise UserValueError(f"{name} has no rate loop {shown(loop)}. Choose from: {', '.join(kind.loops)}.")
     return kind(contract, loop, motors)
 
 
-def require_open_air(contract: Mapping[str, Any]) -> None:
+def check_open_air(contract: Mapping[str, Any]) -> None:
     """Refuse a bundle that needs obstacles or images: no simulator here has any.
 
     Raises:
         ValueError: it needs them.
     """
-    task, sees = contract["task"]["name"], contract["camera"]
-    if sees or task == "forest":
-        why = "its policy reads images, and they have no camera" if sees else "they have no trees"
+    task, unjudged = contract["task"]["name"], contract["task"]["unjudged"]
+    why = "its policy reads images, and they have no camera" if contract["camera"] else unjudged
+    if why:
         raise UserValueError(
             f"The simulators here cannot fly this bundle of the task {task!r}: {why}. Fly it in the package's own "
             "environment: python recipes/evaluate.py checkpoint=..."

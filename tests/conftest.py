@@ -126,11 +126,11 @@ def train(launch, no_pictures):
 
 @pytest.fixture
 def run_here(launch, no_pictures):
-    """As ``reproduce.run``, but in this process, one after the other, and without pictures."""
+    """As ``benchmarks.paper.running.run``, but in this process, one after the other, and without pictures."""
     alone = threading.Lock()
 
-    def run(command, folder):
+    def run(recipe, overrides, folder):
         with alone:
-            launch(Path(command[1]).stem, *command[2:])
+            launch(recipe, *overrides, "resume=auto", f"hydra.run.dir={folder}")
 
     return run

@@ -1,15 +1,15 @@
 """The paper's claims, and the page that is made of the results."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from test_reproduce import curve, run_main
 
-from benchmarks.paper import ablations, claims, elsewhere, matrix, phases, rates, results, running, shipped
+from benchmarks.paper import claims, matrix, results, running, tables
 from benchmarks.paper.claims import Claim, try_claim
-from benchmarks.paper.comparison import interval, is_level
 from benchmarks.paper.evidence import (
     Part,
     Results,
@@ -22,10 +22,11 @@ from benchmarks.paper.evidence import (
     roughness,
     shares,
 )
+from benchmarks.paper.tables import interval, is_level
 from torchrl_quad.files import read_rows, write_rows
 
 PROJECT = Path(__file__).parents[1]
-RENEW = "the page differs from the data: python -m benchmarks.paper.results"
+RENEW = "it differs from the data: python -m benchmarks.paper.results"
 
 
 def data(folder, task="hovering", seeds=matrix.SEEDS, **ends):
@@ -196,57 +197,41 @@ def test_shac_as_published_is_that_of_xu_where_it_was_run_and_the_cut_one_elsewh
 # -- the page ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_page_is_made_of_the_results_and_what_is_written_by_hand_stays(monkeypatch, tmp_path):
+def test_a_page_is_made_of_other_results_and_the_pages_of_the_project_stay_as_they_are(monkeypatch, tmp_path):
     synthetic(tmp_path, strong=True)
-    monkeypatch.setattr(results, "FIGURES", {"main": results.FIGURES["main"]})
-    run_main(monkeypatch, results, "--data", tmp_path)
-    assert (tmp_path / "results/main.png").read_bytes().startswith(b"\x89PNG")
+    monkeypatch.setattr(results, "EXPERIMENTS", {"main": matrix.EXPERIMENTS["main"]})
+    monkeypatch.setattr(results, "pages", lambda: pytest.fail("These are other results."))
+    for _ in range(2):
+        run_main(monkeypatch, results, "--data", tmp_path)
+    assert (tmp_path / "figures/main.png").read_bytes().startswith(b"\x89PNG")
     text = (tmp_path / "results.md").read_text()
     assert all(f"| {claim.id} | {claim.text} |" in text for claim in claims.CLAIMS)
-    assert f"| abcd123 |  |  | {4 * len(matrix.VARIANTS) * 5} | main, published," in text
+    assert "| main | landing | PPO | 5 | 9.9" in text and "# summary" not in text
 
-    nothing = tmp_path / "nothing/results.md"
-    nothing.parent.mkdir()
-    nothing.write_text(text.replace("# Results", "# Results\n\nWritten by hand.") + "\nThe end.\n")
-    run_main(monkeypatch, results, "--data", nothing.parent)
-    text = nothing.read_text()
-    assert text.startswith("# Results\n\nWritten by hand.") and text.endswith("The end.\n")
-    assert all(f"| {claim.id} | {claim.text} | **not run** |" in text for claim in claims.CLAIMS)
-    run_main(monkeypatch, results, "--data", nothing.parent)
-    assert nothing.read_text() == text
-
-
-def test_other_results_leave_the_page_of_the_project_alone(monkeypatch, tmp_path):
-    filled = []
-    monkeypatch.setattr(results, "fill", lambda path, *_: filled.append(path))
-    monkeypatch.setattr(results, "blocks", lambda *_: {})
-    monkeypatch.setattr(results, "draw", lambda *_: None)
+    (tmp_path / "curves/landing.csv").unlink()
     run_main(monkeypatch, results, "--data", tmp_path)
-    run_main(monkeypatch, results)
-    assert filled == [tmp_path / "results.md", PROJECT / "docs/results.md", PROJECT / "docs/results_data.md"]
+    assert "| C9 | BPTT still works in landing | not run |" in (tmp_path / "results.md").read_text()
 
 
-def test_the_page_of_the_project_shows_what_its_data_hold():
-    page = "".join((PROJECT / "docs" / name).read_text() for name in ("results.md", "results_data.md"))
-    readme = (PROJECT / "README.md").read_text()
-    for name, block in results.blocks(running.DATA).items():
-        assert f"{results.MARKER.format(name)}\n\n{block}\n\n{results.END}" in page, f"{name}: {RENEW}"
-    shown = readme + (PROJECT / "docs/choosing.md").read_text()
-    for name, block in shipped.blocks(running.DATA).items():
-        assert f"{results.MARKER.format(name)}\n\n{block}\n\n{results.END}" in shown, (
-            "run: python -m benchmarks.paper.shipped"
-        )
-    options = (PROJECT / "docs/ablations.md").read_text()
-    assert ablations.summary(running.DATA) in options, "run: python -m benchmarks.paper.ablations --tasks landing"
-    assert rates.summary(running.DATA) in options, "benchmarks/paper/rates.py fills it"
-    far = (PROJECT / "docs/elsewhere.md").read_text()
-    assert all(block in far for block in elsewhere.blocks(running.DATA).values()), (
-        "benchmarks/paper/elsewhere.py fills it"
-    )
-    assert phases.block(running.DATA) in (PROJECT / "docs/more_losses.md").read_text(), (
-        "benchmarks/paper/phases.py fills it"
-    )
-    assert page.count("<!-- generated") == page.count(results.END)
+def test_what_is_written_by_hand_stays_beside_the_generated_blocks():
+    begin, table = results.MARKER.format("a"), [{"": "x", "b": "1"}]
+    page = f"# Mine\n\n{begin}\nold\n{results.END}\n\nThe end.\n"
+    new = f"# Mine\n\n{begin}\n\n|  | b |\n| --- | --- |\n| x | 1 |\n\n{results.END}\n\nThe end.\n"
+    assert results.filled(page, {"a": table, "other": table}) == new == results.filled(new, {"a": table})
+
+
+def test_the_pages_and_tables_of_the_project_show_what_its_data_hold():
+    made, shown = tables.make(running.DATA), {}
+    for page in results.pages():
+        text = page.read_text()
+        shown |= dict.fromkeys(re.findall(results.MARKER.format(r"([\w-]+)"), text), page)
+        assert results.filled(text, made) == text, f"{page}: {RENEW}"
+        assert text.count("<!-- generated by benchmarks/paper") == text.count(results.END)
+    assert {"summary", "claims", "reached", "choice", "forest"} <= set(shown) <= set(made)
+    files = {path.stem: read_rows(path) for path in (running.DATA.parent / "tables").glob("*.csv")}
+    assert files.keys() == made.keys(), RENEW
+    for name, table in made.items():
+        assert [{x: row.get(x, "") for x in files[name][0]} for row in table] == files[name], f"{name}: {RENEW}"
 
 
 def test_the_sentences_of_the_page_say_what_its_data_hold():

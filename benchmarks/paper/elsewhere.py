@@ -1,11 +1,4 @@
-"""Train the losses on two environments that are not ours: are they what they say?
-
-python -m benchmarks.paper.elsewhere --environments pendulum
-python -m benchmarks.paper.elsewhere --environments balance --losses shac hybrid ppo
-
-It may be stopped at any moment. Started again, it skips what is in benchmarks/paper/data/elsewhere.csv, and it fills in the
-tables of docs/elsewhere.md: those of the two environments, and that of a track which no setting was chosen on, from
-tracks.csv beside it. That track is flown by shipped.py.
+"""Train the losses on two environments that are independent of this package: are they what they say?
 
 The pendulum is TorchRL's, with the task of gymnasium's Pendulum-v1: 200 steps from a random angle, under a torque too
 weak to lift the pendulum at once. Random actions reach about -1200, and a policy that swings it up about -150.
@@ -16,18 +9,17 @@ times the way that the ball comes closer, and -10 if it falls, which ends the ep
 lasts 200 steps at most. All forces between bar, ball and agents act by contact.
 
 The return is the mean over 256 episodes without exploration noise. All losses have the same networks, rates and number
-of steps. The hybrid has the settings of its recipe instead, and as many steps. PPO has those of its recipe for racing,
-and the horizons and minibatches of the hybrid.
+of steps. The hybrid has the settings of its recipe instead. PPO has those of its recipe for racing, and the horizons
+and minibatches of the hybrid.
 """
 
 from __future__ import annotations
 
-import argparse
-import datetime
 import time
-from pathlib import Path
+from argparse import Namespace
+from collections.abc import Callable
+from itertools import count, product
 
-import numpy as np
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -39,12 +31,8 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss, SoftUpdate
 from torchrl.objectives.value import GAE
 
-from benchmarks.paper.comparison import column, reached_table
-from benchmarks.paper.evidence import Starts
-from benchmarks.paper.results import fill
-from benchmarks.paper.running import DATA, composed, page  # whose import makes the recipes' code known
-from benchmarks.paper.shipped import METHODS, TASKS
-from benchmarks.paper.tables import table
+from benchmarks.paper.flights import about
+from benchmarks.paper.running import composed, kept
 from torchrl_quad import (
     ABPTLoss,
     AHACLoss,
@@ -57,9 +45,9 @@ from torchrl_quad import (
     make_qvalue,
     make_value,
 )
-from torchrl_quad.files import add_rows, machine, read_rows
-from torchrl_quad.training.building import AdaptiveRate, iterations, make_optimizer, make_policy, network, shuffled
-from torchrl_quad.training.processes import backward
+from torchrl_quad.files import add_rows
+from torchrl_quad.training.building import AdaptiveOptimizer, Optimizer, make_policy, network, shuffled
+from torchrl_quad.training.loop import backward
 
 ENVS, HORIZON, EPISODE, EPISODES = 256, 16, 200, 256
 STEPS = 1_024_000  # of all environments together
@@ -104,7 +92,7 @@ class Pendulum:
         return self.env.reset(PendulumEnv.gen_params(batch_size=[count or self.count]), set_state=False)
 
     def go_on(self, carry: TensorDictBase) -> TensorDictBase:
-        """Let half of the pendulums start afresh: an episode has no end of its own."""
+        """Reset half of the pendulums: an episode never ends."""
         fresh = self.starts(len(carry) // 2)
         going_on = carry.select(*fresh.keys())[torch.randperm(len(carry))[: len(carry) - len(fresh)]]
         return torch.cat((fresh, going_on))
@@ -161,7 +149,7 @@ class Balance:
         return self.env.reset()
 
     def go_on(self, carry: TensorDictBase) -> TensorDictBase:
-        """Cut the graph, and let half of the environments start afresh."""
+        """Cut the graph, and reset half of the environments."""
         env = self.env.base_env
         env.world.zero_grad()
         for name, value in vars(env.scenario).items():
@@ -184,45 +172,65 @@ def mean_return(environment: str, actor: torch.nn.Module) -> float:
     return (flight["next", "reward"] * first).sum(1).mean().item() / place.reward
 
 
+def learn(
+    environment: str,
+    place: Pendulum | Balance,
+    actor: torch.nn.Module,
+    iterate: Callable[[int, float, TensorDictBase], tuple[TensorDictBase, TensorDictBase]],
+) -> tuple[float, float, float]:
+    """Train by iterations: the mean returns before and after, and the seconds.
+
+    Args:
+        iterate: takes the number of the iteration, the share of all steps that have been flown, and where the next
+            horizon starts; flies and learns, and gives the rollout and where it ended.
+    """
+    before, start, steps = mean_return(environment, actor), time.process_time(), 0
+    carry = place.starts()
+    for iteration in count():
+        if steps >= STEPS:
+            break
+        rollout, carry = iterate(iteration, steps / STEPS, carry)
+        steps += rollout.numel()
+        carry = place.go_on(carry)
+    return before, mean_return(environment, actor), time.process_time() - start
+
+
 def train(name: str, environment: str, seed: int) -> tuple[float, float, float]:
-    """Train with a loss; return the mean returns before and after, and the seconds."""
+    """Train with a pathwise loss."""
     torch.manual_seed(seed)
     place = ENVIRONMENTS[environment](seed, ENVS)
-    env = place.env
-    actor = make_actor(env, scale_init=0.3, return_log_prob=name == "sapo")
-    loss = LOSSES[name](env, actor)
+    actor = make_actor(place.env, scale_init=0.3, return_log_prob=name == "sapo")
+    loss = LOSSES[name](place.env, actor)
     loss.make_value_estimator(gamma=0.98)
     target = SoftUpdate(loss, tau=0.05) if name in ("shac", "abpt", "abpt-simulated") else None
     extra = [loss.log_alpha] if loss.automatic_alpha else []
     actor_optimizer = torch.optim.Adam([*loss.actor_network_params.parameters(), *extra], betas=(0.7, 0.95))
     critic = [] if name == "bptt" else list(getattr(loss, f"{loss.critic_name}_params").parameters())
     critic_optimizer = torch.optim.Adam(critic, betas=(0.7, 0.95)) if critic else None
-    learn = getattr(loss, loss.critic_loss_key) if critic else None
 
-    before, start, steps = mean_return(environment, actor), time.process_time(), 0
-    carry = place.starts()
-    while steps < STEPS:
+    def iterate(_: int, share: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         for optimizer in (actor_optimizer, critic_optimizer):
             if optimizer:
-                optimizer.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - 0.98 * steps / STEPS)
-        rollout, carry = differentiable_rollout(env, actor, carry, getattr(loss, "horizon", HORIZON))
+                optimizer.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - 0.98 * share)
+        rollout, carry = differentiable_rollout(place.env, actor, carry, getattr(loss, "horizon", HORIZON))
         loss_actor, metadata = loss.loss_actor(rollout)
         actor_optimizer.zero_grad()
         (loss_actor + metadata.get("loss_alpha", 0.0)).backward()
         norm = torch.nn.utils.clip_grad_norm_(loss.actor_network_params.parameters(), 0.5)
         if norm.isfinite():  # the derivative of a contact is NaN now and then
             actor_optimizer.step()
-        if critic:
+        if critic_optimizer:
             data = loss.write_value_target(rollout.detach()).reshape(-1)
             for _ in range(8):
-                optimise(critic_optimizer, learn(data[torch.randint(len(data), (512,))])[0], 1.0)
+                batch = data[torch.randint(len(data), (512,))]
+                optimise(critic_optimizer, getattr(loss, loss.critic_loss_key)(batch)[0], 1.0)
                 if target:
                     target.step()
         if name == "ahac":
             loss.adapt_horizon(metadata["stiffness"])
-        steps += rollout.numel()
-        carry = place.go_on(carry)
-    return before, mean_return(environment, actor), time.process_time() - start
+        return rollout, carry
+
+    return learn(environment, place, actor, iterate)
 
 
 def optimise(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
@@ -242,43 +250,39 @@ def set_up(
 
 
 def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
-    """As :func:`train`, with the settings and the loop of recipes/hybrid.py."""
+    """Train with the settings and the loop of recipes/hybrid.py."""
     cfg, place, actor, value = set_up("hybrid", environment, seed)
     loss = HybridLoss(actor, value, **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
-    count = iterations(cfg)
-    actor_optimizer, _ = make_optimizer(cfg.actor, loss.actor_network_params.parameters(), count)
-    critic_optimizer, critic_schedule = make_optimizer(cfg.critic, loss.value_network_params.parameters(), count)
-    rate = AdaptiveRate(actor_optimizer, cfg.actor.max_kl, count)
+    actor_optimizer, critic_optimizer = AdaptiveOptimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
 
-    before, start = mean_return(environment, actor), time.process_time()
-    carry = place.starts()
-    for iteration in range(count):
+    def iterate(iteration: int, _: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        for optimizer in (actor_optimizer, critic_optimizer):
+            optimizer.anneal(iteration)
         rollout, carry = differentiable_rollout(place.env, actor, carry, cfg.horizon)
         moved = 0.0
         for batch in shuffled(loss.write_targets(rollout).exclude("next"), cfg.batch_size, cfg.epochs):
             losses = loss(batch)
-            if moved < rate.limit(iteration):
+            if moved < actor_optimizer.limit:
                 moved = max(moved, losses["kl"].item())
                 optimise(actor_optimizer, losses["loss_actor"], cfg.actor.max_grad_norm)
             optimise(critic_optimizer, losses["loss_value"], cfg.critic.max_grad_norm)
-        rate.step(iteration, moved)
-        critic_schedule.step()
-        carry = place.go_on(carry)
-    return before, mean_return(environment, actor), time.process_time() - start
+        actor_optimizer.adapt(moved)
+        return rollout, carry
+
+    return learn(environment, place, actor, iterate)
 
 
 def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
-    """As :func:`train`, with the loop of recipes/ppo.py, its settings for racing, and the horizons of the hybrid."""
+    """Train with the loop of recipes/ppo.py, its settings for racing, and the horizons of the hybrid."""
     cfg, place, actor, value = set_up("ppo", environment, seed, "tuned=ppo_racing", "horizon=32", "batch_size=1024")
     advantage = GAE(gamma=cfg.gamma, lmbda=cfg.critic.lmbda, value_network=value, vectorized=False)
     loss = ClipPPOLoss(actor, value, **cfg.loss)
-    actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor.parameters(), iterations(cfg))
-    critic_optimizer, critic_schedule = make_optimizer(cfg.critic, value.parameters(), iterations(cfg))
+    actor_optimizer, critic_optimizer = Optimizer(cfg, "actor", actor), Optimizer(cfg, "critic", value)
 
-    before, start = mean_return(environment, actor), time.process_time()
-    carry = place.starts()
-    for _ in range(iterations(cfg)):
+    def iterate(iteration: int, _: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        for optimizer in (actor_optimizer, critic_optimizer):
+            optimizer.anneal(iteration)
         with torch.no_grad():
             rollout, carry = differentiable_rollout(place.env, actor, carry, cfg.horizon)
             advantage(rollout)
@@ -290,51 +294,22 @@ def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
                 loss_actor = losses["loss_objective"] + losses["loss_entropy"]
                 optimise(actor_optimizer, loss_actor, cfg.actor.max_grad_norm)
             optimise(critic_optimizer, losses["loss_critic"], cfg.critic.max_grad_norm)
-        actor_schedule.step()
-        critic_schedule.step()
-        carry = place.go_on(carry)
-    return before, mean_return(environment, actor), time.process_time() - start
+        return rollout, carry
+
+    return learn(environment, place, actor, iterate)
 
 
-def blocks(data: Path) -> dict[str, str]:
-    """Make the tables of docs/elsewhere.md."""
-    made, rows, tracks = {}, read_rows(data / "elsewhere.csv"), read_rows(data / "tracks.csv")
-    for environment in ENVIRONMENTS:
-        lines = []
-        for name in NAMES:
-            if own := [row for row in rows if (row["environment"], row["loss"]) == (environment, name)]:
-                before, after, seconds = (column(own, x) for x in ("before", "after", "seconds"))
-                each = ", ".join(f"{x:.4g}" for x in sorted(after))
-                lines.append(
-                    [name, f"{np.mean(before):.4g}", f"{np.mean(after):.4g}", each, f"{np.median(seconds):.0f}"]
-                )
-        made[environment] = table(["loss", "before", "after", "each seed", "seconds"], lines)
-    shown = dict.fromkeys(("six_gates", "six_gates_back"), TASKS["racing"])
-    return made | {"tracks": reached_table(tracks, METHODS, shown, Starts(data))}
+OWN_LOOPS = {"hybrid": train_hybrid, "ppo": train_ppo}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--environments", nargs="+", default=list(ENVIRONMENTS), choices=list(ENVIRONMENTS))
-    parser.add_argument("--losses", nargs="+", default=NAMES, choices=NAMES)
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(range(5)))
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the results")
-    args = parser.parse_args()
+def elsewhere(args: Namespace) -> None:
+    """The losses on TorchRL's pendulum and VMAS's balance."""
     torch.set_num_threads(1)
-    jobs = [
-        (environment, name, seed) for seed in args.seeds for environment in args.environments for name in args.losses
-    ]
-    own = {"hybrid": train_hybrid, "ppo": train_ppo}
-    for environment, name, seed in jobs:
-        key = {"environment": environment, "loss": name, "seed": str(seed)}
-        if any(key.items() <= row.items() for row in read_rows(args.data / "elsewhere.csv")):
-            continue
-        flown = own[name](environment, seed) if name in own else train(name, environment, seed)
-        numbers = {x: f"{y:.6g}" for x, y in zip(("before", "after", "seconds"), flown, strict=True)}
-        row = key | numbers | {"steps": STEPS, "machine": machine(), "flown": datetime.date.today().isoformat()}
-        add_rows(args.data / "elsewhere.csv", [row])
-    fill(page(args.data, "elsewhere.md"), blocks(args.data))
-
-
-if __name__ == "__main__":
-    main()
+    path = args.data / "elsewhere.csv"
+    done = kept(path, "environment", "loss", "seed")
+    for seed, environment, name in product(args.seeds, args.environments, args.losses):
+        if (environment, name, str(seed)) not in done:
+            flown = OWN_LOOPS[name](environment, seed) if name in OWN_LOOPS else train(name, environment, seed)
+            numbers = {x: f"{y:.6g}" for x, y in zip(("before", "after", "seconds"), flown, strict=True)}
+            own = {"environment": environment, "loss": name, "seed": seed}
+            add_rows(path, [own | numbers | {"steps": STEPS} | about()])

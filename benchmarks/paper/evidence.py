@@ -103,6 +103,21 @@ class Part:
         return "refuted" if most < self.low or least > self.high else "undecided"
 
 
+def best_learning_rate(task: str, variant: str, data: Path, rates: tuple[float, ...]) -> float | None:
+    """Find the rate whose run in the search ended highest, by the mean of its last tenth of evaluations.
+
+    Returns:
+        the rate, or None while the search is not complete. A run that diverged counts as the lowest.
+    """
+    ends = {}
+    for lr in rates:
+        rows = [x for x in read_rows(data / f"search/{task}.csv") if x["variant"] == variant and x["lr"] == f"{lr:g}"]
+        if not rows:
+            return None
+        ends[lr] = np.mean([float(row["return"]) for row in rows[-max(len(rows) // 10, 1) :]])
+    return max(ends, key=lambda lr: -math.inf if math.isnan(ends[lr]) else ends[lr])
+
+
 class Results:
     """The CSV files by task and variant, as arrays over seeds.
 

@@ -138,6 +138,11 @@ class Job:
         return f"{self.task}/{self.variant}{search}/seed{self.seed}"
 
     @property
+    def key(self) -> tuple[str, str, str]:
+        """Its variant, learning rate and seed, as the results name them; a reported run names no rate."""
+        return self.variant, "" if self.lr is None else f"{self.lr:g}", str(self.seed)
+
+    @property
     def rate_of(self) -> str:
         """The variant whose learning rate it takes: that of its method, under the same reward."""
         variant = VARIANTS[self.variant]

@@ -1,10 +1,11 @@
-"""Run what is missing of the matrix that puts the paper on trial, side by side, and keep the results as CSV files.
+"""Fly what the results of the paper's trial and of the recipes lack, several runs at a time.
 
-python -m benchmarks.paper.reproduce --cores 2
-python -m benchmarks.paper.reproduce --collect --output FOLDER   # add runs that were flown elsewhere; fly nothing
+python -m benchmarks.paper.reproduce trial --cores 2     # the paper's methods and their variants, of matrix.py
+python -m benchmarks.paper.reproduce shipped --cores 2   # the recipes with the settings that ship
+python -m benchmarks.paper.reproduce shipped --tasks mypackage.WindowEnv --data FOLDER   # on a task of your own
 
-It may be stopped at any moment. Started again, it skips what is in the results, and resumes what was cut off. matrix.py
-lists the runs; results.py makes figures, tables and verdicts of them.
+It may be stopped at any moment. Started again, it skips what is in the results, and resumes what was cut off. The
+results are CSV files in a folder; benchmarks/paper/results.py makes tables, figures and verdicts of them.
 """
 
 from __future__ import annotations
@@ -13,14 +14,15 @@ import argparse
 import datetime
 import json
 import math
-import sys
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+import os
+from argparse import Namespace
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from omegaconf import DictConfig
-from tqdm import tqdm
 
-from benchmarks.paper.audits import audit_tasks
+from benchmarks.paper import elsewhere, flights, gradients
+from benchmarks.paper.evidence import best_learning_rate
 from benchmarks.paper.matrix import (
     DYNAMICS,
     EVALUATIONS,
@@ -33,22 +35,74 @@ from benchmarks.paper.matrix import (
     jobs,
     search_jobs,
 )
-from benchmarks.paper.running import QUICK, RECIPES, arguments, command_line, composed, end_runs_with_this, run
+from benchmarks.paper.running import DATA, QUICK, composed, kept, run, ships, side_by_side
 from torchrl_quad.envs import task_class
 from torchrl_quad.files import add_rows, machine, read_rows, write_rows
 
-CURVE = {  # columns of a curve, and their names in metrics.csv
-    "steps": "steps",
-    "seconds": "time/processor_seconds",  # of one thread: other processes do not count
-    "return": "eval/return",
-    "solved": "eval/solved",
-    "crash": "eval/crash",
-    "position_error": "eval/position_error",
-    "tracking_rmse": "eval/tracking_rmse",
-    "gates_passed": "eval/gates_passed",
-    "start_cells": "train/start_cells",
-}
 OWN = "of the paper, or of your own: a registered name or the path of a class, such as mypackage.WindowEnv"
+KEY = ("variant", "lr", "seed")  # what tells one run on a task from another
+
+# -- the trial ---------------------------------------------------------------------------------------------------------
+
+
+def trial(args: Namespace) -> None:
+    """The paper's methods and their variants, after a search for their learning rates; and an audit of the rewards."""
+    rates = LEARNING_RATES[1:2] if args.quick else LEARNING_RATES
+    reported = jobs(tuple(args.experiments), tuple(args.tasks), tuple(args.seeds))
+    search = search_jobs(tuple(args.tasks), {job.rate_of for job in reported}, rates)
+    done = kept(args.data / "final.csv", "task", *KEY)
+    search, reported = ([job for job in some if (job.task, *job.key) not in done] for some in (search, reported))
+
+    def fly(job: Job) -> None:
+        lr = job.lr or best_learning_rate(job.task, job.rate_of, args.data, rates)
+        if lr is None:
+            raise RuntimeError(f"{job.name}: the search for its learning rate is not complete")
+        folder = args.output / job.name
+        run(VARIANTS[job.variant].algorithm, overrides(job, lr, args.quick), folder)
+        keep(job, folder, args.data)
+
+    own_tasks = [task for task in args.tasks if task not in TASKS]
+    write_rows(args.data / "audit.csv", gradients.audit_tasks(own_tasks))
+    side_by_side(args.cores, *([(fly, job) for job in some] for some in (search, reported)))
+
+
+def configuration(job: Job, lr: float) -> DictConfig:
+    """Compose the configuration of a job's recipe, with its overrides."""
+    return composed(VARIANTS[job.variant].algorithm, job.overrides(lr))
+
+
+def overrides(job: Job, lr: float, quick: bool) -> list[str]:
+    """Give the overrides of a job's recipe, with as many evaluations as its curve has points."""
+    if quick:
+        return [*(x for x in job.overrides(lr) if not x.startswith(("total_steps", "horizon"))), *QUICK]
+    cfg = configuration(job, lr)
+    interval = math.ceil(cfg.total_steps // (cfg.num_envs * cfg.horizon) / EVALUATIONS)
+    return [*job.overrides(lr), f"eval.interval={interval}"]
+
+
+def keep(job: Job, folder: Path, data: Path) -> None:
+    """Add a finished run to the results: its curve, and then its final evaluation, which marks it as done."""
+    curve = [
+        {name: f"{float(row[key]):.5g}" for name, key in flights.CURVE.items() if row.get(key)}
+        for row in read_rows(folder / "metrics.csv")
+    ]
+    if (folder / "failure.pt").exists():
+        summary, end = {"diverged": "yes"}, folder / "failure.pt"
+        curve = curve or [{"steps": "0", "seconds": "0", "return": "nan"}]
+        curve.append({name: x if name in ("steps", "seconds") else "nan" for name, x in curve[-1].items()})
+    else:
+        end = folder / "summary.json"
+        summary = json.loads(end.read_text()) | {"seconds": curve[-1]["seconds"]}
+    own = dict(zip(KEY, job.key, strict=True))
+    path = data / ("search" if job.lr is not None else "curves") / f"{job.task}.csv"
+    add_rows(path, [{**own, **row} for row in curve], same=KEY)
+    summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}
+    flown = datetime.date.fromtimestamp(end.stat().st_mtime).isoformat()
+    about = {"task": job.task, **own, "machine": machine(), "flown": flown, "dynamics": DYNAMICS}
+    add_rows(data / "final.csv", [about | {k: v for k, v in summary.items() if k not in about}])
+
+
+# -- the command line --------------------------------------------------------------------------------------------------
 
 
 def known_task(name: str) -> str:
@@ -60,123 +114,79 @@ def known_task(name: str) -> str:
     return name
 
 
-def configuration(job: Job, lr: float) -> DictConfig:
-    """Compose the configuration of a job's recipe, with its overrides."""
-    from torchrl_quad.training.own import offer_tasks  # from the folder above
-
-    offer_tasks([f"task={job.task}"])
-    return composed(VARIANTS[job.variant].algorithm, job.overrides(lr))
+def known_variant(name: str) -> str:
+    """Refuse what is neither a task nor a variant of one."""
+    return name if name in flights.VARIANTS else known_task(name)
 
 
-def command(job: Job, lr: float, folder: Path, quick: bool) -> list[str]:
-    """Give the command that runs a job in a folder, and resumes it where it was stopped."""
-    overrides = job.overrides(lr)
-    if quick:
-        overrides = [*(x for x in overrides if not x.startswith(("total_steps", "horizon"))), *QUICK]
-    else:
-        cfg = configuration(job, lr)
-        interval = math.ceil(cfg.total_steps // (cfg.num_envs * cfg.horizon) / EVALUATIONS)
-        overrides = [*overrides, f"eval.interval={interval}"]
-    recipe = RECIPES / f"{VARIANTS[job.variant].algorithm}.py"
-    return [sys.executable, str(recipe), *overrides, "resume=auto", f"hydra.run.dir={folder}"]
+def command_line() -> argparse.ArgumentParser:
+    """Make the command line: what to fly, with its own options and those of all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    programs = parser.add_subparsers(dest="what", required=True, metavar="what")
+
+    def add(
+        fly: Callable[[Namespace], None], seeds: Iterable[int], **choices: Iterable[str]
+    ) -> argparse.ArgumentParser:
+        """Add what can be flown, with the seeds and choices that fly if none are named."""
+        name, doc = fly.__name__, fly.__doc__ or ""
+        own = programs.add_parser(name, description=doc, help=doc.splitlines()[0])
+        for option, known in choices.items():
+            own.add_argument(f"--{option}", nargs="+", default=list(known), choices=list(known))
+        if seeds:
+            own.add_argument("--seeds", nargs="+", type=int, default=list(seeds))
+        own.add_argument("--cores", type=int, default=os.cpu_count(), help="runs at the same time")
+        own.add_argument("--data", type=Path, default=DATA, help="folder of the results")
+        own.add_argument("--output", type=Path, default=Path("outputs/paper") / name, help="folder of the runs")
+        own.add_argument("--quick", action="store_true", help="runs of a few steps, to see that everything works")
+        own.set_defaults(fly=fly)
+        return own
+
+    def measures(own: argparse.ArgumentParser, states: int, repeats: int) -> None:
+        own.add_argument("--states", type=int, default=states, help="visited states in which gradients are compared")
+        own.add_argument("--repeats", type=even, default=repeats, help="flights from each, each with its own noise")
+        own.add_argument("--steps", type=int, default=256, help="control steps whose rewards count")
+        own.add_argument("--size", type=float, default=0.1, help="change of an action, in its range of -1 to 1")
+
+    own = add(trial, SEEDS, experiments=EXPERIMENTS)
+    own.add_argument("--tasks", nargs="+", default=list(TASKS), type=known_task, help=OWN)
+    own = add(flights.shipped, range(10), methods=flights.METHODS)
+    own.add_argument("--tasks", nargs="+", default=list(flights.TASKS), type=known_variant, help=OWN)
+    add(
+        flights.ablations,
+        range(5),
+        tasks=flights.CHANGED_TASKS,
+        methods=flights.CHANGED_METHODS,
+        changes=flights.CHANGES,
+    )
+    add(flights.rates, (101, 102, 103), tasks=flights.TASKS, methods=flights.METHODS, factors=flights.FACTORS)
+    add(flights.starts, (0,), tasks=flights.TASKS, methods=flights.METHODS)
+    own = add(flights.forest, range(5), policies=flights.POLICIES, difficulties=flights.DIFFICULTIES)
+    own.add_argument("--speeds", nargs="+", type=float, default=list(flights.SPEEDS), help="commanded [m/s]")
+    own.add_argument("--forests", type=int, default=flights.FORESTS, help="for each speed and density")
+    add(elsewhere.elsewhere, range(5), environments=elsewhere.ENVIRONMENTS, losses=elsewhere.NAMES)
+    own = add(gradients.ascent, ())
+    own.add_argument("checkpoints", nargs="+", type=Path)
+    measures(own, states=128, repeats=4)
+    measures(add(gradients.phases, (100,), tasks=("racing", "racing_position")), states=1024, repeats=8)
+    return parser
 
 
-def keep(job: Job, folder: Path, data: Path) -> None:
-    """Add a finished run to the results: its curve, and then its final evaluation, which marks it as done."""
-    curve = [
-        {name: f"{float(row[key]):.5g}" for name, key in CURVE.items() if row.get(key)}
-        for row in read_rows(folder / "metrics.csv")
-    ]
-    if (folder / "failure.pt").exists():
-        summary, end = {"diverged": "yes"}, folder / "failure.pt"
-        curve = curve or [{"steps": "0", "seconds": "0", "return": "nan"}]
-        curve.append({name: x if name in ("steps", "seconds") else "nan" for name, x in curve[-1].items()})
-    else:
-        end = folder / "summary.json"
-        summary = json.loads(end.read_text()) | {"seconds": curve[-1]["seconds"]}
-    own = {"variant": job.variant, "lr": "" if job.lr is None else f"{job.lr:g}", "seed": str(job.seed)}
-    path = data / ("search" if job.lr is not None else "curves") / f"{job.task}.csv"
-    add_rows(path, [{**own, **row} for row in curve], same=list(own))
-    summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}
-    flown = datetime.date.fromtimestamp(end.stat().st_mtime).isoformat()
-    about = {"task": job.task, **own, "machine": machine(), "flown": flown, "dynamics": DYNAMICS}
-    final = about | {k: v for k, v in summary.items() if k not in about}
-    add_rows(data / "final.csv", [final])
-
-
-def is_kept(job: Job, data: Path) -> bool:
-    """Tell whether a run is in the results."""
-    key = (job.task, job.variant, str(job.seed), "" if job.lr is None else f"{job.lr:g}")
-    return any((row["task"], row["variant"], row["seed"], row["lr"]) == key for row in read_rows(data / "final.csv"))
-
-
-def best_learning_rate(task: str, variant: str, data: Path, rates: tuple[float, ...]) -> float | None:
-    """Find the rate whose run in the search ended highest, by the mean of its last tenth of evaluations.
-
-    Returns:
-        the rate, or None while the search is not complete. A run that diverged counts as the lowest.
-    """
-    ends = {}
-    for lr in rates:
-        rows = [x for x in read_rows(data / f"search/{task}.csv") if x["variant"] == variant and x["lr"] == f"{lr:g}"]
-        if not rows:
-            return None
-        last = [float(row["return"]) for row in rows[-max(len(rows) // 10, 1) :]]
-        ends[lr] = sum(last) / len(last)
-    return max(ends, key=lambda lr: -math.inf if math.isnan(ends[lr]) else ends[lr])
-
-
-def collect(waiting: list[Job], output: Path, data: Path) -> None:
-    """Add those of the missing runs to the results that are finished in a folder of runs."""
-    for job in waiting:
-        folder = output / job.name
-        if any((folder / name).exists() for name in ("summary.json", "failure.pt")):
-            keep(job, folder, data)
-            print(folder)
+def even(text: str) -> int:
+    """Refuse an odd number: two halves are compared."""
+    if int(text) % 2:
+        raise argparse.ArgumentTypeError(f"{text} must be even: two halves of them are compared")
+    return int(text)
 
 
 def main() -> None:
-    parser = command_line(__doc__, SEEDS, experiments=EXPERIMENTS)
-    parser.add_argument("--tasks", nargs="+", default=list(TASKS), type=known_task, help=OWN)
-    parser.add_argument("--collect", action="store_true", help="add finished runs in --output to the results, and stop")
-    args = arguments(parser)
-    end_runs_with_this()
-
-    rates = LEARNING_RATES[1:2] if args.quick else LEARNING_RATES
-    reported = jobs(tuple(args.experiments), tuple(args.tasks), tuple(args.seeds))
-    todo = [*search_jobs(tuple(args.tasks), {job.rate_of for job in reported}, rates), *reported]
-    waiting = [job for job in todo if not is_kept(job, args.data)]
-    if args.collect:
-        return collect(waiting, args.output, args.data)
-    write_rows(args.data / "audit.csv", audit_tasks([task for task in args.tasks if task not in TASKS]))
-    running: dict[Future, Job] = {}
-    failed: list[str] = []
-
-    bar = tqdm(total=len(todo), initial=len(todo) - len(waiting), unit="run", smoothing=0)
-    with bar, ThreadPoolExecutor(args.cores) as pool:
-        while waiting or running:
-            for job in list(waiting):
-                if len(running) == args.cores:
-                    break
-                lr = job.lr or best_learning_rate(job.task, job.rate_of, args.data, rates)
-                if lr is not None:
-                    waiting.remove(job)
-                    folder = args.output / job.name
-                    running[pool.submit(run, command(job, lr, folder, args.quick), folder)] = job
-            if not running:  # all that is left waits for a search that failed
-                failed += [f"{job.name}: the search for its learning rate is not complete" for job in waiting]
-                break
-            bar.set_postfix_str(", ".join(job.name for job in running.values()))
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
-                job = running.pop(future)
-                bar.update()
-                if error := future.exception():
-                    failed.append(str(error))
-                else:
-                    keep(job, args.output / job.name, args.data)
-    if failed:
-        sys.exit("\n".join(["These runs failed; started again, they are tried again:", *failed]))
+    parser = command_line()
+    args = parser.parse_args()
+    if ships(args.data):  # which holds the runs of whole length, on the tasks that ship
+        if args.quick or getattr(args, "forests", flights.FORESTS) != flights.FORESTS:
+            parser.error("--quick and --forests give no results to keep: name another folder with --data.")
+        if args.what == "shipped" and set(args.tasks) - set(flights.TASKS):
+            parser.error("The results here are of the tasks that ship: name another folder with --data.")
+    args.fly(args)
 
 
 if __name__ == "__main__":

@@ -1,141 +1,136 @@
-"""The tables of the trial's pages and of README.md, in Markdown, made of the results and the recipes' configuration."""
+"""Tables of the results, each a list of rows: CSV files in full, and those of the pages in Markdown.
+
+The conventions are those of Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical
+precipice": interquartile means, percentile intervals of the bootstrap, and the probability that one method improves on
+another. The bootstrap draws seeds and a set of starts (evidence.py); of tasks that were not flown from many sets, seeds
+alone.
+"""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable
-from functools import cache
+from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import trim_mean
 
-from benchmarks.paper.claims import METHODS, PUBLISHED, Verdict
-from benchmarks.paper.evidence import NotRunError, Part, Results
-from benchmarks.paper.matrix import EXPERIMENTS, LEARNING_RATES, TASKS, VARIANTS
-from benchmarks.paper.reproduce import best_learning_rate
-from benchmarks.paper.running import composed
+from benchmarks.paper import elsewhere, flights
+from benchmarks.paper.claims import METHODS, Verdict, try_all
+from benchmarks.paper.evidence import NotRunError, Results, Starts, bootstrap, judged, probability
+from benchmarks.paper.gradients import GRADIENTS
+from benchmarks.paper.matrix import EXPERIMENTS, TASKS, VARIANTS
+from torchrl_quad.envs import task_class
+from torchrl_quad.envs.metrics import EPISODE_METRICS
 from torchrl_quad.files import read_rows
 
-COLUMNS = {  # of the tables of ends: heading, column of the curves, factor, digits
-    "return": ("return", 1, 2),
-    "solved [%]": ("solved", 100, 0),
-    "gates": ("gates_passed", 1, 1),
-    "error [cm]": ("position_error", 100, 1),
+Row = Mapping[str, str]
+Table = list[dict[str, str]]
+RELIABLE = 0.99  # of the episodes, solved by the worst seed
+ENOUGH, WANTED = 3, 10  # seeds: for an interval, and of each method
+LABELS = {  # of variants of a task
+    "racing_position": "racing, position",
+    "six_gates": "six gates",
+    "six_gates_back": "six gates, backwards",
 }
 
 
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+def make(data: Path) -> dict[str, Table]:
+    """Make all tables of which there are results, by name."""
+    results = Results(data)
+    made = shipped_tables(data) | {
+        "ablations": ablations_table(data),
+        "rates": rates_table(data),
+        "forest": forest_table(data),
+        "phases": phases_table(data),
+        "elsewhere": elsewhere_table(data),
+        "tracks": reached_tables(read_rows(data / "tracks.csv"), Starts(data))["reached"],
+    }
+    if results.all_finals or results.curves:
+        own, published = try_all(data)
+        made |= {
+            "claims": claims_table(own, published),
+            "parts": [*parts_table("the recipes'", own), *parts_table("as published", published)],
+            "methods": methods_table(results),
+            "ends": [row for name in EXPERIMENTS for row in ends_table(results, name)],
+            "ascent": ascent_table(data),
+        }
+    return {name: table for name, table in made.items() if table}
+
+
+def markdown(table: Table) -> str:
     """Write a table in Markdown."""
-    lines = [list(head), ["---" for _ in head], *rows]
+    head = list(dict.fromkeys(name for row in table for name in row))
+    lines = [head, ["---" for _ in head], *([row.get(name, "") for name in head] for row in table)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def spread(values: np.ndarray, factor: float = 1.0, digits: int = 2) -> str:
+def spread(values: ArrayLike, factor: float = 1.0, digits: int = 2) -> str:
     """Write the mean over seeds, and the least and the greatest."""
-    values = factor * values[np.isfinite(values)]
+    values = factor * np.array([x for x in np.asarray(values, float) if np.isfinite(x)])
     if len(values) == 0:
         return ""
     return f"{values.mean():.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
 
 
-# -- protocol ----------------------------------------------------------------------------------------------------------
+def column(rows: Sequence[Row], name: str) -> list[float]:
+    """Read a column, as numbers; what was not measured is left out."""
+    return [float(row[name]) for row in rows if row.get(name)]
 
 
-@cache
-def recipe(algorithm: str, task: str) -> DictConfig:
-    """Compose the configuration of a recipe on a task."""
-    return composed(algorithm, [f"task={task}"])
+def grouped(rows: Sequence[Row], *names: str) -> dict[tuple[str, ...], list[Row]]:
+    """Group the rows by columns."""
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    return groups
 
 
-def starts(task: str, variant: str) -> str:
-    """Say where the horizons of a variant start, from its configuration."""
-    overrides = OmegaConf.from_dotlist(list(VARIANTS[variant].overrides))
-    cfg = OmegaConf.merge(recipe(VARIANTS[variant].algorithm, task), overrides)
-    visited = cfg.buffer.fraction if "buffer" in cfg else None
-    if visited is not None:
-        return f"{visited:.0%} visited, {1 - visited:.0%} fresh"
-    fresh = cfg.get("restart_fraction", 0)
-    return f"{fresh:.0%} fresh, {1 - fresh:.0%} go on" if fresh else "all go on"
+def seeds(count: int) -> str:
+    """Write a number of seeds."""
+    return f"{count} seed{'s' * (count > 1)}"
 
 
-def starts_table() -> str:
-    """List the methods, those as published, and every other variant whose horizons start in another way."""
-    rows = []
-    for name, of in ((name, of) for variants in EXPERIMENTS.values() for name, of in variants.items()):
-        own, usual = (
-            [starts(task, x) if task in of else "" for task in TASKS] for x in (name, VARIANTS[name].algorithm)
-        )
-        if name in METHODS or name in PUBLISHED.values() or own != usual:
-            rows.append([VARIANTS[name].label, *own])
-    return table(["", *TASKS], rows)
+# -- the trial ---------------------------------------------------------------------------------------------------------
 
 
-def revisions_table(data: Path) -> str:
-    """List the revisions of the code that the runs were flown at."""
-    experiments = {variant: name for name, variants in EXPERIMENTS.items() for variant in variants}
-    groups: dict[tuple[str, str, str], list[str]] = {}
-    for row in read_rows(data / "final.csv"):
-        revision = re.sub("[0-9a-f]{40}", lambda match: match[0][:7], row.get("revision") or "unknown")
-        key = row.get("flown") or "", revision, row.get("dynamics") or ""
-        groups.setdefault(key, []).append("search" if row["lr"] else experiments[row["variant"]])
-    rows = [
-        [revision, flown, dynamics, str(len(of)), ", ".join(x for x in ("search", *EXPERIMENTS) if x in of)]
-        for (flown, revision, dynamics), of in sorted(groups.items(), key=lambda group: (group[0][0], -len(group[1])))
+def claims_table(own: list[Verdict], published: list[Verdict]) -> Table:
+    """Show the verdict on each claim, for the methods of the recipes and as published, and the part that decides it."""
+    again = {v.claim.id: v.verdict for v in published}
+    return [
+        {
+            "": v.claim.id,
+            "the paper's claim": v.claim.text,
+            "verdict": v.verdict,
+            "as published": again.get(v.claim.id, ""),
+            "decided by (bound)": "{what}: {value} ({must be})".format(**part) if (part := deciding(v)) else "",
+        }
+        for v in own
     ]
-    return table(["revision", "date", "dynamics", "runs", "experiments"], rows)
 
 
-def search_table(data: Path) -> str:
-    """Show what the search for learning rates found, and its cost."""
-    finals = [row for row in read_rows(data / "final.csv") if row["lr"]]
+def deciding(verdict: Verdict) -> dict[str, str] | None:
+    """The first part of a claim that has the claim's own verdict, as :func:`parts_table` shows it."""
+    own = [x for x in parts_table("", [verdict]) if verdict.verdict.startswith(x["verdict"])]
+    return own[0] if own else None
+
+
+def parts_table(methods: str, verdicts: list[Verdict]) -> Table:
+    """Show the parts of each claim, with the 95 % interval of each."""
     rows = []
-    for name, variant in VARIANTS.items():
-        if not variant.searched:
-            continue
-        own = [row for row in finals if row["variant"] == name]
-        found = {task: best_learning_rate(task, name, data, LEARNING_RATES) for task in TASKS}
-        steps, seconds = (sum(float(row[key] or 0) for row in own) for key in ("steps", "seconds"))
-        if name not in METHODS:  # another reward of racing
-            found |= {task: "" for task in TASKS if task != "racing"}
-        rates = ["not complete" if lr is None else lr and f"{lr:g}" for lr in found.values()]
-        rows.append([variant.label, *rates, f"{len(own)}", f"{steps / 1e6:.1f} M", f"{seconds:.0f}"])
-    return table(["", *TASKS, "runs", "control steps", "seconds"], rows)
+    for v in verdicts:
+        for part in v.parts:
+            low, high = part.interval()
+            bounds = [f"{sign} {x:g}" for sign, x in ((">", part.low), ("<", part.high)) if math.isfinite(x)]
+            row = {"claim": v.claim.id, "methods": methods, "what": part.what, "value": f"{part.value:.3g}"}
+            row |= {"low": f"{low:.3g}", "high": f"{high:.3g}", "must be": " and ".join(bounds)}
+            rows.append(row | {"verdict": part.verdict(len(v.parts)), "seeds": str(v.seeds), "dynamics": v.dynamics})
+    return rows
 
 
-# -- ends of curves ----------------------------------------------------------------------------------------------------
-
-
-def best_level(results: Results, task: str) -> float:
-    """Give the return at which a method counts as converged in the tables: nearly the highest of the mean ends."""
-    return results.level(task, max((results.end(task, method) for method in METHODS), key=np.mean))
-
-
-def ends_table(results: Results, experiment: str) -> str:
-    """Show where the curves of an experiment end, and when they converge."""
-    tasks = [task for task in TASKS if any(task in of for of in EXPERIMENTS[experiment].values())]
-    variants = tuple(EXPERIMENTS[experiment])
-    if experiment != "main":
-        variants = (*dict.fromkeys(VARIANTS[variant].algorithm for variant in variants), *variants)
-    rows = []
-    for task, variant in ((task, variant) for task in tasks for variant in variants):
-        try:
-            columns = [results.end(task, variant, name) for name, _, _ in COLUMNS.values()]
-            level = best_level(results, task)
-            until = [results.until(task, variant, axis, level) for axis in ("steps", "seconds")]
-        except NotRunError:
-            continue
-        cells = [spread(x, factor, digits) for x, (_, factor, digits) in zip(columns, COLUMNS.values(), strict=True)]
-        median = [f"{np.median(x) / scale:.{d}f}" for x, scale, d in zip(until, (1e6, 1), (2, 0), strict=True)]
-        median = ["never" if cell == "inf" else cell for cell in median]
-        if experiment in ("reward", "relaxation"):  # whose returns are of another kind
-            median = ["", ""]
-        rows.append([task, VARIANTS[variant].label, str(len(columns[0])), *cells, *median])
-    return table(["task", "", "seeds", *COLUMNS, "converged at [M steps]", "[s]"], rows)
-
-
-def overview_cell(results: Results, task: str, variant: str) -> str:
+def end_cell(results: Results, task: str, variant: str) -> str:
     """Write the means of the ends: return and solved episodes, and in racing the gates passed."""
     try:
         reached, solved = (results.end(task, variant, name).mean() for name in ("return", "solved"))
@@ -145,91 +140,43 @@ def overview_cell(results: Results, task: str, variant: str) -> str:
     return f"{reached:.1f}, {100 * solved:.0f} %{gates}"
 
 
-def overview(results: Results, variants: Iterable[str], tasks: Iterable[str] = TASKS) -> str:
-    """Show the means of the ends, a row for each variant."""
-    rows = [[VARIANTS[x].label, *(overview_cell(results, task, x) for task in tasks)] for x in variants]
-    return table(["", *tasks], rows)
-
-
-def methods_table(results: Results) -> str:
+def methods_table(results: Results) -> Table:
     """Show the means of the ends, a row for each task and a column for each method."""
-    rows = [[task, *(overview_cell(results, task, x) for x in METHODS)] for task in TASKS]
-    rows.append(["racing, velocity reward", *(overview_cell(results, "racing", f"{x}-velocity") for x in METHODS)])
-    return table(["", *(VARIANTS[method].label for method in METHODS)], rows)
+    of = {task: (task, "") for task in TASKS} | {"racing, velocity reward": ("racing", "-velocity")}
+    return [
+        {"": name} | {VARIANTS[x].label: end_cell(results, task, x + suffix) for x in METHODS}
+        for name, (task, suffix) in of.items()
+    ]
 
 
-def ranking(results: Results) -> str:
-    """Show who converges first, by steps and by seconds: medians over seeds."""
+def best_level(results: Results, task: str) -> float:
+    """Give the return at which a method counts as converged in the tables: nearly the highest of the mean ends."""
+    return results.level(task, max((results.end(task, method) for method in METHODS), key=np.mean))
+
+
+def ends_table(results: Results, experiment: str) -> Table:
+    """Show where the curves of an experiment end, means over seeds, and when they converge, medians."""
+    shown = {"return": ("return", 1, 2), "solved [%]": ("solved", 100, 0), "gates": ("gates_passed", 1, 1)}
+    shown["error [cm]"] = ("position_error", 100, 1)
     rows = []
-    for task in TASKS:
-        cells = []
-        for axis in ("steps", "seconds"):
-            try:
-                level = best_level(results, task)
-                times = {method: np.median(results.until(task, method, axis, level)) for method in METHODS}
-            except NotRunError:
-                break
-            order = sorted(times, key=times.get)
-            cells.append(", ".join(VARIANTS[m].label + (" (never)" if math.isinf(times[m]) else "") for m in order))
-        rows.append([task, *(cells or ["", ""])])
-    return table(["task", "by steps", "by seconds"], rows)
+    for task, variant in ((task, variant) for task in TASKS for variant in EXPERIMENTS[experiment]):
+        try:
+            columns = {head: results.end(task, variant, name) for head, (name, _, _) in shown.items()}
+            level = best_level(results, task)
+            steps, seconds = (np.median(results.until(task, variant, x, level)) for x in ("steps", "seconds"))
+        except NotRunError:
+            continue
+        row = {"experiment": experiment, "task": task, "method": VARIANTS[variant].label}
+        row |= {"seeds": str(len(columns["return"]))} | {x: spread(y, *shown[x][1:]) for x, y in columns.items()}
+        if experiment not in ("reward", "relaxation"):  # whose returns are of another kind
+            row["converged at [M steps]"] = f"{steps / 1e6:.2f}" if np.isfinite(steps) else "never"
+            row["[s]"] = f"{seconds:.0f}" if np.isfinite(seconds) else "never"
+        rows.append(row)
+    return rows
 
 
-def verdicts_table(verdicts: list[Verdict], published: list[Verdict]) -> str:
-    """List the claims under their verdicts, for the recipes' methods and for those as published."""
-    kinds = dict.fromkeys(v.verdict for v in sorted((*verdicts, *published), key=lambda v: v.verdict))
-    rows = [[x, *(", ".join(v.claim.id for v in of if v.verdict == x) for of in (verdicts, published))] for x in kinds]
-    return table(["verdict", "methods of the recipes", "methods as published"], rows)
-
-
-def published_table() -> str:
-    """Show which variant represents each method as published."""
-    rows = [
-        [VARIANTS[method].label, *(VARIANTS[PUBLISHED.get((task, method), method)].label for task in TASKS)]
-        for method in METHODS
-    ]
-    return table(["", *TASKS], rows)
-
-
-def claims_table(verdicts: list[Verdict]) -> str:
-    """Show the verdicts, and then the parts of each claim."""
-    rows = [[v.claim.id, v.claim.text, f"**{v.verdict}**", str(v.seeds or ""), v.dynamics] for v in verdicts]
-    blocks = [table(["", "the paper's claim", "verdict", "seeds", "dynamics"], rows), "### The parts of each claim"]
-    for v in verdicts:
-        if v.parts:
-            head = ["part", "value", "95 % interval", "must be", "verdict"]
-            rows = [part_row(part, len(v.parts)) for part in v.parts]
-            blocks.append(f"**{v.claim.id}** {v.claim.text}\n\n" + table(head, rows))
-    return "\n\n".join(blocks)
-
-
-def part_row(part: Part, parts: int) -> list[str]:
-    """Write a part of a claim as a row."""
-    bounds = [
-        f"> {part.low:g}" if math.isfinite(part.low) else "",
-        f"< {part.high:g}" if math.isfinite(part.high) else "",
-    ]
-    interval = "{:.3g} to {:.3g}".format(*part.interval())
-    must = " and ".join(filter(None, bounds))
-    return [part.what.replace(">", "&gt;"), f"{part.value:.3g}", interval, must, part.verdict(parts)]
-
-
-# -- rewards and gradients ---------------------------------------------------------------------------------------------
-
-
-def audit_table(data: Path) -> str:
-    """Show the share of each reward term in return and gradient."""
-    rows = [
-        [x["task"], x["reward"], x["term"]]
-        + [f"{float(x[name]):.1%}" for name in ("return_share", "gradient_share")]
-        + [x["verdict"]]
-        for x in read_rows(data / "audit.csv")
-    ]
-    return table(["task", "reward", "term", "share of the return", "share of the gradient", "verdict"], rows)
-
-
-def ascent_table(data: Path) -> str:
-    """Compare the gradients at the last policies with the measured ones: the results of ascent.py."""
+def ascent_table(data: Path) -> Table:
+    """Compare the gradients at the last policies with the measured ones: mean cosines over seeds."""
     columns = {
         "N-step return": "n_step_return",
         "0-step return": "zero_step_return",
@@ -237,13 +184,233 @@ def ascent_table(data: Path) -> str:
         "measurement": "halves",
         "explained variance of the critic": "explained_variance",
     }
-    runs: dict[tuple[str, str], list[dict[str, str]]] = {}
-    for row in read_rows(data / "ascent.csv"):
-        runs.setdefault((row["task"], row["variant"]), []).append(row)
-    order = sorted(runs, key=lambda run: (TASKS.index(run[0]), list(VARIANTS).index(run[1])))
-    rows = [
-        [task, VARIANTS[variant].label, str(len(runs[task, variant]))]
-        + [spread(np.array([float(x.get(name) or "nan") for x in runs[task, variant]])) for name in columns.values()]
-        for task, variant in order
+    runs = grouped(read_rows(data / "ascent.csv"), "task", "variant")
+    return [
+        {"task": task, "method": VARIANTS[variant].label, "seeds": str(len(runs[task, variant]))}
+        | {head: spread(column(runs[task, variant], name)) for head, name in columns.items()}
+        for task, variant in sorted(runs, key=lambda run: (TASKS.index(run[0]), list(VARIANTS).index(run[1])))
     ]
-    return table(["task", "", "seeds", *columns], rows)
+
+
+# -- the recipes with the settings that ship ---------------------------------------------------------------------------
+
+
+def interquartile_mean(values: ArrayLike) -> NDArray[np.float64]:
+    """The mean (*) of the middle half of values (*, seeds), without the quarter below and the quarter above it."""
+    return trim_mean(values, 0.25, axis=-1)
+
+
+def interval(values: Sequence[float]) -> tuple[float, float]:
+    """The 95 % interval of the interquartile mean, by the bootstrap over seeds and, of what is ``judged``, starts."""
+    return bootstrap("", interquartile_mean, np.asanyarray(values)).interval()
+
+
+def is_level(one: np.ndarray, best: np.ndarray) -> bool:
+    """Whether the 95 % interval of the difference of two interquartile means, from the same starts, reaches zero."""
+    gap = bootstrap("", lambda a, b: interquartile_mean(a) - interquartile_mean(b), one, best)
+    return not gap.interval()[1] < 0.0
+
+
+def returns_of(rows: Sequence[Row], starts: Starts) -> np.ndarray:
+    """The returns of a method's seeds on a task, with what another set of starts would change."""
+    return judged(np.array(column(rows, "return")), starts.shift(rows[0]["task"], rows[0]["algorithm"], "return"))
+
+
+def in_order(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
+    """The rows by task and method, in the order of the tables."""
+    groups, tasks = grouped(rows, "task", "algorithm"), dict.fromkeys(row["task"] for row in rows)
+    return {
+        task: {x: groups[task, x] for x in flights.METHODS if (task, x) in groups}
+        for task in sorted(tasks, key=[*flights.TASKS, *tasks].index)
+    }
+
+
+def metric_of(task: str) -> tuple[str, float, int, str]:
+    """What is shown of a task beside the solved episodes: of one of your own the metric that its class names first."""
+    if task in flights.TASKS:
+        return flights.TASKS[task]
+    name = flights.VARIANTS.get(task, [f"task={task}"])[0].removeprefix("task=")
+    own = [x for x in task_class(name).metric_info.items() if x[0] not in EPISODE_METRICS]
+    name, metric = own[0] if own else ("return", EPISODE_METRICS["return"])
+    return name, metric.scale, 1 if metric.unit is None else 2, metric.unit or metric.label
+
+
+def shipped_tables(data: Path) -> dict[str, Table]:
+    """Show what the recipes reach with the settings that ship."""
+    runs, starts = read_rows(data / "shipped.csv"), Starts(data)
+    made = {"summary": summary_table(runs), "choice": choice_table(runs, starts)}
+    made |= reached_tables(runs, starts) | {"improvement": improvement_table(runs)}
+    return made | {"speed": speed_table([*runs, *read_rows(data / "rates.csv")])}
+
+
+def summary_table(rows: Sequence[Row]) -> Table:
+    """Show what each method reaches on each task: solved episodes, their least, and the medians of the rest."""
+    flown = in_order(rows)
+
+    def cell(task: str, runs: list[Row]) -> str:
+        metric, factor, digits, unit = metric_of(task)
+        solved = column(runs, "solved")
+        shown, seconds = (np.nanmedian([float(run.get(x) or "nan") for run in runs]) for x in (metric, "seconds"))
+        few = "" if len(runs) == WANTED else f", {seeds(len(runs))}"
+        return f"{np.mean(solved):.1%} ({min(solved):.1%}), {factor * shown:.{digits}f} {unit}, {seconds:.0f} s{few}"
+
+    return [
+        {"": label} | {LABELS.get(t, t): cell(t, of[method]) if method in of else "" for t, of in flown.items()}
+        for method, label in flights.METHODS.items()
+        if any(method in of for of in flown.values())
+    ]
+
+
+def reached_tables(rows: Sequence[Row], starts: Starts) -> dict[str, Table]:
+    """Show what every method reaches on every task, and what it takes: in short, and in full."""
+    full, short = [], {method: {"": label} for method, label in flights.METHODS.items()}
+    for task, of in in_order(rows).items():
+        name, factor, digits, unit = metric_of(task)
+        for method, own in of.items():
+            returns, solved, metric = returns_of(own, starts), *(column(own, x) for x in ("solved", name))
+            mean = f"{interquartile_mean(returns):.4g}"
+            if len(returns) >= ENOUGH:
+                mean += " ({:.4g} to {:.4g})".format(*interval(returns))
+            row = {"task": LABELS.get(task, task), "method": flights.METHODS[method], "seeds": str(len(own))}
+            row |= {"return (95 % interval)": mean}
+            row |= {"solved (worst seed)": f"{np.mean(solved):.1%} ({min(solved):.1%})"}
+            row |= {"metric": f"{factor * np.median(metric):.{digits}f} {unit}" if metric else ""}
+            row |= {"million steps": f"{np.median(column(own, 'steps')) / 1e6:.1f}"}
+            row |= {"seconds": f"{np.median(column(own, 'seconds')):.0f}"}
+            full.append(row)
+            short[method][row["task"]] = f"{mean}, {min(solved):.1%}, {row['million steps']} M"
+    return {"reached": [row for row in short.values() if len(row) > 1], "reached_in_full": full}
+
+
+def choice_table(rows: Sequence[Row], starts: Starts) -> Table:
+    """Show for each task the quickest method that works with every seed, and the one of the highest return.
+
+    They are chosen among the methods that have flown with the most seeds. Those that :func:`is_level` finds are level
+    with the highest return.
+    """
+    lines = []
+    for task, flown in in_order(rows).items():
+        worst = {x: min(column(own, "solved")) for x, own in flown.items()}
+        returns = {x: interquartile_mean(column(own, "return")) for x, own in flown.items()}
+        seconds_of = {x: np.median(column(own, "seconds")) for x, own in flown.items()}
+        most_seeds = max(map(len, flown.values()))
+        tried = [x for x, own in flown.items() if len(own) == most_seeds]
+        quick = min((x for x in tried if worst[x] >= RELIABLE), key=seconds_of.get, default=None)
+        most = max(tried, key=returns.get)
+        reached = {x: returns_of(flown[x], starts) for x in tried if most_seeds >= ENOUGH}
+        level = [flights.METHODS[x] for x in reached if x != most and is_level(reached[x], reached[most])]
+
+        few = f", {seeds(most_seeds)}" if most_seeds < WANTED else ""
+        said = {x: f"{flights.METHODS[x]}: {returns[x]:.4g}, {worst[x]:.1%}, {seconds_of[x]:.0f} s{few}" for x in tried}
+        row = {"task": LABELS.get(task, task), "quickest that works with every seed": said.get(quick, "none")}
+        lines.append(row | {"highest return": said[most], "level with it": ", ".join(level)})
+    return lines
+
+
+def speed_table(rows: Sequence[Row]) -> Table:
+    """Show how many thousand steps a second each method took on each machine: medians over the seeds."""
+    lines = []
+    for task, of in in_order(rows).items():
+        for (name,), own in sorted(grouped([row for runs in of.values() for row in runs], "machine").items()):
+            row = {"task": LABELS.get(task, task), "machine": name}
+            for method, label in flights.METHODS.items():
+                speeds = [float(x["steps"]) / float(x["seconds"]) / 1e3 for x in own if x["algorithm"] == method]
+                row[label] = f"{np.median(speeds):.0f}" if speeds else ""
+            lines.append(row)
+    return lines
+
+
+def improvement_table(rows: Sequence[Row]) -> Table:
+    """Show how probable it is that the method of a row has a higher return than that of a column, over the tasks."""
+    flown = [
+        {x: column(own, "return") for x, own in of.items() if len(own) >= ENOUGH} for of in in_order(rows).values()
+    ]
+    enough = [x for x in flights.METHODS if any(x in of for of in flown)]
+
+    def cell(ours: str, theirs: str) -> str:
+        values = [probability(np.array(of[ours]), np.array(of[theirs])) for of in flown if {ours, theirs} <= set(of)]
+        return f"{np.mean(values):.2f}, {len(values)}" if values and ours != theirs else ""
+
+    return [{"": flights.METHODS[x]} | {flights.METHODS[y]: cell(x, y) for y in enough} for x in enough]
+
+
+# -- one setting changed, and other environments -----------------------------------------------------------------------
+
+
+def ablations_table(data: Path) -> Table:
+    """Show what each option adds to the return, over the seeds that have flown with it and without it.
+
+    A cell also has the episodes that the worst seed solves with the option, and without it, and the number of seeds.
+    """
+    shipped = grouped(read_rows(data / "shipped.csv"), "task", "algorithm")
+    changed = grouped(read_rows(data / "ablations.csv"), "task", "algorithm", "change")
+    rows = []
+    for task, option in product(flights.CHANGED_TASKS, flights.OPTIONS):
+        row = {"task": LABELS.get(task, task), "option": option}
+        for method, no in product(flights.CHANGED_METHODS, ("", "no ")):
+            own = changed.get((task, method, no + option), [])
+            ships = [x for x in shipped.get((task, method), []) if x["seed"] in {y["seed"] for y in own}]
+            if ships:
+                both = (ships, own) if no else (own, ships)  # with the option, and without it
+                (gain, solved), (less, without) = (
+                    (np.mean(column(x, "return")), min(column(x, "solved"))) for x in both
+                )
+                row[flights.METHODS[method]] = f"{gain - less:+.1f}, {solved:.0%} ({without:.0%}), {seeds(len(own))}"
+        rows += [row] if len(row) > 2 else []
+    return rows
+
+
+def rates_table(data: Path) -> Table:
+    """Show the episodes that the worst of three seeds solves at half the rate, at the one that ships, and at twice."""
+    lines = []
+    for method, label in flights.METHODS.items():
+        of = grouped([x for x in read_rows(data / "rates.csv") if x["algorithm"] == method], "task", "factor")
+        row = {"": label}
+        for task in (task for task in flights.TASKS if any(task == key[0] for key in of)):
+            worst = [min(column(of[task, x], "solved")) if (task, x) in of else math.nan for x in flights.FACTORS]
+            row[LABELS.get(task, task)] = " / ".join("" if math.isnan(x) else f"{x:.0%}" for x in worst)
+        lines += [row] if len(row) > 1 else []
+    return lines
+
+
+def forest_table(data: Path) -> Table:
+    """Show the successes of each policy in the middle forest, mean and least, and what its training has cost."""
+    rows, lines = read_rows(data / "forest.csv"), []
+    speeds = sorted({float(row["speed"]) for row in rows})
+
+    def cell(runs: list[Row]) -> str:
+        solved = column(runs, "solved")
+        return f"{np.mean(solved):.0%} ({min(solved):.0%}, {seeds(len(solved))})" if solved else ""
+
+    for policy in (name for name in flights.POLICIES if any(row["policy"] == name for row in rows)):
+        own = [row for row in rows if (row["policy"], row["difficulty"]) == (policy, "middle")]
+        million, cost = (np.median(column(own, name)) if own else math.nan for name in ("steps", "seconds"))
+        row = {"": policy, "million steps": f"{million / 1e6:.1f}", "processor seconds": f"{cost:.0f}"}
+        lines.append(row | {f"{x:g} m/s": cell([r for r in own if float(r["speed"]) == x]) for x in speeds})
+    return lines
+
+
+def phases_table(data: Path) -> Table:
+    """Show which of the hybrid's gradients points along the measured one in each phase of training: cosines."""
+    names = GRADIENTS | {"weight": "weight b", "explained_variance": "explained variance of V"}
+    lines = []
+    for (task, _), own in grouped(read_rows(data / "phases.csv"), "task", "share").items():
+        row = {"task": LABELS.get(task, task), "million steps": f"{np.mean(column(own, 'steps')) / 1e6:.1f}"}
+        lines.append(row | {head: f"{np.mean(column(own, name)):.2f}" for name, head in names.items()})
+    return lines
+
+
+def elsewhere_table(data: Path) -> Table:
+    """Show the returns of the losses on other environments: the mean over seeds, and the worst."""
+    of = grouped(read_rows(data / "elsewhere.csv"), "environment", "loss")
+    lines = []
+    for name in elsewhere.NAMES:
+        row = {"loss": name}
+        for environment in elsewhere.ENVIRONMENTS:
+            if own := of.get((environment, name)):
+                before, after = (column(own, x) for x in ("before", "after"))
+                row |= {f"{environment}, before": f"{np.mean(before):.4g}"}
+                row |= {f"{environment}, after (worst seed)": f"{np.mean(after):.4g} ({min(after):.4g})"}
+                row |= {f"{environment}, seconds": f"{np.median(column(own, 'seconds')):.0f}"}
+        lines += [row] if len(row) > 1 else []
+    return lines

@@ -18,8 +18,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_quad import ActionSequence, DepthCamera, ForestEnv, HoveringEnv, LandingEnv, differentiable_rollout
 from torchrl_quad.adapters import DronesVecEnv
-from torchrl_quad.render import animate_flight, obstacles, plot_from_above, write_replay
-from torchrl_quad.render.canvas import make_figure
+from torchrl_quad.render import animate_flight, plot_from_above, write_replay
 from torchrl_quad.vision import Primitives, nearest
 
 PILLARS = {
@@ -246,7 +245,7 @@ def test_stable_baselines3_learns_from_images_and_vectors_of_a_gymnasium_environ
     check_env(gymnasium.make("torchrl_quad/Forest-v0").unwrapped, skip_render_check=True)
 
 
-def test_pictures_show_the_obstacles_and_beside_the_flight_what_the_camera_saw(tmp_path, monkeypatch):
+def test_pictures_show_the_obstacles_and_beside_the_flight_what_the_camera_saw(tmp_path):
     env = ForestEnv(num_envs=2, density=0.02, camera={"rate": 2})
     rollout = env.rollout(4, break_when_any_done=False)
     write_replay(rollout, tmp_path / "replay.html", env=env)
@@ -260,10 +259,7 @@ def test_pictures_show_the_obstacles_and_beside_the_flight_what_the_camera_saw(t
     trees = [(x[:, 2] == 0.0).sum().item() for x in rollout["state", "scene", "cylinders"][:, 0]]
     meshes = [np.frombuffer(base64.b64decode(x["points"]), "<f4").reshape(-1, 3) for x in page["obstacles"]]
     assert [len(mesh) for mesh in meshes] == [96 * count for count in trees]
-    drawn = []
-    monkeypatch.setattr(obstacles, "make_figure", lambda **o: drawn.append(make_figure(**o)) or drawn[-1])
-    plot_from_above(rollout, tmp_path / "above.png", env=env)
-    panels = drawn[0].axes[:2]
+    panels = plot_from_above(rollout, tmp_path / "above.png", env=env).axes[:2]
     assert [len(panel.patches) for panel in panels] == trees
     assert panels[0].patches[0].get_radius() == rollout["state", "scene", "cylinders"][0, 0, 0, 3].item()
     animate_flight(rollout, tmp_path / "film.gif", env=env, size=200)

@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, describe_metric
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import Positive, Size, checked
 from torchrl_quad.render.canvas import (
     BLUE,
     GREEN,
@@ -40,22 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
-_PAPER = {  # for figures as wide as a page of two columns
-    "font.size": 8,
-    "axes.linewidth": 0.6,
-    "axes.grid": True,
-    "grid.alpha": 0.3,
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.0,
-    "legend.frameon": False,
-    "legend.handlelength": 1.2,
-    "legend.handletextpad": 0.4,
-    "legend.columnspacing": 0.9,
-    "legend.borderaxespad": 0.0,
-    "pdf.fonttype": 42,  # fonts are embedded as TrueType, which publishers ask for
-    "ps.fonttype": 42,
-    "savefig.dpi": 300,  # for PNG
-}
+_PAPER = Path(__file__).with_name("paper.mplstyle")  # for figures as wide as a page of two columns
 _WIDTH = 7.16  # [inches], of a page of two columns
 _BESIDE = {"left": 0.54, "right": 0.99, "top": 0.94, "bottom": 0.12, "hspace": 0.5}  # shares of a page
 _ABOVE: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.02), "ncols": 4}  # a legend
@@ -63,13 +49,14 @@ _COLORS = INK, BLUE, RED, "#d99a1c"
 _PANELS = 4  # of a learning curve
 
 
+@checked
 def plot_flight(
     rollout: TensorDictBase,
     path: str | Path | None = None,
     *,
     env: EnvBase | None = None,
-    num_envs: int = 12,
-    control_dt: float = 0.02,
+    num_envs: Size = 12,
+    control_dt: Positive = 0.02,
     title: str | None = None,
 ) -> Figure:
     """Draw the first episodes of a flight: their paths in space, and over time how well they go.
@@ -122,13 +109,14 @@ def plot_flight(
     return save(figure, path)
 
 
+@checked
 def plot_episode(
     rollout: TensorDictBase,
     path: str | Path | None = None,
     *,
     env: EnvBase | None = None,
     env_index: int = 0,
-    control_dt: float = 0.02,
+    control_dt: Positive = 0.02,
 ) -> Figure:
     """Draw the first episode of one drone as a figure for a paper, as wide as a page of two columns (7.16 inches).
 
@@ -154,7 +142,7 @@ def plot_episode(
     from matplotlib import rc_context
     from matplotlib.ticker import MaxNLocator
 
-    with rc_context(_PAPER):
+    with rc_context(fname=_PAPER):
         space = add_space(figure, (0.0, 0.2, 0.44, 0.8), computed_zorder=False)
         _draw_path(space, figure.add_axes((0.09, 0.12, 0.26, 0.02)), flight)
         rotor_speed = flight.state("rotor_speed")
@@ -218,12 +206,13 @@ def _draw_lines(axis: Axes, time: np.ndarray, lines: dict[str, np.ndarray], labe
 # -- from above --------------------------------------------------------------------------------------------------------
 
 
+@checked
 def plot_from_above(
     rollout: TensorDictBase,
     path: str | Path | None = None,
     *,
     env: EnvBase,
-    num_envs: int = 4,
+    num_envs: Size = 4,
     title: str | None = None,
 ) -> Figure:
     """Draw the first episodes of a flight from above: obstacles, and the paths between them, coloured by speed.

@@ -32,19 +32,12 @@ _WALL = 5.0  # [m], half of the sides of the square that stands for an endless w
 class Flight:
     """The first episodes of a rollout, without their graph, on the CPU.
 
+    Arguments and errors are those of :func:`plot_flight`, and:
+
     Args:
         who: the function that draws, for its errors.
-        rollout: (num_envs, time).
-        env: the environment that flew, also under transforms, or None.
-        control_dt: control step [s], used without ``env``.
         needed: keys of the rollout without which nothing can be drawn.
-        num_envs: how many environments to keep; None for all.
         env_index: the one environment to keep, up to the end of its first episode.
-
-    Raises:
-        TypeError: ``env`` is not a quadrotor environment.
-        ValueError: the rollout has another shape or lacks a key, or ``num_envs`` is less than 1.
-        IndexError: there is no such environment.
     """
 
     def __init__(
@@ -67,8 +60,6 @@ class Flight:
                 f"{who} needs a rollout of batch size (num_envs, time), such as env.rollout(...) returns; got "
                 f"{tuple(rollout.shape)}. For one drone, write rollout.unsqueeze(0)."
             )
-        if num_envs is not None and num_envs < 1:
-            raise UserValueError(f"{who}: num_envs must be at least 1, got {num_envs}.")
         keys = rollout.keys(include_nested=True)
         if missing := [str(key) for key in needed if key not in keys]:
             raise UserValueError(
@@ -179,15 +170,13 @@ class Flight:
         Success is the value from which a state fulfils the task, if the task says so.
         """
         outputs, distance = self.outputs(), self.distance
-        name = self.markers.progress
-        if (name is None or name not in outputs) and distance is not None:
+        named = self.markers.progress if self.markers.progress in outputs else None
+        if named is None and distance is not None:
             return f"distance to the {self.markers.target} [m]", self.log_distance, distance, self.near_enough
-        success = self.markers.success if name in outputs else None
-        if name is None or name not in outputs:
-            name = next(iter(outputs))
+        name = named or next(iter(outputs))
         metric = describe_metric(name, self.metric_info)
-        success = None if success is None else metric.scale * success
-        return metric.axis_label, metric.log, metric.scale * outputs[name], success
+        success = self.markers.success if named else None
+        return metric.axis_label, metric.log, metric.scale * outputs[name], success and metric.scale * success
 
     def progress_lines(self) -> tuple[str, bool, dict[str, np.ndarray]]:
         """All that shows how the flight goes: the label of the axis, whether it is logarithmic, and lines by name.
@@ -254,20 +243,22 @@ def obstacle_shapes(solids: Primitives | None) -> list[Shape]:
     meshes = [Shape.sphere(x[:3], x[3]) for x in solids.spheres[0].tolist()]
     meshes += [Shape.cylinder(x[:3], x[3], x[4]) for x in solids.cylinders[0].tolist()]
     meshes += [box_shape(x) for x in solids.boxes[0].detach().cpu().float()]
-    for x in solids.planes[0].detach().cpu().float():
-        if x[2].abs() < 0.99:  # a wall: the ground is not drawn
-            across = torch.tensor([-x[1], x[0], 0.0]) / x[:2].norm()
-            up = torch.linalg.cross(x[:3], across)
-            corners = [a * across + b * up for a, b in ((-1, 0), (1, 0), (1, 1), (-1, 1))]
-            points = torch.stack([x[3] * x[:3] + _WALL * c for c in corners])
-            meshes.append(Shape(points, torch.tensor([(0, 1, 2), (0, 2, 3)])))
-    first, points, faces = 0, [], []
+    meshes += [_wall(x) for x in solids.planes[0].detach().cpu().float() if x[2].abs() < 0.99]
+    points, faces, first = [], [], 0
     for mesh in meshes:
         if mesh.faces is not None and mesh.points[:, 2].min() > 0.5 * ELSEWHERE:
             points.append(mesh.points)
             faces.append(mesh.faces + first)
             first += len(mesh.points)
     return [Shape(torch.cat(points), torch.cat(faces), color=GREEN, opacity=0.6)] if points else []
+
+
+def _wall(plane: Tensor) -> Shape:
+    """A square of an upright plane: its normal (3), and its distance from the origin along that."""
+    across = torch.tensor([-plane[1], plane[0], 0.0]) / plane[:2].norm()
+    up = torch.linalg.cross(plane[:3], across)
+    corners = [plane[3] * plane[:3] + _WALL * (a * across + b * up) for a, b in ((-1, 0), (1, 0), (1, 1), (-1, 1))]
+    return Shape(torch.stack(corners), torch.tensor([(0, 1, 2), (0, 2, 3)]))
 
 
 def box_shape(box: Tensor) -> Shape:

@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -18,11 +18,10 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import QuadrotorParams
-from torchrl_quad.dynamics.parameters import RawParams
-from torchrl_quad.dynamics.rotors import Rotors
 from torchrl_quad.envs.metrics import at_episode_end
 from torchrl_quad.errors import MissingPackage, UserValueError
 from torchrl_quad.files import replacing
+from torchrl_quad.options import Positive, Size, checked
 from torchrl_quad.render.flights import Flight, depth_image, obstacle_shapes
 
 _X_FRAME = [[0.053, 0.053], [-0.053, 0.053], [-0.053, -0.053], [0.053, -0.053]]  # [m], of a drone that is not known
@@ -46,13 +45,14 @@ class Replay:
         return f'<iframe srcdoc="{html.escape(self.html)}" style="width: 100%; height: 640px; border: 0"></iframe>'
 
 
+@checked
 def write_replay(
     rollout: TensorDictBase,
     path: str | Path | None = None,
     *,
     env: EnvBase | None = None,
-    num_envs: int = 12,
-    control_dt: float = 0.02,
+    num_envs: Size = 12,
+    control_dt: Positive = 0.02,
     title: str | None = None,
 ) -> Replay:
     """Make the first episodes of a flight an HTML page to play, pause, scrub and turn in a browser or a notebook.
@@ -210,18 +210,10 @@ def _panels(flight: Flight) -> list[_Panel]:
 def _endings(rollout: TensorDictBase) -> list[str]:
     """How each first episode ended; "" if it did not."""
     endings, done = [""] * len(rollout), rollout.get(("next", "done"), None)
-    if done is None:
-        return endings
-    # The later ones override the earlier ones.
-    for name, word in (
-        ("done", "ended"),
-        ("terminated", "terminated"),
-        ("truncated", "truncated"),
-        ("success", "success"),
-        ("crash", "crashed"),
-    ):
+    words = {"done": "ended", "terminated": "terminated", "truncated": "truncated", "success": "success"}
+    for name, word in {**words, "crash": "crashed"}.items():  # the later ones override the earlier ones
         flags = rollout.get(("next", name), None)
-        if flags is not None:
+        if flags is not None and done is not None:
             flags = at_episode_end(rollout, flags & done).tolist()
             endings = [word if flag else ending for flag, ending in zip(flags, endings, strict=True)]
     return endings
@@ -237,23 +229,23 @@ def _rotors(flight: Flight, speed: Tensor | None) -> tuple[Tensor, Tensor | None
     if flight.env is None:
         lift = None if speed is None else 2.0 * speed.square() / speed.nan_to_num().square().amax().clamp_min(1e-12)
         return torch.tensor(_X_FRAME).expand(n, 4, 2), lift
-    fields = {}
-    for name, value in flight.env.params.fields().items():
-        randomised = flight.rollout.get(("next", "state", "drone", name), None)
-        if randomised is not None:
+
+    def field(name: str) -> Tensor:
+        """A field of each drone (num_envs or 1, 1, ...)."""
+        value, dim = getattr(flight.env.params, name), QuadrotorParams.dim(name)
+        if (randomised := flight.entry("next", "state", "drone", name)) is not None:
             value = randomised[:, 0]
-        elif value.dim() > QuadrotorParams.dim(name) and len(value) > 1:
-            if len(value) < n:
-                raise UserValueError(
-                    f"write_replay: env has a {name} for each of its {len(value)} environments, and the page would "
-                    f"show {n}. Pass the environment that flew, or num_envs={len(value)}."
-                )
-            value = value[:n]
-        shape = value.shape[-QuadrotorParams.dim(name) :]
-        fields[name] = value.detach().cpu().float().reshape(-1, 1, *shape)
-    params = cast("QuadrotorParams", RawParams(**fields))  # each (num_envs or 1, 1, ...)
-    lift = None if speed is None else Rotors(params).thrust(speed) * 4.0 / (params.mass * params.gravity)
-    return params.rotor_positions[:, 0].expand(n, 4, 2), lift
+        elif value.dim() > dim and 1 < len(value) < n:
+            raise UserValueError(
+                f"write_replay: env has a {name} for each of its {len(value)} environments, and the page would "
+                f"show {n}. Pass the environment that flew, or num_envs={len(value)}."
+            )
+        return value.detach().cpu().float().reshape(-1, 1, *value.shape[-dim:])[:n]
+
+    if speed is not None:
+        k2, k1, k0 = field("thrust_map").split(1, -1)
+        speed = ((k2 * speed + k1) * speed + k0) * 4.0 / (field("mass") * field("gravity"))
+    return field("rotor_positions")[:, 0].expand(n, 4, 2), speed
 
 
 def _encoded(value: Tensor | None) -> str | None:

@@ -24,6 +24,7 @@ from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs.markers import Markers
 from torchrl_quad.errors import MissingPackage, UserValueError, one_line
 from torchrl_quad.files import replacing
+from torchrl_quad.options import Positive, Size, checked
 from torchrl_quad.render.canvas import (
     INK,
     RED,
@@ -104,13 +105,8 @@ class View:
     ) -> np.ndarray:
         """Draw a frame (size, size, 3), uint8.
 
-        Args:
-            position: of the drones (num_drones, 3) [m].
-            attitude: their quaternions (num_drones, 4).
-            target: of each drone (num_drones, 3) [m].
-            trails: the line (*, 3) [m] that each drone has flown.
-            text: for the corner.
-            image: of a camera (height, width), from 0 to 1.
+        Shows positions (num_drones, 3) [m], quaternions (num_drones, 4), targets (num_drones, 3), a trail (*, 3) of
+        each drone, a text in the corner, and the image (height, width) of a camera, from 0 to 1.
         """
         arms = self.arms.to(position.dtype).expand(len(position), -1, -1)
         bodies = position.unsqueeze(1) + quaternion.rotate(attitude.unsqueeze(1), arms)
@@ -131,16 +127,17 @@ class View:
         return np.array(self.canvas.buffer_rgba())[..., :3].copy()
 
 
+@checked
 def animate_flight(
     rollout: TensorDictBase,
     path: str | Path,
     *,
     env: EnvBase | None = None,
-    num_envs: int = 6,
-    control_dt: float = 0.02,
-    fps: int = 15,
-    max_seconds: float = 12.0,
-    size: int = 336,
+    num_envs: Size = 6,
+    control_dt: Positive = 0.02,
+    fps: Positive = 15,
+    max_seconds: Positive = 12.0,
+    size: Size = 336,
     beside: TensorDictBase | None = None,
     labels: tuple[str, str] = ("", ""),
 ) -> None:
@@ -167,9 +164,6 @@ def animate_flight(
     write = {".gif": _write_gif, ".mp4": _write_mp4}.get(Path(path).suffix.lower())
     if write is None:
         raise UserValueError(f"animate_flight writes .gif and .mp4, got {Path(path).name}.")
-    for name, value in (("control_dt", control_dt), ("fps", fps), ("max_seconds", max_seconds), ("size", size)):
-        if not value > 0:
-            raise UserValueError(f"animate_flight: {name} must be positive, got {value!r}.")
     needed = state_keys("position", "quaternion")
     both = [rollout] if beside is None else [rollout, beside]
     flights = [Flight("animate_flight", x, env, control_dt, needed, num_envs) for x in both]

@@ -48,7 +48,7 @@ class Guard:
     def __call__(self, state: State) -> tuple[State, Tensor]:
         """The state with safe entries where it is meaningless, and bool (n) that says where it was meaningful."""
         with torch.no_grad():
-            unit = _is_unit(state["quaternion"])
+            unit = is_unit(state["quaternion"])
             if is_true(unit):  # the usual case, quick to see: nothing is wrong, and nothing is replaced
                 values = torch.cat([state[key].flatten(1) for key in self.bounds], 1)
                 if is_same(values.clamp(self.low, self.high), values):  # NaN is not the same
@@ -67,14 +67,15 @@ class Guard:
         for key, inside in self._inside(state).items():
             low, high = (x.min().item() for x in self.bounds[key])
             found[f"{key!r} must be finite and between {low:.4g} and {high:.4g}"] = ~inside.all(1)
-        return {**found, "'quaternion' must have unit norm": ~_is_unit(state["quaternion"])}
+        return {**found, "'quaternion' must have unit norm": ~is_unit(state["quaternion"])}
 
     def _inside(self, state: State) -> dict[Key, Tensor]:
         values = {key: state[key].flatten(1) for key in self.bounds}
         return {key: (values[key] >= low) & (values[key] <= high) for key, (low, high) in self.bounds.items()}
 
 
-def _is_unit(q: Tensor) -> Tensor:
+def is_unit(q: Tensor) -> Tensor:
+    """Whether quaternions (n, 4) are near enough to unit norm to mean an attitude, bool (n)."""
     return (q.square().sum(1) - 1.0).abs() < MAX_NORM_ERROR
 
 
@@ -138,10 +139,12 @@ def is_true(flags: Tensor) -> bool:
 # -- checks of states and actions --------------------------------------------------------------------------------------
 
 
-def read_state(state: object, safe_state: State, source: str) -> State:
+def read_state(state: Any, safe_state: State, source: str) -> State:
     """The entries of a state (a tensordict), if all are there with the right shape, precision and device."""
     given = dict(as_tensordict(state, source).items())  # reading all names at once is quicker than one by one
-    entries = {key: state.get(key, None) if isinstance(key, tuple) else given.get(key) for key in safe_state}
+    entries: dict[Any, Any] = {
+        key: state.get(key, None) if isinstance(key, tuple) else given.get(key) for key in safe_state
+    }
     for key, x in entries.items():
         expected = safe_state[key]
         if x is None or x.shape != expected.shape or x.dtype != expected.dtype or x.device != expected.device:
@@ -193,7 +196,7 @@ def first_ten(flags: Tensor) -> str:
     return ", ".join(map(str, who[:10])) + (", ..." if len(who) > 10 else "")
 
 
-def as_tensordict(state: object, source: str) -> TensorDictBase:
+def as_tensordict(state: object, source: str) -> Any:
     """The state, if it is a tensordict."""
     if isinstance(state, TensorDictBase):
         return state
@@ -208,7 +211,7 @@ def kind_of(x: Tensor) -> str:
     return "floating point" if x.is_floating_point() else "complex" if x.is_complex() else "whole numbers"
 
 
-def entry_error(entries: Mapping[Key, Tensor | None], key: Key, safe_state: State, source: str) -> UserValueError:
+def entry_error(entries: Mapping[Key, Any], key: Key, safe_state: State, source: str) -> UserValueError:
     """What is wrong with an entry of a state, or what the state lacks."""
     missing = [str(key) for key, x in entries.items() if x is None]
     if missing:

@@ -27,8 +27,9 @@ class Simulation(Protocol):
     substeps: int
     """How often ``substep`` runs between ``begin`` and ``finish``."""
 
-    parameters: tuple[Tensor, ...]
-    """Tensors beside state and action that gradients may reach, such as the mass of a drone."""
+    @property
+    def parameters(self) -> tuple[Tensor, ...]:
+        """Tensors in addition to state and action that gradients may reach, such as the mass of a drone."""
 
     constants: frozenset[str]
     """The outputs that carry no gradient, such as what is only measured."""

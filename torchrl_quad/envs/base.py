@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -197,13 +197,13 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
     @checked
     def sample_start(self, n: Size) -> TensorDict:
         """Draw n complete Markov states from the task's own starts: a tensordict [n] with ``state``."""
-        return TensorDict({"state": nested(sample_state(self, n))}, [n], self.device)
+        return TensorDict({"state": cast(Any, nested(sample_state(self, n)))}, [n], self.device)
 
     def random_state(self) -> dict[str, Any]:
         """Everything random in this environment, to resume from later; torch can save it."""
         return self.randomness.state()
 
-    def set_random_state(self, state: Mapping[str, Any]) -> None:
+    def set_random_state(self, state: dict[str, Any]) -> None:
         """Resume from what :meth:`random_state` returned."""
         self.randomness.set_state(state)
 
@@ -261,10 +261,9 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
 
     def _place(self, nominal: QuadrotorParams) -> None:
         """Build what holds tensors on the device and in the precision of the environment."""
-        self.weights = {
-            name: x.reshape(()).to(self.device, self.dtype) if isinstance(x, Tensor) else x
-            for name, x in self.weights.items()
-        }
+        for name, x in self.weights.items():
+            if isinstance(x, Tensor):
+                self.weights = {**self.weights, name: x.reshape(()).to(self.device, self.dtype)}
         self.dynamics = self.config.build_dynamics(nominal)
         self.disturbances = self.config.build_disturbances(self.dynamics)
         self.randomness = Randomness(self.device, self.dtype)
@@ -300,7 +299,9 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         self._seed = check_value("seed", seed, Seed | None)
         self.randomness.seed(seed)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
+    ) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if set_state:
             source = "reset(..., set_state=True)"
@@ -310,16 +311,16 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         else:
             entries = self.randomness.starts(None if mask is None else mask.reshape(-1))
         self._keep_for_render(entries["state"], mask)
-        return TensorDict(entries, self.batch_size, self.device)
+        return self._tensordict(entries)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action, step = tensordict.get("action", None), self.control_step
+        action, step = cast(Tensor, tensordict.get("action", None)), self.control_step
         step.check_action(action)
         state, valid = step.guard(guard.read_state(tensordict.get("state", None), step.safe_state, "step"))
         state, outputs = self._stepper.step(state, valid, action, self.randomness.noise())
         guard.check_finite(action)
         self._keep_for_render(state)
-        return TensorDict({"state": nested(state), **outputs}, self.batch_size, self.device)
+        return self._tensordict({"state": nested(state), **outputs})
 
     def rollout(self, max_steps: int, policy: Any = None, callback: Any = None, **options: Any) -> TensorDictBase:
         """As TorchRL's, with the same numbers; several times faster with ``break_when_any_done=False``, no other option
@@ -334,13 +335,16 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
             if can_fly(self._stepper, policy, start):
                 state = guard.read_state(start.get("state"), self.control_step.safe_state, "rollout")
                 rollout = fly(self._stepper, self.randomness, policy, state, start, max_steps)
-                guard.check_finite(rollout["action"])
-                self._keep_for_render(rollout.get(("next", "state"))[:, -1].clone())
+                guard.check_finite(cast(Tensor, rollout["action"]))
+                self._keep_for_render(cast(TensorDict, rollout["next", "state"])[:, -1].clone())
                 return rollout
             options |= {"tensordict": start, "auto_reset": False}
         return super().rollout(max_steps, policy, callback, **options)
 
-    def _keep_for_render(self, state: Mapping[Any, Tensor], mask: Tensor | None = None) -> None:
+    def _tensordict(self, entries: dict[str, Any]) -> TensorDict:
+        return TensorDict(cast(Any, entries), torch.Size([self.num_envs]), self.device)
+
+    def _keep_for_render(self, state: Any, mask: Tensor | None = None) -> None:
         """Keep what render() draws, detached; with a mask, of the environments in it."""
         self.render_state = merge_reset(self.render_state, visible_state(state), mask)
 

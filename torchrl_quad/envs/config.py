@@ -180,10 +180,9 @@ class EnvConfig:
 
     def build_dynamics(self, nominal: QuadrotorParams) -> Dynamics:
         """The model of the drone."""
+        model: Callable[..., Dynamics] = DYNAMICS[self.dynamics]
         control = {"control": self.control} if self.takes_control else {}
-        return DYNAMICS[self.dynamics](
-            nominal, dt=self.dt, substeps=self.substeps, integrator=self.integrator, **control
-        )
+        return model(nominal, dt=self.dt, substeps=self.substeps, integrator=self.integrator, **control)
 
     def build_disturbances(self, dynamics: Dynamics) -> dict[str, Disturbance]:
         """The disturbances by name, in the order in which they act."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -14,7 +14,7 @@ from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.config import CameraOption, SceneOption
 from torchrl_quad.envs.markers import Markers
-from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode, read
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenes import ELSEWHERE, MAX_OBSTACLES, Scene, left_out
 from torchrl_quad.envs.terms import norm, outside
@@ -48,8 +48,8 @@ class ForestEnv(QuadrotorEnv):
     command                        3     m/s, body frame: the commanded speed, in the direction of the target
     =============================  ====  ====================================================================
 
-    Beside it ``"depth"`` (num_envs, 1, height, width) [m], as the camera sees it. The trees are upright cylinders, 6 m
-    high, with radii from 0.1 to 0.4 m, on 30 m by 16 m of ground. Each episode draws them anew.
+    The policy can also read ``"depth"`` (num_envs, 1, height, width) [m], the camera's image. The trees are upright
+    cylinders, 6 m high, with radii from 0.1 to 0.4 m, on 30 m by 16 m of ground. Each episode draws new ones.
 
     Reward, with the velocity v, the command c, the distance d from the drone's surface to the nearest obstacle or the
     ground [m], the direction N away from that, and h(x) = (|x|^2 + 0.25)^(1/2) - 0.5:
@@ -75,15 +75,14 @@ class ForestEnv(QuadrotorEnv):
         num_envs: number of drones that fly in parallel.
         difficulty: how dense the forest is: 0.04 trees per square metre, at least 1.5 m from each other, for "easy",
             0.08 and 1.2 m for "middle", 0.12 and 0.9 m for "hard".
-        density: of trees, 0 to 2 per square metre, in the place of that of the difficulty. Trees that find no place are
-            left out.
-        gap: between the surfaces of any two trees, at least, 0.1 to 10 m, in the place of that of the difficulty. Since
-            it is wider than the drone, there always is a way through.
+        density: of trees, 0 to 2 per square metre; overrides the difficulty's. Trees that find no place are left out.
+        gap: the least distance between the surfaces of two trees, 0.1 to 10 m; overrides the difficulty's. It is wider
+            than the drone, so there always is a way through.
         speed: the least and the greatest commanded speed, 0.1 to 30 m/s, or one for all.
         observe_velocity: whether the policy observes its velocity.
         camera: as for :class:`~torchrl_quad.envs.QuadrotorEnv`; a mapping changes the camera of 16 x 12 pixels, 90
-            degrees and 10 m. None flies blind.
-        scene: other obstacles than a random forest, as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
+            degrees and 10 m. None flies without one.
+        scene: replaces the random forest, as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
         max_episode_steps: control steps after which an episode is truncated.
         **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
 
@@ -145,10 +144,11 @@ class ForestEnv(QuadrotorEnv):
         fixed, top = self.scene.touchable, self.ceiling
         if not fixed.total:
             return
+        radius = self.scene.radius
         start = self.tensor([-self.run_up[0], 0.0, self.cruise_height])
         goal = self.tensor([self.length, 0.0, self.cruise_height])
-        low = self.tensor([-self.before, -self.half_width, self.scene.radius])
-        high, radius = self.tensor([self.length + 1.0, self.half_width, top]), self.scene.radius
+        low = self.tensor([-self.before, -self.half_width, radius])
+        high = self.tensor([self.length + 1.0, self.half_width, top])
         if not has_way(fixed, start, goal, low, high, radius):
             raise UserValueError(
                 f"{self.scene.source}: the obstacles leave no way from (x, y, z) = (-1, 0, 1.5) to (30, 0, 1.5) m, "
@@ -160,12 +160,16 @@ class ForestEnv(QuadrotorEnv):
         across, along, up = self.uniform(3, n, 1)
         x = -0.5 * (self.run_up[0] + self.run_up[1]) + 0.5 * (self.run_up[1] - self.run_up[0]) * along
         y, z = self.start_half_width * across, self.cruise_height + self.start_height * up
-        target = torch.cat(
-            (torch.full_like(x, self.length + self.run_out), y, torch.full_like(z, self.cruise_height)), -1
-        )
+        ends = torch.full_like(x, self.length + self.run_out), y, torch.full_like(z, self.cruise_height)
         low, high = self.speeds
         speed = low + (high - low) * 0.5 * (self.uniform(n, 1) + 1.0)
-        return {**self.hover_state(torch.cat((x, y, z), -1)), "target": target, "speed": speed}
+        start = self.hover_state(torch.cat((x, y, z), -1))
+        return {**start, "target": torch.cat(ends, -1), "speed": speed}
+
+    @property
+    def scene(self) -> Scene:
+        """The obstacles, which a forest always has."""
+        return cast(Scene, super().scene)
 
     def command(self, state: State) -> Tensor:
         """The commanded velocity (n, 3) [m/s], world frame."""
@@ -189,7 +193,7 @@ class ForestEnv(QuadrotorEnv):
         distance, away = self.scene.nearest(state)
         closing = (-(away * velocity).sum(-1, keepdim=True)).clamp_min(0.0)
         terms = {
-            # Of a command of 0.1 m/s; no less is commanded but next to the target, where nobody flies.
+            # 0.0099 is that of 0.1 m/s, the least command but for the last metre before the target, outside the forest.
             "speed": 1.0 - _gentle(velocity - command) / _gentle(command).clamp_min(0.0099),
             "clearance": -self.softness * softplus((self.margin - distance) / self.softness) / self.margin,
             "closing": -closing * torch.exp(-distance.clamp_min(0.0) / self.nearness),
@@ -226,9 +230,9 @@ class ForestEnv(QuadrotorEnv):
 
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Takes ``flown_speed`` as the mean over the episode [m/s], and ``clearance`` as its least value [m]."""
-        first, measured = first_episode(rollout), rollout["next", "metrics"]
-        speed = (measured["flown_speed"] * first).sum(1) / first.sum(1)
-        clearance = torch.where(first, measured["clearance"], math.inf).amin(1)
+        first = first_episode(rollout)
+        speed = (read(rollout, "metrics", "flown_speed") * first).sum(1) / first.sum(1)
+        clearance = torch.where(first, read(rollout, "metrics", "clearance"), math.inf).amin(1)
         own = {"flown_speed": speed.squeeze(-1), "clearance": clearance.squeeze(-1)}
         return {**super().episode_metrics(rollout), **own}
 
@@ -237,11 +241,11 @@ class ForestEnv(QuadrotorEnv):
 
 
 class Forest(Scene):
-    """A random forest on flat ground: another one in each episode, whose trees keep a gap between each other.
+    """A random forest on flat ground: a new one in each episode, whose trees keep a gap between each other.
 
-    Trees are drawn evenly over the ground. One that finds no place among 12 that is far enough from the trees before it
-    is left out. Since the gaps are wider than the drone, the trees made thicker by its radius do not touch each other.
-    What does not touch encloses nothing: there is a way through.
+    Trees are drawn uniformly over the ground. A tree is left out if none of 12 places is far enough from the trees
+    before it. Since the gaps are wider than the drone, trees made thicker by its radius do not touch each other, and
+    so enclose nothing: there is a way through.
 
     Args:
         density: trees per square metre, 0 to 2.
@@ -274,7 +278,7 @@ class Forest(Scene):
             raise UserValueError(f"radius must be the least and then the greatest radius of a tree; got {radius!r}.")
         self.trees = round(density * 2.0 * half_width * length)
         if self.trees > MAX_OBSTACLES:
-            raise UserValueError(f"density={density:g} makes {self.trees:,} trees; {MAX_OBSTACLES:,} are the most.")
+            raise UserValueError(f"density={density:g} makes {self.trees:,} trees; the maximum is {MAX_OBSTACLES:,}.")
         self.gap, self.length, self.half_width, self.tree_radius, self.height = gap, length, half_width, radius, height
         if fixed := sorted({"ground", "source"} & set(options)):
             raise UserTypeError(f"A forest has a {fixed[0]} of its own: leave it out.")

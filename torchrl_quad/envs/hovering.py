@@ -7,7 +7,7 @@ from torch import Tensor
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.markers import Markers
-from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode, read
 from torchrl_quad.envs.terms import BODY_BOUNDS, TARGET_WEIGHTS, body_observation, distance, outside, target_reward
 
 
@@ -73,7 +73,7 @@ class HoveringEnv(QuadrotorEnv):
         first = first_episode(rollout)
         steps_left = first.sum(1, keepdim=True) - first.cumsum(1)
         last_second = first & (steps_left < round(1 / self.control_dt))
-        error = rollout["next", "metrics", "position_error"]
+        error = read(rollout, "metrics", "position_error")
         error = ((error * last_second).sum(1) / last_second.sum(1)).squeeze(-1)
         solved = (error < self.success_radius) * (1 - metrics["crash"])
         return {**metrics, "solved": solved, "position_error": error}

@@ -7,7 +7,7 @@ from torch import Tensor
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.markers import Markers, Shape
-from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, at_episode_end
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, at_episode_end, read
 from torchrl_quad.envs.terms import BODY_BOUNDS, Event, ball_entry, body_observation, level_crossing, norm, outside
 
 
@@ -117,7 +117,7 @@ class LandingEnv(QuadrotorEnv):
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Gives a ``landing_speed`` only to drones that came down."""
         metrics = super().episode_metrics(rollout)
-        height = at_episode_end(rollout, rollout["next", "state", "position"][..., 2:])
+        height = at_episode_end(rollout, read(rollout, "state", "position")[..., 2:])
         came_down = height <= self.success_height
         return {**metrics, "landing_speed": torch.where(came_down, metrics["landing_speed"], torch.nan)}
 

@@ -1,4 +1,4 @@
-"""The markers that pictures show beside the drones: targets, gates, curves, and shapes of lines and triangles."""
+"""What pictures show in addition to the drones: targets, gates, curves, and shapes of lines and triangles."""
 
 from __future__ import annotations
 
@@ -14,18 +14,15 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchrl_quad.engine.packing import like
+from torchrl_quad.engine.simulation import State
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import Real, Share, accepted, between, checked
 from torchrl_quad.vision.primitives import SIZES
 
 MAX_POINTS = 1_000_000  # of an object; no picture shows more
 Length = Annotated[float, between(1e-6, 1e6)]  # [m]
-Color = Annotated[
-    Any,
-    accepted(
-        lambda x: isinstance(x, str) and re.fullmatch("#[0-9a-fA-F]{6}", x), "written as #rrggbb, such as #c8452f"
-    ),
-]
+_COLOR = "written as #rrggbb, such as #c8452f"
+Color = Annotated[Any, accepted(lambda x: isinstance(x, str) and bool(re.fullmatch("#[0-9a-fA-F]{6}", x)), _COLOR)]
 _RING = 33  # points of a circle, the first again at its end
 
 
@@ -48,24 +45,24 @@ class Shape:
         ValueError: points, faces or colour are something else.
     """
 
-    points: Tensor
-    faces: Tensor | None = None
+    points: Any  # a tensor, once it is built
+    faces: Any = None
     name: str = ""
     color: Color = "#6b7a90"
     opacity: Share = 0.35
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", as_points("Shape: points", self.points))
-        if self.faces is not None:
-            faces = as_numbers(self.faces)
-            is_triangles = faces is not None and faces.dim() == 2 and faces.shape[1] == 3
-            if not is_triangles or not ((faces >= 0) & (faces < len(self.points)) & (faces == faces.floor())).all():
-                got = type(self.faces).__name__ if faces is None else f"shape {tuple(faces.shape)}"
-                raise UserValueError(
-                    f"Shape: faces must be indices (m, 3) of its {len(self.points)} points, three for each triangle; "
-                    f"got {got}."
-                )
-            object.__setattr__(self, "faces", faces.long())
+        if self.faces is None:
+            return
+        faces, n = as_numbers(self.faces), len(self.points)
+        is_triangles = faces is not None and faces.dim() == 2 and faces.shape[1] == 3
+        if faces is None or not (is_triangles and ((faces >= 0) & (faces < n) & (faces == faces.floor())).all()):
+            got = type(self.faces).__name__ if faces is None else f"shape {tuple(faces.shape)}"
+            raise UserValueError(
+                f"Shape: faces must be indices (m, 3) of its {n} points, three for each triangle; got {got}."
+            )
+        object.__setattr__(self, "faces", faces.long())
 
     @classmethod
     def line(cls, points: Any, **style: Any) -> Shape:
@@ -157,10 +154,8 @@ def rings(centres: Tensor, axes: Tensor, radius: float | Tensor) -> Tensor:
     none = axes.norm(dim=-1, keepdim=True) < 1e-6
     axes = torch.where(none, torch.tensor([1.0, 0.0, 0.0]), axes)
     side = torch.linalg.cross(axes, torch.tensor([0.0, 0.0, 1.0]).expand_as(axes))
-    side = torch.where(
-        side.norm(dim=-1, keepdim=True) > 1e-3, side, torch.tensor([0.0, 1.0, 0.0])
-    )  # the axis is upright
-    side = normalize(side, dim=-1)
+    is_upright = side.norm(dim=-1, keepdim=True) <= 1e-3
+    side = normalize(torch.where(is_upright, torch.tensor([0.0, 1.0, 0.0]), side), dim=-1)
     upright = normalize(torch.linalg.cross(side, axes), dim=-1)
     angle = torch.linspace(0, 2 * math.pi, _RING)[:, None]
     turns = angle.cos() * side[:, None] + angle.sin() * upright[:, None]
@@ -170,10 +165,10 @@ def rings(centres: Tensor, axes: Tensor, radius: float | Tensor) -> Tensor:
 @checked
 @dataclass(frozen=True)
 class Markers:
-    """The things that pictures show beside the drones; positions are in m, in the world frame.
+    """What pictures show in addition to the drones; positions are in m, in the world frame.
 
-    Pictures show all of them. Without places, a curve, or gates that are the targets, they also show where the entry
-    ``target`` (num_envs, 3) of the state has been in the flight.
+    Without places, a curve, or gates that are the targets, pictures also show where the entry ``target`` (num_envs, 3)
+    of the state has been in the flight.
 
     Args:
         target: the name of the target, as in "distance to the target".
@@ -182,7 +177,7 @@ class Markers:
         gates: centres of gates (k, 3), in the order of flight.
         gate_radius: of all gates, or of each (k) [m].
         gate_axes: the direction (k, 3) in which each gate is flown; by default along the course.
-        shapes: objects of your own.
+        shapes: other objects.
         progress: the metric that best shows how a flight goes; by default the distance to the target.
         success: the value of the progress, in SI units, from which a state fulfils the task.
 
@@ -228,21 +223,21 @@ class Markers:
         return [x for x in everything if x is not None]
 
 
-def visible_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The entries of a state that pictures show: ``position``, ``quaternion``, ``target`` if it is a position, and the
-    random obstacles of a scene."""
-    shown = {key: state[key] for key in ("position", "quaternion")}
+def visible_state(state: Mapping[Any, Any]) -> State:
+    """The entries of a state, nested or not, that pictures show: ``position``, ``quaternion``, ``target`` if it is a
+    position, and the random obstacles of a scene."""
+    shown: State = {key: state[key] for key in ("position", "quaternion")}
     if "target" in state and state["target"].shape == state["position"].shape:
         shown["target"] = state["target"]
     nested = state.get("scene", {})
     for kind in SIZES:
-        obstacles = nested.get(kind, None) if ("scene", kind) not in state else state["scene", kind]
+        obstacles = state["scene", kind] if ("scene", kind) in state else nested.get(kind, None)
         if obstacles is not None:
             shown["scene", kind] = obstacles
     return {key: x.detach() for key, x in shown.items()}
 
 
-def merge_reset(before: Mapping[str, Tensor], begun: Mapping[str, Tensor], mask: Tensor | None) -> dict[str, Tensor]:
+def merge_reset(before: State, begun: State, mask: Tensor | None) -> State:
     """The visible state after a reset of the environments in a mask (num_envs, 1), of all of them for None."""
     if mask is None or not before:
         return dict(begun)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -17,7 +17,7 @@ from torchrl_quad.options import Scale, checked
 @checked
 @dataclass(frozen=True)
 class Metric:
-    """How a metric is summed up over episodes, printed, and drawn.
+    """How a metric is averaged over episodes, printed, and drawn.
 
     Values themselves are in SI units everywhere; only print and pictures use ``scale`` and ``unit``.
 
@@ -25,7 +25,7 @@ class Metric:
         label: its name in prose, such as "position error".
         unit: in print, such as "cm".
         scale: how many of these units make one SI unit, 100 for cm.
-        median: whether it is summed up with the median instead of the mean, which a few crashes would dominate.
+        median: whether its average is the median instead of the mean, which a few crashes would dominate.
         log: whether it is drawn on a logarithmic axis.
         goal: "max" if more is better, "min" if less is; wandb keeps the best value of such a metric.
     """
@@ -48,11 +48,11 @@ class Metric:
         return f"{self.label} [{self.unit}]" if self.unit else self.label
 
     def summarise(self, values: Tensor) -> float:
-        """Sum up the values of episodes (n); leave out those without one, which are NaN."""
+        """The average over episodes (n), without those that have no value, which are NaN."""
         return (values.nanmedian() if self.median else values.nanmean()).item()
 
     def format(self, value: float) -> str:
-        """A summed-up value in print, with three significant digits: "3.21 cm (median)", "93 %"; "none" for NaN."""
+        """An average in print, with three significant digits: "3.21 cm (median)", "93 %"; "none" for NaN."""
         if math.isnan(value):
             return "none"
         value = self.scale * value
@@ -73,9 +73,14 @@ def describe_metric(name: str, metric_info: Mapping[str, Metric]) -> Metric:
     return metric_info.get(name) or EPISODE_METRICS.get(name) or Metric(name.replace("_", " "))
 
 
+def read(rollout: TensorDictBase, *names: str) -> Tensor:
+    """An entry ``("next", *names)`` of a rollout."""
+    return cast(Tensor, rollout["next", *names])
+
+
 def first_episode(rollout: TensorDictBase) -> Tensor:
     """Mark the steps of each environment's first episode, its last one included, bool (num_envs, time, 1)."""
-    done = rollout["next", "done"]
+    done = read(rollout, "done")
     return (done.cumsum(1) - done.int()) == 0
 
 
@@ -93,12 +98,11 @@ def summarise_episodes(rollout: TensorDictBase) -> dict[str, Tensor]:
             f'episode_metrics reads ("next", {missing[0]!r}), which is not in the rollout. Judge a rollout before you '
             "leave out entries, and evaluate without the transform that drops this one."
         )
-    ends, first = rollout["next"], first_episode(rollout)
-    crash, success = (at_episode_end(rollout, ends[name]) for name in ("crash", "success"))
-    dtype = ends["reward"].dtype
+    reward, measured = read(rollout, "reward"), cast(Mapping, rollout.get(("next", "metrics"), {}))
+    crash, success = (at_episode_end(rollout, read(rollout, name)) for name in ("crash", "success"))
     return {
-        "return": (ends["reward"] * first).sum(1).squeeze(-1),
-        "crash": crash.to(dtype),
-        "solved": (success & ~crash).to(dtype),
-        **{name: at_episode_end(rollout, value) for name, value in ends.get("metrics", {}).items()},
+        "return": (reward * first_episode(rollout)).sum(1).squeeze(-1),
+        "crash": crash.to(reward.dtype),
+        "solved": (success & ~crash).to(reward.dtype),
+        **{name: at_episode_end(rollout, value) for name, value in measured.items()},
     }

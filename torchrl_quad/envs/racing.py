@@ -12,40 +12,25 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import presets
-from torchrl_quad.dynamics.presets import as_array
 from torchrl_quad.engine.simulation import State
+from torchrl_quad.envs import terms
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.guard import MAX_STEPS
 from torchrl_quad.envs.markers import Markers
-from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode
-from torchrl_quad.envs.terms import (
-    BODY_BOUNDS,
-    TARGET_WEIGHTS,
-    Event,
-    ball_entry,
-    body_observation,
-    distance,
-    norm,
-    outside,
-    target_reward,
-)
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode, read
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import Size, accepted, between, check_value
 
 WEIGHTS = {  # of the reward's terms, by reward
-    "position": {**TARGET_WEIGHTS, "gate": 20.0},
+    "position": {**terms.TARGET_WEIGHTS, "gate": 20.0},
     "velocity": {"towards": 0.02, "across": 0.02, "angular_velocity": 0.001, "gate": 5.0},
 }
 RELAXATION_WEIGHTS = {"log": {"gate": 5.0}, "reciprocal": {"gate": 1.0}}
 MAX_GATES = 1_000
 GateRadius = Annotated[float, between(0.01, 100.0)]
-TrackOption = Annotated[
-    Any,
-    accepted(
-        lambda x: isinstance(x, str | Path | Mapping), "the name of a track, the path of a YAML file, or a mapping"
-    ),
-]
-_TRACKS = resources.files(__package__) / "tracks"
+_TRACK = "the name of a track, the path of a YAML file, or a mapping"
+TrackOption = Annotated[Any, accepted(lambda x: isinstance(x, str | Path | Mapping), _TRACK)]
+_TRACKS = resources.files("torchrl_quad.envs") / "tracks"
 
 
 class RacingEnv(QuadrotorEnv):
@@ -176,37 +161,37 @@ class RacingEnv(QuadrotorEnv):
             line = end - start
             along = ((point - start) * line).sum(-1, keepdim=True)
             fraction = (along / line.square().sum(-1, keepdim=True).clamp_min(1e-12)).clamp(0.0, 1.0)
-            return norm(start + fraction * line - point)
+            return terms.norm(start + fraction * line - point)
 
-    def events(self, previous: State, state: State) -> dict[str, Event]:
+    def events(self, previous: State, state: State) -> dict[str, terms.Event]:
         """``gate``: the drone enters the sphere of the gate that it passes in this step."""
         if self.gate_bonus != "binary":
             return {}
         ends = previous["position"], state["position"]
-        time = ball_entry(*ends, previous["target"], self.track["gate_radius"])
-        return {"gate": Event(state["gate_passed"], time, self.weights["gate"])}
+        time = terms.ball_entry(*ends, previous["target"], self.track["gate_radius"])
+        return {"gate": terms.Event(state["gate_passed"], time, self.weights["gate"])}
 
     def observe(self, state: State) -> Tensor:
         gate = state["gate"][:, 0]  # any number, in environments that are not reset
         relative = [self.gates[k % len(self.gates)] - state["position"] for k in (gate, gate + 1)]
-        return torch.cat((*relative, *body_observation(state)), -1)
+        return torch.cat((*relative, *terms.body_observation(state)), -1)
 
     def observation_bounds(self) -> Tensor:
         width, depth = (2.0 * self.half_width).tolist()  # from one side of the box to the other
-        return self.tensor((*2 * (width, depth, self.ceiling), *BODY_BOUNDS))
+        return self.tensor((*2 * (width, depth, self.ceiling), *terms.BODY_BOUNDS))
 
     def reward_terms(self, state: State) -> State:
-        gap = distance(state)
+        gap = terms.distance(state)
         if self.reward == "position":
-            terms = target_reward(state, self.weights)
+            rewards = terms.target_reward(state, self.weights)
         else:
             direction = (state["target"] - state["position"]) / gap.clamp_min(1e-6)
             towards = (state["velocity"] * direction).sum(-1, keepdim=True)
-            across = norm(state["velocity"] - towards * direction)
-            terms = {
+            across = terms.norm(state["velocity"] - towards * direction)
+            rewards = {
                 "towards": self.weights["towards"] * towards.clamp_max(self.max_rewarded_speed),
                 "across": -self.weights["across"] * across / (gap + 1.0),
-                "angular_velocity": -self.weights["angular_velocity"] * norm(state["angular_velocity"]),
+                "angular_velocity": -self.weights["angular_velocity"] * terms.norm(state["angular_velocity"]),
             }
         if self.gate_bonus == "log":
             bonus = -torch.log(gap + 0.01)
@@ -214,10 +199,10 @@ class RacingEnv(QuadrotorEnv):
             bonus = 1.0 / (gap + 0.05)
         else:
             bonus = state["gate_passed"].to(self.dtype)
-        return {**terms, "gate": self.weights["gate"] * bonus}
+        return {**rewards, "gate": self.weights["gate"] * bonus}
 
     def is_crash(self, state: State) -> Tensor:
-        return outside(state["position"], self.centre, self.half_width, self.ceiling)
+        return terms.outside(state["position"], self.centre, self.half_width, self.ceiling)
 
     def is_success(self, state: State) -> Tensor:
         return state["gates_passed"] >= self.success_gates
@@ -233,16 +218,17 @@ class RacingEnv(QuadrotorEnv):
         """Gives a ``lap_time`` only to drones that flew a full lap; adds ``time_near_gate``, within 1 m of the next."""
         metrics = super().episode_metrics(rollout)
         lap_time = torch.where(metrics["lap_time"] > 0, metrics["lap_time"], torch.nan)
-        near = (distance(rollout["next", "state"]) < 1.0) & first_episode(rollout)
+        far = terms.norm(read(rollout, "state", "position") - read(rollout, "state", "target"))
+        near = (far < 1.0) & first_episode(rollout)
         return {**metrics, "lap_time": lap_time, "time_near_gate": self.control_dt * near.sum((1, 2)).to(self.dtype)}
 
     def markers(self) -> Markers:
-        goal = {"progress": "gates_passed", "success": self.success_gates}
-        return Markers("next gate", gates=self.gates, gate_radius=self.track["gate_radius"], **goal)
+        gates = {"gates": self.gates, "gate_radius": self.track["gate_radius"]}
+        return Markers("next gate", **gates, progress="gates_passed", success=self.success_gates)
 
 
 def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:
-    """Read a track: the name of one that ships with the package, the path of a YAML file, or a mapping.
+    """Read a track: the name of one in the package, the path of a YAML file, or a mapping.
 
     Returns:
         ``gates`` and ``starts``, equally long lists of points [m], and ``gate_radius`` [m].
@@ -252,9 +238,8 @@ def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:
         FileNotFoundError: there is no such file.
     """
     source, values = presets.read("track", track, _TRACKS)
-    for key in values:
-        if key not in ("gates", "starts", "gate_radius"):
-            raise UserValueError(f"{source}: unknown key {shown(key)}. Allowed: gates, starts, gate_radius.")
+    for key in values.keys() - {"gates", "starts", "gate_radius"}:
+        raise UserValueError(f"{source}: unknown key {shown(key)}. Allowed: gates, starts, gate_radius.")
     gates = _points(source, "gates", values.get("gates"))
     if not 2 <= len(gates) <= MAX_GATES:
         raise UserValueError(f"{source}: a track has 2 to {MAX_GATES} gates, got {len(gates)}.")
@@ -267,12 +252,13 @@ def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:
     return {"gates": gates, "starts": starts, "gate_radius": float(radius)}
 
 
-def _points(source: str, name: str, value: Any) -> list[list[float]]:
+def _points(source: str, name: str, value: Any) -> Any:
     try:
-        points = as_array(value.tolist() if isinstance(value, Tensor) else value)
+        points = presets.as_array(value.tolist() if isinstance(value, Tensor) else value)
     except (ValueError, RecursionError):
         points = np.zeros(0)
-    if points.ndim != 2 or points.shape[1] != 3 or not ((abs(points) < 1e4).all() and (points[:, 2] > 0).all()):
+    is_list = points.ndim == 2 and points.shape[-1] == 3
+    if not (is_list and (abs(points) < 1e4).all() and (points[..., -1] > 0).all()):
         raise UserValueError(
             f"{source}: {name} must be a list of points [x, y, z] in metres above ground, within 10 km; got "
             f"{shown(value)}."

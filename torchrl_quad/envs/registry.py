@@ -1,4 +1,4 @@
-"""The tasks by name: those that ship, those that programs register, and those of installed packages."""
+"""The tasks by name: those of this package, those that programs register, and those of installed packages."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.options import imported
 
 GROUP = "torchrl_quad.tasks"  # the group of entry points by which an installed package offers its tasks
-
-# The tasks that ship, and those that register_task has added.
+# The tasks of this package, and those that register_task has added.
 TASKS: dict[str, type[QuadrotorEnv]] = {
     "forest": ForestEnv,
     "hovering": HoveringEnv,
@@ -30,9 +29,9 @@ TASKS: dict[str, type[QuadrotorEnv]] = {
 
 
 def register_task(name: str, cls: type[QuadrotorEnv]) -> None:
-    """Make a task of your own known by a name: to ``make_env``, to gymnasium, and to a recipe in the same program.
+    """Name your own task, for ``make_env``, gymnasium, and a recipe in the same program.
 
-    After ``register_task("window", WindowEnv)`` you can write ``make_env("window")``, and
+    After ``register_task("window", WindowEnv)`` you can write ``make_env("window")`` and
     ``gymnasium.make("torchrl_quad/Window-v0")``. An installed package offers its tasks to every program by an entry
     point of the group "torchrl_quad.tasks": ``window = "mypackage:WindowEnv"``. A class that Python can import needs no
     name: ``make_env("mypackage.WindowEnv")``.
@@ -49,7 +48,7 @@ def register_task(name: str, cls: type[QuadrotorEnv]) -> None:
         raise UserValueError(
             f"A task's name is in small letters, digits and underscores, such as 'window'; got {shown(name)}."
         )
-    _require_task(cls, f"register_task({name!r}, ...)")
+    _checked_class(cls, f"register_task({name!r}, ...)")
     taken = TASKS.get(name)
     if taken is not None and _path(taken) != _path(cls):  # a module that runs again, as in a notebook, may
         raise UserValueError(f"The task {name!r} is {_path(taken)} already. Choose another name for {_path(cls)}.")
@@ -79,9 +78,9 @@ def task_class(task: str) -> type[QuadrotorEnv]:
             f"Several packages offer a task {task!r}: {', '.join(x.value for x in offers)}. Remove all but one."
         )
     if offers:
-        return _require_task(offers[0].load(), f"The entry point {task} = {offers[0].value!r}")
+        return _checked_class(offers[0].load(), f"The entry point {task} = {offers[0].value!r}")
     if isinstance(task, str) and re.fullmatch(r"\w+(\.\w+)+", task):
-        return _require_task(imported(task), f"task {task!r}")
+        return _checked_class(imported(task), f"task {task!r}")
     raise UserValueError(
         f"Unknown task {shown(task)}. Choose from: {', '.join(available_tasks())}. For one of your own give the path "
         "of its class, such as 'mypackage.WindowEnv', or call register_task(name, WindowEnv) before."
@@ -109,7 +108,7 @@ def _offered() -> dict[str, list[EntryPoint]]:
     return offers
 
 
-def _require_task(cls: Any, source: str) -> type[QuadrotorEnv]:
+def _checked_class(cls: Any, source: str) -> type[QuadrotorEnv]:
     if not (isinstance(cls, type) and issubclass(cls, QuadrotorEnv)):
         got = f"the class {cls.__name__}" if isinstance(cls, type) else type(cls).__name__
         raise UserTypeError(f"{source}: a task is a subclass of QuadrotorEnv, itself and not an instance; got {got}.")

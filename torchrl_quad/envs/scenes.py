@@ -254,10 +254,11 @@ class Scene(Disturbance):
         """The obstacles (n, count, ...) of a group; none stands at the points (n, k, 3)."""
         n = len(points)
         none = {name: points.new_zeros((n, 0, size)) for name, size in SIZES.items()}
-        drawn = blocked = None
-        for _ in range(TRIES):
-            new = _draw(random, kind, group, n)
-            drawn = new if drawn is None else torch.where(blocked.unsqueeze(-1), new, drawn)
+        drawn = _draw(random, kind, group, n)
+        blocked = torch.zeros_like(drawn[..., 0], dtype=torch.bool)
+        for tries in range(TRIES):
+            if tries:
+                drawn = torch.where(blocked.unsqueeze(-1), _draw(random, kind, group, n), drawn)
             alone = Primitives(**{**none, kind: drawn})
             blocked = (distances(alone, points) < self.radius + self.clearance).any(1)
             if looks_are_free(points.device) and not blocked.any():

@@ -27,6 +27,7 @@ from torchrl_quad.envs.guard import (
     is_true,
     kind_of,
 )
+from torchrl_quad.envs.scenes import MountedCamera
 from torchrl_quad.envs.task import Task
 from torchrl_quad.envs.terms import time_terms
 from torchrl_quad.errors import UserValueError
@@ -121,8 +122,8 @@ class ControlStep:
         """The reward terms that carry the gradients in the times of events; their values are zero."""
         env = self.env
         old = {key: (before[key] if key in env.task_entries else x).detach() for key, x in state.items()}
-        events, discount = env.events(before, state), env.event_discount
-        return time_terms(events, discount, terms, env.reward_terms(old), terminated)
+        old_terms, discount = env.reward_terms(old), env.event_discount or 1.0
+        return time_terms(env.events(before, state), discount, terms, old_terms, terminated)
 
     def measure(self, state: State) -> dict[str, Any]:
         """The outputs that any state has, also the first of an episode."""
@@ -130,8 +131,8 @@ class ControlStep:
         with torch.no_grad():
             metrics = env.metrics(state)
         outputs: dict[str, Any] = {"observation": self.observe(state)}
-        if "camera" in env.disturbances:
-            outputs["depth"] = env.disturbances["camera"].image(state)
+        if isinstance(camera := env.disturbances.get("camera"), MountedCamera):
+            outputs["depth"] = camera.image(state)
         if env.scene is not None:  # for critics, which may know more than policies
             distance, away = env.scene.nearest(state)
             outputs["obstacle"] = torch.cat((distance, quaternion.rotate_inverse(state["quaternion"], away)), -1)
@@ -180,7 +181,7 @@ class ControlStep:
             ValueError: an entry is missing, of another shape or kind, or outside of what can fly.
         """
         given = as_tensordict(state, source)
-        entries = {key: given.get(key, None) for key in self.safe_state}
+        entries: dict[Any, Any] = {key: given.get(key, None) for key in self.safe_state}
         for key, x in entries.items():
             if x is None or x.shape != self.safe_state[key].shape or kind_of(x) != kind_of(self.safe_state[key]):
                 raise entry_error(entries, key, self.safe_state, source)
@@ -249,7 +250,7 @@ class ControlStep:
 
     def specs(self) -> dict[str, TensorSpec]:
         """The specs of the environment by name, read off what the step writes of the safe state."""
-        env, example = self.env, self.safe_state["position"]
+        example = self.safe_state["position"]
         n, device = example.shape[:1], example.device
 
         def spec(x: Any) -> TensorSpec:
@@ -267,8 +268,8 @@ class ControlStep:
             # A key that is in the state spec alone would never be carried on: it has to be in both.
             "observation_spec": spec({**outputs, "state": state}),
             "state_spec": spec({"state": state}),
-            "action_spec": Bounded(-1.0, 1.0, (env.num_envs, 4), device=device, dtype=example.dtype),
-            "reward_spec": Unbounded((env.num_envs, 1), device=device, dtype=example.dtype),
+            "action_spec": Bounded(-1.0, 1.0, torch.Size((*n, 4)), device=device, dtype=example.dtype),
+            "reward_spec": Unbounded(torch.Size((*n, 1)), device=device, dtype=example.dtype),
             "done_spec": spec(done),
         }
 

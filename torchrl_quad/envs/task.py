@@ -66,7 +66,7 @@ class Task(abc.ABC):
 
     # -- what a task defines -------------------------------------------------------------------------------------------
 
-    weights: Mapping[str, float] = {}  #: of the reward's terms; an argument of the same name overrides some
+    weights: Mapping[str, Any] = {}  #: of the reward's terms; an argument of the same name overrides some
     ends_on_success = False  #: whether success terminates the episode, too
     metric_info: Mapping[str, Metric] = EPISODE_METRICS  #: how each metric is summed up, printed and drawn, by name
 

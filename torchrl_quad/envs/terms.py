@@ -21,6 +21,11 @@ TARGET_WEIGHTS = {
     "velocity": 0.002,
     "angular_velocity": 0.002,
 }
+# Magnitudes of body_observation() that no useful flight exceeds: the quaternion's are exact.
+BODY_BOUNDS = (*4 * (10.0,), *3 * (50.0,), *3 * (50.0,))  # velocity in m/s, angular velocity in rad/s
+# Derivatives of passes that graze a surface, and of those who stand before it, would have no bound. The way across the
+# surface counts as at least this share of the whole way, and as at least so much in the unit of the quantity.
+GRAZING, SLOW = 0.3, 1e-4
 
 
 def norm(x: Tensor) -> Tensor:
@@ -28,12 +33,12 @@ def norm(x: Tensor) -> Tensor:
     return vector_norm(x, dim=-1, keepdim=True)
 
 
-def distance(state: dict[str, Tensor]) -> Tensor:
+def distance(state: Mapping[str, Tensor]) -> Tensor:
     """Distance to the target, (*, 1) [m]."""
     return norm(state["position"] - state["target"])
 
 
-def body_observation(state: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+def body_observation(state: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """Ten times the quaternion, velocity [m/s] in the world frame, angular velocity [rad/s] in the body frame.
 
     The paper observes a tenth of all this, and of positions, which networks learn from slowly. Times ten, a tilt of
@@ -42,11 +47,7 @@ def body_observation(state: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     return 10 * state["quaternion"], state["velocity"], state["angular_velocity"]
 
 
-# Magnitudes of the above that no useful flight exceeds: the quaternion's are exact.
-BODY_BOUNDS = (*4 * (10.0,), *3 * (50.0,), *3 * (50.0,))  # velocity in m/s, angular velocity in rad/s
-
-
-def target_reward(state: dict[str, Tensor], weights: dict[str, float]) -> dict[str, Tensor]:
+def target_reward(state: Mapping[str, Tensor], weights: Mapping[str, float]) -> dict[str, Tensor]:
     """The terms of "be at the target, level and still", each (*, 1): ``survival``, and four penalties."""
     level = quaternion.identity(state["quaternion"])
     return {
@@ -67,11 +68,6 @@ def outside(position: Tensor, centre: Tensor, half_width: Tensor | float, height
     sideways = ((position - centre)[..., :2].abs() > half_width).any(-1, keepdim=True)
     z = position[..., 2:]
     return sideways | (z <= 0.0) | (z >= height)
-
-
-# Derivatives of passes that graze a surface, and of those who stand before it, would have no bound. The way across the
-# surface counts as at least this share of the whole way, and as at least so much in the unit of the quantity.
-GRAZING, SLOW = 0.3, 1e-4
 
 
 class Event(NamedTuple):
@@ -157,5 +153,5 @@ def time_terms(
 
 def _moved(start: Tensor, end: Tensor, surface: Tensor | float, time: Tensor) -> Tensor:
     """How the point on the way at a fixed time moves from the surface: the value is zero, and the gradient is not."""
-    start, end = (x - surface for x in (start, end))
+    start, end = start - surface, end - surface
     return (1.0 - time) * (start - start.detach()) + time * (end - end.detach())

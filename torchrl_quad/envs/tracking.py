@@ -10,18 +10,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.engine.simulation import State
+from torchrl_quad.envs import terms
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.markers import Markers
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric
-from torchrl_quad.envs.terms import (
-    BODY_BOUNDS,
-    TARGET_WEIGHTS,
-    body_observation,
-    distance,
-    norm,
-    outside,
-    target_reward,
-)
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import Size, accepted, between
 
@@ -47,15 +39,8 @@ CURVES: dict[str, tuple[Curve, float]] = {  # by name: the curve, and its period
     # Size and period chosen here.
     "lemniscate": (functools.partial(lemniscate, centre=(2.0, 0.0, 1.5), half_length=2.0), 8.0),
 }
-
-
-CurveOption = Annotated[
-    Any,
-    accepted(
-        lambda x: callable(x) or (isinstance(x, str) and x in CURVES),
-        f"one of {', '.join(CURVES)}, or a function from phases (*) [rad] to positions (*, 3) [m]",
-    ),
-]
+_CURVE = f"one of {', '.join(CURVES)}, or a function from phases (*) [rad] to positions (*, 3) [m]"
+CurveOption = Annotated[Any, accepted(lambda x: callable(x) or (isinstance(x, str) and x in CURVES), _CURVE)]
 Period = Annotated[float, between(0.1, 10_000.0)]
 
 
@@ -105,7 +90,7 @@ class TrackingEnv(QuadrotorEnv):
     box_half_width = 5.0  # [m], around the centre of the curve
     box_margin = 3.0  # [m], beyond the curve at least
     box_height = 6.0  # [m]
-    weights = TARGET_WEIGHTS
+    weights = terms.TARGET_WEIGHTS
     success_radius = 0.1  # [m]
     metric_info = {
         **EPISODE_METRICS,
@@ -154,31 +139,31 @@ class TrackingEnv(QuadrotorEnv):
     def advance(self, previous: State, state: State) -> State:
         phase = torch.remainder(previous["phase"] + self.phase_rate * self.control_dt, 2 * math.pi)
         state = {**state, "phase": phase, "target": self.curve(phase[:, 0])}
-        error = distance(state).detach().square()
-        starts_anew = previous["step"] == self.settling_steps
-        return {**state, "squared_error": error + torch.where(starts_anew, 0.0, previous["squared_error"])}
+        error = terms.distance(state).detach().square()
+        is_settled = previous["step"] == self.settling_steps
+        return {**state, "squared_error": error + torch.where(is_settled, 0.0, previous["squared_error"])}
 
     def observe(self, state: State) -> Tensor:
         points = self.curve(state["phase"] + self.ahead) - state["position"].unsqueeze(1)
-        return torch.cat((points.flatten(1), *body_observation(state)), -1)
+        return torch.cat((points.flatten(1), *terms.body_observation(state)), -1)
 
     def observation_bounds(self) -> Tensor:
         width, depth = (2.0 * self.half_width).tolist()  # from one side of the box to the other
-        return self.tensor((*self.lookahead * (width, depth, self.ceiling), *BODY_BOUNDS))
+        return self.tensor((*self.lookahead * (width, depth, self.ceiling), *terms.BODY_BOUNDS))
 
     def reward_terms(self, state: State) -> State:
-        return target_reward(state, self.weights)
+        return terms.target_reward(state, self.weights)
 
     def is_crash(self, state: State) -> Tensor:
-        return outside(state["position"], self.centre, self.half_width, self.ceiling)
+        return terms.outside(state["position"], self.centre, self.half_width, self.ceiling)
 
     def is_success(self, state: State) -> Tensor:
-        return distance(state) < self.success_radius
+        return terms.distance(state) < self.success_radius
 
     def metrics(self, state: State) -> State:
         settled = state["step"] > self.settling_steps
         counted = torch.where(settled, state["step"] - self.settling_steps, state["step"]).clamp_min(1)
-        return {"position_error": distance(state), "tracking_rmse": (state["squared_error"] / counted).sqrt()}
+        return {"position_error": terms.distance(state), "tracking_rmse": (state["squared_error"] / counted).sqrt()}
 
     def state_bounds(self) -> dict[Any, tuple[float, float]]:
         return {"phase": (0, 2 * math.pi), "squared_error": (0, math.inf)}
@@ -213,7 +198,7 @@ def _checked_points(curve: Curve, phase: Tensor, margin: float) -> Tensor:
     points = points[0]
     if not points.isfinite().all():
         raise UserValueError("The curve is not finite everywhere in [0, 2 pi].")
-    gap = norm(points[0] - points[-1]).item()
+    gap = terms.norm(points[0] - points[-1]).item()
     if gap > 0.01:
         raise UserValueError(
             f"The curve is not periodic: from phase 0 to 2 pi it moves by {gap:.3g} m. Make it close at 2 pi."

@@ -6,6 +6,8 @@ everywhere: where the nearest point is not unique they are those of one choice, 
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -49,12 +51,8 @@ def join(*parts: Primitives) -> Primitives:
 
 def distances(solids: Primitives, points: Tensor) -> Tensor:
     """Signed distances (n, k, m) [m] from points (n, k, 3) to all m solids of their scenes, in the order of kinds."""
-    functions = _sphere, _cylinder, _box, _plane
-    parts = [
-        function(x.unsqueeze(1), points.unsqueeze(2))
-        for function, x in zip(functions, solids, strict=True)
-        if x.shape[1]
-    ]
+    kinds = zip(KINDS.values(), solids, strict=True)
+    parts = [distance(x.unsqueeze(1), points.unsqueeze(2)) for (distance, _), x in kinds if x.shape[1]]
     return torch.cat(parts, -1)
 
 
@@ -165,7 +163,7 @@ def _cylinder_parts(x: Tensor, point: Tensor) -> tuple[Tensor, ...]:
 
 def _box(x: Tensor, point: Tensor) -> Tensor:
     beyond = [p.abs() - half for p, half in zip(_box_frame(x, point), x[..., 3:6].unbind(-1), strict=True)]
-    deepest = torch.maximum(torch.maximum(beyond[0], beyond[1]), beyond[2])
+    deepest = functools.reduce(torch.maximum, beyond)
     return _length(*(q.clamp_min(0.0) for q in beyond)) + deepest.clamp_max(0.0)
 
 
@@ -190,7 +188,8 @@ def _plane_normal(x: Tensor, point: Tensor) -> tuple[Tensor, ...]:
 
 def _length(*parts: Tensor) -> Tensor:
     """The length of vectors, given by components; its derivative at zero is zero."""
-    return sum(p * p for p in parts).clamp_min(1e-16).sqrt()
+    squares = [p * p for p in parts]
+    return functools.reduce(operator.add, squares).clamp_min(1e-16).sqrt()
 
 
 def _unit(*parts: Tensor) -> tuple[Tensor, ...]:
@@ -206,13 +205,11 @@ def _outwards(*beyond: Tensor) -> tuple[Tensor, ...]:
     """How much each of the directions has in the shortest way out, from how far the point lies beyond each face."""
     outside = [q.clamp_min(0.0) for q in beyond]
     length = _length(*outside)
-    deepest = beyond[0]
-    for q in beyond[1:]:
-        deepest = torch.maximum(deepest, q)
-    is_out, taken, weights = deepest > 1e-7, None, []
+    deepest = functools.reduce(torch.maximum, beyond)
+    is_out, taken, weights = deepest > 1e-7, torch.zeros_like(deepest, dtype=torch.bool), []
     for q, out in zip(beyond, outside, strict=True):
-        mine = q == deepest if taken is None else (q == deepest) & ~taken
-        taken = mine if taken is None else taken | mine
+        mine = (q == deepest) & ~taken  # the first, where several are deepest
+        taken = taken | mine
         weights.append(torch.where(is_out, out / length, mine.to(q)))
     return tuple(weights)
 

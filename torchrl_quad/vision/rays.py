@@ -1,6 +1,6 @@
 """Where rays meet solids: closed forms, fused by the compiler into one loop without intermediate results.
 
-A ray enters a convex solid once and leaves it once. What it meets is the entry that lies before the exit; a ray that
+A ray enters a convex solid once and leaves it once. It meets a solid whose entry lies before the exit; a ray that
 begins within a solid meets it at once.
 """
 
@@ -17,9 +17,9 @@ from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine.compiling import Compiled
 from torchrl_quad.vision.primitives import KINDS, Primitives
 
-CHUNK = 2**16  # so many pairs of a ray and a solid are looked at together in an eager flight: they fit into a cache
-TINY = 1e-9  # a ray whose direction has less than this along an axis runs beside that axis
-GRAZING = 0.05  # the least cosine between a ray and a normal that derivatives know; without it they had no bound
+CHUNK = 2**16  # pairs of a ray and a solid that an eager flight handles at once: they fit into a cache
+TINY = 1e-9  # a ray whose direction has less than this along an axis is parallel to the others
+GRAZING = 0.05  # the least cosine between a ray and a normal in derivatives, which would have no bound without it
 
 
 def cast_rays(
@@ -34,26 +34,24 @@ def cast_rays(
 ) -> Tensor:
     """How far rays fly until they meet a solid, as a multiple of their direction, (n, p), at most ``far``.
 
-    The direction of ray p is (1, ``plane[0, p]``, ``plane[1, p]``) in the frame of the eye: the multiple is the depth
-    along the eye's x axis [m].
+    The direction of ray p is (1, ``plane[0, p]``, ``plane[1, p]``) in the frame of the camera: the multiple is the
+    depth along the camera's x axis [m].
 
     Args:
         solids: of n scenes.
-        position: of the eye (n, 3) [m], world frame.
-        attitude: of the eye (n, 4), a unit quaternion, to the world.
-        plane: where the rays pass the plane x = 1 in the frame of the eye (2, p): y to the left, z upwards.
-        far: what is further away is not seen [m].
+        position: of the camera (n, 3) [m], world frame.
+        attitude: of the camera (n, 4), a unit quaternion, to the world.
+        plane: where the rays pass the plane x = 1 in the frame of the camera (2, p): y to the left, z upwards.
+        far: the greatest depth [m].
         fused: compile the rays into one loop, as a compiled step does in any case; it takes seconds the first time.
-        differentiable: with the derivative in position and attitude. It is that of the surface that is seen; what
-            jumps, as an edge does that comes before another surface, has none. At a grazing ray it is limited.
+        differentiable: with the derivative in position and attitude. It is that of the visible surface; a jump, as of
+            an edge before another surface, has none. At a grazing ray it is limited.
     """
     solids = Primitives(*(x.detach() for x in solids))
     inputs = position.detach(), attitude.detach(), plane, *solids._replace(boxes=_with_axes(solids.boxes))
     inputs, fused = [x.contiguous() for x in inputs], fused or is_traced()
-    if not differentiable:
-        return _cast(*inputs, far=far) if fused else _chunks(False, inputs, far)[0]
-    depth, index = _cast_which(*inputs, far=far) if fused else _chunks(True, inputs, far)
-    return _attached(solids, position, attitude, plane, depth, index, far)
+    depth, index = (_cast if fused else _chunks)(*inputs, far=far, which=differentiable)
+    return _attached(solids, position, attitude, plane, depth, index, far) if differentiable else depth
 
 
 def directions(attitude: Tensor, plane: Tensor) -> tuple[Tensor, ...]:
@@ -68,34 +66,26 @@ def directions(attitude: Tensor, plane: Tensor) -> tuple[Tensor, ...]:
 
 
 def meet(
-    position: Tensor,
-    attitude: Tensor,
-    plane: Tensor,
-    spheres: Tensor,
-    cylinders: Tensor,
-    boxes: Tensor,
-    planes: Tensor,
-    *,
-    far: float,
-    which: bool = False,
+    position: Tensor, attitude: Tensor, plane: Tensor, *solids: Tensor, far: float, which: bool = False
 ) -> tuple[Tensor, ...]:
     """The depth of each ray (n, p), and with ``which`` the index of the solid that it meets, in the order of kinds."""
     rays = tuple(d.unsqueeze(1) for d in directions(attitude, plane))  # (n, 1, p)
-    kinds = (_meet_spheres, spheres), (_meet_cylinders, cylinders), (_meet_boxes, boxes), (_meet_planes, planes)
-    depth, index, first = None, None, 0
-    for function, solids in kinds:
-        if not solids.shape[1]:
+    found: list[Tensor] = []  # depth, and index
+    first = 0
+    for function, x in zip((_meet_spheres, _meet_cylinders, _meet_boxes, _meet_planes), solids, strict=True):
+        if not x.shape[1]:
             continue
-        entry, exit = function(solids, position, rays)
+        entry, exit = function(x, position, rays)
         entry = entry.clamp_min(0.0)
         met = torch.where((exit > entry) & (entry < far), entry, far)  # NaN, where a ray misses, is not greater
         least = met.amin(1)
-        if which:
-            mine = met.argmin(1) + first
-            index = mine if depth is None else torch.where(least < depth, mine, index)
-        depth = least if depth is None else torch.minimum(depth, least)
-        first += solids.shape[1]
-    return (depth, index) if which else (depth,)
+        mine = [least, met.argmin(1) + first] if which else [least]
+        if found:
+            nearer = [torch.where(least < found[0], mine[1], found[1])] if which else []
+            mine = [torch.minimum(found[0], least), *nearer]
+        found = mine
+        first += x.shape[1]
+    return tuple(found)
 
 
 def _meet_spheres(x: Tensor, position: Tensor, rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
@@ -121,21 +111,21 @@ def _meet_cylinders(x: Tensor, position: Tensor, rays: tuple[Tensor, ...]) -> tu
 
 
 def _meet_boxes(x: Tensor, position: Tensor, rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    offset, entry, exit = _from(x, position), None, None
+    offset, entries, exits = _from(x, position), [], []
     for number in range(3):
         axis = x[..., 6 + 3 * number : 9 + 3 * number].unsqueeze(-1).unbind(-2)
-        scale = _inverse(sum(a * d for a, d in zip(axis, rays, strict=True)))
-        middle = -sum(a * o for a, o in zip(axis, offset, strict=True)) * scale
+        scale = _inverse(_dot(axis, rays))
+        middle = -_dot(axis, offset) * scale
         half = x[..., 3 + number : 4 + number] * scale.abs()
-        entry = middle - half if entry is None else torch.maximum(entry, middle - half)
-        exit = middle + half if exit is None else torch.minimum(exit, middle + half)
-    return entry, exit
+        entries.append(middle - half)
+        exits.append(middle + half)
+    return functools.reduce(torch.maximum, entries), functools.reduce(torch.minimum, exits)
 
 
 def _meet_planes(x: Tensor, position: Tensor, rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
     normal = x[..., :3].unsqueeze(-1).unbind(-2)
     height = (x[..., :3] * position.unsqueeze(1)).sum(-1, keepdim=True) - x[..., 3:]
-    towards = -sum(a * d for a, d in zip(normal, rays, strict=True))
+    towards = -_dot(normal, rays)
     entry = height * _inverse(towards)
     # A half-space has no end: rays that fly away from it never enter, those below it are in it already.
     return torch.where(height > 0.0, entry, 0.0), torch.where((towards > 0.0) | (height <= 0.0), torch.inf, -torch.inf)
@@ -149,8 +139,12 @@ def _with_axes(boxes: Tensor) -> Tensor:
 
 
 def _from(x: Tensor, position: Tensor) -> tuple[Tensor, ...]:
-    """The eye from the point that a solid is given by, three components (n, m, 1)."""
+    """The camera from the point that a solid is given by, three components (n, m, 1)."""
     return tuple((position.unsqueeze(1) - x[..., :3]).unsqueeze(-1).unbind(-2))
+
+
+def _dot(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> Tensor:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _inverse(x: Tensor) -> Tensor:
@@ -161,36 +155,37 @@ def _inverse(x: Tensor) -> Tensor:
 def _attached(
     solids: Primitives, position: Tensor, attitude: Tensor, plane: Tensor, depth: Tensor, index: Tensor, far: float
 ) -> Tensor:
-    """The same depth, with its derivative in the pose of the eye.
+    """The same depth, with its derivative in the pose of the camera.
 
     The point that is met stays on its surface, whose normal is N. So N (o + t d) is constant, and a change of the
     origin o and of the direction d changes the depth t by -N (do + t dd) / (N d).
     """
     rays = torch.stack(directions(attitude, plane), -1)
     with torch.no_grad():
-        point, normal, first = position.unsqueeze(1) + depth.unsqueeze(-1) * rays, None, 0
+        point, normal, first = position.unsqueeze(1) + depth.unsqueeze(-1) * rays, torch.zeros_like(rays), 0
         for (_, gradient), x in zip(KINDS.values(), solids, strict=True):
             m = x.shape[1]
             if m:
                 own = (index - first).clamp(0, m - 1).unsqueeze(-1).expand(-1, -1, x.shape[-1])
                 mine = x.expand(len(index), -1, -1).gather(1, own)
                 mine = torch.stack(torch.broadcast_tensors(*gradient(mine, point)), -1)
-                normal = mine if normal is None else torch.where((index >= first).unsqueeze(-1), mine, normal)
+                normal = torch.where((index >= first).unsqueeze(-1), mine, normal)
             first += m
         length = rays.square().sum(-1).sqrt()
         slope = (normal * rays).sum(-1)
-        slope = torch.minimum(slope, -GRAZING * length)  # a surface that is seen faces the eye
-        seen = (depth < far) & (depth > 0.0)
+        slope = torch.minimum(slope, -GRAZING * length)  # a visible surface faces the camera
+        visible = (depth < far) & (depth > 0.0)
     moved = (position - position.detach()).unsqueeze(1) + depth.unsqueeze(-1) * (rays - rays.detach())
-    return depth - torch.where(seen, (normal * moved).sum(-1) / slope, 0.0)
+    return depth - torch.where(visible, (normal * moved).sum(-1) / slope, 0.0)
 
 
 # -- how it runs -------------------------------------------------------------------------------------------------------
 
 
-def _chunks(which: bool, inputs: list[Tensor], far: float) -> tuple[Tensor, ...]:
+def _chunks(
+    position: Tensor, attitude: Tensor, plane: Tensor, *solids: Tensor, far: float, which: bool
+) -> tuple[Tensor, Tensor]:
     """Eager: some scenes after the others, so that what lies between stays in the cache."""
-    position, attitude, plane, *solids = inputs
     most = max(x.shape[1] for x in solids)
     rays = max(1, CHUNK // max(most, 1))  # of a scene at once, of which an image may have more
     step = max(1, CHUNK // max(most * plane.shape[1], 1))
@@ -200,11 +195,12 @@ def _chunks(which: bool, inputs: list[Tensor], far: float) -> tuple[Tensor, ...]
         own = [x if len(x) == 1 else x[some] for x in solids]
         images = [meet(position[some], attitude[some], p, *own, far=far, which=which) for p in plane.split(rays, 1)]
         parts.append(images[0] if len(images) == 1 else [torch.cat(x, 1) for x in zip(*images, strict=True)])
-    return tuple(torch.cat(x) for x in zip(*parts, strict=True))
+    depth, *index = (torch.cat(x) for x in zip(*parts, strict=True))
+    return depth, index[0] if which else depth
 
 
 class _Kernel:
-    """The rays of one kind of scene and eye, compiled into one loop."""
+    """The rays of one kind of scene and camera, compiled into one loop."""
 
     def __init__(self, far: float, which: bool) -> None:
         self.far, self.which = far, which
@@ -218,23 +214,18 @@ class _Kernel:
         return meet(*inputs, far=self.far, which=self.which)
 
     def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        # Only tensors of one kind come here, and the function reads nothing that could change.
+        # All inputs of a kernel are of one kind, and the function reads nothing that could change.
         outputs = self.compiled.again(*inputs) if self.is_ready else self.compiled(*inputs)
         self.is_ready = True
         return outputs
 
 
-@functools.lru_cache(maxsize=32)  # the code of one has some megabytes, and few programs see in as many ways
+@functools.lru_cache(maxsize=32)  # the code of one takes some megabytes, and few programs have as many kinds
 def _kernel(far: float, which: bool, *kind: object) -> _Kernel:
     return _Kernel(far, which)
 
 
-def _fused(which: bool, inputs: list[Tensor], far: float) -> tuple[Tensor, ...]:
-    kind = tuple((x.shape, x.dtype, x.device) for x in inputs)
-    with torch.no_grad():
-        return _kernel(far, which, kind)(*(x.contiguous() for x in inputs))
-
-
+# A function of its own for the compiler, which would tear it apart within a step.
 @torch.library.custom_op("torchrl_quad::cast_rays", mutates_args=())
 def _cast(
     position: Tensor,
@@ -245,32 +236,17 @@ def _cast(
     boxes: Tensor,
     planes: Tensor,
     far: float,
-) -> Tensor:
-    """The depth; a function of its own for the compiler, which would tear it apart within a step."""
-    return _fused(False, [position, attitude, plane, spheres, cylinders, boxes, planes], far)[0]
+    which: bool,
+) -> tuple[Tensor, Tensor]:
+    """The depth, and with ``which`` the solids that the rays meet, else nothing (0)."""
+    inputs = [x.contiguous() for x in (position, attitude, plane, spheres, cylinders, boxes, planes)]
+    kind = tuple((x.shape, x.dtype, x.device) for x in inputs)
+    with torch.no_grad():
+        depth, *index = _kernel(far, which, kind)(*inputs)
+    return depth, index[0] if which else depth.new_empty(0, dtype=torch.int64)
 
 
 @_cast.register_fake
-def _(position, attitude, plane, spheres, cylinders, boxes, planes, far):
-    return position.new_empty(len(position), plane.shape[1])
-
-
-@torch.library.custom_op("torchrl_quad::cast_rays_which", mutates_args=())
-def _cast_which(
-    position: Tensor,
-    attitude: Tensor,
-    plane: Tensor,
-    spheres: Tensor,
-    cylinders: Tensor,
-    boxes: Tensor,
-    planes: Tensor,
-    far: float,
-) -> tuple[Tensor, Tensor]:
-    """The depth, and which solid is seen."""
-    return _fused(True, [position, attitude, plane, spheres, cylinders, boxes, planes], far)
-
-
-@_cast_which.register_fake
-def _(position, attitude, plane, spheres, cylinders, boxes, planes, far):
-    shape = len(position), plane.shape[1]
-    return position.new_empty(shape), position.new_empty(shape, dtype=torch.int64)
+def _(position, attitude, plane, spheres, cylinders, boxes, planes, far, which):
+    depth = position.new_empty(len(position), plane.shape[1])
+    return depth, depth.new_empty(depth.shape if which else 0, dtype=torch.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
@@ -40,7 +41,8 @@ class Simulation(Protocol):
     def check_action(self, action: Tensor | None) -> None:
         """Refuse an action of the wrong shape, precision or device."""
 
-    def guard(self, state: State) -> tuple[State, Tensor]:
+    @property
+    def guard(self) -> Callable[[State], tuple[State, Tensor]]:
         """The state with safe entries where it is meaningless, and bool (n) that says where it was meaningful."""
 
     def __call__(self, state: State, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Transition:

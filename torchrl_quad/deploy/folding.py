@@ -66,7 +66,7 @@ def _seeing(
     _require_unit_actions(bounds.get("low"), bounds.get("high"))
     eyes, trunk = (
         [(layer.weight, layer.bias, activation) for layer, activation in zip(x[::2], x[1::2], strict=True)]
-        for x in (parts.eyes, parts.trunk)
+        for x in (parts.convolutions, parts.trunk)
     )
     memory = parts.memory and Memory(*(_float32(_numbers(getattr(parts.memory, name))) for name in GRU))
     sight = Network([], _layers(eyes), tuple(image or (0, 0)), parts.nearest, memory, parts.max_loc)

@@ -1,4 +1,4 @@
-"""Small networks for the losses: tanh-Gaussian actors, blind or seeing, a state value and a state-action value."""
+"""Small networks for the losses: tanh-Gaussian actors, visual ones too, a state value and a state-action value."""
 
 from torchrl_quad.modules.networks import make_actor, make_qvalue, make_value
 from torchrl_quad.modules.visual import make_visual_actor

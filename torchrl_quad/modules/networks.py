@@ -5,21 +5,21 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar, cast
 
 import torch
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
+from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
-from torchrl_quad.data.unwrap import base_env, check_env
+from torchrl_quad.data.unwrap import base_env, check_env, observed
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead
-from torchrl_quad.modules.plain import CorrelatedActor, Critic, Network, TanhGaussianActor
+from torchrl_quad.modules.plain import Critic, GaussianHead, Network, TanhGaussianActor
 from torchrl_quad.options import AfterValidator, Below1, Entries, Field, Scale, Width, checked
 
 OBSERVATION = ("observation",)
@@ -33,11 +33,12 @@ def _pointwise(activation: Any) -> Any:
             with torch.random.fork_rng(devices=[]):
                 if activation()(x).shape == x.shape:
                     return activation
-        except Exception:  # whatever an activation says that is none
+        except Exception:  # classes that are no activations raise anything
             pass
     raise UserValueError("be a class of activations of torch.nn without arguments, such as torch.nn.ELU")
 
 
+Actor = TypeVar("Actor", bound=TanhGaussianActor)
 Activation = Annotated[Any, AfterValidator(_pointwise)]
 Cells = Annotated[Sequence[Width], Field(max_length=64)]
 ScaleInit = Annotated[float, Field(ge=1e-4, le=100)]  # TorchRL's mapping to a scale ends at 1e-4
@@ -59,7 +60,7 @@ def make_actor(
 ) -> ProbabilisticActor:
     """A tanh-Gaussian policy a = tanh(mu(s) + sigma(s) noise), stretched to the bounds of the action.
 
-    The weights of its last layer start near zero. The first actions are close to ``action_init``, with noise of about
+    The weights of its last layer start near zero: the first actions are close to ``action_init``, with noise of about
     ``scale_init`` (before the tanh, in units of half the range). It writes ``loc``, ``scale`` and ``action``.
 
     Args:
@@ -69,20 +70,18 @@ def make_actor(
         activation: of the hidden layers; smooth ones give smooth policy gradients.
         input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``. What the tasks observe
             is of one to ten [m, m/s, rad/s, ten times the quaternion]; entries of the state may be far larger.
-        action_init: the mean action at the start, (k), strictly between the bounds. By default
-            ``env.neutral_action``, averaged over environments, where the environment has one (see
-            :mod:`torchrl_quad.data`; a drone's is to hover), and the middle of the range elsewhere.
+        action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``,
+            averaged over environments, if there is one (see :mod:`torchrl_quad.data`; a drone's is to hover), and the
+            middle of the range otherwise.
         scale_init: the standard deviation of the policy's noise at the start, before the tanh. Training brings it down
             to 0.01 at least, or to a tenth of this.
-        learn_scale: whether this noise changes with the state and in training. Otherwise it stays what it is, and
-            neither a gradient through the simulator nor a KL bound takes the exploration away.
-        noise_correlation: of the policy's noise in two steps that follow each other; 0 is white noise. Correlated noise
-            moves a drone where independent noise averages out; try 0.9 at 50 Hz. Then loc, scale and the
-            log-probability are those of the action given the noise of the step before, which is written to
-            ``noise_before``; ``noise`` is that of the step itself.
+        learn_scale: whether this noise changes with the state and in training. Otherwise neither a gradient through the
+            simulator nor a KL bound takes the exploration away.
+        noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise. Correlated noise moves a
+            drone where independent noise averages out; try 0.9 at 50 Hz. Then loc, scale and the log-probability are
+            those of the action given the noise of the step before, ``noise_before``; ``noise`` is that of the step.
         return_log_prob: whether it also writes the log-probability of the action, which an entropy bonus and PPO need.
-            mu then
-            stays between -5 and 5: further out rounding of the action decides on the log-probability.
+            mu then stays between -5 and 5: further out, rounding of the action determines the log-probability.
 
     Raises:
         ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one; the
@@ -93,12 +92,9 @@ def make_actor(
     spec, first = first_action(env, action_init, "make_actor")
     size = spec.shape[-1]
     net = network_of(env, in_keys, 2 * size if learn_scale else size, num_cells, activation, input_scale)
-    start_near(net.mlp[-1], first)
+    start_near(net.mlp, first)
     params = with_head(net, size, scale_init, noise_correlation, in_keys, return_log_prob)
-    actor = (CorrelatedActor if noise_correlation else TanhGaussianActor)(
-        params, **sampling(spec), return_log_prob=return_log_prob
-    )
-    return writes_noise(actor) if noise_correlation else actor
+    return sampled(TanhGaussianActor, params, spec, return_log_prob)
 
 
 @checked
@@ -112,22 +108,19 @@ def make_value(
 ) -> ValueOperator:
     """A state value V(s), written to ``state_value``, (*, 1).
 
-    LayerNorm normalises its hidden layers. The policy follows the critic's gradient, which is far off without it.
+    LayerNorm normalises its hidden layers: without it the gradient of the critic, which the policy follows, is far off.
 
     A critic may read more than the actor does, such as ``in_keys=("observation", ("state", "rotor_speed"))``. Rotors
-    turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one. Where there are
-    obstacles, ``"obstacle"`` (*, 4) is the distance from the drone's surface to the nearest [m], and the direction away
-    from it in the body frame: what a policy has images of, a critic can know.
+    turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one. Among obstacles,
+    ``"obstacle"`` (*, 4) is the distance from the drone's surface to the nearest [m], and the direction away from it in
+    the body frame.
 
     Args:
-        env: as for :func:`make_actor`.
+        env: as for :func:`make_actor`, and so are its errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
         in_keys: the entries that it reads, each (*, k), in a list: ["observation"].
         activation: of the hidden layers.
         input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``.
-
-    Raises:
-        ValueError, TypeError: as there.
     """
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
     return Critic(net, in_keys=list(in_keys))
@@ -146,18 +139,15 @@ def make_qvalue(
     """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); otherwise as :func:`make_value`.
 
     A policy's action reveals the state. A critic that reads the state off the action gets its gradient in the action
-    wrong. ``action_scale`` below one makes the critic rely on the state first.
+    wrong; an ``action_scale`` below one makes it rely on the state first.
 
     Args:
-        env: as for :func:`make_actor`.
+        env: as for :func:`make_actor`, and so are its errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
         in_keys: the entries that it reads, each (*, k), in a list: ["observation"].
         activation: of the hidden layers.
         input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``.
         action_scale: the action is multiplied by this.
-
-    Raises:
-        ValueError, TypeError: as there.
     """
     in_keys = [*in_keys, "action"]
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, action_scale, layer_norm=True)
@@ -165,7 +155,7 @@ def make_qvalue(
 
 
 def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[Bounded, Tensor]:
-    """The spec of one action, and what the mean of the first actions is before the tanh, (k); checked for ``name``."""
+    """The spec of one action, and the mean of the first actions before the tanh, (k); errors are about ``name``."""
     check_env(env)
     spec = env.action_spec_unbatched
     if not isinstance(spec, Bounded):
@@ -176,11 +166,12 @@ def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[B
             "transform such as MultiAction asks for several actions at once. Leave it out. To hold each action longer, "
             "give the environment a longer control step, control_dt=0.04."
         )
-    low, high = spec.space.low, spec.space.high
+    low, high = bounds_of(spec)
     middle = 0.5 * (low + high)
     if action_init is None:
         action_init = getattr(_single(env), "neutral_action", middle)
         action_init = action_init.mean(0) if action_init.dim() > middle.dim() else action_init
+    first = middle
     try:
         first = torch.as_tensor(action_init)
         fits = not first.is_complex() and first.shape == spec.shape
@@ -197,8 +188,9 @@ def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[B
     return spec, torch.atanh((first.to(middle) - middle) / (0.5 * (high - low)))
 
 
-def start_near(layer: nn.Linear, first: Tensor) -> None:
+def start_near(mlp: MLP, first: Tensor) -> None:
     """Let the last layer of a policy begin with actions of mean ``first`` (k), before the tanh, whatever it reads."""
+    layer = cast(nn.Linear, mlp[-1])
     with torch.no_grad():
         layer.weight.mul_(0.01)
         layer.bias.zero_()
@@ -206,41 +198,36 @@ def start_near(layer: nn.Linear, first: Tensor) -> None:
 
 
 def with_head(
-    network: Network,
-    size: int,
-    scale_init: float,
-    noise_correlation: float,
-    in_keys: Sequence[NestedKey],
-    return_log_prob: bool,
+    network: Network, size: int, scale_init: float, rho: float, in_keys: Sequence[NestedKey], return_log_prob: bool
 ) -> TensorDictModule:
     """Give the last network of a policy, which reads ``in_keys``, a normal distribution of an action of ``size``."""
     least = min(0.01, 0.1 * scale_init)  # to which training can bring the scale down
-    mapping, read = f"biased_softplus_{scale_init}_{least}", list(in_keys)
     max_loc = 5.0 if return_log_prob else math.inf  # as far as TorchRL's TanhNormal goes with tanh_loc=True
-    if noise_correlation:
-        network.head = CorrelatedHead(noise_correlation, size, mapping, max_loc)
-        read.append("noise_before")
-    else:
-        network.head = GaussianHead(size, mapping, max_loc)
+    network.head = GaussianHead(size, f"biased_softplus_{scale_init}_{least}", max_loc, rho)
+    read = [*in_keys, "noise_before"] if rho else list(in_keys)
     return TensorDictModule(network, in_keys=read, out_keys=["loc", "scale"])
 
 
-def writes_noise(actor: ProbabilisticActor) -> ProbabilisticActor:
-    """Let a policy whose noise is correlated in time say that it writes the noise."""
-    actor.out_keys = [*actor.out_keys, "noise_before", "noise"]
+def bounds_of(spec: Bounded) -> tuple[Tensor, Tensor]:
+    """The least and the greatest action."""
+    space = cast(ContinuousBox, spec.space)
+    return space.low, space.high
+
+
+def sampled(cls: type[Actor], params: TensorDictModule, spec: Bounded, return_log_prob: bool) -> Actor:
+    """A policy that samples a tanh-Gaussian action within the bounds of its spec."""
+    low, high = bounds_of(spec)
+    actor = cls(
+        params,
+        in_keys=["loc", "scale"],
+        spec=spec,
+        distribution_class=TanhNormal,
+        distribution_kwargs={} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high},
+        return_log_prob=return_log_prob,
+    )
+    if "noise_before" in actor.in_keys:
+        actor.out_keys = [*actor.out_keys, "noise_before", "noise"]
     return actor
-
-
-def sampling(spec: Bounded) -> dict[str, Any]:
-    """How an actor samples a tanh-Gaussian action with these bounds, as keywords of ProbabilisticActor."""
-    low, high = spec.space.low, spec.space.high
-    bounds = {} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high}
-    return {
-        "in_keys": ["loc", "scale"],
-        "spec": spec,
-        "distribution_class": TanhNormal,
-        "distribution_kwargs": bounds,
-    }
 
 
 def network_of(
@@ -266,27 +253,24 @@ def network_of(
     if action_scale is not None:
         scales.append(action_scale)
     sizes = [more + sum(spec.shape[-1] for spec in specs), *num_cells, out_features]
-    require_memory([a * b for a, b in itertools.pairwise(sizes)])
-    norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": cells} for cells in num_cells]}
+    check_memory([a * b for a, b in itertools.pairwise(sizes)])
+    norm_kwargs = [{"normalized_shape": cells} for cells in num_cells] if layer_norm else None
     mlp = MLP(
         in_features=sizes[0],
         out_features=out_features,
         num_cells=list(num_cells),
         activation_class=activation,
+        norm_class=nn.LayerNorm if layer_norm else None,
+        norm_kwargs=norm_kwargs,
         device=env.device,
-        **(norm if layer_norm else {}),
     )
     dtype = next((spec.dtype for spec in specs if spec.dtype.is_floating_point), None)
     widths = [spec.shape[-1] for spec in specs]
     return Network(mlp.to(dtype), [1.0, *scales] if more else scales, [more, *widths] if more else widths)
 
 
-def require_memory(weights: Sequence[int]) -> None:
-    """Refuse layers with so many weights that they fit into no memory that trains on a horizon, before they are made.
-
-    Raises:
-        ValueError: there are more than 100 million.
-    """
+def check_memory(weights: Sequence[int]) -> None:
+    """Raise a UserValueError for layers of more than 100 million weights, before they are made."""
     if sum(weights) > MOST_WEIGHTS:
         raise UserValueError(
             f"A network of this many cells has {sum(weights):,} weights, more than {MOST_WEIGHTS:,}: write smaller "
@@ -304,10 +288,11 @@ def _single(env: EnvBase) -> EnvBase:
 
 def _spec(env: EnvBase, key: NestedKey) -> TensorSpec:
     """The spec of an entry (*, k) that a network can read."""
-    known = {**dict(env.observation_spec.items(True, True)), "action": env.action_spec}
+    known: dict[NestedKey, TensorSpec] = {**dict(observed(env).items(True, True))}
+    known["action"] = cast(TensorSpec, env.action_spec)
     if key not in known:
         raise UserValueError(f"Unknown entry {key!r} in in_keys. Choose from: {', '.join(map(str, known))}.")
-    if known[key].ndim != len(env.batch_size) + 1:
+    if known[key].ndim != env.ndim + 1:
         raise UserValueError(
             f"Entry {key!r} has shape {tuple(known[key].shape)} and a network reads vectors: flatten it, for example "
             "with TorchRL's FlattenObservation."

@@ -1,74 +1,127 @@
-"""Networks as pure functions of tensors: policies that environments fly in their compiled step, and critics."""
+"""Networks as pure functions of tensors: tanh-Gaussian policies that fly in the compiled step, and critics."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import dispatch
+from tensordict.nn import NormalParamExtractor, ProbabilisticTensorDictModule, dispatch
 from tensordict.nn.utils import biased_softplus
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.func import vjp
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
+from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead, tanh_gaussian
+
+
+class GaussianHead(NormalParamExtractor):
+    """The normal distribution of an action, from what a network returns and, if rho > 0, the noise of the step before.
+
+    With noise e_t = rho e_(t-1) + sqrt(1 - rho^2) xi_t the action mu + sigma e_t has mean mu + rho sigma e_(t-1) and
+    standard deviation sigma sqrt(1 - rho^2). Each e_t is standard normal: the noise is as large as without correlation.
+
+    Args:
+        size: of the action, k.
+        scale_mapping: as for NormalParamExtractor.
+        max_loc: the largest absolute value of mu. Beyond 7.25 tanh is clipped, and an action no longer determines what
+            was drawn: its log-probability falls without bound.
+        rho: the correlation of the noise of two consecutive steps.
+    """
+
+    def __init__(self, size: int, scale_mapping: str, max_loc: float = math.inf, rho: float = 0.0) -> None:
+        super().__init__(scale_mapping=scale_mapping)
+        self.size, self.max_loc = size, max_loc
+        self.rho, self.rest = rho, math.sqrt(1.0 - rho**2)
+
+    def forward(self, raw: Tensor, *before: Tensor) -> tuple[Tensor, Tensor]:  # pyrefly: ignore[bad-override]  # 1 input
+        """loc and scale (*, k), from both (*, 2k), or from loc alone (*, k): the scale stays what it starts as."""
+        loc, scale = super().forward(raw if raw.shape[-1] > self.size else torch.cat((raw, torch.zeros_like(raw)), -1))
+        loc = loc if self.max_loc == math.inf else loc.clamp(-self.max_loc, self.max_loc)
+        return (loc + self.rho * scale * before[0], self.rest * scale) if before else (loc, scale)
+
+    def next(self, before: Tensor, xi: Tensor) -> Tensor:
+        """The noise of this step, from that of the step before and its new part xi."""
+        return self.rho * before + self.rest * xi
+
+    def innovation(self, before: Tensor, noise: Tensor) -> Tensor:
+        """The new part of the noise of this step."""
+        return (noise - self.rho * before) / self.rest
+
+
+def tanh_gaussian(
+    loc: Tensor, scale: Tensor, noise: Tensor, bounds: tuple[Tensor, Tensor] | None, log_prob_key: NestedKey | None
+) -> dict[NestedKey, Tensor]:
+    """loc, scale, the action (*, k) that standard normal noise makes of them, and its log-probability (*) if wanted."""
+    x = loc + scale * noise
+    limit = 1.0 - torch.finfo(x.dtype).resolution
+    squashed = torch.tanh(x)
+    # Clipped as in TorchRL's TanhNormal, which keeps the derivative where it clips.
+    squashed = squashed + (squashed.clamp(-limit, limit) - squashed).detach()
+    action = squashed
+    if bounds is not None:
+        low, high = bounds
+        action = (high + low) / 2 + (high - low) / 2 * squashed
+    written: dict[NestedKey, Tensor] = {"loc": loc, "scale": scale, "action": action}
+    if log_prob_key is not None:
+        x = x + (torch.atanh(squashed) - x).detach()
+        density = -((x - loc) ** 2) / (2 * scale**2) - scale.log() - 0.5 * math.log(2 * math.pi)
+        slope = 2.0 * (math.log(2.0) - x - nn.functional.softplus(-2.0 * x))
+        if bounds is not None:
+            slope = slope + ((bounds[1] - bounds[0]) / 2).log()
+        written[log_prob_key] = (density - slope).sum(-1)
+    return written
 
 
 class Network(nn.Module):
-    """A multi-layer perceptron on the concatenation of its inputs, each multiplied by a constant of its own.
-
-    Args:
-        mlp: the perceptron.
-        scales: the constants.
-        widths: the sizes of the inputs.
-    """
+    """A multi-layer perceptron on the concatenation of its inputs of ``widths``, each times one of ``scales``."""
 
     def __init__(self, mlp: MLP, scales: Sequence[float], widths: Sequence[int]) -> None:
         super().__init__()
-        self.mlp, self.scales, self.widths, self.head = mlp, tuple(scales), tuple(widths), nn.Identity()
+        self.mlp, self.scales, self.widths = mlp, tuple(scales), tuple(widths)
+        self.head: nn.Module = nn.Identity()
 
     def forward(self, *inputs: Tensor) -> Any:
         """The head's output for inputs (*, k_i); the head receives (*, out_features), and the further inputs."""
         own = len(self.scales)
-        _require_widths(inputs[:own], self.widths)
+        check_widths(inputs[:own], self.widths)
         return self.head(self.mlp(_concatenated(inputs[:own], self.scales)), *inputs[own:])
 
 
 class Critic(ValueOperator):
-    """What :func:`~torchrl_quad.make_value` and :func:`~torchrl_quad.make_qvalue` build.
-
-    Losses call it as a pure function, which computes the same.
-    """
+    """What :func:`~torchrl_quad.make_value` and :func:`~torchrl_quad.make_qvalue` build."""
 
     def plain(self) -> Callable[[Mapping[str, Tensor], Sequence[Tensor]], Tensor] | None:
-        """The prediction (*, 1) as a function of the parameters, by name, and the inputs, each (*, k).
+        """The prediction (*, 1) as a pure function of the parameters, by name, and the inputs, each (*, k).
 
         None if somebody has changed its parts, or hooks it.
         """
         network = self.module
-        is_known = type(self) is Critic and type(network) is Network and type(network.mlp) is MLP
-        if not is_known or type(network.head) is not nn.Identity or is_hooked(self):
+        if type(self) is not Critic or type(network) is not Network or type(network.mlp) is not MLP:
+            return None
+        if type(network.head) is not nn.Identity or is_hooked(self):
             return None
         layers = {f"module.mlp.{name}": layer for name, layer in network.mlp.named_children()}
         known = (nn.Linear, nn.LayerNorm)
-        if len(layers) < len(network.mlp) or not all(
-            type(layer) in known or is_pointwise(layer) for layer in layers.values()
-        ):
+        are_known = all(type(layer) in known or is_pointwise(layer) for layer in layers.values())
+        # A layer that stands in two places has one name.
+        if len(layers) < len(network.mlp) or not are_known:
             return None
 
         def predict(params: Mapping[str, Tensor], inputs: Sequence[Tensor]) -> Tensor:
-            _require_widths(inputs, network.widths)
+            check_widths(inputs, network.widths)
             x = _concatenated(inputs, network.scales)
             for name, layer in layers.items():
-                own = params.get(f"{name}.weight"), params.get(f"{name}.bias")
+                weight, bias = params.get(f"{name}.weight"), params.get(f"{name}.bias")
                 if type(layer) is nn.Linear:
-                    x = nn.functional.linear(x, *own)
+                    x = nn.functional.linear(x, cast(Tensor, weight), bias)
                 elif type(layer) is nn.LayerNorm:
-                    x = nn.functional.layer_norm(x, layer.normalized_shape, *own, layer.eps)
+                    x = nn.functional.layer_norm(x, layer.normalized_shape, weight, bias, layer.eps)
                 else:
                     x = layer(x)
             return x
@@ -79,69 +132,75 @@ class Critic(ValueOperator):
 class TanhGaussianActor(ProbabilisticActor):
     """What :func:`~torchrl_quad.make_actor` builds: a tanh-Gaussian policy that environments can fly as pure functions.
 
-    It computes the same either way.
+    With noise that is correlated in time it writes ``noise``, that of the step, and ``noise_before``, that of the step
+    before. A flight hands ``noise`` on from step to step. If there is none yet it is drawn. A deterministic flight has
+    none.
     """
+
+    @property
+    def last(self) -> Network:
+        """The network that ends in the head."""
+        return cast(Network, self[0].module)
+
+    @property
+    def sampler(self) -> ProbabilisticTensorDictModule:
+        """The part that samples."""
+        return cast(ProbabilisticTensorDictModule, self[1])
+
+    @property
+    def is_random(self) -> bool | None:
+        """Whether it samples, or takes the mode; None if it is asked for something else."""
+        kind = exploration_type() or self.sampler.default_interaction_type
+        return {ExplorationType.RANDOM: True, ExplorationType.DETERMINISTIC: False}.get(kind)
+
+    @property
+    def log_prob_entry(self) -> NestedKey | None:
+        """The entry of the log-probability, if it is wanted."""
+        return self.sampler.log_prob_key if self.sampler.return_log_prob else None
+
+    @property
+    def bounds(self) -> tuple[Tensor, Tensor] | None:
+        """The least and the greatest action, each (k); None for -1 and 1."""
+        bounds = self.sampler.distribution_kwargs
+        return (bounds["low"], bounds["high"]) if bounds else None
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
+        """Write loc, scale and action, the noise if it is correlated, and the log-probability if wanted."""
+        head = getattr(self.last, "head", None)
+        if not isinstance(head, GaussianHead) or not head.rho:
+            return super().forward(tensordict, **kwargs)
+        is_random, before = self.is_random, tensordict.get("noise", None)
+        if before is None or not is_random:
+            last = cast(nn.Linear, self.last.mlp[-1])
+            before = _first_noise(last.weight.new_zeros((*tensordict.batch_size, head.size)), is_random)
+        tensordict.set("noise_before", before)
+        if is_random is None:
+            return super().forward(tensordict, **kwargs).set("noise", before)
+        read = self[0](tensordict)
+        loc, scale = leaf(read, "loc"), leaf(read, "scale")
+        xi = _first_noise(torch.zeros_like(loc.detach()), is_random)
+        written = tanh_gaussian(loc, scale, xi, self.bounds, self.log_prob_entry)
+        return tensordict.update(written).set("noise", head.next(before, xi))
 
     def plain(self) -> PlainTanhGaussian | None:
         """The policy as pure functions of its present weights; None if somebody has changed its parts, or hooks it."""
-        is_random = samples(self)
-        network = getattr(self[0], "module", None)
-        is_known = is_random is not None and type(self) in (TanhGaussianActor, CorrelatedActor)
-        if not is_known or type(network) is not Network or is_hooked(self) or len(self.module) != 2:
+        is_random, network = self.is_random, getattr(self[0], "module", None)
+        if is_random is None or type(self) is not TanhGaussianActor or len(self.module) != 2:
+            return None
+        if type(network) is not Network or is_hooked(self) or self.sampler.distribution_class is not TanhNormal:
             return None
         if len(set(map(str, self[0].in_keys))) < len(self[0].in_keys):
             return None
-        mapping = getattr(network.head, "scale_mapping", None)
-        parts = (mapping, biased_softplus), (network.mlp, MLP)
-        if type(network.head) not in (GaussianHead, CorrelatedHead):
+        head, mlp = network.head, network.mlp
+        if type(head) is not GaussianHead or type(head.scale_mapping) is not biased_softplus or type(mlp) is not MLP:
             return None
-        if any(type(x) is not cls for x, cls in parts) or self[1].distribution_class is not TanhNormal:
-            return None
-        layers, activations = list(network.mlp)[::2], list(network.mlp)[1::2]
+        layers, activations = list(mlp)[::2], list(mlp)[1::2]
         if any(type(layer) is not nn.Linear or layer.bias is None for layer in layers):
             return None
         if len(activations) != len(layers) - 1 or not all(map(is_pointwise, activations)):
             return None
-        return PlainTanhGaussian(self, layers, activations, is_random)
-
-
-class CorrelatedActor(TanhGaussianActor):
-    """A tanh-Gaussian policy whose noise is correlated in time.
-
-    ``noise`` is that of the step, and ``noise_before`` that of the step before. A flight hands ``noise`` on from step
-    to step. Where there is none yet it is drawn. A deterministic flight has none.
-    """
-
-    @dispatch(auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
-        """Write loc, scale, action, noise and noise_before, and the log-probability if wanted."""
-        return explore(self, self[0].module, super().forward, tensordict, **kwargs)
-
-
-def explore(
-    actor: ProbabilisticActor, network: Network, act: Callable[..., Any], tensordict: TensorDictBase, **kwargs: Any
-) -> TensorDictBase:
-    """Let a policy act with noise that is correlated in time; see :class:`CorrelatedActor`.
-
-    Args:
-        actor: the policy.
-        network: its last one, whose head is a :class:`CorrelatedHead`.
-        act: what it does under an exploration type that is neither RANDOM nor DETERMINISTIC.
-        tensordict: the states (*), which it writes into.
-        kwargs: of ``act``.
-    """
-    is_random, head = samples(actor), network.head
-    shape, before = (*tensordict.batch_size, head.size), tensordict.get("noise", None)
-    if before is None or not is_random:
-        before = _first_noise(network.mlp[-1].weight.new_zeros(shape), is_random)
-    tensordict.set("noise_before", before)
-    if is_random is None:
-        return act(tensordict, **kwargs).set("noise", before)
-    loc, scale = (actor[0](tensordict).get(key) for key in ("loc", "scale"))
-    xi = _first_noise(torch.zeros_like(loc.detach()), is_random)
-    log_prob_key = actor[1].log_prob_key if actor[1].return_log_prob else None
-    written = tanh_gaussian(loc, scale, xi, *bounds_of(actor), log_prob_key)
-    return tensordict.update(written).set("noise", head.next(before, xi))
+        return PlainTanhGaussian(self, cast(list[nn.Linear], layers), activations, is_random)
 
 
 class PlainTanhGaussian:
@@ -150,23 +209,25 @@ class PlainTanhGaussian:
     def __init__(
         self, actor: TanhGaussianActor, layers: list[nn.Linear], activations: list[nn.Module], is_random: bool
     ) -> None:
-        network, sample = actor[0].module, actor[1]
+        network = actor.last
         self.scales, self.widths = network.scales, network.widths
         self.in_keys, self.out_keys = list(actor[0].in_keys)[: len(self.scales)], list(actor.out_keys)
-        self.rho = network.head.rho if type(network.head) is CorrelatedHead else None
-        self.head, self.activations, self.is_random = network.head, activations, is_random
-        self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
+        self.activations, self.is_random = activations, is_random
         self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
-        self.size = self.head.size
-        self.low, self.high = (x if x is None else x.tolist() for x in bounds_of(actor))
-        mapping = self.head.scale_mapping
+        self._take_head(actor)
+        mapping = cast(biased_softplus, self.head.scale_mapping)
         self.signature = (
             *map(str, (self.in_keys, self.out_keys, self.scales, self.activations, self.low, self.high)),
             *(tuple(x.shape) for x in self.weights),
             (self.head.scale_lb, mapping.bias, mapping.min_val, self.rho, self.head.max_loc),
         )
 
-    def normalize(self, key: Any, loc: Tensor, scale: Tensor) -> None:
+    def _take_head(self, actor: TanhGaussianActor) -> None:
+        self.head = cast(GaussianHead, actor.last.head)
+        self.size, self.rho, self.log_prob_key = self.head.size, self.head.rho, actor.log_prob_entry
+        self.low, self.high = (x.tolist() for x in actor.bounds) if actor.bounds else (None, None)
+
+    def normalize(self, key: NestedKey, loc: Tensor, scale: Tensor) -> None:
         """Subtract ``loc`` (k) from the input ``key``, and divide it by ``scale`` (k); the first layer can do both."""
         at = self.in_keys.index(key)
         weight, bias, *others = self.weights
@@ -179,14 +240,14 @@ class PlainTanhGaussian:
         x, weight = torch.cat([x[:1] for x in inputs], -1), self.weights[0]
         return (x.shape[-1], x.dtype, x.device) == (weight.shape[1], weight.dtype, weight.device)
 
-    def drawn(self, steps: int, n: int, before: Mapping[Any, Tensor]) -> Tensor:
+    def drawn(self, steps: int, n: int, before: Mapping[NestedKey, Tensor]) -> Tensor:
         """Standard normal noise, as the distribution would draw it step by step; zeros for the mode.
 
         Noise that is correlated in time comes with that of the step before, (steps, n, 2 size).
         """
         like = self.weights[0]
         noise = like.new_zeros((steps, n, self.size))
-        if self.rho is None:
+        if not self.rho:
             for x in noise if self.is_random else ():
                 x.normal_()
             return noise
@@ -200,10 +261,10 @@ class PlainTanhGaussian:
 
     def drawn_again(self, tensordict: TensorDictBase) -> Tensor:
         """What was drawn for the actions of a rollout (*), as rows (n, k); see :meth:`drawn` for correlated noise."""
-        if self.rho is not None:
-            noise, before = (tensordict[key].detach() for key in ("noise", "noise_before"))
+        if self.rho:
+            noise, before = (leaf(tensordict, key).detach() for key in ("noise", "noise_before"))
             return torch.cat((self.head.innovation(before, noise), before), -1).flatten(0, -2)
-        action, loc, scale = (tensordict[key].detach() for key in ("action", "loc", "scale"))
+        action, loc, scale = (leaf(tensordict, key).detach() for key in ("action", "loc", "scale"))
         if self.low is not None:
             low, high = (action.new_tensor(x) for x in (self.low, self.high))
             action = (2.0 * action - (high + low)) / (high - low)
@@ -212,15 +273,15 @@ class PlainTanhGaussian:
 
     def distribution(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """loc and scale (*, k) in the states of a rollout (*), with gradients in the weights alone."""
-        keys = [*self.in_keys, *([] if self.rho is None else ["noise_before"])]
-        read = [tensordict[key].detach().flatten(0, -2) for key in keys]
+        keys = [*self.in_keys, *(["noise_before"] if self.rho else [])]
+        read = [leaf(tensordict, key).detach().flatten(0, -2) for key in keys]
         own = len(self.in_keys)
         loc, scale = self.head(self._layers(self.weights, read[:own])[-1], *read[own:])
         return loc.view(*tensordict.shape, -1), scale.view(*tensordict.shape, -1)
 
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
-    ) -> tuple[list[Tensor], dict[Any, Tensor]]:
+    ) -> tuple[list[Tensor], dict[NestedKey, Tensor]]:
         """What each layer returns before its activation, and loc, scale, action, and log-probability if wanted."""
         kept = self._layers(weights, inputs)
         return kept, self._sample(kept[-1], drawn)
@@ -231,21 +292,21 @@ class PlainTanhGaussian:
         inputs: Sequence[Tensor],
         kept: Sequence[Tensor],
         drawn: Tensor,
-        grads: dict[Any, Tensor],
+        grads: dict[NestedKey, Tensor],
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """What each layer read, and the gradient of what it returned; the gradients of inputs and noise."""
-        _, pull = vjp(self._sample, kept[-1], drawn)
+        pull = vjp(self._sample, kept[-1], drawn)[1]
         grad, grad_drawn = pull(grads)
         read, grads_kept = [], [grad]
         for weight, activation, x in zip(weights[-2:0:-2], self.activations[::-1], kept[-2::-1], strict=True):
-            activated, pull = vjp(activation, x)
+            activated, pull = vjp(activation, x)[:2]
             (grad,) = pull(grad @ weight)
             read.append(activated)
             grads_kept.append(grad)
         read.append(_concatenated(inputs, self.scales))
-        grads = (grad @ weights[0]).split([x.shape[-1] for x in inputs], -1)
-        grads = [g if scale == 1.0 else g * scale for g, scale in zip(grads, self.scales, strict=True)]
-        return [*read[::-1], *grads_kept[::-1]], grads, grad_drawn
+        of_inputs = (grad @ weights[0]).split([x.shape[-1] for x in inputs], -1)
+        of_inputs = [g if scale == 1.0 else g * scale for g, scale in zip(of_inputs, self.scales, strict=True)]
+        return [*read[::-1], *grads_kept[::-1]], of_inputs, grad_drawn
 
     def weight_gradient(self, traces: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of weight and bias of each layer, over a batch."""
@@ -265,11 +326,13 @@ class PlainTanhGaussian:
             x = kept[-1] if activation is None else activation(kept[-1])
         return kept
 
-    def _squash(self, loc: Tensor, scale: Tensor, xi: Tensor, log_prob_key: Any) -> dict[Any, Tensor]:
-        low, high = (None if bound is None else loc.new_tensor(bound) for bound in (self.low, self.high))
-        return tanh_gaussian(loc, scale, xi, low, high, log_prob_key)
+    def _squash(
+        self, loc: Tensor, scale: Tensor, xi: Tensor, log_prob_key: NestedKey | None
+    ) -> dict[NestedKey, Tensor]:
+        bounds = None if self.low is None else (loc.new_tensor(self.low), loc.new_tensor(self.high))
+        return tanh_gaussian(loc, scale, xi, bounds, log_prob_key)
 
-    def _sample(self, raw: Tensor, drawn: Tensor) -> dict[Any, Tensor]:
+    def _sample(self, raw: Tensor, drawn: Tensor) -> dict[NestedKey, Tensor]:
         xi, *before = drawn.split(self.size, -1)
         loc, scale = self.head(raw, *before)
         written = self._squash(loc, scale, xi, self.log_prob_key)
@@ -278,24 +341,13 @@ class PlainTanhGaussian:
         return {key: written[key] for key in self.out_keys}
 
 
-def samples(actor: ProbabilisticActor) -> bool | None:
-    """Whether it samples, or takes the mode; None where it is asked for something else."""
-    kind = exploration_type() or actor[1].default_interaction_type
-    return {ExplorationType.RANDOM: True, ExplorationType.DETERMINISTIC: False}.get(kind)
-
-
-def bounds_of(actor: ProbabilisticActor) -> tuple[Tensor | None, Tensor | None]:
-    """The least and the greatest action, each (k); None for -1 and 1."""
-    bounds = actor[1].distribution_kwargs
-    return (bounds["low"], bounds["high"]) if bounds else (None, None)
-
-
 def _first_noise(x: Tensor, is_random: bool | None) -> Tensor:
     """Standard normal numbers into zeros (*, k), or the zeros where nothing is random."""
     return x.normal_() if is_random else x
 
 
-def _require_widths(inputs: Sequence[Tensor], widths: Sequence[int]) -> None:
+def check_widths(inputs: Sequence[Tensor], widths: Sequence[int]) -> None:
+    """Raise a UserValueError for inputs that a network was not built for."""
     found = tuple(x.shape[-1] for x in inputs)
     if found != tuple(widths):
         raise UserValueError(

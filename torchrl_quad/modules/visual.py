@@ -1,13 +1,15 @@
-"""Policies that see: a convolutional network on depth images, memory in a GRU, and the tanh-Gaussian head."""
+"""Visual policies: a convolutional network on depth images, memory in a GRU, and the tanh-Gaussian head."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, cast
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase, TensorDictPrimer
@@ -15,35 +17,32 @@ from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, TanhNor
 from torchrl.modules.models.utils import SquashDims
 from torchrl.modules.tensordict_module.rnn import GRU
 
-from torchrl_quad.data.unwrap import check_env
+from torchrl_quad.data.unwrap import check_env, leaf, observed
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.modules.heads import CorrelatedHead, GaussianHead
 from torchrl_quad.modules.networks import (
     OBSERVATION,
     Activation,
     Cells,
     ScaleInit,
+    check_memory,
     first_action,
     network_of,
-    require_memory,
-    sampling,
+    sampled,
     start_near,
     with_head,
-    writes_noise,
 )
 from torchrl_quad.modules.plain import (
+    GaussianHead,
     Network,
     PlainTanhGaussian,
-    bounds_of,
-    explore,
+    TanhGaussianActor,
     is_hooked,
     is_pointwise,
-    samples,
 )
 from torchrl_quad.options import Below1, Entries, Entry, Field, Scale, Width, checked
 
 MEMORY = "recurrent_state"
-NEAREST = 0.3  # [m], of what a policy tells apart
+NEAREST = 0.3  # [m]; closer depths are clamped
 
 
 @checked
@@ -66,13 +65,13 @@ def make_visual_actor(
 ) -> ProbabilisticActor:
     """A tanh-Gaussian policy of a depth image and vectors, with memory or without.
 
-    TorchRL's ConvNet reads the inverse of the depth, 1 / max(depth, 0.3 m), so that what is near counts most. A
-    multi-layer perceptron reads what it finds, beside the vectors. Its output goes to TorchRL's GRUModule, and both
-    outputs to the head. What is not said here is as for :func:`~torchrl_quad.make_actor`.
+    TorchRL's ConvNet reads the inverse of the depth, 1 / max(depth, 0.3 m), which weights near depths most. A
+    multi-layer perceptron reads its features and the vectors; its output goes to TorchRL's GRUModule, and both outputs
+    to the head. What is not described here is as for :func:`~torchrl_quad.make_actor`.
 
     The policy of a recurrent network also reads ``recurrent_state`` (*, 1, hidden_size) and ``is_init`` (*, 1), and
     writes ``("next", "recurrent_state")``. Environments of this package that fly without transforms hand the memory on,
-    with its graph, and clear it where an episode begins. Others need TorchRL's transforms:
+    with its graph, and clear it at the start of an episode. Others need TorchRL's transforms:
 
     .. code-block:: python
 
@@ -81,7 +80,7 @@ def make_visual_actor(
     Args:
         env: any TorchRL environment with an image, for the sizes of its entries.
         num_cells: the width of every layer between the convolutions and the memory, or the head, in a list: [64].
-        in_keys: the vectors that it reads beside the image, each (*, k), in a list: ["observation"].
+        in_keys: the vectors that it reads, each (*, k), in a list: ["observation"].
         image_key: the entry of the image, (*, channels, height, width) [m].
         channels: of the convolutions, each 3 x 3, which halve height and width, in a list: [8, 16].
         recurrent: whether it has a memory.
@@ -91,16 +90,15 @@ def make_visual_actor(
         action_init: as for :func:`~torchrl_quad.make_actor`.
         scale_init: the standard deviation of the policy's noise at the start, before the tanh.
         learn_scale: whether this noise changes with the state and in training.
-        noise_correlation: of the policy's noise in two steps that follow each other; 0 is white noise.
+        noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise.
         return_log_prob: whether it also writes the log-probability of the action.
 
     Raises:
         ValueError: the environment has no such image; or as for :func:`~torchrl_quad.make_actor`.
-        TypeError: ``env`` is no environment.
     """
     check_env(env)
-    known = dict(env.observation_spec.items(True, True))
-    if image_key not in known or known[image_key].ndim != len(env.batch_size) + 3:
+    known = dict(observed(env).items(True, True))
+    if image_key not in known or known[image_key].ndim != env.ndim + 3:
         raise UserValueError(
             f"make_visual_actor reads an image (channels, height, width) from {image_key!r}, and the environment has "
             f'none there. Give it a camera, camera={{"width": 16, "height": 12}}, or choose image_key from: '
@@ -108,12 +106,12 @@ def make_visual_actor(
         )
     spec, first = first_action(env, action_init, "make_visual_actor")
     image, size = known[image_key], len(first)
-    convolutions = [9 * a * b for a, b in itertools.pairwise((image.shape[-3], *channels))]
-    require_memory([*convolutions, 3 * hidden_size * (num_cells[-1] + hidden_size) if recurrent else 0])
+    filters = [9 * a * b for a, b in itertools.pairwise((image.shape[-3], *channels))]
+    check_memory([*filters, 3 * hidden_size * (num_cells[-1] + hidden_size) if recurrent else 0])
     height, width = image.shape[-2:]
     for _ in channels:
         height, width = (height + 1) // 2, (width + 1) // 2
-    eyes = ConvNet(
+    convolutions = ConvNet(
         in_features=image.shape[-3],
         num_cells=list(channels),
         kernel_sizes=3,
@@ -126,54 +124,48 @@ def make_visual_actor(
     trunk = network_of(
         env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale, more=channels[-1] * height * width
     )
-    seen = TensorDictModule(Sight(eyes, trunk, activation()), in_keys=[image_key, *in_keys], out_keys=["seen"])
-    parts, widths = [seen], [num_cells[-1]]
+    features = VisualFeatures(convolutions, trunk, activation())
+    parts: list[Any] = [TensorDictModule(features, in_keys=[image_key, *in_keys], out_keys=["features"])]
+    widths = [num_cells[-1]]
     if recurrent:
         memory = GRUModule(
             input_size=num_cells[-1],
             hidden_size=hidden_size,
             python_based=True,
             device=env.device,
-            in_keys=["seen", MEMORY],
+            in_keys=["features", MEMORY],
             out_keys=["recalled", ("next", MEMORY)],
         ).to(image.dtype)
         parts.append(memory)
         widths.append(hidden_size)
     outputs = 2 * size if learn_scale else size
     last = MLP(sum(widths), outputs, num_cells=[], device=env.device).to(image.dtype)
-    start_near(last[-1], first)
+    start_near(last, first)
     head = Network(last, [1.0] * len(widths), widths)
-    in_keys = ["seen", "recalled"][: len(widths)]
-    parts.append(with_head(head, size, scale_init, noise_correlation, in_keys, return_log_prob))
-    actor = VisualActor(TensorDictSequential(*parts), **sampling(spec), return_log_prob=return_log_prob)
-    return writes_noise(actor) if noise_correlation else actor
+    read = ["features", "recalled"][: len(widths)]
+    parts.append(with_head(head, size, scale_init, noise_correlation, read, return_log_prob))
+    return sampled(VisualActor, TensorDictSequential(*parts), spec, return_log_prob)
 
 
-class Sight(nn.Module):
-    """What a policy sees: features (*, k) of an image and of vectors.
+class VisualFeatures(nn.Module):
+    """Features (*, k) of an image and of vectors: convolutions, and a trunk that reads their output and the vectors."""
 
-    Args:
-        eyes: the convolutions.
-        trunk: reads what they return, and the vectors.
-        activation: of the features.
-    """
-
-    def __init__(self, eyes: ConvNet, trunk: Network, activation: nn.Module) -> None:
+    def __init__(self, convolutions: ConvNet, trunk: Network, activation: nn.Module) -> None:
         super().__init__()
-        self.eyes, self.trunk, self.activation = eyes, trunk, activation
+        self.convolutions, self.trunk, self.activation = convolutions, trunk, activation
 
     def forward(self, depth: Tensor, *vectors: Tensor) -> Tensor:
-        """The features (*, k) of a depth image (*, channels, height, width) [m] and of vectors (*, k_i)."""
-        return self.activation(self.trunk(self.eyes(depth.clamp_min(NEAREST).reciprocal()), *vectors))
+        """The features of a depth image (*, channels, height, width) [m] and of vectors (*, k_i)."""
+        return self.activation(self.trunk(self.convolutions(depth.clamp_min(NEAREST).reciprocal()), *vectors))
 
 
 class Parts(NamedTuple):
-    """What a policy that sees is made of, in the order in which it computes."""
+    """What a visual policy is made of, in the order in which it computes."""
 
-    eyes: list[nn.Module]  #: convolutions, each followed by its activation
+    convolutions: list[nn.Module]  #: each followed by its activation
     nearest: float  #: [m]; they read 1 / max(depth, nearest)
-    trunk: list[nn.Module]  #: linear layers, each followed by its activation; the first reads the eyes, then vectors
-    widths: tuple[int, ...]  #: of what the eyes give, and of the vectors
+    trunk: list[nn.Module]  #: linear layers, each followed by its activation; the first reads images, then vectors
+    widths: tuple[int, ...]  #: of the output of the convolutions, and of the vectors
     scales: tuple[float, ...]  #: by which these are multiplied
     memory: GRU | None  #: reads what the trunk returns
     head: nn.Linear  #: reads what trunk and memory return; its first outputs are the mean action before the tanh
@@ -181,15 +173,20 @@ class Parts(NamedTuple):
     max_loc: float  #: the largest mean action before the tanh
 
 
-class VisualActor(ProbabilisticActor):
+class VisualActor(TanhGaussianActor):
     """What :func:`~torchrl_quad.make_visual_actor` builds."""
+
+    @property
+    def last(self) -> Network:
+        """The network that ends in the head."""
+        return cast(Any, self[0])[-1].module
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write loc, scale and action, the memory, correlated noise, and the log-probability if wanted.
 
         Raises:
-            ValueError: nobody says where episodes begin.
+            ValueError: "is_init", which marks the first steps of episodes, is missing.
         """
         if "is_init" in self.in_keys and "is_init" not in tensordict:
             raise UserValueError(
@@ -198,46 +195,51 @@ class VisualActor(ProbabilisticActor):
                 "transforms; or give the environment TorchRL's: TransformedEnv(env, Compose(InitTracker(), "
                 "actor.make_tensordict_primer()))."
             )
-        network = getattr(self[0][-1], "module", None)
-        if type(getattr(network, "head", None)) is CorrelatedHead:
-            return explore(self, network, super().forward, tensordict, **kwargs)
         return super().forward(tensordict, **kwargs)
 
     def replayed(self) -> Replay | None:
-        """The policy as losses let it act again in a whole rollout, or None where it explores in another way."""
-        return None if samples(self) is None else Replay(self)
+        """The policy as losses let it act again in a whole rollout, or None if it explores in another way."""
+        return None if self.is_random is None else Replay(self)
 
     def parts(self) -> Parts | None:
         """The parts as :func:`~torchrl_quad.make_visual_actor` builds them; None if somebody changed or hooks them."""
-        if type(self) is not VisualActor or len(self.module) != 2 or is_hooked(self) or samples(self) is None:
+        if type(self) is not VisualActor or len(self.module) != 2 or is_hooked(self) or self.is_random is None:
             return None
-        if self[1].distribution_class is not TanhNormal or type(self[0]) is not TensorDictSequential:
+        if self.sampler.distribution_class is not TanhNormal or type(self[0]) is not TensorDictSequential:
             return None
         if len(self[0].module) not in (2, 3):
             return None
-        seen, *memory, last = self[0].module
-        sight, head = (getattr(part, "module", None) for part in (seen, last))
-        if type(sight) is not Sight or not _is_network(sight.trunk, nn.Identity):
+        first, *memory, last = cast(Any, self[0].module)
+        features: Any = getattr(first, "module", None)
+        network: Any = getattr(last, "module", None)
+        if type(features) is not VisualFeatures or not _is_network(features.trunk, nn.Identity):
             return None
-        is_correlated = _is_network(head, CorrelatedHead)
-        if not is_correlated and not _is_network(head, GaussianHead):
+        if not _is_network(network, GaussianHead) or len(network.mlp) != 1 or not _is_linear(network.mlp[0]):
             return None
-        eyes, trunk = list(sight.eyes), [*sight.trunk.mlp, sight.activation]
-        if type(sight.eyes) is not ConvNet or type(eyes.pop()) is not SquashDims or sight.eyes[-1].ndims_in != 3:
+        convolutions, trunk = list(features.convolutions), [*features.trunk.mlp, features.activation]
+        if type(features.convolutions) is not ConvNet or type(convolutions.pop()) is not SquashDims:
             return None
-        if not _alternates(eyes, _halves) or not _alternates(trunk, _is_linear):
+        if features.convolutions[-1].ndims_in != 3 or any(scale != 1.0 for scale in network.scales):
             return None
-        if len(head.mlp) != 1 or not _is_linear(head.mlp[0]) or any(scale != 1.0 for scale in head.scales):
+        if not _alternates(convolutions, _halves) or not _alternates(trunk, _is_linear):
             return None
         if memory and not _is_memory(memory[0]):
             return None
-        reads, keys = ["seen", "recalled"][: len(memory) + 1], [list(part.in_keys) for part in (last, *memory)]
-        wanted = [reads + ["noise_before"] * is_correlated, *([["seen", MEMORY, "is_init"]] if memory else [])]
-        if keys != wanted or len(head.scales) != len(reads):
+        head, reads = network.head, ["features", "recalled"][: len(memory) + 1]
+        wanted = [reads + ["noise_before"] * bool(head.rho), *([["features", MEMORY, "is_init"]] if memory else [])]
+        if [list(part.in_keys) for part in (last, *memory)] != wanted or len(network.scales) != len(reads):
             return None
-        gru = memory[0].gru if memory else None
-        last = head.mlp[0], head.head.size, head.head.max_loc
-        return Parts(eyes, NEAREST, trunk, sight.trunk.widths, sight.trunk.scales, gru, *last)
+        return Parts(
+            convolutions,
+            NEAREST,
+            trunk,
+            features.trunk.widths,
+            features.trunk.scales,
+            memory[0].gru if memory else None,
+            network.mlp[0],
+            head.size,
+            head.max_loc,
+        )
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """TorchRL's transform that gives an environment the memory of this policy, in its precision.
@@ -247,20 +249,18 @@ class VisualActor(ProbabilisticActor):
         """
         for part in self.modules():
             if isinstance(part, GRUModule):
-                weight = part.gru.weight_hh_l0
-                spec = Unbounded((1, weight.shape[-1]), dtype=weight.dtype, device=weight.device)
+                weight = cast(Tensor, part.gru.weight_hh_l0)
+                spec = Unbounded(torch.Size((1, weight.shape[-1])), dtype=weight.dtype, device=weight.device)
                 return TensorDictPrimer({MEMORY: spec}, expand_specs=True)
         raise UserValueError("This policy has no memory: it was built with recurrent=False, and needs no primer.")
 
 
 class Replay(PlainTanhGaussian):
-    """A policy that sees, in the states of a rollout that it has flown. Its memory comes about anew in them."""
+    """A visual policy in the states of a rollout that it has flown, in which its memory is built up again."""
 
     def __init__(self, actor: VisualActor) -> None:
-        head, sample = actor[0][-1].module.head, actor[1]
-        self.actor, self.head, self.size, self.rho = actor, head, head.size, getattr(head, "rho", None)
-        self.log_prob_key = sample.log_prob_key if sample.return_log_prob else None
-        self.low, self.high = (x if x is None else x.tolist() for x in bounds_of(actor))
+        self.actor = actor
+        self._take_head(actor)
 
     def distribution(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """loc and scale in the states of a rollout (*, horizon), with gradients in the weights alone.
@@ -269,16 +269,16 @@ class Replay(PlainTanhGaussian):
         """
         has_time = tensordict.ndim > 1 or tensordict.names[-1] == "time"
         with set_recurrent_mode(has_time):
-            read = self.actor.get_dist_params(tensordict.select(*self.actor.in_keys).detach())
-        return read["loc"], read["scale"]
+            read = cast(TensorDictBase, self.actor.get_dist_params(tensordict.select(*self.actor.in_keys).detach()))
+        return leaf(read, "loc"), leaf(read, "scale")
 
-    def replay(self, tensordict: TensorDictBase) -> dict[Any, Tensor]:
+    def replay(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
         """What it writes in the states of a rollout (*, horizon), with the noise of the rollout."""
-        noise = self.drawn_again(tensordict)[:, : self.size].view_as(tensordict["action"])
+        noise = self.drawn_again(tensordict)[:, : self.size].view_as(leaf(tensordict, "action"))
         return self._squash(*self.distribution(tensordict), noise, self.log_prob_key)
 
 
-def _is_network(module: nn.Module | None, head: type[nn.Module]) -> bool:
+def _is_network(module: Any, head: type[nn.Module]) -> bool:
     return type(module) is Network and type(module.mlp) is MLP and type(module.head) is head
 
 
@@ -301,7 +301,7 @@ def _halves(layer: nn.Module) -> bool:
 
 def _is_memory(module: nn.Module) -> bool:
     """Whether it is a GRU of one layer that goes forwards."""
-    gru = getattr(module, "gru", None)
+    gru: Any = getattr(module, "gru", None)
     if type(module) is not GRUModule or type(gru) not in (GRU, nn.GRU):
         return False
     return (gru.num_layers, gru.bias, gru.bidirectional) == (1, True, False)

@@ -55,7 +55,7 @@ def predict(
         return torch.stack(predictions)
     tensors = [leaf(tensordict, name) for name in critic.in_keys]
     _check_precision(critic, critic.in_keys, tensors, params)
-    weights = {".".join(name): x for name, x in params.items(True, True)}
+    weights = {".".join(cast(tuple[str, ...], name)): x for name, x in params.items(True, True)}
     if learning:
         tensors = [x.detach() for x in tensors]
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -10,7 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.utils import ValueEstimators
 
-from torchrl_quad.data.unwrap import check_tensordict, group
+from torchrl_quad.data.unwrap import check_tensordict, group, leaf
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.calls import predict, segments, takes_rollout
 from torchrl_quad.objectives.pathwise import PathwiseLoss
@@ -96,10 +97,8 @@ class PathwiseCriticLoss(PathwiseLoss):
         missing = [name for name in getattr(self, self.critic_name).in_keys if name not in tensordict]
         if missing:
             raise UserValueError(f"{self.critic_name} reads {missing[0]!r}, which these samples lack.")
-        target = tensordict.get(key, None)
-        if target is None:
-            target = self.write_value_target(tensordict.copy()).get(key)
-        target, prediction = target.detach(), self._critics(tensordict, learning=True)
+        samples = tensordict if key in tensordict else self.write_value_target(tensordict.copy())
+        target, prediction = leaf(samples, key).detach(), self._critics(tensordict, learning=True)
         if target.shape != prediction.shape[1:]:
             raise UserValueError(
                 f"{key!r} has shape {tuple(target.shape)}, and the critic's predictions {tuple(prediction.shape[1:])}: "
@@ -126,7 +125,7 @@ class PathwiseCriticLoss(PathwiseLoss):
         discount = self._gamma * self._discounts(tensordict)
         if next_state.shape[0] == 0:  # a recurrent policy refuses an empty batch
             return torch.zeros_like(discount).sum((-2, -1))
-        value = self._value(next_state, target=self.target_bootstrap)
+        value = self._value(cast(TensorDictBase, next_state), target=self.target_bootstrap)
         return (discount * torch.zeros_like(discount).masked_scatter(where, value.to(discount.dtype))).sum((-2, -1))
 
     def _critic_inputs(self) -> set[NestedKey]:

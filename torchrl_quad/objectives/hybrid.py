@@ -201,7 +201,7 @@ class HybridLoss(SHACLoss):
             loc = leaf(data, "loc").detach().requires_grad_()
             with torch.enable_grad():
                 (grad,) = torch.autograd.grad((plain.action(loc, scale, xi) * grad).sum(), loc)
-        if plain.rho is not None:
+        if plain.rho:
             # Noise goes on in later actions of the episode: the gradient is that in its new part, divided by the scale.
             decay = plain.rho * (self._gamma * cast(Tensor, self.value_estimator.lmbda))
             in_noise, steps, done = torch.zeros_like(grad[..., 0, :]), [], self._next(data, "done")

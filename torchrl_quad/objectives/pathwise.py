@@ -74,7 +74,7 @@ class PathwiseLoss(LossModule):
     default_value_estimator = ValueEstimators.TD1
     supported_value_estimators: tuple[ValueEstimators, ...] = (ValueEstimators.TD1,)
 
-    out_keys = ["loss_actor", "n_step_return"]
+    out_keys = ["loss_actor", "n_step_return"]  # pyrefly: ignore[bad-override-mutable-attribute]  # as in TorchRL
     value_part: str | None = None  # the part of the objective that comes from a critic
     # What is measured of the gradients in single actions. Where anything is, the policy learns from these gradients.
     measured_of_actions: list[str] = []
@@ -135,7 +135,7 @@ class PathwiseLoss(LossModule):
     # -- keys and parameters -------------------------------------------------------------------------------------------
 
     @property
-    def in_keys(self) -> list[NestedKey]:  # pyrefly: ignore[bad-override-param-name]  # of a setter of TorchRL's
+    def in_keys(self) -> list[NestedKey]:  # pyrefly: ignore[bad-override]  # nobody sets them
         """The keys of a rollout that :meth:`forward` reads; others do no harm."""
         keys = self.tensor_keys
         names = {keys.action, *self._network_in_keys()}
@@ -219,13 +219,13 @@ class PathwiseLoss(LossModule):
         self._forward_value_estimator_keys()
         return self
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         # The estimator is made when it is first needed, and a checkpoint may hold one already.
         kept = f"{prefix}_value_estimator."
         if self._value_estimator is None and f"{kept}gamma" in state_dict:
             has_default = f"{kept}lmbda" in state_dict or self.default_value_estimator is ValueEstimators.TD1
             self.make_value_estimator(None if has_default else ValueEstimators.TD0)
-        super()._load_from_state_dict(state_dict, prefix, *args)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def set_keys(self, **keys: NestedKey | None) -> None:
         """Read entries of a rollout under other names; None means the name that TorchRL uses."""

@@ -1,7 +1,6 @@
 """Commands that are written anywhere run: those of blocks here, and every other one in a test that it is known by."""
 
 import argparse
-import importlib
 import re
 import runpy
 import shlex
@@ -16,6 +15,7 @@ from test_docs import PAGES, code, files, importable, name_of  # noqa: F401, a f
 from test_examples import EXAMPLES
 from test_recipes import RECIPES, ROOT, SMALL, run
 
+from torchrl_quad.training.configuration import compose
 from torchrl_quad.training.schema import check
 
 AFTER_TRAINING = ("evaluate", "export")  # recipes that read a checkpoint
@@ -29,19 +29,9 @@ SMOKE = {  # the test that runs a program on a reduced budget
     "recipes/identify.py": "test_identification: test_the_recipe_fits_a_real_flight_and_draws_it",
     "recipes/transfer.py": "test_transfer: "
     "test_the_recipe_flies_without_torch_keeps_a_table_and_finds_mistakes_of_a_port",
-    "benchmarks/paper/ablations.py": "test_reproduce: test_options_are_changed_one_at_a_time_and_shown_beside_what_ships",
-    "benchmarks/paper/ascent.py": "test_ascent: test_the_gradients_of_every_method_are_compared_with_the_simulator",
-    "benchmarks/paper/elsewhere.py": "test_elsewhere: "
-    "test_a_loss_trains_on_an_environment_that_is_not_ours_once_and_has_a_row_in_the_table",
-    "benchmarks/paper/forest.py": "test_reproduce: "
-    "test_policies_of_the_forest_are_flown_at_the_speeds_and_densities_and_not_twice",
-    "benchmarks/paper/phases.py": "test_ascent: test_the_phases_of_the_hybrid_are_flown_and_measured_once",
-    "benchmarks/paper/rates.py": "test_reproduce: test_half_and_twice_a_rate_fly_once_and_are_judged_by_their_worst_seed",
     "benchmarks/paper/reproduce.py": "test_reproduce: test_a_shrunken_matrix_runs_and_goes_on_where_it_was_stopped",
-    "benchmarks/paper/results.py": "test_claims: test_the_page_is_made_of_the_results_and_what_is_written_by_hand_stays",
-    "benchmarks/paper/shipped.py": "test_reproduce: "
-    "test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again",
-    "benchmarks/paper/starts.py": "test_reproduce: test_a_policy_is_flown_from_every_set_of_starts_once",
+    "benchmarks/paper/results.py": "test_claims: "
+    "test_a_page_is_made_of_other_results_and_the_pages_of_the_project_stay_as_they_are",
     **dict.fromkeys(
         (
             f"benchmarks/{name}.py"
@@ -71,7 +61,7 @@ def commands():
 @pytest.mark.usefixtures("quick_fits", "importable")
 @pytest.mark.parametrize("command", list(commands()))
 def test_every_command_of_a_block_runs(command, launch, request, monkeypatch, tmp_path):
-    program, *words = command
+    program, *words = as_a_script(command)
     if "logger.backend=wandb" not in words:
         request.getfixturevalue("no_pictures")
     script = next((word for word in words if word.endswith(".py")), "")
@@ -93,6 +83,12 @@ def test_every_command_of_a_block_runs(command, launch, request, monkeypatch, tm
         pytest.fail(f"No test knows how to try {program!r}: add it here, or fence as text what cannot be tried.")
 
 
+def as_a_script(words):
+    """``python -m benchmarks.paper.results`` as the file that it runs."""
+    is_ours = words[1:2] == ["-m"] and words[2].startswith("benchmarks.")
+    return [words[0], f"{words[2].replace('.', '/')}.py", *words[3:]] if is_ours else words
+
+
 class Understood(Exception):
     """A program has read its arguments."""
 
@@ -102,13 +98,12 @@ def understands(words, monkeypatch):
     script, *arguments = words
     is_run(script)
     arguments = [re.sub(r"\b(mypackage|shuttle)\.\w+", "own_task.CornerEnv", x) for x in arguments]
-    monkeypatch.syspath_prepend(ROOT / "benchmarks/paper")
     monkeypatch.syspath_prepend((ROOT / script).parent)  # as python does
     if script == "recipes/transfer.py":
         runpy.run_path(str(ROOT / script))["settings"](arguments)
     elif Path(script).parent.name == "recipes":
         settings = [re.sub(r"^([\w.]+=[^,{\[]*),.*", r"\1", x) for x in arguments if not x.startswith(("--", "hydra"))]
-        check(importlib.import_module("running").composed(Path(script).stem, settings), settings)
+        check(compose(Path(script).stem, settings), settings)
     else:
 
         def parse(parser, *args, read=argparse.ArgumentParser.parse_args):
@@ -163,7 +158,7 @@ def words_of(command):
 def test_every_command_in_a_sentence_or_a_docstring_is_one_that_a_test_runs(monkeypatch):
     seen, wrong = {tuple(param.values[0]) for param in commands()}, []
     for path, command in written():
-        program, *words = words_of(command)
+        program, *words = as_a_script(words_of(command))
         if (key := (program, *words)) in seen:
             continue
         seen.add(key)

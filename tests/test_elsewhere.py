@@ -27,7 +27,7 @@ def test_a_loss_trains_on_another_environment_once_and_has_a_row_in_the_table(
     assert low < float(rows[0]["before"]) < high
     table = tables.elsewhere_table(tmp_path)
     assert [row["loss"] for row in table] == list(losses)
-    assert all(f"{environment}, after (worst seed)" in row for row in table)
+    assert all(environment in row for row in table)
     monkeypatch.setattr(elsewhere, "learn", lambda *_: pytest.fail("It has been trained."))
     run_main(monkeypatch, reproduce, *arguments)
 

@@ -270,7 +270,7 @@ def reached_tables(rows: Sequence[Row], starts: Starts) -> dict[str, Table]:
             returns, solved, metric = returns_of(own, starts), *(column(own, x) for x in ("solved", name))
             mean = f"{interquartile_mean(returns):.4g}"
             if len(returns) >= ENOUGH:
-                mean += " ({:.4g} to {:.4g})".format(*interval(returns))
+                mean += " ({:.4g}–{:.4g})".format(*interval(returns))
             row = {"task": LABELS.get(task, task), "method": flights.METHODS[method], "seeds": str(len(own))}
             row |= {"return (95 % interval)": mean}
             row |= {"solved (worst seed)": f"{np.mean(solved):.1%} ({min(solved):.1%})"}
@@ -278,7 +278,7 @@ def reached_tables(rows: Sequence[Row], starts: Starts) -> dict[str, Table]:
             row |= {"million steps": f"{np.median(column(own, 'steps')) / 1e6:.1f}"}
             row |= {"seconds": f"{np.median(column(own, 'seconds')):.0f}"}
             full.append(row)
-            short[method][row["task"]] = f"{mean}, {min(solved):.1%}, {row['million steps']} M"
+            short[method][row["task"]] = f"{mean}, {min(solved):.1%}"
     return {"reached": [row for row in short.values() if len(row) > 1], "reached_in_full": full}
 
 
@@ -355,7 +355,7 @@ def ablations_table(data: Path) -> Table:
                 (gain, solved), (less, without) = (
                     (np.mean(column(x, "return")), min(column(x, "solved"))) for x in both
                 )
-                row[flights.METHODS[method]] = f"{gain - less:+.1f}, {solved:.0%} ({without:.0%}), {seeds(len(own))}"
+                row[flights.METHODS[method]] = f"{gain - less:+.1f}, {solved:.0%} ({without:.0%}), {len(own)}"
         rows += [row] if len(row) > 2 else []
     return rows
 
@@ -368,7 +368,7 @@ def rates_table(data: Path) -> Table:
         row = {"": label}
         for task in (task for task in flights.TASKS if any(task == key[0] for key in of)):
             worst = [min(column(of[task, x], "solved")) if (task, x) in of else math.nan for x in flights.FACTORS]
-            row[LABELS.get(task, task)] = " / ".join("" if math.isnan(x) else f"{x:.0%}" for x in worst)
+            row[LABELS.get(task, task)] = "/".join("?" if math.isnan(x) else f"{100 * x:.0f}" for x in worst)
         lines += [row] if len(row) > 1 else []
     return lines
 
@@ -408,9 +408,7 @@ def elsewhere_table(data: Path) -> Table:
         row = {"loss": name}
         for environment in elsewhere.ENVIRONMENTS:
             if own := of.get((environment, name)):
-                before, after = (column(own, x) for x in ("before", "after"))
-                row |= {f"{environment}, before": f"{np.mean(before):.4g}"}
-                row |= {f"{environment}, after (worst seed)": f"{np.mean(after):.4g} ({min(after):.4g})"}
-                row |= {f"{environment}, seconds": f"{np.median(column(own, 'seconds')):.0f}"}
+                after = column(own, "after")
+                row[environment] = f"{np.mean(after):.4g} ({min(after):.4g})"
         lines += [row] if len(row) > 1 else []
     return lines

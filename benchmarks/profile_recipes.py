@@ -65,16 +65,16 @@ def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) ->
     import torchrl_quad
     from torchrl_quad import objectives
     from torchrl_quad.data import rollout as rollouts
-    from torchrl_quad.engine import node, stepper
+    from torchrl_quad.engine import stepper
     from torchrl_quad.envs import base
     from torchrl_quad.training import building, loop
 
     clocks = Clocks()
     clocks.around(stepper.Stepper, "step", "physics")
     for name in ("forward", "backward"):
-        clocks.around(node._Horizon, name, "physics")
+        clocks.around(stepper._Horizon, name, "physics")
     for name in ("forward", "adjoint", "weight_gradients"):
-        clocks.around(node._Policy, name, "actor")
+        clocks.around(stepper._Policy, name, "actor")
     clocks.around(ProbabilisticTensorDictSequential, "forward", "actor")
     clocks.around(base, "fly", "bookkeeping")
     clocks.around(rollouts, "differentiable_rollout", "bookkeeping")
@@ -91,10 +91,10 @@ def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) ->
     optimise, iterate = loop.Run.optimise, loop.Run.__iter__
     total, count = 0.0, 0
 
-    def timed_optimise(self, name, *arguments):
-        clocks.switch(name)
+    def timed_optimise(self, optimizer, loss):
+        clocks.switch(optimizer.name)
         try:
-            optimise(self, name, *arguments)
+            optimise(self, optimizer, loss)
         finally:
             clocks.switch(None)
 

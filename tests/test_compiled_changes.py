@@ -7,8 +7,21 @@ import torch
 from torch._dynamo.utils import counters
 
 from torchrl_quad import HoveringEnv, audit_reward, differentiable_rollout, make_actor
+from torchrl_quad.dynamics import DYNAMICS, PointMass
 
 BONUS = 1.0
+LIFT = 1.0
+
+
+def moved(state, dt):
+    return [state[0] + state[2] * (LIFT * dt), *state[1:]]
+
+
+class Gliding(PointMass):
+    """Keeps its velocity; a global and a function of this module move it."""
+
+    def physics_step(self, state, setpoint, plant, controller, wind):
+        return moved(state, self.dt)
 
 
 class Paid(HoveringEnv):
@@ -46,6 +59,29 @@ def test_a_compiled_step_sees_changed_attributes_classes_and_globals(monkeypatch
     copied = copy.deepcopy(compiled)
     copied.extra = 30.0  # a copy shares nothing with what it was made of
     assert step(copied)[0] == [32.0, 32.0] and step(compiled)[0] == [22.0, 22.0]
+
+
+def test_a_compiled_step_sees_changes_of_dynamics_in_a_module_of_ones_own(monkeypatch):
+    monkeypatch.setitem(DYNAMICS, "gliding", Gliding)
+    eager, compiled = (HoveringEnv(num_envs=2, dynamics="gliding") for _ in range(2))
+    compiled.compile(backend="eager")
+    start = eager.reset()
+    start["state", "velocity"] = torch.ones(2, 3)
+
+    def height():
+        ends = [env.step(start.copy().set("action", torch.zeros(2, 4)))["next", "state"] for env in (eager, compiled)]
+        torch.testing.assert_close(ends[0]["position"], ends[1]["position"])
+        return (ends[1]["position"] - start["state", "position"])[0, 2].item()
+
+    step = eager.control_dt
+    assert height() == pytest.approx(step, rel=1e-3)
+    monkeypatch.setitem(globals(), "LIFT", 2.0)
+    assert height() == pytest.approx(2 * step, rel=1e-3)
+    for env in (eager, compiled):
+        env.dynamics.dt *= 2
+    assert height() == pytest.approx(4 * step, rel=1e-3)
+    monkeypatch.setitem(globals(), "moved", lambda state, dt: state)
+    assert height() == 0.0
 
 
 def test_the_gradients_in_actions_are_those_of_a_compiled_horizon():

@@ -157,7 +157,7 @@ def test_limits_can_be_chosen_and_gymnasium_takes_them():
     ("control", "message"),
     [
         ("thrust", "Unknown control 'thrust'. Choose from: rates, attitude, rotor_thrusts, velocity; or"),
-        ({"max_tilt": 0.5}, r"control=\{'max_tilt': 0.5\} names no mode. Choose from: rates, "),
+        ({"max_tilt": 0.5}, r"control=\{'max_tilt': 0.5\} has no .mode. key. Choose from: rates, "),
         (None, "control must be a name, such as rates, or a mapping with limits, got None"),
         ({"mode": "attitude", "max_speed": 1.0}, "'attitude' has no limit 'max_speed'. Choose from: max_tilt"),
         ({"mode": "rates", "max_tilt": 1.0}, "'rates' has no limit 'max_tilt'. It has none; those of the drone hold"),

@@ -12,14 +12,11 @@ from torchrl_quad.dynamics.modes import (
 )
 from torchrl_quad.dynamics.parameters import MotorCommand, QuadrotorParams, available_drones, load_drone
 from torchrl_quad.dynamics.point_mass import PointMass
-from torchrl_quad.dynamics.quadrotor import Quadrotor, QuadrotorState, control_step, physics_step
+from torchrl_quad.dynamics.quadrotor import Quadrotor, QuadrotorState
 from torchrl_quad.dynamics.rigid_body import (
     INTEGRATORS,
     RigidBodyState,
     accelerations,
-    euler,
-    rk4,
-    semi_implicit_euler,
 )
 
 #: The dynamics models by name.
@@ -43,12 +40,7 @@ __all__ = [
     "VelocityController",
     "accelerations",
     "available_drones",
-    "control_step",
-    "euler",
     "load_drone",
     "make_controller",
-    "physics_step",
     "quaternion",
-    "rk4",
-    "semi_implicit_euler",
 ]

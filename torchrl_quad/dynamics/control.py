@@ -1,4 +1,4 @@
-"""The flight controller: from an action to four rotor speeds, with the drone it believes to fly."""
+"""The flight controller: from an action to four rotor speeds, with the parameters of the nominal drone."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class Setpoint(NamedTuple):
 class FlightController:
     """Rate controller and mixer with the nominal parameters of the drone: ``control="rates"``.
 
-    The plant may differ (randomised, fitted): the controller keeps a copy of what it was built with, and no gradient
-    flows into that. Those of :mod:`~torchrl_quad.dynamics.modes` give actions another meaning.
+    The drone that flies may differ (randomised, fitted): the controller keeps a copy of what it was built with, and no
+    gradient flows into that. Those of :mod:`~torchrl_quad.dynamics.modes` give actions another meaning.
 
     Raises:
         ValueError: the rotor layout cannot make thrust and torque about each axis, or the drone cannot hover.
@@ -107,12 +107,11 @@ class FlightController:
 
     def setpoint(self, action: Tensor) -> Any:
         """Decode an action (*, 4), for :meth:`command`."""
-        return Setpoint(*self.decode(action).split((1, 3), -1))
+        return self.setpoint_type(*self.decode(action).split(self.setpoint_sizes, -1))
 
     def command(self, setpoint: Any, state: Any, wrench: Vector) -> Vector:
         """Commanded rotor speed (*, 4) [rad/s] for a setpoint, the drone's state, and the present wrench (*, 4)."""
-        rates = self.rate_setpoint(setpoint, state.quaternion, state.velocity)
-        moment = None
+        rates, moment = self.rate_setpoint(setpoint, state.quaternion, state.velocity), None
         if self.knows_moment:
             velocity_body = quaternion.rotate_inverse(state.quaternion, state.velocity)
             moment = drag_moment(drag(velocity_body, self.nominal), self.nominal)
@@ -128,9 +127,9 @@ class FlightController:
         """Commanded rotor speed (*, 4) [rad/s] for a setpoint, the body rates (*, 3), and the present wrench (*, 4).
 
         Torque = J K (desired rate - rate) - D (angular acceleration) + w x J w, where the angular acceleration follows
-        from the wrench that the controller believes the rotors to exert. The paper prints a derivative of the desired
-        rate as well; a setpoint that is held for a control step has none. The rotors also hold against the moment
-        (*, 3) of a drag above the centre of mass, which firmware leaves to an integral.
+        from the wrench that nominal rotors exert. The paper prints a derivative of the desired rate as well; a setpoint
+        that is held for a control step has none. The rotors also hold against the moment (*, 3) of a drag above the
+        centre of mass, which firmware leaves to an integral.
         """
         inertia = self.nominal.inertia
         held = gyroscopic_torque(angular_velocity, inertia)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Protocol
 import torch
 from torch import Tensor
 
+from torchrl_quad.dynamics.control import FlightController
 from torchrl_quad.dynamics.modes import make_controller
 from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
 from torchrl_quad.dynamics.vector import Components, Vector, cat, stack
@@ -39,7 +40,7 @@ class Dynamics(Protocol):
     """Greatest absolute values of its own entries, beyond which the numbers mean nothing and the episode ends."""
 
     nominal: QuadrotorParams
-    """The drone that the controller believes in."""
+    """The drone that the controller is built for."""
 
     hover_action: Tensor
     """The action (4) that holds the nominal drone where it is; (num_envs, 4) where drones differ in it."""
@@ -74,7 +75,7 @@ class Dynamics(Protocol):
 
 
 class ControlledModel:
-    """A model whose flight controller is one of ``CONTROLS``."""
+    """What both models share: the flight controller, and how a physics step becomes a control step in both forms."""
 
     sizes: dict[str, int]
     plant_fields: tuple[str, ...]
@@ -88,9 +89,25 @@ class ControlledModel:
         self.dt, self.substeps, self.integrator = dt, substeps, integrator
         self.limits: dict[str, Tensor] = {}
 
-    def substep(self, *args: Any, **kwargs: Any) -> Sequence[Vector]:
-        """The entries of the state after a physics step, from those before, the setpoint, and so on."""
+    def plant(self, params: QuadrotorParams, controller: FlightController) -> Any:
+        """What physics steps read of the drone that flies, worked out once in a control step."""
+        return params
+
+    def physics_step(
+        self, state: Sequence[Vector], setpoint: Any, plant: Any, controller: FlightController, wind: Vector | None
+    ) -> Sequence[Vector]:
+        """The entries of the state, in the order of ``sizes``, after a physics step."""
         raise NotImplementedError
+
+    def control_step(
+        self, state: dict[str, Tensor], action: Tensor, params: QuadrotorParams, wind: Tensor | None
+    ) -> dict[str, Tensor]:
+        """The entries of the drone after a control step, which holds the action (n, 4) in [-1, 1]."""
+        setpoint, plant = self.controller.setpoint(action), self.plant(params, self.controller)
+        entries: Sequence[Tensor] = [state[name] for name in self.sizes]
+        for _ in range(self.substeps):
+            entries = self.physics_step(entries, setpoint, plant, self.controller, wind)
+        return dict(zip(self.sizes, entries, strict=True))
 
     def setpoint_rows(self, action: Tensor) -> Tensor:
         """What an action (n, 4) asks of the controller, as rows (k, n)."""
@@ -102,11 +119,11 @@ class ControlledModel:
 
         def step(x: Tensor, setpoint: Tensor, plant: tuple[Tensor, ...], wind: tuple[Tensor, ...]) -> Tensor:
             state = Components(x.unbind()).split(list(self.sizes.values()), -1)
-            wanted = Components(setpoint.unbind()).split(controller.setpoint_sizes, -1)
+            wanted = controller.setpoint_type(*Components(setpoint.unbind()).split(controller.setpoint_sizes, -1))
             params = controller.nominal
             if plant:
                 params = RawParams(**{k: Components(v.unbind()) for k, v in zip(self.plant_fields, plant, strict=True)})
             air = Components(wind[0].unbind()) if wind else None
-            return stack(cat(*self.substep(state, controller.setpoint_type(*wanted), params, controller, air)))
+            return stack(cat(*self.physics_step(state, wanted, self.plant(params, controller), controller, air)))
 
         return step

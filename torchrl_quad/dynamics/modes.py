@@ -20,12 +20,14 @@ from torchrl_quad.dynamics.vector import Vector, cat, clamp, dot, soft_limit
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import between, checked
 
+Tilt = Annotated[float, between(0.01, 1.5)]
+
 
 class AttitudeSetpoint(NamedTuple):
     """What an action of ``control="attitude"`` asks for."""
 
     thrust: Vector  #: (*, 1) [N], collective
-    up: Vector  #: (*, 3), the world's up as the body shall see it, a unit vector in the body frame
+    up: Vector  #: (*, 3), the world's up in the wanted body frame, a unit vector
     yaw_rate: Vector  #: (*, 1) [rad/s], about the world's up
 
 
@@ -42,22 +44,12 @@ class VelocitySetpoint(NamedTuple):
     yaw_rate: Vector  #: (*, 1) [rad/s], about the world's up
 
 
-Tilt = Annotated[float, between(0.01, 1.5)]
-MaxSpeed = Annotated[float, between(0.01, 100.0)]
-
-
-@checked
 class TiltController(FlightController):
-    """What the controllers of attitude and velocity share: a loop that tilts the drone.
-
-    Args:
-        nominal: the drone it believes to fly.
-        max_tilt: greatest roll and greatest pitch that an action can ask for, each 0.01 to 1.5 rad, 86 degrees.
-    """
+    """What the controllers of attitude and velocity share: a loop that tilts the drone."""
 
     constants = (*FlightController.constants, "tilt_gain", "tilt_rate")
 
-    def __init__(self, nominal: Nominal, max_tilt: Tilt) -> None:
+    def __init__(self, nominal: QuadrotorParams, max_tilt: float) -> None:
         super().__init__(nominal)
         self.max_tilt = float(max_tilt)
         nominal = self.nominal
@@ -66,11 +58,7 @@ class TiltController(FlightController):
         self.tilt_gain, self.tilt_rate = 0.5 / lag[..., :2], nominal.max_body_rate[..., :2]
 
     def tilting_rates(self, error: Vector) -> Vector:
-        """Roll and pitch rate (*, 2) [rad/s] that reduce a tilt error.
-
-        Args:
-            error: sine of the angle left to turn about body x and y, (*, 2).
-        """
+        """Roll and pitch rate (*, 2) [rad/s] for a tilt error: the sine of the angle left about x and y, (*, 2)."""
         return soft_limit(self.tilt_gain * error, self.tilt_rate)
 
 
@@ -82,7 +70,6 @@ class AttitudeController(TiltController):
     the world's up. Thrust is that of ``control="rates"``.
 
     Args:
-        nominal: the drone it believes to fly.
         max_tilt: greatest roll and greatest pitch that an action can ask for, each 0.01 to 1.5 rad, 86 degrees.
     """
 
@@ -106,13 +93,12 @@ class AttitudeController(TiltController):
         (x, y, z), (wanted_x, wanted_y, wanted_z) = _entries(up), _entries(setpoint.up)
         error = cat(wanted_y * z - wanted_z * y, wanted_z * x - wanted_x * z)  # wanted up x present up
         yaw = setpoint.yaw_rate  # about the world's up: roll and pitch turn with the heading
-        rates = cat(self.tilting_rates(error) + yaw * up[..., :2], yaw * up[..., 2:])
-        return Setpoint(setpoint.thrust, rates)
+        return Setpoint(setpoint.thrust, cat(self.tilting_rates(error) + yaw * up[..., :2], yaw * up[..., 2:]))
 
 
 @checked
 class RotorThrustController(FlightController):
-    """``control="rotor_thrusts"``: the thrust of each rotor, without any control loop.
+    """``control="rotor_thrusts"``: the thrust of each rotor, without a flight controller.
 
     Each entry maps -1..1 to 0..1 times the rotor's part of the full collective thrust of ``control="rates"``. Rotors
     are in the order of ``rotor_positions``; what they cannot give is cut off.
@@ -125,10 +111,6 @@ class RotorThrustController(FlightController):
         super().__init__(nominal)
         self.offset, self.scale = self.offset.new_ones(4), self.half_range * self.share
         self.hover_action = self.hover_action[..., :1].expand(*self.hover_action.shape).contiguous()
-
-    def setpoint(self, action: Tensor) -> RotorSetpoint:
-        """Decode an action (*, 4)."""
-        return RotorSetpoint(self.decode(action))
 
     def command(self, setpoint: RotorSetpoint, state: Any, wrench: Vector) -> Vector:
         """Commanded rotor speed (*, 4) [rad/s]."""
@@ -143,7 +125,6 @@ class VelocityController(TiltController):
     no integral part: drag, wind, and a weight that differs from the nominal one leave an error.
 
     Args:
-        nominal: the drone it believes to fly.
         max_tilt: greatest angle by which it tilts, 0.01 to 1.5 rad, 86 degrees.
         max_speed: greatest velocity along each axis that an action can ask for, 0.01 to 100 m/s.
     """
@@ -152,7 +133,9 @@ class VelocityController(TiltController):
     setpoint_type, setpoint_sizes = VelocitySetpoint, (3, 1)
     constants = (*TiltController.constants, "velocity_gain", "max_climb", "full_thrust")
 
-    def __init__(self, nominal: Nominal, *, max_tilt: Tilt = math.pi / 6, max_speed: MaxSpeed = 3.0) -> None:
+    def __init__(
+        self, nominal: Nominal, *, max_tilt: Tilt = math.pi / 6, max_speed: Annotated[float, between(0.01, 100.0)] = 3.0
+    ) -> None:
         super().__init__(nominal, max_tilt)
         nominal = self.nominal
         # Sideways it acts through the tilt: its lag, and the time to tilt fully at the greatest rate. Upwards it acts
@@ -167,21 +150,16 @@ class VelocityController(TiltController):
         self.offset, self.scale = self.offset.new_zeros(4), join(speed, nominal.max_body_rate[..., 2:])
         self.hover_action = self.offset.clone()
 
-    def setpoint(self, action: Tensor) -> VelocitySetpoint:
-        """Decode an action (*, 4)."""
-        return VelocitySetpoint(*self.decode(action).split((3, 1), -1))
-
     def rate_setpoint(self, setpoint: VelocitySetpoint, attitude: Vector, velocity: Vector) -> Setpoint:
         """Thrust and body rates that lead to the velocity."""
         wanted = self.velocity_gain * (setpoint.velocity - velocity)
         climb = soft_limit(wanted[..., 2:], self.max_climb) + self.nominal.gravity
-        sideways = wanted[..., :2]
-        reach = climb * self.slope
+        sideways, reach = wanted[..., :2], climb * self.slope
         sideways = sideways * (dot(sideways, sideways) / reach.square() + 1.0).rsqrt()
         wanted = cat(sideways, climb)
-        seen = quaternion.rotate_inverse(attitude, wanted)
-        thrust = (seen[..., 2:] * self.nominal.mass).clamp_min(0.0).minimum(self.full_thrust)
-        x, y, _ = _entries(seen * dot(wanted, wanted).rsqrt())
+        in_body = quaternion.rotate_inverse(attitude, wanted)
+        thrust = (in_body[..., 2:] * self.nominal.mass).clamp_min(0.0).minimum(self.full_thrust)
+        x, y, _ = _entries(in_body * dot(wanted, wanted).rsqrt())
         error = cat(-y, x)  # body z x wanted direction of thrust
         # The thrust keeps its direction in the world while the drone turns under it.
         rates = cat(self.tilting_rates(error), setpoint.yaw_rate * quaternion.up_in_body(attitude)[..., 2:])
@@ -198,12 +176,12 @@ CONTROLS: dict[str, type[FlightController]] = {
 
 
 def make_controller(control: str | Mapping[str, Any], nominal: QuadrotorParams) -> FlightController:
-    """Build a flight controller.
+    """Build a flight controller for a drone.
 
     Args:
         control: a name of ``CONTROLS``, or a mapping with ``mode``, the name, and limits: ``{"mode": "velocity",
             "max_speed": 5.0}``.
-        nominal: the drone it believes to fly.
+        nominal: what it takes to be the drone's parameters.
 
     Raises:
         ValueError: the name is unknown, or the mode has no such limit, or the limit is out of its range.
@@ -211,7 +189,7 @@ def make_controller(control: str | Mapping[str, Any], nominal: QuadrotorParams) 
     limits = dict(control) if isinstance(control, Mapping) else {"mode": control}
     mode = limits.pop("mode", None)
     if not isinstance(mode, str) or mode not in CONTROLS:
-        what = f"Unknown control {shown(mode)}" if mode is not None else f"control={shown(control)} names no mode"
+        what = f"Unknown control {shown(mode)}" if mode is not None else f"control={shown(control)} has no 'mode' key"
         raise UserValueError(
             f'{what}. Choose from: {", ".join(CONTROLS)}; or {{"mode": "velocity", "max_speed": 5.0}}.'
         )

@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -20,44 +20,18 @@ from torchrl_quad.options import between, build, checked
 _DRONES = resources.files("torchrl_quad.dynamics") / "drones"
 
 
-class _Field(NamedTuple):
-    """The shape of one drone's value, the least and the greatest number that makes sense for it, and its unit.
+# The fields that only the flight controller reads, from its nominal drone.
+CONTROLLER_FIELDS = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
+_OTHER_SHAPES = {"motor_time_constant": (2,)}  # which a field may have as well
+_OPTIONAL = {"drag_height": 0.0}
+
+
+def _field(shape: tuple[int, ...], low: float, high: float, unit: str = "", **default: Any) -> Any:
+    """A field, with the shape of one drone's value, its unit, and the least and the greatest number that makes sense.
 
     Beyond them the numbers of a drone that could never fly overflow, and their derivatives with them.
     """
-
-    shape: tuple[int, ...]
-    low: float
-    high: float
-    unit: str = ""
-
-
-_FIELDS = {
-    "mass": _Field((1,), 1e-3, 1e3, "kg"),
-    "inertia": _Field((3,), 1e-8, 1e3, "kg m2"),
-    "rotor_positions": _Field((4, 2), -1e1, 1e1, "m"),
-    "rotor_spin": _Field((4,), -1.0, 1.0),
-    "yaw_torque_coefficient": _Field((1,), 1e-5, 1e1, "m"),
-    "thrust_map": _Field((3,), -1e3, 1e3, "N s2, N s, N"),
-    "rotor_speed_min": _Field((1,), 0.0, 1e5, "rad/s"),
-    "rotor_speed_max": _Field((1,), 1e0, 1e5, "rad/s"),
-    "motor_time_constant": _Field((1,), 1e-4, 1e1, "s"),
-    "linear_drag": _Field((3,), 0.0, 1e2, "N s/m"),
-    "quadratic_drag": _Field((3,), 0.0, 1e2, "N s2/m2"),
-    "rate_gain": _Field((3,), 1e-3, 1e4, "1/s"),
-    "rate_damping": _Field((3,), 0.0, 1e3, "kg m2"),
-    "max_body_rate": _Field((3,), 1e-2, 1e2, "rad/s"),
-    "max_thrust_to_weight": _Field((1,), 1e-1, 1e2),
-    "gravity": _Field((1,), 1e-2, 1e3, "m/s2"),
-    "drag_height": _Field((1,), -1e0, 1e0, "m"),
-}
-_OTHER_SHAPES = {"motor_time_constant": (2,)}  # which a field may have as well
-_OPTIONAL = {"drag_height": 0.0}
-_ZERO = cast(Tensor, 0.0)  # a number, until QuadrotorParams has made it like the others
-LIMITS = {name: (field.low, field.high) for name, field in _FIELDS.items()}
-# The fields that only the flight controller reads, from its nominal drone; and those of the drone that flies.
-CONTROLLER_FIELDS = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
-PLANT_FIELDS = tuple(name for name in _FIELDS if name not in CONTROLLER_FIELDS)
+    return dataclasses.field(metadata={"shape": shape, "low": low, "high": high, "unit": unit}, **default)
 
 
 @checked
@@ -93,29 +67,32 @@ class QuadrotorParams:
         ValueError: a value has the wrong shape, is not finite, or breaks the rule of its field.
     """
 
-    mass: Tensor  #: (1) [kg]
-    inertia: Tensor  #: (3) [kg m2], principal axes
-    rotor_positions: Tensor  #: (4, 2) [m], x and y of each rotor
-    rotor_spin: Tensor  #: (4), sign of the yaw torque that each rotor exerts on the body
-    yaw_torque_coefficient: Tensor  #: (1) [m], kappa, yaw torque per thrust
-    thrust_map: Tensor  #: (3), k2 [N s2], k1 [N s] and k0 [N] of thrust = k2 w^2 + k1 w + k0
-    rotor_speed_min: Tensor  #: (1) [rad/s]
-    rotor_speed_max: Tensor  #: (1) [rad/s]
-    motor_time_constant: Tensor  #: (1) [s], or (2) for rotors that speed up and slow down at a different pace
-    linear_drag: Tensor  #: (3) [N s/m]
-    quadratic_drag: Tensor  #: (3) [N s2/m2]
-    rate_gain: Tensor  #: (3) [1/s], times the inertia
-    rate_damping: Tensor  #: (3) [kg m2], on the angular acceleration
-    max_body_rate: Tensor  #: (3) [rad/s], commanded at full stick
-    max_thrust_to_weight: Tensor  #: (1), commanded at full stick
-    gravity: Tensor  #: (1) [m/s2]
-    drag_height: Tensor = _ZERO  #: (1) [m], above the centre of mass, where the drag acts
+    mass: Tensor = _field((1,), 1e-3, 1e3, "kg")  #: (1) [kg]
+    inertia: Tensor = _field((3,), 1e-8, 1e3, "kg m2")  #: (3) [kg m2], principal axes
+    rotor_positions: Tensor = _field((4, 2), -1e1, 1e1, "m")  #: (4, 2) [m], x and y of each rotor
+    rotor_spin: Tensor = _field((4,), -1.0, 1.0)  #: (4), sign of the yaw torque that each rotor exerts on the body
+    yaw_torque_coefficient: Tensor = _field((1,), 1e-5, 1e1, "m")  #: (1) [m], kappa, yaw torque per thrust
+    #: (3), k2 [N s2], k1 [N s] and k0 [N] of thrust = k2 w^2 + k1 w + k0
+    thrust_map: Tensor = _field((3,), -1e3, 1e3, "N s2, N s, N")
+    rotor_speed_min: Tensor = _field((1,), 0.0, 1e5, "rad/s")  #: (1) [rad/s]
+    rotor_speed_max: Tensor = _field((1,), 1e0, 1e5, "rad/s")  #: (1) [rad/s]
+    #: (1) [s], or (2) for rotors that speed up and slow down at a different pace
+    motor_time_constant: Tensor = _field((1,), 1e-4, 1e1, "s")
+    linear_drag: Tensor = _field((3,), 0.0, 1e2, "N s/m")  #: (3) [N s/m]
+    quadratic_drag: Tensor = _field((3,), 0.0, 1e2, "N s2/m2")  #: (3) [N s2/m2]
+    rate_gain: Tensor = _field((3,), 1e-3, 1e4, "1/s")  #: (3) [1/s], times the inertia
+    rate_damping: Tensor = _field((3,), 0.0, 1e3, "kg m2")  #: (3) [kg m2], on the angular acceleration
+    max_body_rate: Tensor = _field((3,), 1e-2, 1e2, "rad/s")  #: (3) [rad/s], commanded at full stick
+    max_thrust_to_weight: Tensor = _field((1,), 1e-1, 1e2)  #: (1), commanded at full stick
+    gravity: Tensor = _field((1,), 1e-2, 1e3, "m/s2")  #: (1) [m/s2]
+    #: (1) [m], above the centre of mass, where the drag acts
+    drag_height: Tensor = _field((1,), -1e0, 1e0, "m", default=0.0)
     motor_command: MotorCommand | None = None  #: from motor commands of logs to rotor speeds; None if unknown
 
     def __post_init__(self) -> None:
         like = self.mass if isinstance(self.mass, Tensor) and self.mass.is_floating_point() else torch.empty(0)
         for name, value in self.fields().items():
-            object.__setattr__(self, name, _field(name, value, like, "QuadrotorParams"))
+            object.__setattr__(self, name, _checked(name, value, like, "QuadrotorParams"))
         low, high = self.rotor_speed_min.detach(), self.rotor_speed_max.detach()
         if not (low < high).all():
             raise UserValueError(
@@ -132,8 +109,8 @@ class QuadrotorParams:
 
     def __repr__(self) -> str:
         """A table with units."""
-        labels = {name: f"{name} [{field.unit}]" if field.unit else name for name, field in _FIELDS.items()}
-        rows = {labels[name]: _table(x, len(_FIELDS[name].shape)) for name, x in self.fields().items()}
+        units = {name: f" [{about['unit']}]" if about["unit"] else "" for name, about in _FIELDS.items()}
+        rows = {name + units[name]: _table(x, self.dim(name)) for name, x in self.fields().items()}
         rows |= {} if self.motor_command is None else {"motor_command": str(self.motor_command)}
         width = max(map(len, rows))
         return "\n  ".join([type(self).__name__, *(f"{label:{width}}  {value}" for label, value in rows.items())])
@@ -173,12 +150,16 @@ class QuadrotorParams:
     @staticmethod
     def dim(name: str) -> int:
         """The number of dimensions of a field of a single drone."""
-        return len(_FIELDS[name].shape)
+        return len(_FIELDS[name]["shape"])
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> QuadrotorParams:
         mapped = {name: function(value) for name, value in self.fields().items()}
         return QuadrotorParams(**mapped, motor_command=self.motor_command)
 
+
+_FIELDS = {field.name: field.metadata for field in dataclasses.fields(QuadrotorParams) if field.metadata}
+LIMITS = {name: (about["low"], about["high"]) for name, about in _FIELDS.items()}
+PLANT_FIELDS = tuple(name for name in _FIELDS if name not in CONTROLLER_FIELDS)  # of the drone that flies
 
 if TYPE_CHECKING:
 
@@ -218,7 +199,7 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
     if unknown:
         raise UserValueError(f"{source}: unknown field {unknown[0]!r}. Allowed: {', '.join(_FIELDS)}, motor_command.")
     like = torch.empty(0, dtype=torch.float64)
-    fields = {name: _field(name, values[name], like, source).to(torch.float64) for name in _FIELDS}
+    fields = {name: _checked(name, values[name], like, source).to(torch.float64) for name in _FIELDS}
     command = None if motors is None else build(MotorCommand, f"{source}: motor_command", motors)
     return QuadrotorParams(**fields, motor_command=command).to(dtype=dtype)
 
@@ -251,11 +232,11 @@ def _tensor(name: str, value: Any, like: Tensor, source: str) -> Tensor:
         ) from error
 
 
-def _field(name: str, value: Any, like: Tensor, source: str) -> Tensor:
+def _checked(name: str, value: Any, like: Tensor, source: str) -> Tensor:
     """A value as the tensor of a field, checked."""
     value = _tensor(name, value, like, source)
     value = value if value.dim() else value.reshape(1)
-    shape, low, high, _ = _FIELDS[name]
+    shape, low, high, _ = _FIELDS[name].values()
     shapes = (shape, _OTHER_SHAPES.get(name))
     if value.shape not in shapes and value.shape[1:] not in shapes:
         raise UserValueError(

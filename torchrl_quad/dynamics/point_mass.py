@@ -12,7 +12,6 @@ from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Nominal
 from torchrl_quad.dynamics.model import ControlledModel, PhysicsStep, Substeps
 from torchrl_quad.dynamics.modes import RotorThrustController
-from torchrl_quad.dynamics.parameters import QuadrotorParams
 from torchrl_quad.dynamics.rigid_body import Integrator, drag
 from torchrl_quad.dynamics.vector import Vector, along_z
 from torchrl_quad.errors import UserValueError
@@ -66,29 +65,14 @@ class PointMass(ControlledModel):
         level = quaternion.identity(position)
         return {"position": position, "quaternion": level, "velocity": still, "angular_velocity": still.clone()}
 
-    def control_step(
-        self, state: dict[str, Tensor], action: Tensor, params: QuadrotorParams, wind: Tensor | None
-    ) -> dict[str, Tensor]:
-        """The entries of the drone after one control step."""
-        setpoint = self.controller.setpoint(action)
-        entries: Sequence[Tensor] = [state[name] for name in self.sizes]
-        for _ in range(self.substeps):
-            entries = self.substep(entries, setpoint, params, self.controller, wind)
-        return dict(zip(self.sizes, entries, strict=True))
-
-    def substep(
-        self,
-        state: Sequence[Vector],
-        setpoint: Any,
-        params: QuadrotorParams,
-        controller: FlightController,
-        wind: Vector | None,
+    def physics_step(
+        self, state: Sequence[Vector], setpoint: Any, plant: Any, controller: FlightController, wind: Vector | None
     ) -> Sequence[Vector]:
-        """The entries of the drone after one physics step."""
+        """Turn, then move."""
         position, attitude, velocity, _ = state
         thrust, rates = controller.rate_setpoint(setpoint, attitude, velocity)
         attitude = quaternion.normalize(attitude + quaternion.derivative(attitude, rates) * self.dt)
         air = velocity if wind is None else velocity - wind
-        force = drag(quaternion.rotate_inverse(attitude, air), params) + along_z(thrust)
-        velocity = velocity + (quaternion.rotate(attitude, force / params.mass) - along_z(params.gravity)) * self.dt
+        force = drag(quaternion.rotate_inverse(attitude, air), plant) + along_z(thrust)
+        velocity = velocity + (quaternion.rotate(attitude, force / plant.mass) - along_z(plant.gravity)) * self.dt
         return position + velocity * self.dt, attitude, velocity, rates

@@ -25,12 +25,7 @@ def names(folder: Traversable) -> list[str]:
 
 
 def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = None) -> tuple[str, Mapping[str, Any]]:
-    """What a preset says, and what to call it in an error.
-
-    Args:
-        kind: what it describes, for errors: "drone".
-        preset: the name of a file in the folder, the path of a file that ends in .yaml, or a mapping.
-        folder: where the package keeps its own; None where it has none.
+    """What a preset says, and its name in errors: a file by its name in a folder of the package, its path, or a mapping.
 
     Raises:
         ValueError: the name is unknown, or :func:`parse` refuses the file, or it is no mapping.
@@ -59,8 +54,7 @@ def parse(content: bytes, source: str) -> Any:
     """The content of a YAML file, read in time and memory proportional to its size.
 
     Numbers are those of YAML 1.2: 1e-3 is one, and 1:30 is a string, as are dates. Aliases and tags are refused, since
-    a file of a few lines can mean billions of values through them; so are names that come twice, of which one would
-    be lost.
+    a file of a few lines can mean billions of values through them.
 
     Raises:
         ValueError: the content is too large, too deep, not in UTF-8, no YAML, or has an alias, a tag, a name that is no
@@ -150,11 +144,7 @@ def is_number(value: Any) -> bool:
 
 
 def as_array(value: Any) -> NDArray[np.float64]:
-    """A setting of numbers, or of lists of numbers that are equally long, as an array.
-
-    Raises:
-        ValueError: it holds anything else: a string, true, a number that no float holds, or lists of several lengths.
-    """
+    """A setting of numbers, or of lists of numbers that are equally long, as an array; a ValueError of all else."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "iuf":
         return value.astype(np.float64)
     if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str | bytes | bytearray):

@@ -1,4 +1,4 @@
-"""The whole quadrotor: rate controller, rotors and rigid body over one control step."""
+"""The whole quadrotor: flight controller, rotors and rigid body."""
 
 from __future__ import annotations
 
@@ -28,55 +28,12 @@ class QuadrotorState(NamedTuple):
     rotor_speed: Vector  #: (*, 4) [rad/s]
 
 
-def physics_step(
-    state: QuadrotorState,
-    setpoint: Any,
-    params: QuadrotorParams,
-    rotors: Rotors,
-    controller: FlightController,
-    dt: float,
-    integrator: str = "semi_implicit_euler",
-    wind: Vector | None = None,
-) -> QuadrotorState:
-    """One physics step of dt [s]: the present rotor speeds make the wrench, and the controller sets their next target.
-
-    ``rotors`` are those of ``params``; the controller flies by its own. ``wind`` is (*, 3) [m/s], world frame.
-    """
-    speed = state.rotor_speed
-    wrench = rotors.wrench(speed)
-    believed = wrench if rotors is controller.rotors else controller.rotors.wrench(speed)
-    commanded = controller.command(setpoint, state, believed)
-    if rotors is not controller.rotors:  # the nominal rotors can do what the controller asks of them; these may not
-        commanded = clamp(commanded, params.rotor_speed_min, params.rotor_speed_max)
-    body = INTEGRATORS[integrator](RigidBodyState(*state[:4]), lambda s: accelerations(s, wrench, params, wind), dt)
-    return QuadrotorState(*body, rotors.follow(speed, commanded, dt))
-
-
-def control_step(
-    state: QuadrotorState,
-    action: Tensor,
-    params: QuadrotorParams,
-    controller: FlightController,
-    dt: float,
-    substeps: int,
-    integrator: str = "semi_implicit_euler",
-    wind: Tensor | None = None,
-) -> QuadrotorState:
-    """Hold an action (*, 4) in [-1, 1] over ``substeps`` physics steps of dt [s], with the drone ``params`` in the
-    wind (*, 3) [m/s], world frame."""
-    setpoint = controller.setpoint(action)
-    rotors = controller.rotors if params is controller.nominal else Rotors(params)
-    for _ in range(substeps):
-        state = physics_step(state, setpoint, params, rotors, controller, dt, integrator, wind)
-    return state
-
-
 @checked
 class Quadrotor(ControlledModel):
     """The quadrotor as environments fly it: an implementation of :class:`~torchrl_quad.dynamics.Dynamics`.
 
     Args:
-        nominal: the drone that the flight controller believes in.
+        nominal: the drone that the flight controller is built for.
         dt: physics step, 1e-6 to 0.1 s.
         substeps: physics steps in a control step, 1 to 200.
         integrator: how the rigid body moves on in a physics step.
@@ -107,23 +64,26 @@ class Quadrotor(ControlledModel):
             "rotor_speed": self.controller.hover_speed.expand(len(position), 4).clone(),
         }
 
-    def control_step(
-        self, state: dict[str, Tensor], action: Tensor, params: QuadrotorParams, wind: Tensor | None
-    ) -> dict[str, Tensor]:
-        """The entries of the drone after one control step; see :func:`control_step`."""
-        drone = QuadrotorState(*(state[name] for name in self.sizes))
-        after = control_step(drone, action, params, self.controller, self.dt, self.substeps, self.integrator, wind)
-        return after._asdict()
+    def plant(self, params: QuadrotorParams, controller: FlightController) -> tuple[QuadrotorParams, Rotors]:
+        """The parameters and the rotors."""
+        return params, controller.rotors if params is controller.nominal else Rotors(params)
 
-    def substep(
+    def physics_step(
         self,
         state: Sequence[Vector],
         setpoint: Any,
-        params: QuadrotorParams,
+        plant: tuple[QuadrotorParams, Rotors],
         controller: FlightController,
         wind: Vector | None,
     ) -> QuadrotorState:
-        """See :func:`physics_step`."""
-        rotors = controller.rotors if params is controller.nominal else Rotors(params)
-        before = QuadrotorState(*state)
-        return physics_step(before, setpoint, params, rotors, controller, self.dt, self.integrator, wind)
+        """The present rotor speeds make the wrench, and the controller, by its own rotors, sets their next target."""
+        (params, rotors), before = plant, QuadrotorState(*state)
+        speed = before.rotor_speed
+        wrench = rotors.wrench(speed)
+        believed = wrench if rotors is controller.rotors else controller.rotors.wrench(speed)
+        commanded = controller.command(setpoint, before, believed)
+        if rotors is not controller.rotors:  # the nominal rotors can do what the controller asks of them; these may not
+            commanded = clamp(commanded, params.rotor_speed_min, params.rotor_speed_max)
+        integrate = INTEGRATORS[self.integrator]
+        body = integrate(RigidBodyState(*before[:4]), lambda s: accelerations(s, wrench, params, wind), self.dt)
+        return QuadrotorState(*body, rotors.follow(speed, commanded, self.dt))

@@ -1,4 +1,4 @@
-"""Compile a function of tensors; check what was assumed of everything else once in a horizon, not at every step."""
+"""Compile a function of tensors; check what was assumed of everything else once per horizon, not at every step."""
 
 from __future__ import annotations
 
@@ -50,10 +50,8 @@ class Compiled:
         backend = options.get("backend", "inductor")
         self.backend = None if backend == "inductor" else torch._dynamo.lookup_backend(backend)
         given = {name: x for name, x in options.items() if name not in ("mode", "options", "backend")}
-        watch = {"guard_filter_fn": _watched}
-        self.checked = torch.compile(
-            _own(method), **{"fullgraph": True, "dynamic": False, **given}, backend=self._compile, options=watch
-        )
+        keywords: dict[str, Any] = {"fullgraph": True, "dynamic": False, **given, "backend": self._compile}
+        self.checked = torch.compile(_own(method), **keywords, options={"guard_filter_fn": _watched})
         self.last: tuple[Function, Sequence[Any], Sequence[Any]] | None = None  # call of what was compiled
         self.direct: _Direct | None = None
 
@@ -74,7 +72,7 @@ class Compiled:
 
     def _compile(self, graph: torch.fx.GraphModule, examples: list[Tensor], **_: Any) -> Function:
         if self.backend is None:
-            function = torch._inductor.compile(graph, examples, options=self.patches)
+            function = torch._inductor.compile(graph, list(examples), options=self.patches)
         else:
             function = self.backend(graph, examples)
 
@@ -141,11 +139,11 @@ def _own(method: types.MethodType) -> types.MethodType:
 
 
 # Of some 700 assumptions the compiled step keeps those that a user can break: on its input, on torch's state, on the
-# attributes of the environment and its class, on globals of the modules that tasks live in. Checking the others at each
-# call would cost more than the physics.
+# attributes of the simulation, its class and its physics, on globals of the modules that they live in. The others are
+# about torch and the engine.
 _FIXED_TYPES = {"TYPE_MATCH", "BUILTIN_MATCH", "MODULE_MATCH", "CLASS_MATCH", "DUPLICATE_INPUT"}
-_FIXED_PLACES = ("self.layout", "self.output_layout", "self.substep", "self.pull", "__import__", "list(dict.keys(__imp")
-_FIXED_MODULES = ("torch_dot", "torch'", "torchrl_quad_dot_dynamics", "torchrl_quad_dot_engine", "builtins")
+_FIXED_PLACES = ("self.layout", "self.output_layout", "__import__", "list(dict.keys(__imp")
+_FIXED_MODULES = ("torch_dot", "torch'", "torchrl_quad_dot_engine", "builtins")
 
 
 def _watched(guards: Sequence[Any]) -> list[bool]:

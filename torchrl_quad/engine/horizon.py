@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_quad.engine.packing import Key, Rows, flat, like, looks_are_free, nested
+from torchrl_quad.engine.packing import Record, flat, like, looks_are_free, nested
 from torchrl_quad.engine.policy import GivenActions, PlainPolicy, plain
-from torchrl_quad.engine.program import Record, policy_inputs
+from torchrl_quad.engine.program import policy_inputs
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.engine.stepper import Stepper
+
+Entries = dict[Any, Tensor]
+_NAMES: Any = [None, "time"]  # of the dimensions; tensordict's annotations know no None
 
 
 class Source(Protocol):
@@ -21,9 +24,11 @@ class Source(Protocol):
 
     def noise(self) -> dict[str, Tensor]:
         """What the next step needs at random, by name."""
+        ...
 
     def starts(self, mask: Tensor) -> dict[str, Any]:
         """What a reset writes, nested, for the environments of the mask, bool (n); rows of the others mean nothing."""
+        ...
 
 
 def can_fly(stepper: Stepper, policy: Any, tensordict: TensorDictBase) -> bool:
@@ -63,161 +68,164 @@ def fly(
         steps: at least one.
     """
     state, valid = stepper.simulation.guard(state)
-    plain = _plain(stepper, policy)
-    memory = _memory(policy)
-    own = (*policy.out_keys, *memory, "is_init")
-    before = {key: tensordict.get(key) for key in own if key in tensordict and key != "action"}
-    for key in memory if {"is_init", *memory} <= before.keys() else ():
-        before[key] = torch.where(like(before["is_init"], before[key]), 0.0, before[key])
+    loop, acts = _Loop(stepper, source, policy, tensordict), _plain(stepper, policy)
+    about = _entries(tensordict, ["observation", *(key for key in stepper.output_layout.place if key != "reward")])
     if not stepper.is_compiled:
-        roots, ends, written = _fly_eager(stepper, source, policy, state, tensordict, valid, steps, before)
-    elif plain is None:
-        start = _record(stepper, state, tensordict)
-        roots, ends, written = _call(stepper, source, policy, start, valid, steps, before)
+        roots, ends, written = loop.eager(state, about, valid, steps)
+    elif acts is None:
+        roots, ends, written = loop.called(loop.record(state, about), valid, steps)
     else:
-        start = _record(stepper, state, tensordict)
-        roots, ends, written = _fly_inside(stepper, source, plain, start, valid, steps, before)
+        roots, ends, written = loop.inside(acts, loop.record(state, about), valid, steps)
     rollout = {**roots, **ends, **{unravel_key(key): x for key, x in written.items()}}
     rollout.pop("reward", None)  # there is none before the first step
-    return TensorDict(nested(rollout), (len(tensordict), steps), tensordict.device, names=[None, "time"])
+    return TensorDict(nested(rollout), (len(tensordict), steps), tensordict.device, names=_NAMES)
+
+
+class _Loop:
+    """Three ways to fly one horizon, each to the entries of all roots and of all ends, and what the policy wrote."""
+
+    def __init__(
+        self, stepper: Stepper, source: Source, policy: TensorDictModuleBase, tensordict: TensorDictBase
+    ) -> None:
+        self.stepper, self.source, self.policy, self.memory = stepper, source, policy, _memory(policy)
+        self.kind, self.done_row, _ = stepper.output_layout.place["done"]
+        own = (*policy.out_keys, *self.memory, "is_init")
+        # What the policy has written in the step before.
+        self.before = _entries(tensordict, [key for key in own if key in tensordict and key != "action"])
+        for key in self.memory if {"is_init", *self.memory} <= self.before.keys() else ():
+            self.before[key] = torch.where(like(self.before["is_init"], self.before[key]), 0.0, self.before[key])
+
+    def inside(self, acts: PlainPolicy | GivenActions, start: Record, valid: Tensor, steps: int) -> tuple[Entries, ...]:
+        """With a policy that acts inside the compiled step."""
+
+        def restarted(end: Record) -> tuple[Record, Tensor] | None:
+            done = self.done(end)
+            return (self.restarted(end, done), done[0]) if _may_restart(done) else None
+
+        flight = self.stepper.fly(acts, start, valid, steps, self.source.noise, restarted, self.before)
+        roots = []
+        for i, (first, ends) in enumerate(zip(start.leaves, flight.ends.leaves, strict=True)):
+            dim = 0 if i < 6 else 1  # of time: only observations have the environments first
+            steps_from = [first, *ends.unbind(dim)[:-1]]
+            for t, fresh, done in flight.restarts:
+                mask = done.unsqueeze(1) if dim else done
+                steps_from[t + 1] = torch.where(mask, fresh.leaves[i], steps_from[t + 1])
+            roots.append(torch.stack(steps_from, dim))
+        return self.entries(Record.of(roots)), self.entries(flight.ends, "next"), flight.written
+
+    def called(self, start: Record, valid: Tensor, steps: int) -> tuple[Entries, ...]:
+        """With a policy that is called before each compiled step."""
+        roots, ends, written = [start], [], []
+        reads = any(unravel_key(key) in self.stepper.output_layout.place for key in self.policy.in_keys)
+        for t in range(steps):
+            root = roots[-1]
+            outputs = self.stepper.unpack_outputs(root.outputs) if reads else {}
+            state = self.stepper.layout.unpack(root.state)
+            action, now = self.act({"observation": root.observation, **outputs}, state)
+            end = self.stepper.step_rows(root.state, valid, action, self.source.noise())
+            written.append(now)
+            ends.append(end)
+            valid = torch.ones_like(valid) if t == 0 else valid  # a step leads to meaningful states
+            done = self.done(end)
+            self.hand_on(now, done.t())
+            roots.append(self.restarted(end, done) if t < steps - 1 and _may_restart(done) else end)
+        return self.entries(_stacked(roots[:-1])), self.entries(_stacked(ends), "next"), _over_time(written)
+
+    def eager(self, state: State, outputs: Entries, valid: Tensor, steps: int) -> tuple[Entries, ...]:
+        """Without a compiler, on entries: each is a tensor of its own anyway."""
+        roots, ends, written = [_of_state(state) | outputs], [], []
+        for t in range(steps):
+            action, now = self.act(roots[-1], state)
+            state, outputs = self.stepper.step(state, valid, action, self.source.noise())
+            written.append(now)
+            ends.append(_of_state(state) | flat(outputs))
+            done = outputs["done"]
+            self.hand_on(now, done)
+            valid = torch.ones_like(valid) if t == 0 else valid  # a step leads to meaningful states
+            root = {key: x for key, x in ends[-1].items() if key != "reward"}
+            if t < steps - 1 and _may_restart(done):
+                fresh = flat(self.source.starts(done[:, 0]))
+                root = {key: torch.where(like(done, x), fresh[key].detach(), x) for key, x in root.items()}
+                state = {key: root[unravel_key(("state", key))] for key in state}
+            roots.append(root)
+        next_ends = {unravel_key(("next", key)): x for key, x in _over_time(ends).items()}
+        return _over_time(roots[:-1]), next_ends, _over_time(written)
+
+    def act(self, outputs: Entries, state: State) -> tuple[Tensor, Entries]:
+        """The action of a policy that is called, and all that it writes; it reads what it wrote in the step before."""
+        policy, before = self.policy, self.before
+        handed_on = {key: x for key, x in before.items() if key != "action"}
+        reads, observation = {unravel_key(key) for key in policy.in_keys}, outputs["observation"]
+        read = {key: x for key, x in outputs.items() if key in reads or key == "observation"}
+        td: TensorDictBase = TensorDict({**handed_on, **nested(read)}, [len(observation)], observation.device)
+        if reads - {"observation"}:
+            td["state"] = nested(state)
+        if self.memory:
+            td["is_init"] = before.get("is_init", torch.zeros_like(observation[:, :1], dtype=torch.bool))
+        written = _entries(policy(td), [*policy.out_keys, *(["is_init"] if self.memory else [])])
+        self.stepper.simulation.check_action(written["action"])
+        for key in self.memory:
+            after = written[unravel_key(("next", key))]
+            written[key] = torch.zeros_like(after) if before.get(key) is None else before[key]
+        if self.memory:
+            written["next", "is_init"] = torch.zeros_like(written["is_init"])
+        return written["action"], written
+
+    def hand_on(self, written: Entries, done: Tensor) -> None:
+        """Keep what the policy reads in the next step; where an episode ends, bool (n, 1), it forgets.
+
+        The gradient ends there with the memory.
+        """
+        if not self.memory:
+            self.before = written
+            return
+        self.before = {key: x for key, x in written.items() if not (isinstance(key, tuple) and key[0] == "next")}
+        for key in self.memory:
+            x = written[unravel_key(("next", key))]
+            self.before[key] = torch.where(like(done, x), 0.0, x) if _may_restart(done) else x
+        self.before["is_init"] = done
+
+    def done(self, end: Record) -> Tensor:
+        """Where an episode ends, bool (1, n)."""
+        return end.outputs[self.kind][self.done_row]
+
+    def record(self, state: State, outputs: Entries) -> Record:
+        """What is known of a state, on rows; there is no reward before the first step."""
+        reward = torch.zeros_like(outputs["done"], dtype=self.stepper.layout.dtypes[0])
+        rows = self.stepper.output_layout.pack({**outputs, "reward": reward})
+        return Record(self.stepper.layout.pack(state), rows, outputs["observation"])
+
+    def restarted(self, end: Record, done: Tensor) -> Record:
+        """The record to continue from, with fresh starts where ``done`` (1, n); gradients stop there."""
+        entries = {key: x.detach() for key, x in flat(self.source.starts(done[0])).items()}
+        fresh = self.record({key: entries[unravel_key(("state", key))] for key in self.stepper.layout.place}, entries)
+        return Record(
+            fresh.state.where(done, end.state),
+            fresh.outputs.where(done, end.outputs),
+            torch.where(done.t(), fresh.observation, end.observation),
+        )
+
+    def entries(self, records: Record, *prefix: str) -> Entries:
+        """All entries of the records of a horizon, each (n, time, ...)."""
+        entries = _of_state(self.stepper.layout.unpack(records.state))
+        entries |= self.stepper.unpack_outputs(records.outputs) | {"observation": records.observation}
+        return {unravel_key((*prefix, key)): x for key, x in entries.items()}
 
 
 def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | GivenActions | None:
     """The policy as the engine can fly it inside its step, if it can."""
-    policy = plain(policy) if stepper.is_compiled else None
-    if policy is None:
+    acts = plain(policy) if stepper.is_compiled else None
+    if acts is None:
         return None
     state = stepper.layout.unpack(stepper.example.state)
-    if not {unravel_key(key) for key in policy.in_keys} <= {"observation", *_of_state(state)}:
+    if not {unravel_key(key) for key in acts.in_keys} <= {"observation", *_of_state(state)}:
         return None
-    return policy if policy.fits(policy_inputs(policy, state, stepper.example.observation)) else None
+    return acts if acts.fits(policy_inputs(acts, state, stepper.example.observation)) else None
 
 
-def _fly_inside(
-    stepper: Stepper,
-    source: Source,
-    policy: PlainPolicy | GivenActions,
-    start: Record,
-    valid: Tensor,
-    steps: int,
-    before: dict[Any, Tensor],
-) -> tuple[dict[Key, Tensor], ...]:
-    """The entries of all roots and of all ends, and what the policy wrote, of one compiled horizon."""
-    kind, done_row, _ = stepper.output_layout.place["done"]
-
-    def restarted(end: Record) -> tuple[Record, Tensor] | None:
-        done = end.outputs[kind][done_row]
-        return (_restarted(stepper, source, end, done), done[0]) if _may_restart(done) else None
-
-    flight = stepper.fly(policy, start, valid, steps, source.noise, restarted, before)
-    leaves = [[*record.state, *record.outputs, record.observation] for record in (start, flight.ends)]
-    again = [(t, [*fresh.state, *fresh.outputs, fresh.observation], done) for t, fresh, done in flight.restarts]
-    roots = [
-        _roots(first, x, [(t, fresh[i], done) for t, fresh, done in again], 0 if i < 6 else 1)
-        for i, (first, x) in enumerate(zip(*leaves, strict=True))
-    ]
-    roots = Record(Rows(*roots[:3]), Rows(*roots[3:6]), roots[6])
-    return _entries(stepper, roots), _entries(stepper, flight.ends, "next"), flight.written
-
-
-def _roots(start: Tensor, ends: Tensor, again: list[tuple[int, Tensor, Tensor]], dim: int) -> Tensor:
-    """Where steps begin: at the start, where the step before ended, or afresh."""
-    roots = [start, *ends.unbind(dim)[:-1]]
-    for t, fresh, done in again:
-        roots[t + 1] = torch.where(done.unsqueeze(1) if dim else done, fresh, roots[t + 1])
-    return torch.stack(roots, dim)
-
-
-def _call(
-    stepper: Stepper,
-    source: Source,
-    policy: TensorDictModuleBase,
-    start: Record,
-    valid: Tensor,
-    steps: int,
-    before: dict[Any, Tensor],
-) -> tuple[dict[Key, Tensor], ...]:
-    """The same for a policy that is called before each compiled step."""
-    roots = [start]
-    ends: list[Record] = []
-    written = []
-    kind, done_row, _ = stepper.output_layout.place["done"]
-    reads = any(unravel_key(key) in stepper.output_layout.place for key in policy.in_keys)
-    for t in range(steps):
-        root = roots[-1]
-        outputs = {"observation": root.observation, **(stepper.unpack_outputs(root.outputs) if reads else {})}
-        action, now = _act(stepper, policy, outputs, stepper.layout.unpack(root.state), before)
-        written.append(now)
-        end = stepper.step_rows(root.state, valid, action, source.noise())
-        ends.append(end)
-        if t == 0:
-            valid = torch.ones_like(valid)  # a step leads to meaningful states
-        done = end.outputs[kind][done_row]
-        before = _handed_on(policy, now, done.t())
-        if t < steps - 1:
-            roots.append(_restarted(stepper, source, end, done) if _may_restart(done) else end)
-    return _entries(stepper, _stacked(roots)), _entries(stepper, _stacked(ends), "next"), _over_time(written)
-
-
-def _fly_eager(
-    stepper: Stepper,
-    source: Source,
-    policy: TensorDictModuleBase,
-    state: State,
-    tensordict: TensorDictBase,
-    valid: Tensor,
-    steps: int,
-    before: dict[Any, Tensor],
-) -> tuple[dict[Key, Tensor], ...]:
-    """The same without a compiler, on entries: each is a tensor of its own anyway."""
-    outputs = {key: tensordict.get(key) for key in ("observation", *stepper.output_layout.place) if key != "reward"}
-    roots, ends, written = [_of_state(state) | outputs], [], []
-    for t in range(steps):
-        action, now = _act(stepper, policy, roots[-1], state, before)
-        written.append(now)
-        state, outputs = stepper.step(state, valid, action, source.noise())
-        ends.append(_of_state(state) | flat(outputs))
-        before = _handed_on(policy, now, outputs["done"])
-        if t == 0:
-            valid = torch.ones_like(valid)  # a step leads to meaningful states
-        if t < steps - 1:
-            root = {key: x for key, x in ends[-1].items() if key != "reward"}
-            done = outputs["done"]
-            if _may_restart(done):
-                fresh = flat(source.starts(done[:, 0]))
-                root = {key: torch.where(like(done, x), fresh[key].detach(), x) for key, x in root.items()}
-                state = {key: root[unravel_key(("state", key))] for key in state}
-            roots.append(root)
-    return (
-        _over_time(roots),
-        {unravel_key(("next", key)): x for key, x in _over_time(ends).items()},
-        _over_time(written),
-    )
-
-
-def _act(
-    stepper: Stepper, policy: TensorDictModuleBase, outputs: dict[Key, Tensor], state: State, before: dict[Any, Tensor]
-) -> tuple[Tensor, dict[Any, Tensor]]:
-    """The action of a policy that is called, and all that it writes; it sees what it wrote in the step before."""
-    handed_on = {key: x for key, x in before.items() if key != "action"}
-    reads, observation = {unravel_key(key) for key in policy.in_keys}, outputs["observation"]
-    read = {key: x for key, x in outputs.items() if key in reads or key == "observation"}
-    td = TensorDict({**handed_on, **nested(read)}, [len(observation)], observation.device)
-    if reads - {"observation"}:
-        td["state"] = nested(state)
-    memory = _memory(policy)
-    if memory:
-        td["is_init"] = before.get("is_init", torch.zeros_like(observation[:, :1], dtype=torch.bool))
-    td = policy(td)
-    action = td.get("action")
-    stepper.simulation.check_action(action)
-    written = {key: td.get(key) for key in policy.out_keys}
-    for key in memory:
-        after = written[unravel_key(("next", key))]
-        written[key] = torch.zeros_like(after) if before.get(key) is None else before[key]
-    if memory:
-        written |= {"is_init": td["is_init"], ("next", "is_init"): torch.zeros_like(td["is_init"])}
-    return action, written
+def _entries(tensordict: TensorDictBase, keys: list[Any]) -> Entries:
+    """Some entries of a tensordict."""
+    return {key: cast(Tensor, tensordict.get(key)) for key in keys}
 
 
 def _memory(policy: TensorDictModuleBase) -> list[Any]:
@@ -226,67 +234,22 @@ def _memory(policy: TensorDictModuleBase) -> list[Any]:
     return [key for key in policy.in_keys if unravel_key(("next", key)) in written]
 
 
-def _handed_on(policy: TensorDictModuleBase, written: dict[Any, Tensor], done: Tensor) -> dict[Any, Tensor]:
-    """Of what a policy has written that which it sees in the next step; where an episode ends, bool (n, 1), it forgets.
-
-    The gradient ends there with the memory.
-    """
-    memory = _memory(policy)
-    if not memory:
-        return written
-    before = {key: x for key, x in written.items() if not (isinstance(key, tuple) and key[0] == "next")}
-    for key in memory:
-        x = written[unravel_key(("next", key))]
-        before[key] = torch.where(like(done, x), 0.0, x) if _may_restart(done) else x
-    return before | {"is_init": done}
-
-
-def _over_time(steps: list[dict[Key, Tensor]]) -> dict[Key, Tensor]:
+def _over_time(steps: list[Entries]) -> Entries:
     """The entries of several steps, each (n, time, ...)."""
     return {key: torch.stack([entries[key] for entries in steps], 1) for key in steps[0]}
 
 
-def _of_state(state: State) -> dict[Key, Tensor]:
+def _of_state(state: State) -> Entries:
     """The entries of a state by their names in a tensordict."""
     return {unravel_key(("state", key)): x for key, x in state.items()}
 
 
-def _record(stepper: Stepper, state: State, tensordict: TensorDictBase) -> Record:
-    """What is known of a state, on rows; there is no reward before the first step."""
-    outputs = {key: tensordict.get(key) for key in stepper.output_layout.place if key != "reward"}
-    outputs["reward"] = torch.zeros_like(outputs["done"], dtype=stepper.layout.dtypes[0])
-    return Record(stepper.layout.pack(state), stepper.output_layout.pack(outputs), tensordict.get("observation"))
-
-
-def _restarted(stepper: Stepper, source: Source, end: Record, done: Tensor) -> Record:
-    """The record to continue from, with fresh starts where ``done`` (1, n); gradients stop there."""
-    entries = flat(source.starts(done[0]))
-    state = {key: entries[unravel_key(("state", key))].detach() for key in stepper.layout.place}
-    fresh = _record(stepper, state, TensorDict({k: x.detach() for k, x in entries.items()}, done.shape[1:]))
-    return Record(
-        fresh.state.where(done, end.state),
-        fresh.outputs.where(done, end.outputs),
-        torch.where(done.t(), fresh.observation, end.observation),
-    )
-
-
 def _may_restart(done: Tensor) -> bool:
-    """Whether an episode may have ended: whoever asks an accelerator has to wait for it."""
+    """Whether an episode may have ended: reading that of an accelerator would be a synchronisation."""
     return not looks_are_free(done.device) or bool(done.any())
 
 
 def _stacked(records: list[Record]) -> Record:
-    """Some records as one, as :func:`_entries` reads it."""
-    rows = (
-        Rows(*(torch.stack(x) for x in zip(*part, strict=True)))
-        for part in ([record.state for record in records], [record.outputs for record in records])
-    )
-    return Record(*rows, torch.stack([record.observation for record in records], 1))
-
-
-def _entries(stepper: Stepper, records: Record, *prefix: str) -> dict[Key, Tensor]:
-    """All entries of the records of a horizon, each (n, time, ...)."""
-    entries = _of_state(stepper.layout.unpack(records.state))
-    entries |= stepper.unpack_outputs(records.outputs)
-    entries["observation"] = records.observation
-    return {unravel_key((*prefix, key)): x for key, x in entries.items()}
+    """Some records as one, as :meth:`_Loop.entries` reads it."""
+    rows = [torch.stack(x) for x in zip(*(record.leaves[:6] for record in records), strict=True)]
+    return Record.of([*rows, torch.stack([record.observation for record in records], 1)])

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_quad.engine.simulation import Transition
+
 Key = str | tuple[str, ...]
 Entries = Mapping[Any, Tensor]
 
@@ -23,13 +25,27 @@ class Rows(NamedTuple):
     integers: Tensor
     flags: Tensor
 
-    def detach(self) -> Rows:
-        """The same without gradient."""
-        return Rows(*(x.detach() for x in self))
-
     def where(self, condition: Tensor, other: Rows) -> Rows:
         """These where the condition holds, the others elsewhere."""
         return Rows(*(torch.where(condition, mine, its) for mine, its in zip(self, other, strict=True)))
+
+
+class Record(NamedTuple):
+    """A transition on rows, or all of a horizon."""
+
+    state: Rows  # at the end of the step
+    outputs: Rows  # reward, flags and so on, without the observation
+    observation: Tensor  # (n, k), or (n, time, k)
+
+    @classmethod
+    def of(cls, leaves: Any) -> Record:
+        """From its seven tensors."""
+        return cls(Rows(*leaves[:3]), Rows(*leaves[3:6]), leaves[6])
+
+    @property
+    def leaves(self) -> tuple[Tensor, ...]:
+        """Its seven tensors."""
+        return (*self.state, *self.outputs, self.observation)
 
 
 class Layout:
@@ -51,12 +67,8 @@ class Layout:
         for key, (kind, _, _) in self.place.items():
             columns[kind].append(entries[key].flatten(1).t())
         like = next(iter(entries.values()))
-        return Rows(
-            *(
-                torch.cat(column) if column else like.new_empty((0, len(like)), dtype=dtype)
-                for column, dtype in zip(columns, self.dtypes, strict=True)
-            )
-        )
+        both = zip(columns, self.dtypes, strict=True)
+        return Rows(*(torch.cat(x) if x else like.new_empty((0, len(like)), dtype=dtype) for x, dtype in both))
 
     def unpack(self, rows: Rows) -> dict[Key, Tensor]:
         """Views of the entries, each (n, ...), or (n, time, ...) of a horizon."""
@@ -75,7 +87,12 @@ class Layout:
         return torch.cat(parts)
 
 
-def flat(entries: Mapping[Any, Any], *prefix: str) -> dict[Key, Tensor]:
+def record(end: Transition, layout: Layout, output_layout: Layout) -> Record:
+    """A transition on rows."""
+    return Record(layout.pack(end.state), output_layout.pack(flat(end.outputs)), end.outputs["observation"])
+
+
+def flat(entries: Mapping[Any, Any], *prefix: str) -> dict[Any, Tensor]:
     """The entries of nested mappings, by one key each."""
     result = {}
     for key, value in entries.items():
@@ -85,7 +102,7 @@ def flat(entries: Mapping[Any, Any], *prefix: str) -> dict[Key, Tensor]:
     return result
 
 
-def nested(entries: Entries) -> dict[str, Any]:
+def nested(entries: Entries) -> dict[Any, Any]:
     """The reverse of :func:`flat`."""
     result: dict[str, Any] = {}
     for key, value in entries.items():
@@ -103,5 +120,5 @@ def like(flags: Tensor, x: Tensor) -> Tensor:
 
 
 def looks_are_free(device: torch.device) -> bool:
-    """Whether a value on the device can be read at once; an accelerator would have to finish all that it was given."""
+    """Whether reading values on the device needs no synchronisation."""
     return device.type == "cpu"

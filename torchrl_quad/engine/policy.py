@@ -31,22 +31,25 @@ class PlainPolicy(Protocol):
     weights: tuple[Tensor, ...]
     """The tensors that it learns, of which gradients are wanted."""
 
-    def fits(self, inputs: Sequence[Tensor]) -> bool:
-        """Whether it can read inputs of this width, precision and device; otherwise it is called, and can complain."""
-
     size: int | None
     """The entries of an action, of those drawn; None for all of them."""
+
+    def fits(self, inputs: Sequence[Tensor]) -> bool:
+        """Whether it can read inputs of this width, precision and device; otherwise it is called, and can complain."""
+        ...
 
     def drawn(self, steps: int, n: int, before: Mapping[Any, Tensor]) -> Tensor:
         """What changes from step to step and does not depend on the state, such as noise: (steps, n, at least size).
 
         ``before`` holds what the policy has written in the step before the first one, if it was there.
         """
+        ...
 
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
     ) -> tuple[list[Tensor], dict[Any, Tensor]]:
         """What a backward pass needs, each (n, ...), and the entries that it writes, ``action`` among them."""
+        ...
 
     def adjoint(
         self,
@@ -57,9 +60,11 @@ class PlainPolicy(Protocol):
         grads: dict[Any, Tensor],
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """Traces for ``weight_gradient``, each (n, ...), and the gradients of its inputs and of what was drawn."""
+        ...
 
     def weight_gradient(self, traces: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of its weights, over a batch (n) of any steps."""
+        ...
 
 
 class GivenActions:
@@ -103,7 +108,8 @@ class ActionSequence(TensorDictModuleBase):
                 "actions must be a floating-point tensor (horizon, num_envs, k), such as "
                 f"torch.zeros(32, env.num_envs, 4, requires_grad=True); got {got}."
             )
-        self.in_keys, self.out_keys = [], ["action"]
+        self.in_keys: list[Any] = []
+        self.out_keys: list[Any] = ["action"]
         super().__init__()
         self.actions, self.played = actions, 0
 
@@ -112,7 +118,7 @@ class ActionSequence(TensorDictModuleBase):
         return tensordict.set("action", self.take(1)[0])
 
     def plain(self) -> GivenActions:
-        """The rest of the sequence on plain tensors, for an environment that flies it inside its compiled step."""
+        """The rest of the sequence, for a compiled step."""
         return GivenActions(self.take)
 
     def take(self, steps: int) -> Tensor:
@@ -120,7 +126,7 @@ class ActionSequence(TensorDictModuleBase):
         left = len(self.actions) - self.played
         if steps > left:
             raise UserValueError(
-                f"The sequence has {len(self.actions)} actions, {left} of them unplayed, and the flight wants {steps} "
+                f"The sequence has {len(self.actions)} actions, {left} of them unplayed, and the flight needs {steps} "
                 "more. Give as many actions as the flight has steps, and build a new ActionSequence for each flight."
             )
         self.played += steps

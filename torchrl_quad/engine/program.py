@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.func import vjp
 
 from torchrl_quad.engine.compiling import Compiled
-from torchrl_quad.engine.packing import Layout, Rows, flat, like
-from torchrl_quad.engine.policy import PlainPolicy
-from torchrl_quad.engine.simulation import Simulation, State, Transition
-
-
-class Record(NamedTuple):
-    """A transition on rows."""
-
-    state: Rows  # at the end of the step
-    outputs: Rows  # reward, flags and so on, without the observation
-    observation: Tensor  # (n, k)
+from torchrl_quad.engine.packing import Layout, Rows, like, record
+from torchrl_quad.engine.policy import GivenActions, PlainPolicy
+from torchrl_quad.engine.simulation import Simulation, State
 
 
 class StepProgram:
@@ -46,14 +38,15 @@ class StepProgram:
 
     def __init__(self, simulation: Simulation, layout: Layout, output_layout: Layout, options: dict[str, Any]) -> None:
         self.simulation, self.layout, self.output_layout = simulation, layout, output_layout
-        self.substeps, self.noise_names, self.parameter_count = simulation.substeps, (), len(simulation.parameters)
+        self.substeps, self.parameter_count = simulation.substeps, len(simulation.parameters)
+        self.noise_names: tuple[str, ...] = ()
         substep = simulation.rows_step()
 
         def pull(x: Tensor, inputs: tuple[Any, ...], grad: Tensor) -> tuple[Tensor, ...]:
             grad_x, grad_inputs = vjp(lambda x, inputs: substep(x, *inputs), x, inputs)[1](grad)
             return (grad_x, *_flat(grad_inputs))  # a flat tuple: only such a region is traced once for all
 
-        self.substep, self.pull = (torch.compiler.nested_compile_region(f) for f in (substep, pull))
+        self.substep, self.pull = _region(substep), _region(pull)
         self.forward = Compiled(self._forward, options)
         self.adjoint = Compiled(self._adjoint, options)
 
@@ -74,22 +67,21 @@ class StepProgram:
         def begin(floats: Tensor, action: Tensor, parameters: tuple[Tensor, ...]) -> tuple[Any, Any]:
             state = self.layout.unpack(rows._replace(floats=floats))
             before, is_valid, x, inputs = self.simulation.begin(state, valid, action, parameters)
-            floats = {key: x for key, x in before.items() if x.is_floating_point()}
-            return (x, inputs, floats), (is_valid, {key: x for key, x in before.items() if key not in floats})
+            own = {key: x for key, x in before.items() if x.is_floating_point()}
+            return (x, inputs, own), (is_valid, {key: x for key, x in before.items() if key not in own})
 
         def finish(floats: State, x: Tensor) -> tuple[Any, Any]:
             end = self.simulation.finish({**others, **floats}, x, is_valid, noise)
             end_record = record(end, self.layout, self.output_layout)
             return (end_record.state.floats, end_record.outputs.floats, end_record.observation), end.valid
 
-        primals, pull_begin, (is_valid, others) = vjp(begin, rows.floats, action, parameters, has_aux=True)
-        first, inputs, before = primals
-        _, pull_finish, keep = vjp(finish, before, states[-1], has_aux=True)
+        (first, inputs, before), pull_begin, (is_valid, others) = _vjp(begin, rows.floats, action, parameters)
+        _, pull_finish, keep = _vjp(finish, before, states[-1])
         grad_before, grad_x = pull_finish(grads)
-        total = None
+        total: list[Tensor] = []
         for x in reversed((first, *states[:-1])):
             grad_x, *more = self.pull(x, inputs, grad_x.contiguous())
-            total = more if total is None else [a + b for a, b in zip(total, more, strict=True)]
+            total = [a + b for a, b in zip(total, more, strict=True)] if total else more
         # What has become meaningless may have infinite derivatives. They must not reach what all share.
         grad_x, *total = (torch.where(keep, g, 0.0) for g in (grad_x, *total))
         grad_before = {key: torch.where(like(keep, g), g, 0.0) for key, g in grad_before.items()}
@@ -124,24 +116,24 @@ class PolicyProgram:
         self.adjoint = Compiled(self._adjoint, options)
 
     def _forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        weights, inputs, (drawn,) = _split(inputs, *self.counts)
-        kept, written = self.policy.forward(weights, inputs, drawn)
+        weights, read, (drawn,) = self._parts(inputs)
+        kept, written = self.policy.forward(weights, read, drawn)
         return *kept, *(written[key] for key in self.policy.out_keys)
 
     def _adjoint(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        weights, inputs, (drawn, *more) = _split(inputs, *self.counts)
+        weights, read, (drawn, *more) = self._parts(inputs)
         count = len(more) - len(self.policy.out_keys)
         grads = dict(zip(self.policy.out_keys, more[count:], strict=True))
-        traces, grad_inputs, grad_drawn = self.policy.adjoint(weights, inputs, more[:count], drawn, grads)
+        traces, grad_inputs, grad_drawn = self.policy.adjoint(weights, read, more[:count], drawn, grads)
         return *traces, *grad_inputs, grad_drawn
 
+    def _parts(self, inputs: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor], Sequence[Tensor]]:
+        """Weights, what the policy reads, and the rest of a flat list."""
+        first, count = self.counts
+        return inputs[:first], inputs[first : first + count], inputs[first + count :]
 
-def record(end: Transition, layout: Layout, output_layout: Layout) -> Record:
-    """A transition on rows."""
-    return Record(layout.pack(end.state), output_layout.pack(flat(end.outputs)), end.outputs["observation"])
 
-
-def policy_inputs(policy: PlainPolicy, state: State, observation: Tensor) -> list[Tensor]:
+def policy_inputs(policy: PlainPolicy | GivenActions, state: State, observation: Tensor) -> list[Tensor]:
     """The entries that a policy reads."""
     return [observation if key == "observation" else state[name_in_state(key)] for key in policy.in_keys]
 
@@ -151,8 +143,15 @@ def name_in_state(key: tuple[str, ...]) -> Any:
     return key[1] if len(key) == 2 else key[1:]
 
 
-def _split(values: Sequence[Any], first: int, second: int) -> tuple[Sequence[Any], ...]:
-    return values[:first], values[first : first + second], values[first + second :]
+def _region(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, compiled once for all of its calls in a step."""
+    return torch.compiler.nested_compile_region(function)
+
+
+def _vjp(function: Callable[..., Any], *primals: Any) -> tuple[Any, Callable[..., Any], Any]:
+    """What the function returns, its derivative, and what it returns besides."""
+    outputs: Any = vjp(function, *primals, has_aux=True)
+    return outputs
 
 
 def _flat(inputs: Sequence[Any]) -> list[Tensor]:
@@ -161,5 +160,5 @@ def _flat(inputs: Sequence[Any]) -> list[Tensor]:
 
 def _like(inputs: Sequence[Any], flat: Sequence[Tensor]) -> tuple[Any, ...]:
     """The reverse of :func:`_flat`."""
-    flat = iter(flat)
-    return tuple(tuple(next(flat) for _ in part) if isinstance(part, tuple) else next(flat) for part in inputs)
+    rest = iter(flat)
+    return tuple(tuple(next(rest) for _ in part) if isinstance(part, tuple) else next(rest) for part in inputs)

@@ -1,17 +1,28 @@
-"""Run a control step on rows: eager, or compiled with its derivative as one node of the graph."""
+"""Run a control step on rows: eager, or a compiled horizon with its derivative as one node of the graph."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
-from typing import Any
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
-from torchrl_quad.engine.node import Flight, Horizon, fly_horizon
-from torchrl_quad.engine.packing import Layout, Rows, flat, nested
+from torchrl_quad.engine.packing import Layout, Record, Rows, flat, nested, record
 from torchrl_quad.engine.policy import GivenActions, PlainPolicy
-from torchrl_quad.engine.program import PolicyProgram, Record, StepProgram, record
+from torchrl_quad.engine.program import PolicyProgram, StepProgram, name_in_state, policy_inputs
 from torchrl_quad.engine.simulation import Simulation, State, Transition
+from torchrl_quad.errors import Unsupported
+
+LEARNING_BATCH = 1024  # so many steps of one drone make a batch for the gradient of the weights
+
+
+class Flight(NamedTuple):
+    """All steps of a compiled horizon, their tensors one above the other."""
+
+    ends: Record  # rows (steps, rows, n), observations (n, steps, k)
+    written: dict[Any, Tensor]  # by the policy, (n, steps, ...)
+    restarts: list[tuple[int, Record, Tensor]]  # where some restarted: the step before, from where, and who
 
 
 class Stepper:
@@ -27,7 +38,8 @@ class Stepper:
         state, outputs = simulation.example()
         self.layout = Layout(state)
         self.output_layout = Layout({key: x for key, x in flat(outputs).items() if key != "observation"})
-        self.example = record(Transition(state, outputs, None), self.layout, self.output_layout)
+        meaningful = torch.ones(0, dtype=torch.bool)  # of an example nobody asks
+        self.example = record(Transition(state, outputs, meaningful), self.layout, self.output_layout)
         self.steps: dict[int, StepProgram] = {}  # by the number of the simulation's parameters
         self.policies: dict[Hashable, PolicyProgram] = {}  # by signature
 
@@ -47,8 +59,9 @@ class Stepper:
         if not self.is_compiled:
             end = self.simulation(state, valid, action, noise)
             return end.state, end.outputs
-        state, outputs, observation = self.step_rows(self.layout.pack(state), valid, action, noise)
-        return self.layout.unpack(state), {**nested(self.unpack_outputs(outputs)), "observation": observation}
+        after = self.step_rows(self.layout.pack(state), valid, action, noise)
+        outputs = {**nested(self.unpack_outputs(after.outputs)), "observation": after.observation}
+        return self.layout.unpack(after.state), outputs
 
     def unpack_outputs(self, rows: Rows) -> dict[Any, Tensor]:
         """The outputs of a step, or of a horizon, by name; the constants among them without gradient."""
@@ -57,10 +70,9 @@ class Stepper:
 
     def step_rows(self, rows: Rows, valid: Tensor, action: Tensor, noise: dict[str, Tensor]) -> Record:
         """One compiled step on rows, from a state under an action (n, k); the rest is that of :meth:`fly`."""
-        start = Record(rows, self.example.outputs, self.example.observation)
-        flight = self.fly(GivenActions(lambda _: action.unsqueeze(0)), start, valid, 1, lambda: noise)
-        state, outputs, observation = flight.ends
-        return Record(Rows(*(x[0] for x in state)), Rows(*(x[0] for x in outputs)), observation[:, 0])
+        start = self.example._replace(state=rows)
+        ends = self.fly(GivenActions(lambda _: action.unsqueeze(0)), start, valid, 1, lambda: noise).ends
+        return Record.of([*(x[0] for x in ends.leaves[:6]), ends.observation[:, 0]])
 
     def fly(
         self,
@@ -74,23 +86,211 @@ class Stepper:
     ) -> Flight:
         """A compiled horizon with its graph, as one node.
 
+        Gradients reach its start, what the policy draws (steps, n, k), its weights, and the parameters. They reach the
+        actions as well: the node of all that is flown has ``actions``, a tensor (steps, n, k) that stands for them, and
+        ``learns``, to be switched off for a backward pass that wants no gradient of the policy's weights.
+
         Args:
             policy: acts inside the step.
             start: where it begins.
             valid: where that state is meaningful, bool (n); elsewhere the episode ends with the first step.
             steps: at least one.
             noise: gives what each disturbance has drawn for the next step, by name.
-            restarted: from the end of a step where to go on, and who begins anew, bool (n); None if nobody does.
+            restarted: from the end of a step where to continue, and who restarts, bool (n); None if nobody does.
             before: what the policy has written in the step before.
         """
-        drawn = policy.drawn(steps, len(valid), before or {})
+        if self.options is None:
+            raise RuntimeError("Only a compiled stepper flies horizons.")
+        drawn, parameters = policy.drawn(steps, len(valid), before or {}), self.simulation.parameters
         self.simulation.check_action(drawn[0, :, : policy.size])
-        count = len(self.simulation.parameters)
-        if count not in self.steps:
-            self.steps[count] = StepProgram(self.simulation, self.layout, self.output_layout, self.options)
-        program = None
+        if len(parameters) not in self.steps:
+            program = StepProgram(self.simulation, self.layout, self.output_layout, self.options)
+            self.steps[len(parameters)] = program
+        acts = None
         if not isinstance(policy, GivenActions):
             if policy.signature not in self.policies:
                 self.policies[policy.signature] = PolicyProgram(policy, self.options)
-            program = self.policies[policy.signature]
-        return fly_horizon(Horizon(self.steps[count], policy, program, start, valid, steps, noise, restarted), drawn)
+            acts = self.policies[policy.signature]
+        horizon = Horizon(self.steps[len(parameters)], policy, acts, start, valid, steps, noise, restarted, [])
+        tensors = start.state.floats, start.observation, drawn, *policy.weights, *parameters
+        keeps = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
+        actions = drawn.new_zeros(()).expand(drawn[..., : policy.size].shape).requires_grad_(keeps)
+        leaves = _Horizon.apply(horizon, keeps, actions, *tensors)
+        if keeps:
+            leaves[0].grad_fn.actions, leaves[0].grad_fn.learns = actions, True
+        return Flight(Record.of(leaves), dict(zip(policy.out_keys, leaves[7:], strict=True)), horizon.restarts)
+
+
+class Horizon(NamedTuple):
+    """What a compiled horizon flies with, besides the tensors that have gradients; see :meth:`Stepper.fly`."""
+
+    step: StepProgram
+    policy: PlainPolicy | GivenActions
+    policy_program: PolicyProgram | None  # None for given actions
+    start: Record
+    valid: Tensor
+    steps: int
+    noise: Callable[[], dict[str, Tensor]]
+    restarted: Callable[[Record], tuple[Record, Tensor] | None]
+    restarts: list[tuple[int, Record, Tensor]]  # to be filled
+
+
+class _Horizon(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, horizon: Horizon, keeps: bool, _: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+        step, policy = horizon.step, _Policy(horizon)
+        floats, observation, drawn, *others = (x.detach().contiguous() for x in tensors)
+        count = len(policy.weights)
+        policy.weights, parameters = others[:count], others[count:]
+        rows, valid = Rows(floats, *horizon.start.state[1:]), horizon.valid
+        saved, ends, entries = [], [], []
+        leaves = written = ()
+        for t in range(horizon.steps):
+            inputs = policy.inputs(rows, observation)
+            kept, written = policy.forward(inputs, drawn[t], is_first=t == 0)
+            noise = horizon.noise()
+            step.noise_names = tuple(noise)
+            # The stride of a single row can be anything, and a compiler takes another one for another kind of input.
+            fixed = (x.reshape(-1).view(x.shape) for x in rows[1:])
+            start = (rows.floats, *fixed, valid, written[policy.action], *parameters, *noise.values())
+            states_end = (step.forward if t == 0 else step.forward.again)(*start)
+            states, leaves = states_end[: step.substeps], states_end[step.substeps :]
+            end = Record.of(leaves)
+            if keeps:
+                saved.append((start, states, inputs, kept, drawn[t]))
+            ends.append(leaves)
+            entries.append(written)
+            if t == 0:
+                valid = torch.ones_like(valid)  # a step leads to meaningful states
+            if t < horizon.steps - 1 and (again := horizon.restarted(end)) is not None:
+                horizon.restarts.append((t, *again))
+                end = again[0]
+            rows, observation = end.state, end.observation
+        ctx.horizon, ctx.parameter_count = horizon, len(parameters)
+        ctx.like = [(x.shape, x.dtype, x.device) for x in (leaves[0], leaves[3], leaves[6], *written)]
+        ctx.shapes = [tuple(map(len, parts[:4])) for parts in saved]
+        ctx.save_for_backward(
+            *policy.weights, *(x for parts in saved for part in (*parts[:4], parts[4:]) for x in part)
+        )
+        ctx.set_materialize_grads(False)
+        stacked = [_stack(x, 0) for x in zip(*(leaves[:6] for leaves in ends), strict=True)]
+        ctx.mark_non_differentiable(*stacked[1:3], *stacked[4:6])
+        observations = _stack([leaves[6] for leaves in ends], 1)
+        return *stacked, observations, *(_stack(x, 1) for x in zip(*entries, strict=True))
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():  # so it is only under create_graph=True
+            raise Unsupported(
+                "A compiled flight has first derivatives only. For second ones (create_graph=True) call env.eager() "
+                "and fly again."
+            )
+        horizon, policy, step = ctx.horizon, _Policy(ctx.horizon, ctx.learns), ctx.horizon.step
+        saved = iter(ctx.saved_tensors)
+        policy.weights = _take(saved, len(policy.weights))
+        steps = [(*(_take(saved, count) for count in counts), next(saved)) for counts in ctx.shapes]
+        # A tensor for each: a compiler would count on two being one.
+        zeros = [torch.zeros(shape, dtype=dtype, device=device) for shape, dtype, device in ctx.like]
+        restarted = {t: who for t, _, who in horizon.restarts}
+        of_end, of_written = (grads[0], grads[3], grads[6]), grads[7:]
+        grad_floats: Tensor | None = None
+        grad_observation: Tensor | None = None
+        grads_action, grads_drawn, grads_parameter = [], [], []
+        for t in reversed(range(horizon.steps)):
+            start, states, inputs, kept, drawn = steps[t]
+            if t in restarted and grad_floats is not None:
+                grad_floats = torch.where(restarted[t], 0.0, grad_floats)
+            if t in restarted and grad_observation is not None:
+                grad_observation = torch.where(restarted[t].unsqueeze(1), 0.0, grad_observation)
+            end = [None if g is None else g[:, t] if i == 2 else g[t] for i, g in enumerate(of_end)]
+            end[0], end[2] = _add(end[0], grad_floats), _add(end[2], grad_observation)
+            end = [zero if g is None else g.contiguous() for g, zero in zip(end, zeros, strict=False)]
+            is_first = t == horizon.steps - 1
+            adjoint = step.adjoint if is_first else step.adjoint.again
+            grad_floats, grad_action, *grad_parameters = adjoint(*start, *states, *end)
+            written = [None if g is None else g[:, t] for g in of_written]
+            written[policy.action] = _add(written[policy.action], grad_action)
+            grads_action.append(written[policy.action])
+            written = [zero if g is None else g.contiguous() for g, zero in zip(written, zeros[3:], strict=True)]
+            grad_inputs, grad_drawn = policy.adjoint(inputs, kept, drawn, written, is_first=is_first)
+            grad_floats, grad_observation = policy.add(grad_floats, grad_inputs)
+            grads_drawn.append(grad_drawn)
+            grads_parameter.append(grad_parameters)
+        actions = torch.stack(grads_action[::-1]) if ctx.needs_input_grad[2] else None
+        drawn = torch.stack(grads_drawn[::-1]) if ctx.needs_input_grad[5] else None
+        parameters = (torch.stack(x).sum(0) for x in zip(*grads_parameter, strict=True))
+        return None, None, actions, grad_floats, grad_observation, drawn, *policy.weight_gradients(), *parameters
+
+
+class _Policy:
+    """The policy of one pass over a horizon, on lists of tensors; backwards it gathers the gradient of its weights."""
+
+    def __init__(self, horizon: Horizon, learns: bool = True) -> None:
+        self.learns = learns
+        self.policy, self.program, self.layout = horizon.policy, horizon.policy_program, horizon.step.layout
+        self.weights: Sequence[Tensor] = self.policy.weights
+        self.action = list(self.policy.out_keys).index("action")
+        self.steps: list[Sequence[Tensor]] = []  # whose gradient in the weights is still to be taken
+        self.total: list[Tensor] | None = None
+
+    def inputs(self, rows: Rows, observation: Tensor) -> list[Tensor]:
+        """What it reads."""
+        if tuple(self.policy.in_keys) == ("observation",):
+            return [observation]
+        return policy_inputs(self.policy, self.layout.unpack(rows) if self.policy.in_keys else {}, observation)
+
+    def forward(
+        self, inputs: list[Tensor], drawn: Tensor, *, is_first: bool
+    ) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+        """What it keeps, and what it writes."""
+        if self.program is None:
+            return [], [drawn]
+        function = self.program.forward if is_first else self.program.forward.again
+        values = function(*self.weights, *inputs, drawn)
+        count = len(values) - len(self.policy.out_keys)
+        return values[:count], values[count:]
+
+    def adjoint(
+        self, inputs: list[Tensor], kept: list[Tensor], drawn: Tensor, grads: list[Tensor], *, is_first: bool
+    ) -> tuple[Sequence[Tensor], Tensor]:
+        """The gradients of its inputs, and of what was drawn, from those of what it wrote."""
+        if self.program is None:
+            return [], grads[self.action]
+        function = self.program.adjoint if is_first else self.program.adjoint.again
+        values = function(*self.weights, *inputs, drawn, *kept, *grads)
+        end = len(values) - 1 - len(inputs)
+        if self.weights and self.learns:
+            self.steps.append(values[:end])
+            if len(self.steps) * len(drawn) >= LEARNING_BATCH:
+                self._learn(self.program)
+        return values[end:-1], values[-1]
+
+    def add(self, grad_floats: Tensor, grad_inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor | None]:
+        """The gradients of the state's floats, the policy's share included, and of the observation."""
+        of_state = dict(zip(self.policy.in_keys, grad_inputs, strict=True))
+        of_observation = of_state.pop("observation", None)
+        return self.layout.add(grad_floats, {name_in_state(key): g for key, g in of_state.items()}), of_observation
+
+    def weight_gradients(self) -> Sequence[Tensor | None]:
+        """The gradient of each weight, over all steps."""
+        if self.steps and self.program is not None:
+            self._learn(self.program)
+        return self.total or [None] * len(self.weights)
+
+    def _learn(self, program: PolicyProgram) -> None:
+        traces = self.steps[0] if len(self.steps) == 1 else [torch.cat(x) for x in zip(*self.steps, strict=True)]
+        grads = program.policy.weight_gradient(traces)
+        self.total = grads if self.total is None else [a + b for a, b in zip(self.total, grads, strict=True)]
+        self.steps = []
+
+
+def _take(values: Iterator[Tensor], count: int) -> list[Tensor]:
+    return [next(values) for _ in range(count)]
+
+
+def _stack(steps: Any, dim: int) -> Tensor:
+    return torch.stack(steps, dim) if len(steps) > 1 else steps[0].unsqueeze(dim)
+
+
+def _add(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+    return b if a is None else a if b is None else a + b

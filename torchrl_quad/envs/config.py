@@ -90,37 +90,23 @@ WeightsOption = Annotated[Any, AfterValidator(_weights)]
 
 
 def as_disturbances(value: Any) -> list[Disturbance]:
-    """Disturbances of a user's own, from one or a list of instances, classes, and what recipes write for them.
-
-    On a command line, where there are no objects, a disturbance is the path of its class, or a mapping that adds
-    arguments: ``{"_target_": "mypackage.GyroBias", "spread": 0.1}``.
-
-    Raises:
-        TypeError, ValueError: one is something else, or Python finds no such class.
-    """
+    """A user's own disturbances, from one or a list of instances, classes, paths of classes, and mappings of the path
+    and arguments of one: ``{"_target_": "mypackage.GyroBias", "spread": 0.1}``."""
     is_one = isinstance(value, (str, Mapping, Disturbance, type))
     if not (is_one or isinstance(value, Sequence)):
         raise UserTypeError(f"disturbances must be a list of Disturbance, got {type(value).__name__}.")
-    return [_disturbance(x) for x in ([value] if is_one else value)]
-
-
-def _disturbance(value: Any) -> Disturbance:
-    arguments: dict[str, Any] = {}
-    if isinstance(value, Mapping):
-        arguments = {str(name): x for name, x in value.items() if name != "_target_"}
-        value = value.get("_target_", value)
-    found = imported(value, "disturbance") if isinstance(value, str) else value
-    if isinstance(found, type) and issubclass(found, Disturbance):
-        try:
-            return found(**arguments)
-        except TypeError as error:
-            raise UserTypeError(f"disturbances: {found.__name__}: {error}") from error
-    if not isinstance(found, Disturbance):
-        raise UserTypeError(
-            f"disturbances: each must be a Disturbance, its class, its path such as 'mypackage.GyroBias', or a mapping "
-            f"with its path as _target_; got {type(found).__name__}."
-        )
-    return found
+    built = []
+    for x in [value] if is_one else value:
+        arguments = dict(x) if isinstance(x, Mapping) else {}
+        found = arguments.pop("_target_", x)
+        found = imported(found, "disturbance") if isinstance(found, str) else found
+        if isinstance(found, type) and issubclass(found, Disturbance):
+            found = build(found, "disturbances", arguments)
+        if not isinstance(found, Disturbance):
+            got = type(found).__name__
+            raise UserTypeError(f"disturbances: each must be a Disturbance, its class, or its path; got {got}.")
+        built.append(found)
+    return built
 
 
 # -- what is built of them ---------------------------------------------------------------------------------------------

@@ -154,9 +154,6 @@ class Wind(Disturbance):
         spread: by which the mean of an episode may differ to either side, along x, y and z [m/s]; drawn at reset.
         gust: standard deviation of the gusts [m/s]; five of them, the mean and the spread add up to 100 m/s at most.
         gust_time: the time after which a gust has decayed to 1/e, 0.001 to 1e6 s.
-
-    Raises:
-        ValueError: a value has the wrong type, is out of its range, or has the wrong number of entries.
     """
 
     mean: Speeds = (0.0, 0.0, 0.0)
@@ -206,9 +203,6 @@ class Sensors(Disturbance):
         velocity: standard deviation per axis of the world frame, 0 to 300 m/s.
         angular_velocity: standard deviation per axis of the body frame, 0 to 100 rad/s.
         delay: control steps by which the readings lag behind, 0 to 1000.
-
-    Raises:
-        ValueError: a value has the wrong type or is out of its range.
     """
 
     position: PositionNoise = 0.0
@@ -263,9 +257,6 @@ class RandomStart(Disturbance):
         yaw: the greatest angle by which it is turned to either side, 0 to pi rad.
         velocity: the greatest speed to either side per axis of the world frame, 0 to 300 m/s.
         angular_velocity: the greatest rate to either side per axis of the body frame, 0 to 100 rad/s.
-
-    Raises:
-        ValueError: a value has the wrong type or is out of its range, beyond which no flight goes.
     """
 
     tilt: Angle = 0.0

@@ -72,7 +72,6 @@ class ForestEnv(QuadrotorEnv):
     mean over an episode; ``clearance``, d of the trees and the ground [m], the least of an episode.
 
     Args:
-        num_envs: number of drones that fly in parallel.
         difficulty: how dense the forest is: 0.04 trees per square metre, at least 1.5 m from each other, for "easy",
             0.08 and 1.2 m for "middle", 0.12 and 0.9 m for "hard".
         density: of trees, 0 to 2 per square metre; overrides the difficulty's. Trees that find no place are left out.
@@ -83,11 +82,10 @@ class ForestEnv(QuadrotorEnv):
         camera: as for :class:`~torchrl_quad.envs.QuadrotorEnv`; a mapping changes the camera of 16 x 12 pixels, 90
             degrees and 10 m. None flies without one.
         scene: replaces the random forest, as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
-        max_episode_steps: control steps after which an episode is truncated.
         **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
 
     Raises:
-        ValueError: an option is out of its range, or the scene leaves no way through.
+        ValueError: the scene leaves no way through.
     """
 
     length, half_width, ceiling = 30.0, 8.0, 4.0  # [m]
@@ -257,8 +255,7 @@ class Forest(Scene):
         **options: as for :class:`~torchrl_quad.Scene`, but for ground and source.
 
     Raises:
-        ValueError: a value is out of its range, or there are more than 1000 trees; (in use) the drone is as wide as the
-            gap.
+        ValueError: there are more than 1000 trees; (in use) the drone is as wide as the gap.
     """
 
     is_drawn_elsewhere = True

@@ -40,9 +40,6 @@ class Shape:
         name: of the object in the legend.
         color: of lines and surfaces.
         opacity: of a surface, above 0, at most 1.
-
-    Raises:
-        ValueError: points, faces or colour are something else.
     """
 
     points: Any  # a tensor, once it is built
@@ -111,11 +108,7 @@ class Shape:
 
 
 def as_points(what: str, points: Any) -> Tensor:
-    """Points (n, 3) as pictures take them: on the CPU, in single precision, without gradient.
-
-    Raises:
-        ValueError: they are something else.
-    """
+    """Points (n, 3) as pictures take them: on the CPU, in single precision, without gradient."""
     found = as_numbers(points)
     if found is None:
         raise UserValueError(f"{what} must be points (n, 3) [m], got {shown(points)}.")
@@ -180,9 +173,6 @@ class Markers:
         shapes: other objects.
         progress: the metric that best shows how a flight goes; by default the distance to the target.
         success: the value of the progress, in SI units, from which a state fulfils the task.
-
-    Raises:
-        ValueError: something has another type or shape.
     """
 
     target: str = "target"

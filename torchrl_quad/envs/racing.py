@@ -68,18 +68,12 @@ class RacingEnv(QuadrotorEnv):
     lap; ``time_near_gate`` [s], within 1 m of the next gate.
 
     Args:
-        num_envs: number of drones that fly in parallel.
         track: "visfly", "six_gates", the path of a YAML file, or a mapping, with ``gates``, a list of 2 to 1000 centres
             [m]; and, if wanted, ``starts``, as many points [m] (by default half way between gates), and
             ``gate_radius``, 0.01 to 100 m. Coordinates are within 10 km.
         reward: which of the two rewards above.
         gate_bonus: how gates are paid, as above.
-        max_episode_steps: control steps after which an episode is truncated.
         **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
-
-    Raises:
-        ValueError: an option is unknown, or the track is not one.
-        FileNotFoundError: there is no such file.
     """
 
     start_range = 0.2  # [m], to both sides of the start

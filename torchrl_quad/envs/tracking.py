@@ -33,10 +33,9 @@ def lemniscate(phase: Tensor, centre: tuple[float, float, float], half_length: f
     return torch.stack((x + half_length * cosine, y + half_length * sine * cosine, torch.full_like(phase, z)), -1)
 
 
-CURVES: dict[str, tuple[Curve, float]] = {  # by name: the curve, and its period [s]
+CURVES: dict[str, tuple[Curve, float]] = {  # by name: the curve, and its period [s]; the lemniscate is not the paper's
     "slow_circle": (functools.partial(circle, centre=(2.0, 0.0, 1.0), radius=2.0), 10.0),
     "fast_circle": (functools.partial(circle, centre=(3.0, 0.0, 2.0), radius=1.5), 2.0),
-    # Size and period chosen here.
     "lemniscate": (functools.partial(lemniscate, centre=(2.0, 0.0, 1.5), half_length=2.0), 8.0),
 }
 _CURVE = f"one of {', '.join(CURVES)}, or a function from phases (*) [rad] to positions (*, 3) [m]"
@@ -71,16 +70,14 @@ class TrackingEnv(QuadrotorEnv):
     after the start [m] (before that: since the start).
 
     Args:
-        num_envs: number of drones that fly in parallel.
         curve: "slow_circle" (2 m, 1.26 m/s), "fast_circle" (1.5 m, 4.7 m/s, 14.8 m/s2: out of reach at 2 rad/s, fly it
-            with a drone that turns at 6 rad/s), "lemniscate" (2 m, 8 s), or a function of your own from phases (*)
-            [rad] to positions (*, 3) [m], of period 2 pi, made of torch operations.
+            with a drone that turns at 6 rad/s), "lemniscate" (2 m, 8 s), or your own function from phases (*) [rad] to
+            positions (*, 3) [m], of period 2 pi, made of torch operations.
         period: time for one round, 0.1 to 10,000 s; by default that of the named curve.
-        max_episode_steps: control steps after which an episode is truncated.
         **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
 
     Raises:
-        ValueError: the curve is unknown, not periodic, underground, of the wrong shape, or has no period.
+        ValueError: the curve is not periodic, underground, of the wrong shape, or has no period.
     """
 
     lookahead = 10  # points observed
@@ -111,7 +108,7 @@ class TrackingEnv(QuadrotorEnv):
             curve, default_period = CURVES[curve]
             period = default_period if period is None else period
         if period is None:
-            raise UserValueError("A curve of your own needs a period in seconds, such as period=10.0; got none.")
+            raise UserValueError("Your own curve needs a period in seconds, such as period=10.0; got none.")
         self.curve = functools.partial(curve)  # not itself: an environment registers modules as its own
         self.period = period
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)

@@ -1,4 +1,4 @@
-"""A depth camera: what it sees, and what its sensor makes of it."""
+"""A depth camera: its images, and what its sensor makes of them."""
 
 from __future__ import annotations
 
@@ -32,31 +32,25 @@ Range = Annotated[float, between(0.01, 10_000.0)]
 class DepthCamera:
     """A depth camera on the drone, as an option of every task: ``HoveringEnv(camera=DepthCamera(), scene=...)``.
 
-    An image is (n, 1, height, width) [m]. Its first row is the uppermost, and its first column the leftmost. A pixel is
-    the depth along the optical axis of what its ray meets, as depth cameras measure it, or with ``along_ray`` the
-    length of the ray. What is further away than ``range``, and empty space, has the depth ``range``.
-
-    The pixels are square, and the rays go through their centres. Without ``pitch`` and ``quaternion`` the camera looks
-    along the body's x axis, and the top of the image is the body's z axis.
+    An image is (n, 1, height, width) [m], its first row the uppermost, its first column the leftmost. A pixel is the
+    depth along the optical axis, as depth cameras measure it, or with ``along_ray`` the length of the ray, at most
+    ``range``. Pixels are square, and rays go through their centres. Without ``pitch`` and ``quaternion`` the camera
+    looks along the body's x axis, and the top of the image is the body's z axis.
 
     Args:
         width: pixels of a row, at most 10,000; an image has at most a million.
         height: rows of pixels, at most 10,000.
-        field_of_view: the horizontal angle from edge to edge, 0.01 to 2.967 rad, 170 degrees, since a plane shows no
-            more; 90 degrees are 1.571 rad.
+        field_of_view: the horizontal angle from edge to edge, 0.01 to 2.967 rad (170 degrees).
         position: of the camera [m], x, y and z in the body frame, each within 10 m.
         pitch: by which the camera looks upwards [rad], -pi to pi.
-        quaternion: (w, x, y, z) of unit norm, from camera to body, in the place of the pitch.
-        range: how far the camera sees, 0.01 to 10,000 m.
+        quaternion: (w, x, y, z) of unit norm, from camera to body; replaces the pitch.
+        range: the greatest depth, 0.01 to 10,000 m.
         rate: control steps from one image to the next, 1 to 1000.
-        delay: control steps from the instant of an image until the policy sees it, 0 to 1000.
-        noise: standard deviation of the depth in each pixel by itself, as a share of the depth, 0 to 1.
-        dropout: the probability that a pixel measures nothing, which it shows as 0; below 1.
+        delay: control steps from the instant of an image until the policy gets it, 0 to 1000.
+        noise: standard deviation of the depth, independent in each pixel, as a share of the depth, 0 to 1.
+        dropout: the probability that a pixel measures nothing, and is 0; below 1.
         along_ray: whether a pixel is the length of the ray instead of the depth along the optical axis.
         differentiable: whether images have their derivative in the pose of the drone.
-
-    Raises:
-        ValueError: a value is out of its range; there is no pixel, or the field of view is 170 degrees or more.
     """
 
     width: Side = 16
@@ -74,13 +68,13 @@ class DepthCamera:
     differentiable: bool = False
 
     def __post_init__(self) -> None:
-        tall = math.atan(self.height / self.width * math.tan(0.5 * self.field_of_view)) * 2
+        tall = 2 * math.atan(self.height / self.width * math.tan(0.5 * self.field_of_view))
         if self.pixels > MAX_PIXELS:
             raise UserValueError(f"{self.width} x {self.height} pixels are too many. Give a million at most.")
         if tall >= MAX_ANGLE:
             raise UserValueError(
-                f"{self.height} rows of {self.width} square pixels see {math.degrees(tall):.0f} degrees from top to "
-                "bottom; 170 are too many. Give fewer rows, or a smaller field_of_view."
+                f"{self.height} rows of {self.width} square pixels span {math.degrees(tall):.0f} degrees from top to "
+                "bottom, and 170 are too many. Give fewer rows, or a smaller field_of_view."
             )
         q = self.quaternion
         if q is not None and abs(math.sqrt(sum(x * x for x in q)) - 1.0) > 1e-3:
@@ -123,11 +117,11 @@ class DepthCamera:
     def pose(self, position: Tensor, attitude: Tensor) -> tuple[Tensor, Tensor]:
         """Position (n, 3) [m] and attitude (n, 4) of the camera, world frame, from those of the drone."""
         offset = torch.tensor(tuple(self.position), dtype=position.dtype, device=position.device)
-        eye = position + quaternion.rotate(attitude, offset.expand_as(position))
-        return eye, quaternion.multiply(attitude, self.mount(attitude).expand_as(attitude))
+        place = position + quaternion.rotate(attitude, offset.expand_as(position))
+        return place, quaternion.multiply(attitude, self.mount(attitude).expand_as(attitude))
 
     def depth(self, solids: Primitives, position: Tensor, attitude: Tensor, *, fused: bool = False) -> Tensor:
-        """What the camera sees without noise, rate and delay.
+        """Images without noise, rate and delay.
 
         Args:
             solids: of n scenes.

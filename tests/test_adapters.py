@@ -153,7 +153,7 @@ WRONG = [
 WRONG += [x.numpy() for x in (FLOWN.long(), FLOWN.bool(), FLOWN.to(torch.complex64), FLOWN[:2], FLOWN / 0)]
 WRONG += [FLOWN.long(), FLOWN.bool(), FLOWN.to("meta"), FLOWN.to_sparse(), FLOWN[:2], FLOWN[0], FLOWN.log(), FLOWN / 0]
 OPTIONS = ["reset_mask", ["x"], {"seed": 0}, {"x": 1}]
-SEEDS = [-1, 2**63, 10**5000, 1.5, "0", True, np.array(0), torch.tensor(0)]
+SEEDS = [-1, 2**63, 10**5000, 1.5, "0", True, torch.tensor(0)]
 ADAPTERS = {
     "gymnasium": (drones, FLOWN.numpy()),
     "sb3": (lambda: DronesVecEnv(drones()), FLOWN.numpy()),
@@ -236,7 +236,7 @@ def test_what_is_no_environment_of_its_kind_is_refused(adapter):
     if adapter is DronesVecEnv:
         with pytest.raises(ValueError, match=r"'NextStep', and stable-baselines3 .* autoreset_mode=\"SameStep\""):
             adapter(gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=2))
-    with pytest.raises(AttributeError, match="no 'Rllib'. Choose from: DronesVecEnv, "):
+    with pytest.raises(AttributeError, match="no 'Rllib'. Choose from: .*DronesVecEnv, "):
         adapters.Rllib  # noqa: B018
 
 

@@ -14,9 +14,9 @@ HOVERING = "torchrl_quad/Hovering-v0"
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (np.zeros((3, 3)), r"The action has shape \(3, 3\), expected \(3, 4\), each .*, a row for each drone."),
+        (np.zeros((3, 3)), r"The action has shape \(3, 3\), expected \(3, 4\), one row per drone."),
         (np.zeros(4), r"shape \(4,\), expected \(3, 4\)"),
-        (None, r"shape \(\), expected \(3, 4\)"),
+        (None, r"must be an array of floats .*; got NoneType of object"),
         (np.zeros((3, 4), int), r"must be an array of floats of shape \(3, 4\) .*; got ndarray of int64"),
         ([[0.0] * 4, [0.0]], "must be an array of floats .* env.action_space.sample.*; got list"),
         ([[0, 0, 0, 0], [0, np.nan, 0, 0], [0, 0, 0, np.inf]], r"NaN or infinite at \[\[1, 1\], \[2, 3\]\]"),
@@ -32,19 +32,19 @@ def test_an_action_that_cannot_be_flown_is_refused(action, message):
 def test_one_drone_s_action_is_refused_in_its_own_words():
     env = GymEnv("hovering")
     env.reset()
-    with pytest.raises(ValueError, match=r"shape \(3,\), expected \(4,\), each entry in \[-1, 1\]\.$"):
+    with pytest.raises(ValueError, match=r"shape \(3,\), expected \(4,\)\.$"):
         env.step(np.zeros(3))
-    with pytest.raises(ValueError, match=r"NaN or infinite at \[\[2\]\], .* np.nan_to_num"):
+    with pytest.raises(ValueError, match=r"NaN or infinite at \[\[2\]\]\. .* nan_to_num"):
         env.step([0, 0, np.nan, 0])
 
 
 def test_unknown_options_are_refused_with_those_that_exist():
-    with pytest.raises(ValueError, match="Unknown autoreset_mode 'same'. Choose from: NextStep, SameStep, Disabled."):
+    with pytest.raises(ValueError, match="autoreset_mode must be 'NextStep', 'SameStep' or 'Disabled', got 'same'"):
         GymVectorEnv("hovering", autoreset_mode="same")
     with pytest.raises(ValueError, match="num_envs is for many drones, .* Write gymnasium.make_vec instead."):
         gymnasium.make(HOVERING, num_envs=2)
     for build in (GymEnv, GymVectorEnv):
-        with pytest.raises(ValueError, match="Unknown render_mode 'human'. Choose \"rgb_array\""):
+        with pytest.raises(ValueError, match="render_mode must be 'rgb_array', got 'human'"):
             build("hovering", render_mode="human")
     with pytest.raises(TypeError, match="control_dt"):
         GymEnv("hovering", frameskip=2)
@@ -59,8 +59,8 @@ def test_a_reset_mask_has_to_mark_some_of_the_drones(mask):
 @pytest.mark.parametrize("build", [GymEnv, GymVectorEnv])
 def test_what_cannot_begin_an_episode_is_refused_before_anything_changes(build):
     env, undisturbed = build("hovering", seed=0), build("hovering", seed=0)
-    for seed in (-1, 2**63, 10**5000, 0.5, "0", True, np.array(0), [0]):
-        with pytest.raises(UserError, match=r"seed must be (a whole number, such as 0|from 0 to 2\*\*63 - 1)"):
+    for seed in (-1, 2**63, 10**5000, 0.5, "0", True, [0]):
+        with pytest.raises(UserError, match="seed must be "):
             env.reset(seed=seed)
     for options in ("reset_mask", [1], {"seed": 0}, {"reset_mask": None}, {"reset_mask": [[True], [True, False]]}):
         with pytest.raises(UserError, match=r"options|reset_mask must be"):

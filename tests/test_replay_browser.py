@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from browsing import TIMEOUT
 
 from torchrl_quad import HoveringEnv, RacingEnv, TrackingEnv, make_env
 from torchrl_quad.dynamics import quaternion
@@ -84,6 +85,19 @@ def test_positions_and_attitudes_are_all_a_replay_needs(open_page, tmp_path):
     assert replay.page.inner_text("#clock") == "0.50 s of 1.20 s"
     assert replay.series()[1] == ["height [m]"]
     replay.close()
+
+
+def test_a_notebook_shows_a_replay_below_its_cell(browser, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    replay = write_replay(HoveringEnv(num_envs=2).rollout(12, break_when_any_done=False))
+    assert not list(tmp_path.iterdir()) and repr(replay) == f"Replay({len(replay.html) / 1e6:.1f} MB)"
+    (tmp_path / "notebook.html").write_text(f"<!doctype html><div>{replay._repr_html_()}</div>")
+    page = browser.new_context(offline=True).new_page()
+    page.goto((tmp_path / "notebook.html").as_uri())
+    frame = page.frame_locator("iframe")
+    frame.locator("body[data-ready]").wait_for(timeout=TIMEOUT)
+    assert frame.locator("#clock").inner_text() == "0.00 s of 0.24 s"
+    page.context.close()
 
 
 def test_play_moves_the_drones_and_pause_stops_them(replay):

@@ -40,15 +40,15 @@ def replacing(path: str | Path) -> Iterator[Path]:
         OSError: the folder does not exist, is read-only or is full; ``path`` is then as it was.
     """
     path = Path(path)
-    check_file(path)
-    _delete_leftovers(path)
+    check_place(path)
+    _clean(path)
     temporary = _temporary(path)
     os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     try:
         yield temporary
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
-        check_file(path)  # again: writing took its time
+        check_place(path)  # again: writing took its time
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -60,21 +60,21 @@ def replacing_folder(folder: Path, check: Callable[[Path], None]) -> Iterator[Pa
 
     Args:
         folder: which may be missing, and its parents too.
-        check: refuses a folder that must not be replaced; called before the block and after it.
+        check: raises for a folder that must not be replaced; called before the block and after it.
 
     Raises:
         FileExistsError: ``folder`` is anything else but a folder.
     """
     make_folder(folder.parent)
-    check_folder(folder)
-    _restore(folder)
+    check_place(folder, "folder")
+    _clean(folder)
     check(folder)
     temporary = _temporary(folder)
     old = temporary.with_name(f"{temporary.name}.old")
     temporary.mkdir()
     try:
         yield temporary
-        check_folder(folder)
+        check_place(folder, "folder")
         check(folder)
         if folder.exists():
             os.replace(folder, old)
@@ -90,11 +90,7 @@ def replacing_folder(folder: Path, check: Callable[[Path], None]) -> Iterator[Pa
 
 
 def make_folder(path: str | Path) -> Path:
-    """Make a folder, with its parents, to write files into. A link to a folder is one.
-
-    Raises:
-        FileExistsError: there is something else of that name.
-    """
+    """Make a folder, with its parents; a link to one will do. FileExistsError for anything else of that name."""
     path = Path(path)
     if (kind := _kind(path)) and not path.is_dir():
         raise FileExistsError(f"{path} is {kind}, and no folder. Choose another folder.")
@@ -102,24 +98,10 @@ def make_folder(path: str | Path) -> Path:
     return path
 
 
-def check_file(path: Path) -> None:
-    """Refuse to replace what exists and is not a plain file.
-
-    Raises:
-        FileExistsError: it is a folder, a link, a pipe, a socket or a device.
-    """
-    if (kind := _kind(path)) not in (None, "a file"):
-        raise FileExistsError(f"{path} is {kind}, and no plain file: it is not replaced. Choose another path.")
-
-
-def check_folder(path: Path) -> None:
-    """Refuse to replace what exists and is not a folder.
-
-    Raises:
-        FileExistsError: it is a file, a link, a pipe, a socket or a device.
-    """
-    if (kind := _kind(path)) not in (None, "a folder"):
-        raise FileExistsError(f"{path} is {kind}, and no folder: it is not replaced. Choose another folder.")
+def check_place(path: Path, wanted: str = "file") -> None:
+    """Raise FileExistsError for what exists and is not a plain file, or not a "folder": it must not be replaced."""
+    if (kind := _kind(path)) not in (None, f"a {wanted}"):
+        raise FileExistsError(f"{path} is {kind}, and no plain {wanted}: it is not replaced. Choose another path.")
 
 
 @contextlib.contextmanager
@@ -136,7 +118,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[Path]:
         FileExistsError: ``path`` is anything else but a plain file.
         filelock.Timeout: another process or thread holds it, and ``wait`` is false.
     """
-    check_file(path)
+    check_place(path)
     lock = FileLock(path, timeout=-1 if wait else 0, fallback_to_soft=False, thread_local=False)
     try:
         lock.acquire(poll_interval=0.02)
@@ -169,11 +151,7 @@ def machine() -> str:
 
 
 def read_rows(path: str | Path) -> list[dict[str, str]]:
-    """Read the rows of a CSV file; no rows where there is no file.
-
-    Raises:
-        FileExistsError: there is a folder, a pipe or the like of that name.
-    """
+    """Read the rows of a CSV file, none if it is missing; FileExistsError for a folder, a pipe or the like."""
     path = Path(path)
     if not path.exists():
         return []
@@ -204,7 +182,7 @@ def add_rows(path: str | Path, rows: Sequence[Mapping[str, Any]], same: Sequence
     """
     path = Path(path)
     make_folder(path.parent)
-    check_file(path)
+    check_place(path)
     with locked(path.with_name(f".{path.name}.lock")):
         own = {tuple(str(row[name]) for name in same) for row in rows} if same else set()
         others = [row for row in read_rows(path) if tuple(row.get(name) for name in same) not in own]
@@ -237,21 +215,16 @@ def _left_behind(path: Path) -> Iterator[tuple[Path, bool]]:
             yield other, not _is_running(int(match[1]))
 
 
-def _delete_leftovers(path: Path) -> None:
+def _clean(path: Path) -> None:
+    """Delete what dead processes left behind, and bring back a folder that was set aside and not replaced."""
     for other, abandoned in _left_behind(path):
         with contextlib.suppress(OSError):  # another process has deleted it just now
-            if abandoned:
+            if other.name.endswith(".old") and not any(path.glob("*")):
+                os.replace(other, path)
+            elif abandoned and other.is_dir():
+                shutil.rmtree(other, ignore_errors=True)
+            elif abandoned:
                 other.unlink()
-
-
-def _restore(folder: Path) -> None:
-    """Bring back a folder that was set aside and not replaced, and delete what dead processes left behind."""
-    for other, abandoned in _left_behind(folder):
-        if other.name.endswith(".old") and not any(folder.glob("*")):
-            with contextlib.suppress(OSError):
-                os.replace(other, folder)
-        elif abandoned:
-            shutil.rmtree(other, ignore_errors=True)
 
 
 def _is_running(pid: int) -> bool:

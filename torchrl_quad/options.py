@@ -27,9 +27,9 @@ import inspect
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
@@ -50,18 +50,6 @@ Coefficient = Annotated[float, Field(allow_inf_nan=False, ge=0, le=1e6)]
 Horizon = Annotated[int, Field(ge=1, le=100_000)]
 Width = Annotated[int, Field(ge=1, le=65_536)]
 Copies = Annotated[int, Field(ge=1, le=64)]
-
-
-def _entry(key: Any) -> Any:
-    if isinstance(key, str) or (isinstance(key, tuple) and key and all(isinstance(part, str) for part in key)):
-        return key
-    raise UserValueError('be the name of an entry, such as "observation" or ("state", "velocity")')
-
-
-Entry = Annotated[Any, AfterValidator(_entry)]
-Entries = Annotated[Sequence[Entry], Field(min_length=1)]
-
-
 Delay = Annotated[int, Field(ge=0, le=1_000)]  # in control steps
 
 
@@ -90,6 +78,10 @@ def accepted(accepts: Callable[[Any], bool], wanted: str) -> AfterValidator:
     return AfterValidator(validate)
 
 
+def _is_entry(key: Any) -> bool:
+    return isinstance(key, str) or (isinstance(key, tuple) and bool(key) and all(isinstance(x, str) for x in key))
+
+
 def _is_device(device: Any) -> bool:
     import torch  # which not all that checks options needs
 
@@ -100,6 +92,8 @@ def _is_device(device: Any) -> bool:
     return isinstance(device, str | torch.device)
 
 
+Entry = Annotated[Any, accepted(_is_entry, 'the name of an entry, such as "observation" or ("state", "velocity")')]
+Entries = Annotated[Sequence[Entry], Field(min_length=1)]
 Device = Annotated[Any, accepted(_is_device, "a device of this machine that torch knows, such as 'cpu' or 'cuda'")]
 
 _CONFIG = ConfigDict(strict=True, allow_inf_nan=False)
@@ -149,7 +143,7 @@ def checked(target: _F, described_by: type | None = None) -> _F:
                 bound.arguments[name] = _checked(name, value, *adapters[name])
         return target(*bound.args, **bound.kwargs)
 
-    return function
+    return cast("_F", function)
 
 
 def check_value(name: str, value: Any, kind: Any, description: str = "") -> Any:
@@ -169,7 +163,7 @@ def build(cls: type[_T], name: str, spec: Any, **more: Any) -> _T:
     """
     if isinstance(spec, cls):
         changes = {key: value for key, value in more.items() if value}
-        return dataclasses.replace(spec, **changes) if changes else spec
+        return dataclasses.replace(cast("Any", spec), **changes) if changes else spec
     arguments = inspect.signature(cls).parameters
     allowed = [key for key in arguments if key not in more]
     if not isinstance(spec, Mapping):
@@ -226,7 +220,8 @@ def declared(target: Callable[..., Any]) -> dict[str, tuple[Any, str]]:
     found: dict[str, tuple[Any, str]] = {}
     for owner, function in reversed(_takers(target)):
         described = _descriptions(owner) or _descriptions(function)
-        found |= {name: (kind, described.get(name, "")) for name, kind in _annotations(function).items()}
+        for name, kind in _annotations(function).items():  # what a subclass does not describe, its base does
+            found[name] = kind, described.get(name) or found.get(name, (kind, ""))[1]
     return found
 
 
@@ -281,11 +276,7 @@ def _without_numpy(value: Any) -> Any:
 
 
 def check_known(called: Callable[..., Any], given: Iterable[str]) -> None:
-    """Refuse the first name that is no argument, with the closest one that is.
-
-    Raises:
-        UserTypeError: there is one.
-    """
+    """Raise UserTypeError for the first name that is no argument, with the closest one that is."""
     known = argument_names(called)
     for unknown in (name for name in given if name not in known):
         close = difflib.get_close_matches(unknown, known, 1)
@@ -357,16 +348,12 @@ def _is_plain(kind: Any) -> bool:
 
 def _descriptions(owner: Any) -> dict[str, str]:
     """The first sentence of each argument's entry under "Args:" in a docstring."""
-    text = inspect.getdoc(owner) or ""
-    if not isinstance(owner, type) and owner.__name__ == "__init__":
-        text = ""
+    found: dict[str, str] = {}
+    is_constructor = not isinstance(owner, type) and owner.__name__ == "__init__"  # its class describes its arguments
+    text = "" if is_constructor else inspect.getdoc(owner) or ""
     section = re.search(r"^Args:\n((?:[ \n].*\n?)+)", text, re.MULTILINE)
-    return dict(_sentences(section[1])) if section else {}
-
-
-def _sentences(section: str) -> Iterator[tuple[str, str]]:
-    for names, said in re.findall(r"^ {4}([\w, ]+): (.*(?:\n {6,}.*)*)", section, re.MULTILINE):
+    for names, said in re.findall(r"^ {4}([\w, ]+): (.*(?:\n {6,}.*)*)", section[1] if section else "", re.MULTILINE):
         plain = re.sub(r":\w+:`~?([^`]+)`", r"\1", said).replace("``", "")
         sentence = " ".join(plain.split()).split(". ")[0].rstrip(".:") + "."
-        for name in names.split(", "):
-            yield name, sentence[0].upper() + sentence[1:]
+        found |= dict.fromkeys(names.split(", "), sentence[0].upper() + sentence[1:])
+    return found

@@ -2,31 +2,35 @@
 
 Importing ``torchrl_quad`` registers them, and so does ``gymnasium.make("torchrl_quad:torchrl_quad/Hovering-v0")``.
 
-``AsyncVectorEnv`` and ``vectorization_mode="async"`` start processes that import your program anew: torchrl sets
-multiprocessing's start method to "spawn". Put what starts them under ``if __name__ == "__main__":``. ``make_vec`` alone
-flies all drones in one batch, and needs no processes.
+``AsyncVectorEnv`` and ``vectorization_mode="async"`` start processes that import your program again: torchrl sets
+multiprocessing's start method to "spawn". Put what starts them under ``if __name__ == "__main__":``. A plain
+``make_vec`` flies all drones in one batch, and needs no processes.
 """
 
 from __future__ import annotations
 
-import numbers
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, cast
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Dict
+from gymnasium.spaces import Box, Dict, Space
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from tensordict import TensorDictBase
+from torch import Tensor
 
-from torchrl_quad.envs import make_env
-from torchrl_quad.errors import UserTypeError, UserValueError, WrongState, shown
+from torchrl_quad.envs import QuadrotorEnv, make_env
+from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
+from torchrl_quad.options import Seed, check_value
 
 # An episode ends before an entry of the state exceeds this, where a task does not know better.
 _LIMIT = 1e6
 _NO_LIMIT = 10_000_000  # control steps, as many as a task takes: gymnasium.make has a time limit of its own
-_INFO = "success", "crash", "reward_terms", "metrics"
+INFO = "success", "crash", "reward_terms", "metrics"
+Mode = Literal["NextStep", "SameStep", "Disabled"]
+Observation = np.ndarray | dict[str, np.ndarray]
 
 
 class ResetNeeded(WrongState, gymnasium.error.ResetNeeded):
@@ -42,7 +46,7 @@ class GymVectorEnv(VectorEnv):
 
     Observations are float32 (num_envs, k), actions floats (num_envs, 4), clipped to [-1, 1], as
     :class:`~torchrl_quad.envs.QuadrotorEnv` has them, rewards float64 (num_envs). ``info`` holds ``success``,
-    ``crash``, ``reward_terms`` and ``metrics`` by name, each (num_envs), with a mask ``_name`` beside every name as in
+    ``crash``, ``reward_terms`` and ``metrics`` by name, each (num_envs), with a mask ``_name`` for every name as in
     gymnasium's own vector environments.
 
     With a ``camera``, as "torchrl_quad/Forest-v0" has one, the observation is a dictionary of ``observation``, the
@@ -51,9 +55,10 @@ class GymVectorEnv(VectorEnv):
     Observations are clipped to the bounds of their space: the box of the task, 10 for ten times the quaternion, 50 m/s
     and 50 rad/s; 1e6 for a task without ``observation_bounds``.
 
-    The time limit is the task's ``max_episode_steps``. An episode that has ended begins anew at the next step, which
-    ignores the action and has no reward; or in the same step, with ``final_obs`` and ``final_info`` in ``info``; or,
-    with "Disabled", when ``reset(options={"reset_mask": mask})`` is called with a bool mask (num_envs).
+    The time limit is the task's ``max_episode_steps``. With "NextStep" an episode that has ended resets at the next
+    step, which ignores the action and has no reward; with "SameStep" in the same step, with ``final_obs`` and
+    ``final_info`` in ``info``; with "Disabled", when ``reset(options={"reset_mask": mask})`` is called with a bool mask
+    (num_envs).
 
     ``reset(seed=...)`` seeds the one generator of all drones; without a seed it continues to draw. ``torchrl_env`` is
     the TorchRL environment, to be read: its ``params``, ``hover_action`` and so on.
@@ -67,9 +72,9 @@ class GymVectorEnv(VectorEnv):
             gymnasium.
 
     Raises:
-        TypeError: an argument is unknown, or an action, a seed or the options have another type.
-        ValueError: an argument is out of its range, or an action has another shape or is not finite. What refuses a
-            call leaves the flight as it was.
+        TypeError: an argument is unknown, or an action or the options have another type.
+        ValueError: an argument is out of its range, or an action has another shape or is not finite. A call that is
+            refused leaves the flight as it was.
         ResetNeeded: a step before the first reset, or, with "Disabled", after an episode's end.
         ClosedEnvironmentError: a call after ``close()``, which may be called twice.
     """
@@ -85,21 +90,15 @@ class GymVectorEnv(VectorEnv):
         render_mode: str | None = None,
         **kwargs: Any,
     ) -> None:
-        modes = [mode.value for mode in AutoresetMode]
-        if not isinstance(autoreset_mode, str | AutoresetMode) or autoreset_mode not in (*modes, *AutoresetMode):
-            raise UserValueError(f"Unknown autoreset_mode {shown(autoreset_mode)}. Choose from: {', '.join(modes)}.")
-        if render_mode is not None and not (isinstance(render_mode, str) and render_mode == "rgb_array"):
-            raise UserValueError(
-                f'Unknown render_mode {shown(render_mode)}. Choose "rgb_array", pictures as arrays, or leave it out.'
-            )
-        self.render_mode = render_mode
+        mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        self.autoreset_mode = AutoresetMode(check_value("autoreset_mode", mode, Mode))
+        self.render_mode = check_value("render_mode", render_mode, Literal["rgb_array"] | None)
         if kwargs.get("max_episode_steps", 0) is None:  # as the task has it
             del kwargs["max_episode_steps"]
-        self.torchrl_env = make_env(task, num_envs=num_envs, **kwargs)
+        self.torchrl_env: QuadrotorEnv = make_env(task, num_envs=num_envs, **kwargs)
         if "seed" not in kwargs:
             self.torchrl_env.set_seed(None)
-        num_envs = self.num_envs = self.torchrl_env.num_envs
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.num_envs = self.torchrl_env.num_envs
         fps = round(1 / self.torchrl_env.control_dt)
         self.metadata = {**self.metadata, "render_fps": fps, "autoreset_mode": self.autoreset_mode}
         self._bounds = _bounds(self.torchrl_env)
@@ -108,28 +107,28 @@ class GymVectorEnv(VectorEnv):
             depth = Box(0.0, camera.range, (1, camera.height, camera.width), np.float32)
             self.single_observation_space = Dict({"observation": self.single_observation_space, "depth": depth})
         self.single_action_space = Box(-1.0, 1.0, (4,), np.float32)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self._now: Any = None  # the tensordict to step from
-        self._over = np.zeros(num_envs, dtype=bool)  # whose episode has ended, and has not begun anew
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._now: TensorDictBase | None = None  # the tensordict to step from
+        self._over = np.zeros(self.num_envs, dtype=bool)  # whose episode has ended, and has not been reset
 
     @torch.no_grad()
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode with all drones, or with those of the bool ``options["reset_mask"]`` (num_envs)."""
-        seed, mask = checked_seed(seed), self._checked_mask(checked_options(options, "reset_mask"))
-        self._require_open()
+        seed, mask = check_value("seed", seed, Seed | None), self._check_mask(check_options(options, "reset_mask"))
+        self._check_open()
         super().reset(seed=seed)
         if seed is not None:
             self.torchrl_env.set_seed(seed)
-        self._restart(mask)
-        return self._observe(self._now), _info(self._now, mask)
+        now = self._restart(self._now, mask)
+        return self._observe(now), _info(now.select(*INFO, strict=False), mask)
 
     @torch.no_grad()
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Fly one control step with actions (num_envs, 4)."""
         env, over, info = self.torchrl_env, self._over, {}
-        actions = checked_action(actions, self.action_space)
-        self._require_open()
+        actions = check_action(actions, self.action_space)
+        self._check_open()
         if self._now is None:
             raise ResetNeeded("A step needs an episode: call reset() first.")
         if self.autoreset_mode is AutoresetMode.DISABLED and over.any():
@@ -138,28 +137,32 @@ class GymVectorEnv(VectorEnv):
                 'step or, to leave the others alone, reset(options={"reset_mask": terminated | truncated}).'
             )
         after = env.step(self._now.set("action", torch.tensor(actions, dtype=env.dtype, device=env.device)))["next"]
-        self._now = after.exclude("reward")
+        self._now = now = after.exclude("reward")
         reward, terminated, truncated = (_array(after[name]) for name in ("reward", "terminated", "truncated"))
         if over.any():
-            self._restart(over)
+            now = self._restart(now, over)
             reward[over], terminated[over], truncated[over] = 0.0, False, False
-        self._over = terminated | truncated
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._over.any():
-            info = self._final(after)
-            self._restart(self._over)
-        everyone = np.ones(self.num_envs, dtype=bool)
-        return self._observe(self._now), reward, terminated, truncated, {**info, **_info(self._now, everyone)}
+        self._over = over = terminated | truncated
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and over.any():
+            last, observations = self._observe(after), np.full(self.num_envs, None, dtype=object)
+            for i in np.flatnonzero(over):
+                observations[i] = _row(last, int(i))
+            info = {"final_obs": observations, "_final_obs": over.copy()}
+            info |= {"final_info": _info(after.select(*INFO, strict=False), over), "_final_info": over.copy()}
+            now = self._restart(now, over)
+        info |= _info(now.select(*INFO, strict=False), np.ones(self.num_envs, dtype=bool))
+        return self._observe(now), reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture (336, 336, 3) of each drone, uint8; None without ``render_mode="rgb_array"``.
 
-        Of an episode that has ended, with "SameStep", it shows the start of the next, as gymnasium's own do.
+        After the end of an episode, with "SameStep", it shows the start of the next, as gymnasium's own do.
 
         Raises:
             ResetNeeded: before the first reset.
             ClosedEnvironmentError: after ``close()``.
         """
-        self._require_open()
+        self._check_open()
         if self.render_mode is None:
             gymnasium.logger.warn('render() draws nothing without render_mode="rgb_array", an argument of make_vec.')
             return None
@@ -171,15 +174,14 @@ class GymVectorEnv(VectorEnv):
         """Close the TorchRL environment."""
         self.torchrl_env.close()
 
-    def _require_open(self) -> None:
+    def _check_open(self) -> None:
         if self.closed:
             raise Closed("The environment has been closed: make another one, gymnasium.make_vec(...).")
 
-    def _checked_mask(self, options: Mapping[str, Any]) -> np.ndarray:
+    def _check_mask(self, options: Mapping[str, Any]) -> np.ndarray:
         """Whose episodes ``reset`` begins, bool (num_envs)."""
-        everyone = np.ones(self.num_envs, dtype=bool)
         if "reset_mask" not in options:
-            return everyone
+            return np.ones(self.num_envs, dtype=bool)
         mask = _as_array(options["reset_mask"])
         if mask is None or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             got = type(options["reset_mask"]).__name__ if mask is None else f"shape {mask.shape}, dtype {mask.dtype}"
@@ -191,35 +193,23 @@ class GymVectorEnv(VectorEnv):
             raise ResetNeeded("The first episodes begin together: call reset() without reset_mask first.")
         return mask.copy()
 
-    def _restart(self, mask: np.ndarray) -> None:
-        """Begin anew with the drones of the mask, as a rollout does where their episodes end."""
-        start = None
-        if self._now is not None:
+    def _restart(self, now: TensorDictBase | None, mask: np.ndarray) -> TensorDictBase:
+        """Reset the drones of the mask, as a rollout does where their episodes end."""
+        if now is not None:
             chosen = torch.as_tensor(mask, device=self.torchrl_env.device).unsqueeze(-1)
-            start = self._now.exclude("action").set("_reset", chosen)
-        self._now = self.torchrl_env.reset(start, set_state=False)
+            now = now.exclude("action").set("_reset", chosen)
+        self._now = now = self.torchrl_env.reset(now, set_state=False)
         self._over = self._over & ~mask
+        return now
 
-    def _observe(self, outputs: Any) -> Any:
+    def _observe(self, outputs: TensorDictBase) -> Observation:
         # What is handed out is copied: the next step starts from the same memory.
-        observation = outputs["observation"].numpy(force=True).astype(np.float32)
+        observation = cast("Tensor", outputs["observation"]).numpy(force=True).astype(np.float32)
         observation.clip(-self._bounds, self._bounds, out=observation)
-        if not isinstance(self.single_observation_space, Dict):
+        if (camera := self.torchrl_env.camera) is None:
             return observation
-        depth = outputs["depth"].numpy(force=True).astype(np.float32, order="C")
-        return {"observation": observation, "depth": depth.clip(0.0, self.torchrl_env.camera.range, out=depth)}
-
-    def _final(self, after: Any) -> dict[str, Any]:
-        over, last = self._over, self._observe(after)
-        observations = np.full(self.num_envs, None, dtype=object)
-        for i in np.flatnonzero(over):
-            observations[i] = _row(last, i)
-        return {
-            "final_obs": observations,
-            "_final_obs": over.copy(),
-            "final_info": _info(after, over),
-            "_final_info": over.copy(),
-        }
+        depth = cast("Tensor", outputs["depth"]).numpy(force=True).astype(np.float32, order="C")
+        return {"observation": observation, "depth": depth.clip(0.0, camera.range, out=depth)}
 
 
 class GymEnv(gymnasium.Env):
@@ -256,16 +246,17 @@ class GymEnv(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; there are no options."""
-        seed = checked_seed(seed)
-        checked_options(options)
+        seed = check_value("seed", seed, Seed | None)
+        check_options(options)
         observation, info = self._drones.reset(seed=seed)
         super().reset(seed=seed)
         return _row(observation, 0), _first(info)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Fly one control step with an action (4)."""
-        observation, *ends, info = self._drones.step(checked_action(action, self.action_space)[None])
-        return _row(observation, 0), *(x.item() for x in ends), _first(info)
+        observation, *ends, info = self._drones.step(check_action(action, self.action_space)[None])
+        reward, terminated, truncated = (x.item() for x in ends)
+        return _row(observation, 0), reward, terminated, truncated, _first(info)
 
     def render(self) -> np.ndarray | None:
         """A picture (336, 336, 3), uint8; None without ``render_mode="rgb_array"``."""
@@ -277,51 +268,39 @@ class GymEnv(gymnasium.Env):
         self._drones.close()
 
 
-def checked_action(action: Any, space: Box) -> np.ndarray:
+def check_action(action: Any, space: Space) -> np.ndarray:
     """An action as a float64 array of the shape of its space, a copy, clipped to the bounds.
 
     Raises:
         TypeError: it is no array of floats, nor can be read as one.
         ValueError: it has another shape, or is not finite.
     """
-    given, shape = _as_array(action), space.shape
-    if given is not None and given.shape != shape:
-        raise UserValueError(
-            f"The action has shape {given.shape}, expected {shape}, each entry in [-1, 1]"
-            + (", a row for each drone." if len(shape) > 1 else ".")
-        )
+    given, space = _as_array(action), cast("Box", space)
     if given is None or given.dtype.kind != "f":
         got = type(action).__name__ + ("" if given is None else f" of {given.dtype}")
         raise UserTypeError(
-            f"The action must be an array of floats of shape {shape} in the memory of the CPU, each entry in [-1, 1], "
-            f"as env.action_space.sample() returns it; got {got}."
+            f"The action must be an array of floats of shape {space.shape} in the memory of the CPU, each entry in "
+            f"[-1, 1], as env.action_space.sample() returns it; got {got}."
         )
-    if not np.isfinite(given).all():
-        broken = np.argwhere(~np.isfinite(given)).tolist()
-        raise UserValueError(
-            f"The action is NaN or infinite at {broken[:10]}{' and others' * (len(broken) > 10)}, which no drone can "
-            "fly. Check the policy's parameters, or write np.nan_to_num(action)."
-        )
+    check_numbers(given, space.shape)
     return given.clip(space.low, space.high).astype(np.float64)
 
 
-def checked_seed(seed: Any) -> int | None:
-    """A seed as a Python integer, or None.
-
-    Raises:
-        TypeError: it is no whole number.
-        ValueError: it is negative or too large.
-    """
-    if seed is None:
-        return None
-    if not isinstance(seed, numbers.Integral) or isinstance(seed, bool):
-        raise UserTypeError(f"seed must be a whole number, such as 0, or None; got {type(seed).__name__}.")
-    if not 0 <= seed < 2**63:
-        raise UserValueError("seed must be from 0 to 2**63 - 1; got one that is negative or larger.")
-    return int(seed)
+def check_numbers(action: np.ndarray | Tensor, shape: Sequence[int]) -> None:
+    """Raise unless an action has its shape, and is finite."""
+    if tuple(action.shape) != tuple(shape):
+        rows = ", one row per drone" if len(shape) > 1 else ""
+        raise UserValueError(f"The action has shape {tuple(action.shape)}, expected {tuple(shape)}{rows}.")
+    finite = torch.as_tensor(action.isfinite() if isinstance(action, Tensor) else np.isfinite(action))
+    if not finite.all():
+        broken = (~finite).nonzero().tolist()
+        raise UserValueError(
+            f"The action is NaN or infinite at {broken[:10]}{' and others' * (len(broken) > 10)}. Check the policy's "
+            "parameters, or replace these by nan_to_num."
+        )
 
 
-def checked_options(options: Any, *known: str) -> Mapping[str, Any]:
+def check_options(options: Any, *known: str) -> Mapping[str, Any]:
     """The options of a reset, none for None.
 
     Raises:
@@ -330,14 +309,10 @@ def checked_options(options: Any, *known: str) -> Mapping[str, Any]:
     """
     if options is None:
         return {}
+    choice = f"Choose from: {', '.join(known)}." if known else "There are none: leave options out."
     if not isinstance(options, Mapping):
-        raise UserTypeError(
-            f"options must be a dictionary, {{}} or with {', '.join(known)}, or None; got {type(options).__name__}."
-            if known
-            else f"There are no options, {{}} or None; got {type(options).__name__}."
-        )
+        raise UserTypeError(f"options must be a dictionary or None; got {type(options).__name__}. {choice}")
     if unknown := [str(name) for name in options if name not in known]:
-        choice = f"Choose from: {', '.join(known)}." if known else "There are none: leave options out."
         raise UserValueError(f"Unknown options {', '.join(unknown[:10])}. {choice}")
     return options
 
@@ -345,42 +320,38 @@ def checked_options(options: Any, *known: str) -> Mapping[str, Any]:
 def _as_array(x: Any) -> np.ndarray | None:
     """Whatever was given as an array; None if it is none, as a ragged list or a tensor of another device."""
     try:
-        return np.asarray(x.detach() if isinstance(x, torch.Tensor) else x)
+        return np.asarray(x.detach() if isinstance(x, Tensor) else x)
     except Exception:  # numpy lets every error of other people's objects pass
         return None
 
 
-def _bounds(env: Any) -> np.ndarray:
+def _bounds(env: QuadrotorEnv) -> np.ndarray:
     """The bounds of the observation (k): the task's, and of the commands on their way those of the action."""
-    size = env.observation_spec["observation"].shape[-1]
+    size = cast("Any", env.observation_spec)["observation"].shape[-1]
     own, commands = env.observation_bounds(), env.action_delay if env.observe_last_action else 0
-    action = env.action_spec.space.high[0].repeat(commands)
+    action = cast("Any", env.action_spec).space.high[0].repeat(commands)
     if own is None or len(own) + len(action) != size:
         return np.full(size, _LIMIT, dtype=np.float32)
     return torch.cat((own, action)).numpy(force=True).astype(np.float32)
 
 
-def _row(observation: Any, i: int) -> Any:
+def _row(observation: Observation, i: int) -> Observation:
     """The observation of one drone."""
     return {name: x[i] for name, x in observation.items()} if isinstance(observation, dict) else observation[i]
 
 
-def _array(x: torch.Tensor) -> np.ndarray:
+def _array(x: Tensor) -> np.ndarray:
     """An entry (n, 1) as (n), a copy, float64 as gymnasium has it, or bool."""
     return np.array(x.squeeze(-1).numpy(force=True), dtype=bool if x.dtype is torch.bool else np.float64)
 
 
-def _info(outputs: Any, mask: np.ndarray) -> dict[str, Any]:
+def _info(entries: Any, mask: np.ndarray) -> dict[str, Any]:
     """Gymnasium's info of the drones under the mask (n), of others zeros."""
-
-    def masked(entries: Any) -> dict[str, Any]:
-        info = {}
-        for name, x in entries.items():
-            info[name] = np.where(mask, _array(x), False) if isinstance(x, torch.Tensor) else masked(x)
-            info[f"_{name}"] = mask.copy()
-        return info
-
-    return masked({name: outputs[name] for name in _INFO if name in outputs.keys()})  # noqa: SIM118, a tensordict
+    info: dict[str, Any] = {}
+    for name, x in entries.items():
+        info[name] = np.where(mask, _array(x), False) if isinstance(x, Tensor) else _info(x, mask)
+        info[f"_{name}"] = mask.copy()
+    return info
 
 
 def _first(info: dict[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
@@ -44,15 +44,19 @@ class RslRlVecEnv(VecEnv):
                 "HoveringEnv(num_envs=512), or derive your task from QuadrotorEnv."
             )
         self.num_envs, self.device = self.drones.num_envs, self.drones.device
-        self.num_actions = env.action_spec.shape[-1]
-        self.max_episode_length = env.max_episode_steps
+        self.num_actions = self.drones.single_action_space.shape[0]
+        self.max_episode_length = cast("int", env.max_episode_steps)
         self.cfg = {"task": type(getattr(env, "base_env", env)).__name__, "num_envs": self.num_envs}
         self.drones.reset()
 
     @property
+    def _now(self) -> Any:  # a tensordict, since the drones have been reset
+        return self.drones.now
+
+    @property
     def episode_length_buf(self) -> Tensor:
         """Control steps since the start of each episode (num_envs)."""
-        return self.drones.now["state", "step"].squeeze(-1)
+        return self._now["state", "step"].squeeze(-1)
 
     @episode_length_buf.setter
     def episode_length_buf(self, steps: Tensor) -> None:
@@ -66,11 +70,11 @@ class RslRlVecEnv(VecEnv):
                 f"episode_length_buf must have shape ({self.num_envs},), on {now.device}, with steps from 0 to "
                 f"{limit - 1}. Write torch.randint_like(env.episode_length_buf, high={limit})."
             )
-        self.drones.now["state", "step"] = steps.unsqueeze(-1).to(now.dtype, copy=True)
+        self._now["state", "step"] = steps.unsqueeze(-1).to(now.dtype, copy=True)
 
     def get_observations(self) -> TensorDict:
         """The present observations: ``policy`` (num_envs, k)."""
-        return self._grouped(self.drones.now["observation"])
+        return self._grouped(self._now["observation"])
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """Fly one control step with actions (num_envs, 4): observations, rewards and ends (num_envs), extras."""

@@ -21,7 +21,7 @@ class SkrlEnv(Wrapper):
     """An environment of skrl: ``SequentialTrainer(env=SkrlEnv(HoveringEnv(num_envs=512)), agents=agent, cfg=...)``.
 
     It takes the place of skrl's ``wrap_env``. Rewards and ends are (num_envs, 1); ``info`` is that of
-    :class:`~torchrl_quad.adapters.TorchVectorEnv`, whose episodes begin anew in the step in which they end.
+    :class:`~torchrl_quad.adapters.TorchVectorEnv`, which resets in the step in which an episode ends.
 
     Args:
         env: as for :class:`~torchrl_quad.adapters.TorchVectorEnv`; a task, or transforms around one.

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from torchrl_quad.adapters.gym import checked_action, checked_options, checked_seed
+from torchrl_quad.adapters.gym import check_action, check_options
 from torchrl_quad.errors import MissingPackage, Unsupported, UserTypeError, UserValueError, WrongState
+from torchrl_quad.options import Seed, check_value
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -63,18 +64,18 @@ class DronesVecEnv(VecEnv):
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the next :meth:`reset`; None takes a random one."""
-        return super().seed(checked_seed(seed))
+        return super().seed(check_value("seed", seed, Seed | None))
 
     def set_options(self, options: list[dict] | dict | None = None) -> None:
         """Refuse options for :meth:`reset`: all drones begin together."""
         for each in options if isinstance(options, list) else [options]:
-            checked_options(each)
+            check_options(each)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions (num_envs, 4) for :meth:`step_wait`."""
         if self.actions is not None:
             raise WrongState("Actions are waiting to be flown: call step_wait() before the next step_async().")
-        self.actions = checked_action(actions, self.env.action_space)
+        self.actions = check_action(actions, self.env.action_space)
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Fly one control step: observations (num_envs, k), rewards and ends (num_envs), an ``info`` of each drone."""
@@ -98,7 +99,7 @@ class DronesVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """A picture of each drone; None without a render mode."""
-        pictures = self.env.render()
+        pictures = cast("tuple[np.ndarray, ...] | None", self.env.render())
         return [None] * self.num_envs if pictures is None else pictures
 
     def render(self, mode: str | None = None) -> np.ndarray | None:
@@ -110,18 +111,18 @@ class DronesVecEnv(VecEnv):
                 'render("human") needs OpenCV: pip install opencv-python, or write render("rgb_array").'
             ) from error
 
-    def get_attr(self, name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """An attribute of the vector environment, once for each drone of the indices."""
-        return [getattr(self.env, name) for _ in self._get_indices(indices)]
+        return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
 
-    def env_is_wrapped(self, wrapper: type, indices: Any = None) -> list[bool]:
-        """False for each drone of the indices: none is wrapped on its own."""
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """False for each drone of the indices."""
         return [False for _ in self._get_indices(indices)]
 
-    def set_attr(self, name: str, value: Any, indices: Any = None) -> None:
-        """Refused: the drones are one environment, and none can change alone."""
-        raise Unsupported(f"Drones of one environment share {name!r}. Set it on the environment before training.")
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Raises: all drones share one environment."""
+        raise Unsupported(f"All drones share {attr_name!r}. Set it on the environment before training.")
 
-    def env_method(self, name: str, *arguments: Any, indices: Any = None, **keywords: Any) -> list[Any]:
-        """Refused: the drones are one environment, and none can be called alone."""
-        raise Unsupported(f"Drones of one environment share {name!r}. Call it on the environment, `.env`.")
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Raises: all drones share one environment."""
+        raise Unsupported(f"All drones share {method_name!r}. Call it on the environment, `.env`.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -13,23 +13,22 @@ from torch import Tensor
 from torchrl.data import Bounded, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_quad.adapters.gym import Closed, ResetNeeded, checked_options, checked_seed
+from torchrl_quad.adapters.gym import INFO, Closed, ResetNeeded, check_numbers, check_options
 from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.options import Seed, check_value
 
 _FLOATS = torch.float16, torch.bfloat16, torch.float32, torch.float64
-_INFO = "success", "crash", "reward_terms", "metrics"
 
 
 class TorchVectorEnv:
     """Tensors in and out, in the manner of gymnasium's vector environments; all stay on the environment's device.
 
-    An episode that has ended begins anew in the same step. The observation that ``step`` returns is then the first of
-    the next episode, and ``info["final_obs"]`` has the last of the one before. There is no gradient: for gradients fly
-    the TorchRL environment itself, with :func:`~torchrl_quad.differentiable_rollout`.
+    An episode that ends resets in the same step: ``step`` returns the first observation of the next episode, and
+    ``info["final_obs"]`` has the last of the one before. There is no gradient: for gradients fly the TorchRL
+    environment itself, with :func:`~torchrl_quad.differentiable_rollout`.
 
-    ``info`` tells how the step ended, also where an episode began anew: ``success`` and ``crash``, bool (num_envs);
-    ``reward_terms`` and ``metrics``, floats (num_envs) by name; ``final_obs`` (num_envs, k), all observations at the
-    end of the step.
+    ``info`` tells how the step ended, before any reset: ``success`` and ``crash``, bool (num_envs); ``reward_terms``
+    and ``metrics``, floats (num_envs) by name; ``final_obs`` (num_envs, k), all observations.
 
     Args:
         env: a task, ``HoveringEnv(num_envs=512, compile=True)``, or any TorchRL environment of batch size (num_envs)
@@ -48,20 +47,22 @@ class TorchVectorEnv:
                 "The environment must be a task or another TorchRL environment, such as HoveringEnv(num_envs=512); got "
                 f"{type(env).__name__}."
             )
-        if len(env.batch_size) != 1:
+        batch, action, shown = (cast("Any", x) for x in (env.batch_size, env.action_spec, env.observation_spec))
+        if len(batch) != 1:
             raise UserValueError(
-                f"The environment has the batch size {tuple(env.batch_size)}, and must have one dimension. Build it "
+                f"The environment has the batch size {tuple(batch)}, and must have one dimension. Build it "
                 "with the number of its drones, HoveringEnv(num_envs=512)."
             )
-        action, observation = env.action_spec, env.observation_spec.get("observation", None)
+        observation = shown.get("observation", None)
         if not (isinstance(action, Bounded | Unbounded) and action.dtype in _FLOATS) or observation is None:
             raise UserTypeError(
                 'The environment must have one action of floats and an entry "observation"; its actions are '
-                f"{type(action).__name__}, and it shows {', '.join(map(str, env.observation_spec.keys()))}."
+                f"{type(action).__name__}, and it shows {', '.join(map(str, shown.keys()))}."
             )
         self.torchrl_env, self.closed = env, False
-        self.num_envs, self.device = env.batch_size[0], env.device
-        self._low, self._high = action.space.low, action.space.high
+        self.num_envs, self.device = batch[0], env.device
+        space = cast("Any", action.space)
+        self._low, self._high = space.low, space.high
         size = observation.shape[-1]
         self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = Box(*(x[0].numpy(force=True).astype(np.float32) for x in (self._low, self._high)))
@@ -78,12 +79,12 @@ class TorchVectorEnv:
         """Begin an episode with all drones: observations (num_envs, k), and an empty ``info``; there are no options.
 
         Raises:
-            TypeError, ValueError: the seed is no whole number from 0, or there are options.
+            TypeError, ValueError: the seed is not a whole number from 0, or there are options.
             ClosedEnvironmentError: after ``close()``.
         """
-        seed = checked_seed(seed)
-        checked_options(options)
-        self._require_open()
+        seed = check_value("seed", seed, Seed | None)
+        check_options(options)
+        self._check_open()
         with torch.inference_mode(False), torch.no_grad():
             if seed is not None:
                 self.torchrl_env.set_seed(seed)
@@ -100,21 +101,20 @@ class TorchVectorEnv:
             ResetNeeded: before the first reset.
             ClosedEnvironmentError: after ``close()``.
             TypeError: the actions are no tensor of floats.
-            ValueError: the actions have another shape, are on another device, or are not finite. What refuses a call
+            ValueError: the actions have another shape, are on another device, or are not finite. A call that is refused
                 leaves the flight as it was.
         """
-        self._require_open()
+        self._check_open()
         if self.now is None:
             raise ResetNeeded("A step needs an episode: call reset() first.")
-        self._check(action)
+        self._check_action(action)
         # Frameworks act in inference mode, whose tensors could not be differentiated later.
         with torch.inference_mode(False), torch.no_grad():
             action = action.to(self._low).clamp(self._low, self._high)
             flown, self.now = self.torchrl_env.step_and_maybe_reset(self.now.set("action", action))
-        end = flown["next"]
+        end = cast("Any", flown["next"])
         reward, terminated, truncated = (end[name].squeeze(-1) for name in ("reward", "terminated", "truncated"))
-        info = {name: _squeezed(end[name]) for name in _INFO if name in end.keys()}  # noqa: SIM118, a tensordict
-        info["final_obs"] = end["observation"]
+        info = {**_squeezed(end.select(*INFO, strict=False)), "final_obs": end["observation"]}
         return self.now["observation"], reward, terminated, truncated, info
 
     def close(self) -> None:
@@ -123,17 +123,17 @@ class TorchVectorEnv:
             self.torchrl_env.close()
         self.closed = True
 
-    def _require_open(self) -> None:
+    def _check_open(self) -> None:
         if self.closed:
-            raise Closed("The environment has been closed: build the task and its adapter anew.")
+            raise Closed("The environment has been closed: build the task and its adapter again.")
 
-    def _check(self, action: Any) -> None:
+    def _check_action(self, action: Any) -> None:
         """Refuse actions that cannot be flown."""
         shape, device, dtype = tuple(self._low.shape), self._low.device, self._low.dtype
         if not isinstance(action, Tensor) or action.is_nested or action.layout is not torch.strided:
             layout = f" of layout {action.layout}" if isinstance(action, Tensor) else ""
             raise UserTypeError(
-                f"The actions must be a dense tensor of floats of shape {shape}, a row a drone; got "
+                f"The actions must be a dense tensor of floats of shape {shape}, one row per drone; got "
                 f"{type(action).__name__}{layout}. Arrays become one by torch.as_tensor(action, dtype={dtype}, "
                 f"device={str(device)!r})."
             )
@@ -142,20 +142,13 @@ class TorchVectorEnv:
                 f"The actions are {action.dtype}, and must be floats in the bounds of env.action_space. If these are "
                 f"meant, write action.to({dtype})."
             )
-        if action.shape != shape:
-            raise UserValueError(f"The actions have shape {tuple(action.shape)}, expected {shape}: a row a drone.")
         if action.device != device:
             raise UserValueError(
                 f"The actions are on {action.device}, and the environment on {device}. Move the policy there."
             )
-        if not action.isfinite().all():
-            drones = (~action.isfinite().all(-1)).nonzero().flatten().tolist()
-            raise UserValueError(
-                f"The actions of drones {drones[:10]}{' and others' * (len(drones) > 10)} are NaN or infinite. Check "
-                "the policy's parameters, or write action.nan_to_num()."
-            )
+        check_numbers(action, shape)
 
 
-def _squeezed(x: Any) -> Any:
-    """An entry (n, 1) as (n); of a tensordict each by its name."""
-    return x.squeeze(-1) if isinstance(x, Tensor) else {name: _squeezed(y) for name, y in x.items()}
+def _squeezed(entries: Any) -> dict[str, Any]:
+    """Entries (n, 1) as (n), by name."""
+    return {name: x.squeeze(-1) if isinstance(x, Tensor) else _squeezed(x) for name, x in entries.items()}

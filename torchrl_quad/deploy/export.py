@@ -35,7 +35,7 @@ from torchrl_quad.deploy.reading import MOST_BYTES
 from torchrl_quad.deploy.tracing import Rules, trace
 from torchrl_quad.envs import QuadrotorEnv
 from torchrl_quad.errors import MissingPackage, UserValueError
-from torchrl_quad.files import check_folder, replacing_folder
+from torchrl_quad.files import check_place, replacing_folder
 
 VECTORS, SELF_TEST_VECTORS = 1024, 16
 IMAGES, SELF_TEST_IMAGES = 256, 4  # the same with images, which are large
@@ -105,7 +105,7 @@ def export_policy(
         raise MissingPackage(f"export_policy needs {needed}: pip install {needed}") from error
     env, normalizer = _unwrapped(env, normalizer)
     place = Path(folder) if Path(folder).name not in ("", "..") else Path(folder).resolve()
-    check_folder(place)
+    check_place(place, "folder")
     require_bundle(place)
     camera = env.camera
     network = fold(actor, normalizer, camera and (camera.height, camera.width))

@@ -126,8 +126,9 @@ def plot_episode(
     line the distance from which a state fulfils the task, if the markers name it. PDF and SVG embed their fonts, PNG
     has 300 dots per inch.
 
+    The other arguments are those of :func:`plot_flight`.
+
     Args:
-        rollout, path, env, control_dt: as in :func:`plot_flight`.
         env_index: which environment.
 
     Raises:
@@ -220,8 +221,7 @@ def plot_from_above(
     Environments with obstacles of their own get a panel each; those that share them, one for all. A cross marks a
     crash, a ring the start. Only what stands between the least and the greatest height of the flight is drawn.
 
-    Args:
-        rollout, path, env, num_envs, title: as in :func:`plot_flight`, of a task with a scene.
+    The arguments are those of :func:`plot_flight`; the task has a scene.
 
     Raises:
         ImportError, TypeError: as in :func:`plot_flight`.

@@ -63,6 +63,8 @@ def write_replay(
     needs no network. A drone stays where its episode ended, and the page says how it ended: "success" if the last state
     fulfils the task.
 
+    The other arguments are those of :func:`plot_flight`.
+
     Args:
         rollout: (num_envs, time), of any task. It must hold ``("next", "state", "position")`` and ``("next", "state",
             "quaternion")``; the page leaves out whatever else is missing.
@@ -70,7 +72,6 @@ def write_replay(
         env: the environment that flew, also under transforms. It provides the control step, the markers, the positions
             of the rotors, and their thrust in newtons. Without it, the page shows an X frame and the squared speed of
             each rotor.
-        num_envs, control_dt, title: as in :func:`plot_flight`.
 
     Raises:
         ImportError: plotly is not installed.

@@ -146,8 +146,9 @@ def animate_flight(
     A task with a camera shows the first drone's depth image, the nearer the brighter. Where each episode has obstacles
     of its own, the film shows only the first environment.
 
+    The other arguments are those of :func:`plot_flight`.
+
     Args:
-        rollout, env, num_envs, control_dt: as in :func:`plot_flight`.
         path: the film to write: GIF, or MP4 (H.264) with ``imageio-ffmpeg`` of the extra ``render``, by its suffix.
         fps: frames per second, at least; up to 50, and rounded up so that a frame lasts whole control steps.
         max_seconds: the maximum length of the film.

@@ -22,7 +22,7 @@ from torchrl.envs import EnvBase
 from torchrl_quad.deploy import Bundle
 from torchrl_quad.deploy.transfer import as_rollout, fly
 from torchrl_quad.errors import UserError
-from torchrl_quad.files import check_file
+from torchrl_quad.files import check_place
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, write_replay
 from torchrl_quad.render.video import NoFfmpeg
 
@@ -100,7 +100,7 @@ def _log_traceback(path: Path) -> str:
     """Add the traceback of the present error to drawing.log, or print it where that cannot be written; say which."""
     log = path.with_name("drawing.log")
     try:
-        check_file(log)
+        check_place(log)
         with open(log, "a", encoding="utf-8") as file:
             file.write(f"{path.name} is missing.\n{traceback.format_exc()}\n")
     except OSError:

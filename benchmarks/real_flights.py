@@ -1,4 +1,4 @@
-"""Fit a drone to real flights, and judge it on flights of other shapes, beside what others would predict.
+"""Fit a drone to real flights, and judge it on flights of other shapes, next to what published drones predict.
 
     python benchmarks/real_flights.py --flights FOLDER    # minutes; writes results/real_flights.csv
 
@@ -21,8 +21,19 @@ from torchrl_quad import QuadrotorParams, load_drone
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.rigid_body import RigidBodyState
 from torchrl_quad.identification import FlightLog, NoFlight, TooShort, identify, prediction_error, read_log
-from torchrl_quad.identification.prediction import CONSTANT_VELOCITY, ERRORS, PAST, differences
-from torchrl_quad.identification.windows import Plant, Push, Trajectory, Windows, cut, stream_delay
+from torchrl_quad.identification.prediction import (
+    CONSTANT_VELOCITY,
+    ERRORS,
+    PAST,
+    Plant,
+    Push,
+    Windows,
+    cut,
+    differences,
+    plant_of,
+    states_at,
+    stream_delay,
+)
 
 JUDGED = ("figure8", "trefoil")  # in the names of flights that are judged; all others are fitted
 MASS = 0.027  # [kg], take-off weight, arXiv:2603.09908
@@ -31,26 +42,19 @@ HORIZONS = (0.1, 0.25, 0.5)
 
 def old_preset() -> QuadrotorParams:
     """The preset as it was before these flights."""
-    drone = load_drone("crazyflie", torch.float64)
-    return QuadrotorParams(
-        **{
-            **drone.fields(),
-            **{
-                name: torch.tensor(value, dtype=torch.float64)
-                for name, value in {
-                    "mass": [0.027],
-                    "inertia": [1.4e-5, 1.4e-5, 2.17e-5],
-                    "yaw_torque_coefficient": [0.00596],
-                    "thrust_map": [2.88e-8, 0.0, 0.0],
-                    "rotor_speed_max": [2270.0],
-                    "motor_time_constant": [0.072],
-                    "linear_drag": [1e-3, 1e-3, 1e-3],
-                    "quadratic_drag": [1e-4, 1e-4, 2e-4],
-                    "drag_height": [0.0],
-                }.items()
-            },
-        }
-    )
+    values = {
+        "mass": [0.027],
+        "inertia": [1.4e-5, 1.4e-5, 2.17e-5],
+        "yaw_torque_coefficient": [0.00596],
+        "thrust_map": [2.88e-8, 0.0, 0.0],
+        "rotor_speed_max": [2270.0],
+        "motor_time_constant": [0.072],
+        "linear_drag": [1e-3, 1e-3, 1e-3],
+        "quadratic_drag": [1e-4, 1e-4, 2e-4],
+        "drag_height": [0.0],
+    }
+    fields = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
+    return QuadrotorParams(**{**load_drone("crazyflie", torch.float64).fields(), **fields})
 
 
 def published() -> dict[str, QuadrotorParams]:
@@ -98,13 +102,13 @@ def learn(logs: list[FlightLog], drone: QuadrotorParams, steps: int) -> Residual
     torch.manual_seed(0)
     windows = cut(logs, 0.5, PAST, 0.1, stride=2)
     late = torch.tensor([stream_delay(log) for log in logs], dtype=torch.float64)
-    network = Residual(_plant(drone, late[windows.log]))
+    network = Residual(plant_of(drone, drone.motor_command, late[windows.log]))
     optimizer = torch.optim.Adam(network.parameters(), 3e-3, weight_decay=1e-5)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.05, steps)
     scale = None
     for _ in tqdm(range(steps), desc="network"):
         part = windows.select(torch.randint(len(windows), (128,)))
-        error = _errors(part, _plant(drone, late[part.log]), network)[:, [5, 12, 25]]
+        error = _errors(part, plant_of(drone, drone.motor_command, late[part.log]), network)[:, [5, 12, 25]]
         scale = error.detach().abs().median(0).values.clamp_min(1e-4) * 1.5 if scale is None else scale
         loss = nn.functional.smooth_l1_loss(error / scale, torch.zeros_like(error), beta=2.0)
         optimizer.zero_grad()
@@ -119,7 +123,7 @@ def network_error(logs: list[FlightLog], drone: QuadrotorParams, network: Residu
     """As :func:`prediction_error`, with the network."""
     windows = cut(logs, max(HORIZONS), PAST, 0.1)
     late = torch.tensor([stream_delay(log) for log in logs], dtype=torch.float64)[windows.log]
-    errors = _errors(windows, _plant(drone, late), network)
+    errors = _errors(windows, plant_of(drone, drone.motor_command, late), network)
     rms = errors[:, [round(h / windows.dt) for h in HORIZONS]].square().sum(-1).mean(0).sqrt()
     return {name: dict(zip(HORIZONS, rms[:, i].tolist(), strict=True)) for i, name in enumerate(ERRORS)}
 
@@ -129,14 +133,7 @@ def _errors(windows: Windows, plant: Plant, network: Residual) -> Tensor:
         speed = windows.rotor_speed(plant)
         push = windows.push(plant, speed)
         seen = windows.measured(plant.stream_delay, torch.arange(0, windows.future + 1, windows.stride))
-    return differences(Trajectory(*windows.fly(plant, seen.at(0), speed, push, network)), seen)
-
-
-def _plant(drone: QuadrotorParams, late: Tensor) -> Plant:
-    motors = drone.motor_command
-    return Plant(
-        drone, *(late.new_tensor(x) for x in (motors.speed_at_zero, motors.speed_per_volt, motors.delay)), late
-    )
+    return differences(windows.fly(plant, states_at(seen, 0), speed, push, network), seen)
 
 
 def read_all(folder: Path) -> dict[str, FlightLog]:
@@ -173,18 +170,17 @@ def main() -> None:
         "preset, fitted on all eight": "crazyflie",
         "fitted": result.drone,
     }
-    rows = []
-    for name, drone in models.items():
-        rows += _rows(name, prediction_error(judged, drone, HORIZONS))
+    errors = {name: prediction_error(judged, drone, HORIZONS) for name, drone in models.items()}
     if options.network_steps:
         network = learn(fitted, result.drone, options.network_steps)
-        rows += _rows("fitted, and a network", network_error(judged, result.drone, network))
+        errors["fitted, and a network"] = network_error(judged, result.drone, network)
+    rows = [
+        {"model": name, "horizon_s": h, **{k: float(f"{found[k][h]:.4g}") for k in ERRORS}}
+        for name, found in errors.items()
+        for h in HORIZONS
+    ]
     flights = {"fitted_on": " ".join(x.name for x in fitted), "judged_on": " ".join(x.name for x in judged)}
     save(options.output, rows, **flights)
-
-
-def _rows(name: str, errors: dict[str, dict[float, float]]) -> list[dict[str, Any]]:
-    return [{"model": name, "horizon_s": h, **{k: float(f"{errors[k][h]:.4g}") for k in ERRORS}} for h in HORIZONS]
 
 
 if __name__ == "__main__":

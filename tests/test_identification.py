@@ -18,12 +18,12 @@ from torchrl_quad.identification import (
     TooLittleFlight,
     TooShort,
     UnknownField,
+    estimation,
     fitting,
     identify,
+    prediction,
     prediction_error,
     read_log,
-    stages,
-    windows,
 )
 from torchrl_quad.identification.parameters import UNKNOWNS, Model
 
@@ -99,7 +99,7 @@ def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(b
 
 
 def test_a_fit_that_was_stopped_goes_on_as_if_it_had_not(real, tmp_path, monkeypatch, capsys):
-    file, write = tmp_path / "checkpoint.json", stages.Checkpoint.write
+    file, write = tmp_path / "checkpoint.json", estimation.Checkpoint.write
     options = {"fields": ["linear_drag"], "draws": 0, "iterations": 9, "horizon": 0.2, "past": 0.1}
     short = dataclasses.replace(real, segments=((300, 700),))
     straight = identify(short, **options)
@@ -111,7 +111,7 @@ def test_a_fit_that_was_stopped_goes_on_as_if_it_had_not(real, tmp_path, monkeyp
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(stages.Checkpoint, "write", stop)
+        patch.setattr(estimation.Checkpoint, "write", stop)
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
                 identify(short, **options, checkpoint=file)
@@ -124,7 +124,7 @@ def test_a_checkpoint_is_of_one_flight_only(real):
     prior = load_drone("visfly", torch.float64)
 
     def seen(**changes):
-        return stages.fingerprint([dataclasses.replace(real, **changes)], prior, MotorCommand(500.0, 3.7), "lag")
+        return estimation.fingerprint([dataclasses.replace(real, **changes)], prior, MotorCommand(500.0, 3.7), "lag")
 
     assert seen(name="renamed", notes=("one more",)) == seen()  # which no fit reads
     columns = ["time", "position", "velocity", "quaternion", "angular_velocity", "motor_command", "battery_voltage"]
@@ -159,10 +159,10 @@ def test_the_jacobian_of_a_fit_is_that_of_central_differences(real):
     prior = load_drone("crazyflie", torch.float64)
     free = tuple(name for name in UNKNOWNS if name != "stream")
     model = Model(prior, prior.motor_command, free)
-    short = windows.cut([real], 0.3, 0.1, 4.0, 2, prior.motor_command.nominal_voltage)
+    short = prediction.cut([real], 0.3, 0.1, 4.0, 2, prior.motor_command.nominal_voltage)
     problem = fitting.Problem(model, short, moves_streams=True, counts_push=True)
     x = model.start + 0.1 * torch.randn(len(free), dtype=torch.float64)  # where two time constants are two
-    streams = torch.tensor([windows.stream_delay(real)], dtype=torch.float64)
+    streams = torch.tensor([prediction.stream_delay(real)], dtype=torch.float64)
     jacobian = problem.linearise(fitting.State(free, x, streams), update_scale=True).jacobian
     assert jacobian.shape == (len(short), problem.scale.numel(), len(UNKNOWNS))
     for i, name in enumerate(UNKNOWNS):
@@ -296,7 +296,7 @@ def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
         texts.append(json.dumps({**whole, "stages": {first: stage}}))
     for text in texts:
         file.write_text(text, encoding="latin-1")
-        with pytest.raises(UserError, match="checkpoint.json is no checkpoint of a fit: .*Delete it, to start anew"):
+        with pytest.raises(UserError, match="checkpoint.json is no checkpoint of a fit: .*Delete it to start again"):
             identify(short, **options)
 
 

@@ -1,8 +1,12 @@
-"""Find the parameters of a drone from its flights."""
+"""Find the parameters of a drone from its flights, in stages: what the flights do not tell is left out, and a second
+time constant is tried at the end."""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,22 +14,45 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from pydantic import Field
+from torch import Tensor
 
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
 from torchrl_quad.dynamics.presets import is_number
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.files import replacing
 from torchrl_quad.identification.errors import TooLittleFlight, UnknownField
-from torchrl_quad.identification.fitting import MAX_ITERATIONS
+from torchrl_quad.identification.fitting import (
+    MAX_ITERATIONS,
+    Linear,
+    Problem,
+    State,
+    bootstrap,
+    covariance,
+    minimise,
+)
 from torchrl_quad.identification.log import FlightLog, as_logs
-from torchrl_quad.identification.parameters import FIELDS, Model, unknowns_of
-from torchrl_quad.identification.prediction import PAST, as_params, carrying_speed
+from torchrl_quad.identification.parameters import FIELDS, UNKNOWNS, Model, report, unknowns_of
+from torchrl_quad.identification.prediction import (
+    CONSTANT_VELOCITY,
+    PAST,
+    Windows,
+    as_params,
+    carrying_speed,
+    cut,
+    predict,
+    rms_errors,
+    stream_delay,
+)
 from torchrl_quad.identification.result import IdentificationResult
-from torchrl_quad.identification.stages import Checkpoint, Fit, fingerprint, held_out
-from torchrl_quad.identification.windows import cut
 from torchrl_quad.options import Seed, checked
 
+MAX_BYTES = 10**7  # of a checkpoint, which has some numbers for each unknown
 _BODY_STEP = 0.02  # [s]
 _MOST_WINDOWS = 360  # more would cost more and tell little more, since neighbours overlap
+_HORIZONS = (0.1, 0.25, 0.5)  # [s], of the errors that are reported
+_BLOCK = 2.0  # [s] of flight that are held out together
+_EVERY_BLOCK = 5  # of which the last is held out
+_MASS = "without a known mass, motion only tells its ratio to the mass, which `ratios` gives"
 
 
 @checked
@@ -45,8 +72,8 @@ def identify(
 ) -> IdentificationResult:
     """Fit a drone to the open-loop predictions of short windows, by gradient through its dynamics.
 
-    Every window starts in a measured state and reads only motor commands, as in :func:`prediction_error`; what is
-    minimised is how far its states at five times lie from the measured ones, robustly. All windows fly at once, and the
+    Every window starts in a measured state and reads only motor commands, as in :func:`prediction_error`. The fit
+    minimises, robustly, how far its states at five times lie from the measured ones. All windows fly at once, and the
     derivative of each prediction in each unknown makes Gauss-Newton steps. A fifth of the flight is held out.
 
     Motion only tells ratios: thrust, drag and inertia by the mass. ``known={"mass": 0.03}`` makes numbers of them.
@@ -65,7 +92,7 @@ def identify(
         draws: of the bootstrap over windows; 0 for none, else two or more.
         seed: of these draws; the rest is deterministic.
         progress: print a line for each step.
-        checkpoint: a file that each step is written to, and from which a fit of the same flights and settings goes on.
+        checkpoint: a file that gets each step, and from which a fit of the same flights and settings continues.
 
     Raises:
         UnknownField: a field cannot be fitted.
@@ -76,16 +103,15 @@ def identify(
     logs = as_logs(log, "identify")
     if draws == 1:
         raise UserValueError("draws must be 0, for no bootstrap, or at least 2: one draw has no spread.")
-    known = dict(known or {})
-    delay = known.pop("command_delay", None)
+    given = dict(known or {})
+    delay = given.pop("command_delay", None)
     prior = as_params(drone)
-    prior = as_params(prior.replace(**known)) if known else prior
+    prior = as_params(prior.replace(**given)) if given else prior
     prior, motors = _with_motors(prior, logs, delay)
-    wanted = [x for x in unknowns_of(fields) if x != "stream"]
-    for name in (*known, *(["command_delay"] if delay is not None else [])):
-        wanted = [x for x in wanted if x not in FIELDS.get(name, ())]
-    lagging = any("angular_velocity" in x.onboard for x in logs)
-    moves_streams = lagging and "stream" in unknowns_of(fields)
+    unknowns = unknowns_of(fields)
+    not_fitted = {x for name in known or () for x in FIELDS.get(name, ())} | {"stream"}  # which each log has
+    wanted = [x for x in unknowns if x not in not_fitted]
+    moves_streams = "stream" in unknowns and any("angular_velocity" in x.onboard for x in logs)
     if not wanted and not moves_streams:
         raise UnknownField("identify: nothing is left to fit, since all of the fields are known. Name more fields.")
     step = min(x.dt * max(1, round(0.01 / x.dt)) for x in logs)
@@ -99,20 +125,53 @@ def identify(
             f"identify: {len(kept)} windows of {horizon:g} s are too few for {len(wanted)} unknowns. Give more "
             "flights, or fewer fields."
         )
-    fit = Fit(Model(prior, motors, ()), kept, logs, moves_streams, progress, iterations)
-    fit.file = Checkpoint(checkpoint, fingerprint(logs, prior, motors, wanted, past, horizon))
+    mark = fingerprint(logs, prior, motors, wanted, past, horizon)
+    fit = Fit(Model(prior, motors, ()), kept, logs, moves_streams, progress, iterations, Checkpoint(checkpoint, mark))
     state, dropped, two = fit.run(wanted)
-    return fit.result(
-        state,
-        dropped,
-        two,
-        windows.select(torch.nonzero(held).flatten()),
-        has_mass="mass" in known,
-        fields=fields,
-        past=past,
-        horizon=horizon,
-        draws=draws,
-        seed=seed,
+    model = fit.model.only(state.free)
+    _, linear, cover, _ = fit.uncertainty(state)
+    n = len(state.x)
+    # Student's distribution, nearly, and the bias of a sum over so many of the lags that there are.
+    quantile = 1.96 * (1.0 + 2.5 / max(len(kept) - n, 1) + 1.5 * fit.lags / len(kept))
+    has_mass = "mass" in given
+    parameters, ratios = report(model, state.x, cover[:n, :n], quantile, has_mass)
+    resampled = {}
+    if draws:
+        changes = bootstrap(linear, kept.log, len(logs), fit.lags, draws, seed)
+        tables = report(model, state.x, torch.cov(changes[:, :n].T).reshape(n, n), 1.96, has_mass)
+        resampled = {name: (entry["low"], entry["high"]) for table in tables for name, entry in table.items()}
+    if "command_delay" in parameters:
+        motors = dataclasses.replace(motors, delay=parameters["command_delay"]["value"])
+    motors = dataclasses.replace(motors, delay=float(np.clip(motors.delay, -0.1, 0.5)))
+    fitted = QuadrotorParams(**model.params(state.x)._asdict(), motor_command=motors)
+    half = quantile * cover.diag()[n:].clamp_min(0.0).sqrt() * UNKNOWNS["stream"].scale
+    return IdentificationResult(
+        drone=fitted,
+        prior=prior,
+        has_mass=has_mass,
+        parameters=parameters,
+        ratios=ratios,
+        stream_delay={
+            log.name: {"value": float(s), "low": float(s - h), "high": float(s + h), "unit": "s"}
+            for log, s, h in zip(logs, state.streams, half, strict=True)
+        },
+        bootstrap=resampled,
+        names=list(state.free),
+        correlation=_correlation(cover[:n, :n]).tolist(),
+        not_identifiable=_not_identifiable(dropped, has_mass, fields),
+        time_constants=two,
+        errors=_errors(logs, {"fitted": fitted, "prior": prior}, past, horizon),
+        settings={
+            "past": past,
+            "horizon": horizon,
+            "seed": seed,
+            "windows": len(kept),
+            "held_out": len(windows) - len(kept),
+            "iterations": state.iteration,
+            "cost": state.cost,
+        },
+        logs=[log.name for log in logs],
+        flights=logs,
     )
 
 
@@ -128,3 +187,206 @@ def _with_motors(
     if delay is not None:
         motors = dataclasses.replace(motors, delay=float(delay) if is_number(delay) else delay)
     return dataclasses.replace(prior, motor_command=motors), motors
+
+
+@dataclasses.dataclass
+class Fit:
+    """One fit: its windows, and the stages in which unknowns come and go."""
+
+    model: Model
+    windows: Windows
+    logs: list[FlightLog]
+    moves_streams: bool
+    progress: bool
+    iterations: int
+    file: Checkpoint
+
+    @property
+    def lags(self) -> int:
+        """How many windows in a row err alike."""
+        overlap = 2 * (self.windows.past + self.windows.future) // self.windows.future
+        return max(overlap, round(4.0 * (len(self.windows) / 100.0) ** (2.0 / 9.0)))
+
+    def run(self, wanted: list[str]) -> tuple[State, dict[str, str], str]:
+        """Fit what is wanted; leave out what the flights do not tell; then ask for two time constants."""
+        streams = torch.tensor([stream_delay(log) for log in self.logs], dtype=torch.float64)
+        free, dropped = [x for x in wanted if x != "asymmetry"], {}
+        x, near = self.model.only(free).start, min(4, self.iterations - 1)  # a later stage starts near its end
+        while True:
+            start = State(tuple(free), x, streams, iteration=near if dropped else 0)
+            state = self._minimise(start, f"without {sorted(dropped)}")
+            worst = self._least_certain(state)
+            if not worst:
+                break
+            dropped |= worst
+            if self.progress:
+                print("\n".join(f"{name}: {reason}" for name, reason in worst.items()))
+            x = state.x[[i for i, name in enumerate(free) if name not in worst]]
+            free, streams = [name for name in free if name not in worst], state.streams
+        if "asymmetry" not in wanted or "lag" not in free:
+            return state, dropped, "not asked for"
+        start = State((*free, "asymmetry"), torch.cat((state.x, state.x.new_zeros(1))), state.streams, iteration=near)
+        more = self._minimise(start, "two time constants")
+        _, _, cover, _ = self.uncertainty(more)
+        ratio, error = float(more.x[-1]), float(cover[len(free), len(free)].sqrt())
+        said = (
+            f"rising / falling = {math.exp(ratio):.2f}, 95 % between {math.exp(ratio - 1.96 * error):.2f} and "
+            f"{math.exp(ratio + 1.96 * error):.2f}"
+        )
+        if abs(ratio) > 2.58 * error and abs(ratio) > math.log(1.2):
+            return more, dropped, f"two time constants: {said}"
+        return state, dropped, f"one time constant: {said}"
+
+    def uncertainty(self, state: State) -> tuple[Problem, Linear, Tensor, Tensor]:
+        """The covariance (n + L, n + L) of the unknowns at the optimum, and the inverse Hessian."""
+        problem = self._problem(state)
+        linear = problem.linearise(state, update_scale=True)
+        cover, bread, scores = covariance(linear, self.windows.log, len(self.logs), self.lags)
+        if len(self.logs) > 2 and "thrust" in state.free:
+            # The level of thrust differs from flight to flight, with rotors and battery, more than within one.
+            sums = scores.new_zeros(len(self.logs), scores.shape[1]).index_add(0, self.windows.log, scores)
+            between = (bread @ (sums.T @ sums) @ bread).diag() * len(self.logs) / (len(self.logs) - 1)
+            wider = torch.ones_like(between)
+            i = state.free.index("thrust")
+            wider[i] = (between[i] / cover[i, i].clamp_min(1e-300)).clamp_min(1.0).sqrt()
+            cover = cover * wider[:, None] * wider
+        return problem, linear, cover, bread
+
+    def _problem(self, state: State) -> Problem:
+        return Problem(self.model.only(state.free), self.windows, self.moves_streams, "thrust" in state.free)
+
+    def _minimise(self, start: State, stage: str) -> State:
+        def after(now: State) -> None:
+            self.file.write(stage, now)
+            if self.progress:
+                print(f"step {now.iteration}, cost {now.cost:.4g}, {len(now.free)} unknowns, {stage}")
+
+        return minimise(self._problem(start), self.file.resume(stage, start), after, self.iterations)
+
+    def _least_certain(self, state: State) -> dict[str, str]:
+        """The unknown of which flights tell least, if too little, and why; or all of which they tell nothing."""
+        if not state.free:
+            return {}
+        _, _, cover, _ = self.uncertainty(state)
+        variance = cover.diag()[: len(state.x)]
+        untold = [name for name, x in zip(state.free, variance, strict=True) if x <= 0]
+        if untold:
+            return {x: f"nothing in the flights depends on it; it needs {UNKNOWNS[x].why}" for x in untold}
+        halves = 1.96 * variance.sqrt()
+        excess = halves / halves.new_tensor([UNKNOWNS[name].wide for name in state.free])
+        i = int(excess.argmax())
+        name, half = state.free[i], float(halves[i])
+        unknown = UNKNOWNS[name]
+        if excess[i] <= 1.0 and abs(float(state.x[i])) < unknown.limit:
+            return {}
+        if unknown.is_log:
+            spread = f"its 95 % interval spans a factor of {math.exp(2 * min(half, 20.0)):.3g}"
+        else:
+            spread = f"its 95 % interval is {2 * half * unknown.scale:.3g} wide"
+        correlation = _correlation(cover)[i, : len(state.x)].clone()
+        correlation[i] = 0.0
+        j = int(correlation.abs().argmax())
+        if abs(float(correlation[j])) > 0.9:
+            spread += f", and it is hardly told from {state.free[j]} (correlation {float(correlation[j]):.2f})"
+        return {name: f"{spread}; it needs {unknown.why}"}
+
+
+@dataclasses.dataclass
+class Checkpoint:
+    """A file with the last step of each stage of a fit."""
+
+    path: str | Path | None
+    fingerprint: str
+
+    def resume(self, stage: str, start: State) -> State:
+        """The last step of a stage, or its start."""
+        found = self._read().get(stage)
+        try:
+            if found is None or tuple(found["free"]) != start.free:
+                return start
+            changes: dict[str, Any] = {**found, "free": start.free}
+            for name in ("x", "streams"):
+                changes[name] = torch.tensor(found[name], dtype=torch.float64)
+                if changes[name].shape != getattr(start, name).shape:
+                    raise ValueError("another number of unknowns")
+                if not changes[name].isfinite().all():
+                    raise ValueError("an unknown is not finite")
+            return State(**changes)
+        except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
+            raise self._broken(error) from error
+
+    def write(self, stage: str, state: State) -> None:
+        """Keep a step."""
+        if self.path is None:
+            return
+        entry = dataclasses.asdict(state) | {"x": state.x.tolist(), "streams": state.streams.tolist()}
+        content = {"fingerprint": self.fingerprint, "stages": {**self._read(), stage: entry}}
+        with replacing(self.path) as temporary:
+            temporary.write_text(json.dumps(content))
+
+    def _read(self) -> dict[str, Any]:
+        if self.path is None or not Path(self.path).is_file():
+            return {}
+        if Path(self.path).stat().st_size > MAX_BYTES:
+            raise self._broken(f"it has more than {MAX_BYTES:,} bytes")
+        try:
+            content = json.loads(Path(self.path).read_text())
+            return dict(content["stages"]) if content["fingerprint"] == self.fingerprint else {}
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise self._broken(error) from error
+
+    def _broken(self, error: object) -> UserValueError:
+        return UserValueError(f"{self.path} is no checkpoint of a fit: {shown(error)}. Delete it to start again.")
+
+
+def held_out(windows: Windows) -> Tensor:
+    """Which windows (W) are held out: of each log every fifth block of two seconds, or of less in a short log."""
+    held = torch.zeros(len(windows), dtype=torch.bool)
+    for k in windows.log.unique():
+        own = windows.log == k
+        start = (windows.start[own] - windows.start[own].min()) * windows.dt
+        block = min(_BLOCK, float(start.max()) / _EVERY_BLOCK + 1e-9)
+        held[own] = start // block % _EVERY_BLOCK == _EVERY_BLOCK - 1
+    return held
+
+
+def _errors(
+    logs: Sequence[FlightLog], drones: Mapping[str, QuadrotorParams], past: float, horizon: float
+) -> dict[str, dict[str, dict[float, float]]]:
+    """RMS errors of the predictions in the held-out windows, of drones by name, and of constant velocity."""
+    horizons = sorted({h for h in _HORIZONS if h <= horizon} | {horizon})
+    table = {}
+    for name, drone in {**drones, CONSTANT_VELOCITY: CONSTANT_VELOCITY}.items():
+        windows, *flights = predict(logs, drone, horizon, past, 0.1)
+        flown, seen = (type(flight)(*(x[held_out(windows)] for x in flight)) for flight in flights)
+        table[name] = rms_errors(windows, flown, seen, horizons)
+    return table
+
+
+def _not_identifiable(dropped: Mapping[str, str], has_mass: bool, fields: str | Sequence[str] | None) -> dict[str, str]:
+    """Fields that got no number, with the reason."""
+    found = {UNKNOWNS[name].number: reason for name, reason in dropped.items()}
+    if not has_mass:
+        found["mass"] = "motion does not tell it: weigh the drone, and give known={'mass': ...}"
+        for name in ("thrust_map", "linear_drag", "inertia"):
+            if fields is None or name in fields:
+                found.setdefault(name, _MASS)
+    return found
+
+
+def _correlation(cover: Tensor) -> Tensor:
+    deviation = cover.diag().clamp_min(1e-300).sqrt()
+    return (cover / deviation[:, None] / deviation).clamp(-1.0, 1.0)
+
+
+def fingerprint(logs: Sequence[FlightLog], prior: QuadrotorParams, motors: MotorCommand, *settings: Any) -> str:
+    """What the flights, the start and the settings of a fit amount to: a checkpoint is of one of them."""
+    digest = hashlib.sha256(repr((settings, motors)).encode())
+    for value in prior.fields().values():
+        digest.update(value.numpy().tobytes())
+    for log in logs:
+        motion = (log.position, log.velocity, log.quaternion, log.angular_velocity)
+        for column in (*motion, log.motor_command, log.battery_voltage):
+            digest.update(b"none" if column is None else np.ascontiguousarray(column).tobytes())
+        digest.update(repr((log.dt, log.segments, log.onboard)).encode())
+    return digest.hexdigest()

@@ -11,16 +11,15 @@ from torch import Tensor
 from torch.func import jacfwd
 
 from torchrl_quad.identification.parameters import UNKNOWNS, Model
-from torchrl_quad.identification.prediction import differences
-from torchrl_quad.identification.windows import Trajectory, Windows
+from torchrl_quad.identification.prediction import Windows, differences, states_at
 
 ROBUST = 3.0  # standard deviations, from which a residual counts less and less
 POINTS = 5  # times in a window at which predictions are compared
 MAX_ITERATIONS = 30
 CONVERGED = 1e-3  # change of the coordinates in a step
 
-# What a residual is whitened by at the least: position [m], velocity [m/s], attitude [rad], body rate [rad/s], and
-# the constant force [m/s2].
+# The least that a residual is whitened by: position [m], velocity [m/s], attitude [rad], body rate [rad/s]; and the
+# constant force [m/s2].
 _FLOOR = (1e-4, 1e-3, 1e-4, 1e-3)
 _PUSH_FLOOR = 1e-2
 
@@ -59,10 +58,9 @@ def residuals(
     speed = windows.rotor_speed(plant)
     push = windows.push(plant, speed)
     seen = windows.measured(plant.stream_delay, torch.arange(0, windows.future + 1, windows.stride))
-    flown = windows.fly(plant, seen.at(0), speed, push)
-    steps = windows.future // windows.stride
-    points = torch.arange(1, POINTS + 1) * steps // POINTS
-    errors = differences(*(Trajectory(*(y[:, points] for y in z)) for z in (flown, seen)))
+    flown = windows.fly(plant, states_at(seen, 0), speed, push)
+    points = torch.arange(1, POINTS + 1) * (windows.future // windows.stride) // POINTS
+    errors = differences(states_at(flown, points), states_at(seen, points))
     return errors, torch.stack(push, -2), windows.turning(plant.stream_delay, windows.future // POINTS)
 
 
@@ -77,7 +75,7 @@ class Problem:
     def __init__(self, model: Model, windows: Windows, moves_streams: bool, counts_push: bool) -> None:
         self.model, self.windows = model, windows
         self.moves_streams, self.counts_push = moves_streams, counts_push
-        self.scale: Tensor | None = None
+        self.scale = torch.empty(0)  # until it is found
 
     def raw(self, x: Tensor, shift: Tensor, streams: Tensor) -> Tensor:
         """All residuals of each window, (W, m)."""
@@ -97,7 +95,7 @@ class Problem:
             return raw, raw
 
         jacobian, raw = jacfwd(f, has_aux=True)(torch.cat((state.x, state.x.new_zeros(1))))
-        if update_scale or self.scale is None:
+        if update_scale or not len(self.scale):
             self.scale = self._spread(raw)
         residual = raw / self.scale
         jacobian = jacobian / self.scale[:, None]
@@ -126,13 +124,9 @@ def minimise(
     report: Callable[[State], None] | None = None,
     max_iterations: int = MAX_ITERATIONS,
 ) -> State:
-    """Levenberg-Marquardt steps until the coordinates stand still. The scales of the residuals follow the first ones.
+    """Levenberg-Marquardt steps from a state until the coordinates stand still, each of which is reported.
 
-    Args:
-        problem: what to minimise.
-        state: where to start, or to go on.
-        report: called after each iteration, with the state there.
-        max_iterations: at most, counted from the start of the state.
+    The scales of the residuals follow the first steps.
     """
     if state.scale is not None:
         problem.scale = state.x.new_tensor(state.scale)
@@ -141,29 +135,23 @@ def minimise(
         state.scale = problem.scale.tolist()
         state.cost = problem.cost(state)
         hessian, gradient = normal_equations(linear, problem.windows.log, len(state.streams))
-        moved = None
-        for _ in range(8):
-            step = _solve(hessian, gradient, state.damping)
-            trial = _moved(state, step)
-            cost = problem.cost(trial)
-            if math.isfinite(cost) and cost <= state.cost * (1.0 + 1e-9):
-                moved = trial
-                break
-            state.damping *= 8.0
         before = state
-        if moved is None:
-            state = dataclasses.replace(state, iteration=state.iteration + 1, converged=True)
-        else:
-            change = float((moved.x - before.x).abs().max()) if len(before.x) else 0.0
-            change = max(change, float((moved.streams - before.streams).abs().max()) / UNKNOWNS["stream"].scale)
-            state = dataclasses.replace(
-                moved,
-                cost=cost,
-                damping=max(before.damping / 6.0, 1e-9),
-                iteration=before.iteration + 1,
-                converged=before.iteration >= 8
-                and (change < CONVERGED or before.cost - cost < CONVERGED * 0.1 * before.cost),
-            )
+        for _ in range(8):
+            state = _moved(before, _solve(hessian, gradient, before.damping))
+            cost = problem.cost(state)
+            if math.isfinite(cost) and cost <= before.cost * (1.0 + 1e-9):
+                change = float((state.x - before.x).abs().max()) if len(before.x) else 0.0
+                change = max(change, float((state.streams - before.streams).abs().max()) / UNKNOWNS["stream"].scale)
+                is_still = change < CONVERGED or before.cost - cost < CONVERGED * 0.1 * before.cost
+                damping = max(before.damping / 6.0, 1e-9)
+                state = dataclasses.replace(
+                    state, cost=cost, damping=damping, converged=before.iteration >= 8 and is_still
+                )
+                break
+            before.damping *= 8.0
+        else:  # no step makes it better
+            state = dataclasses.replace(before, converged=True)
+        state.iteration += 1
         if report is not None:
             report(state)
     return state
@@ -213,15 +201,9 @@ def covariance(linear: Linear, log: Tensor, logs: int, lags: int) -> tuple[Tenso
 
 
 def bootstrap(linear: Linear, log: Tensor, logs: int, block: int, draws: int, seed: int) -> Tensor:
-    """Changes of the unknowns (draws, n + L) where blocks of windows are drawn anew, with one Gauss-Newton step each.
+    """Changes of the unknowns (draws, n + L) where blocks of windows are resampled, with one Gauss-Newton step each.
 
-    Args:
-        linear: at the optimum.
-        log: of each window (W).
-        logs: how many there are.
-        block: windows in a block.
-        draws: how many.
-        seed: of the draws.
+    ``log`` is that of each window (W), of so many ``logs``; a ``block`` is a number of windows.
     """
     h, g = per_window(linear)
     n = g.shape[1] - 1
@@ -262,16 +244,11 @@ def _inverse(hessian: Tensor) -> Tensor:
 
 
 def _moved(state: State, step: Tensor) -> State:
-    n = len(state.x)
-    low = state.x.new_tensor([UNKNOWNS[name].low for name in state.free])
-    high = state.x.new_tensor([UNKNOWNS[name].high for name in state.free])
-    is_log = torch.tensor([UNKNOWNS[name].scale is None for name in state.free], dtype=torch.bool)
-    most = torch.where(is_log, 0.7, 2.0).to(state.x)
-    x = state.x + step[:n].clamp(-most, most)
-    centre = torch.where(is_log, state.x, 0.0)
-    x = x.maximum(torch.where(is_log, centre - 7.0, low)).minimum(torch.where(is_log, centre + 7.0, high))
-    stream = UNKNOWNS["stream"]
-    streams = (state.streams + step[n:].clamp(-2.0, 2.0) * stream.scale).clamp(
-        stream.low * stream.scale, stream.high * stream.scale
-    )
+    """The state after a step (n + L) that goes no further than its derivatives are good for."""
+    n, stream = len(state.x), UNKNOWNS["stream"]
+    limit = state.x.new_tensor([UNKNOWNS[name].limit for name in state.free])
+    most = torch.tensor([0.7 if UNKNOWNS[name].is_log else 2.0 for name in state.free]).to(state.x)
+    x = (state.x + step[:n].clamp(-most, most)).clamp(-limit, limit)
+    end = stream.limit * stream.scale
+    streams = (state.streams + step[n:].clamp(-2.0, 2.0) * stream.scale).clamp(-end, end)
     return dataclasses.replace(state, x=x, streams=streams)

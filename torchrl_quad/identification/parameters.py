@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, NotRequired, TypedDict
 
 import torch
 from torch import Tensor
@@ -14,51 +14,48 @@ from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
 from torchrl_quad.dynamics.parameters import RawParams
 from torchrl_quad.errors import shown
 from torchrl_quad.identification.errors import UnknownField
-from torchrl_quad.identification.windows import MAX_DELAY, Plant
-
-#: What ``fields`` of :func:`~torchrl_quad.identification.identify` may name, and the unknowns that each stands for.
-FIELDS: dict[str, tuple[str, ...]] = {
-    "thrust_map": ("thrust",),
-    "motor_time_constant": ("lag", "asymmetry"),
-    "linear_drag": ("drag_xy", "drag_z"),
-    "drag_height": ("height",),
-    "inertia": ("roll", "pitch", "z_ratio"),
-    "yaw_torque_coefficient": ("yaw",),
-    "command_delay": ("delay",),
-    "stream_delay": ("stream",),
-}
+from torchrl_quad.identification.prediction import MAX_DELAY, Plant, plant_of
 
 
 @dataclasses.dataclass(frozen=True)
 class Unknown:
     """One number that a fit looks for, in coordinates of its own: a logarithm, or a multiple of ``scale``."""
 
-    name: str
-    low: float  #: of the coordinate
-    high: float
-    wide: float  #: half of a 95 % interval that is wider than this says that the flights do not tell
-    scale: float | None  #: None: the coordinate is the logarithm
+    number: str  #: of a drone that it makes, as it is reported
     why: str  #: what a flight needs to tell it
+    wide: float = math.log(3.0)  #: half of a 95 % interval that is wider says that the flights do not tell it
+    limit: float = math.inf  #: of the coordinate, either way
+    scale: float = 1.0
+
+    @property
+    def field(self) -> str:
+        """The field of the drone."""
+        return self.number.partition(".")[0]
+
+    @property
+    def is_log(self) -> bool:
+        """Whether the coordinate is a logarithm, which has no limit."""
+        return math.isinf(self.limit)
 
 
-_LOG = {"low": -7.0, "high": 7.0, "wide": math.log(3.0), "scale": None}
 UNKNOWNS = {
-    x.name: x
-    for x in (
-        Unknown("thrust", **_LOG, why="changes of thrust, or hovering"),
-        Unknown("lag", **_LOG, why="quick changes of the motor commands"),
-        Unknown("asymmetry", **{**_LOG, "wide": 10.0}, why="quick changes of the motor commands, up and down"),
-        Unknown("drag_xy", **_LOG, why="fast flight sideways"),
-        Unknown("drag_z", **_LOG, why="fast climbs and descents"),
-        Unknown("height", -20.0, 20.0, 2.0, 0.01, "fast flight sideways, and quick turns of the body"),
-        Unknown("roll", **_LOG, why="quick rolls"),
-        Unknown("pitch", **_LOG, why="quick pitching"),
-        Unknown("z_ratio", **{**_LOG, "wide": math.log(2.0)}, why="quick turns about two axes at once"),
-        Unknown("yaw", **_LOG, why="yaw manoeuvres"),
-        Unknown("delay", -10.0, 10.0, 2.0, 0.01, "quick changes of the motor commands"),
-        Unknown("stream", -100 * MAX_DELAY + 5, 100 * MAX_DELAY - 5, 2.0, 0.01, "quick turns of the body"),
-    )
+    "thrust": Unknown("thrust_map", "changes of thrust, or hovering"),
+    "lag": Unknown("motor_time_constant", "quick changes of the motor commands"),
+    "asymmetry": Unknown("motor_time_constant", "quick changes of the motor commands, up and down", 10.0),
+    "drag_xy": Unknown("linear_drag.xy", "fast flight sideways"),
+    "drag_z": Unknown("linear_drag.z", "fast climbs and descents"),
+    "height": Unknown("drag_height", "fast flight sideways, and quick turns of the body", 2.0, 20.0, 0.01),
+    "roll": Unknown("inertia.x", "quick rolls"),
+    "pitch": Unknown("inertia.y", "quick pitching"),
+    "z_ratio": Unknown("inertia.z", "quick turns about two axes at once", math.log(2.0)),
+    "yaw": Unknown("yaw_torque_coefficient", "yaw manoeuvres"),
+    "delay": Unknown("command_delay", "quick changes of the motor commands", 2.0, 10.0, 0.01),
+    "stream": Unknown("stream_delay", "quick turns of the body", 2.0, 100 * MAX_DELAY - 5, 0.01),
 }
+#: What ``fields`` of :func:`~torchrl_quad.identification.identify` may name, and the unknowns that each stands for.
+FIELDS: dict[str, tuple[str, ...]] = {}
+for _name, _unknown in UNKNOWNS.items():
+    FIELDS[_unknown.field] = (*FIELDS.get(_unknown.field, ()), _name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +90,6 @@ class Model:
             "z_ratio": prior.inertia[2].log() - 0.5 * (prior.inertia[0] * prior.inertia[1]).log(),
             "yaw": (prior.yaw_torque_coefficient[0] * k2 / prior.inertia[2]).log(),
             "delay": prior.mass.new_tensor(self.motors.delay / UNKNOWNS["delay"].scale),
-            "stream": prior.mass.new_zeros(()),
         }
         return torch.stack([values[name] for name in self.free]) if self.free else prior.mass.new_zeros(0)
 
@@ -107,39 +103,37 @@ class Model:
         arm, mass = prior.rotor_positions.abs().mean(0), prior.mass[0]
         fields: dict[str, Tensor] = dict(prior.fields())
         k2 = c["thrust"].exp() * mass if "thrust" in c else prior.thrust_map[0]
-        fields["thrust_map"] = prior.thrust_map * (k2 / prior.thrust_map[0])
-        if "lag" in c:
-            half = 0.5 * c["asymmetry"] if "asymmetry" in c else torch.zeros_like(c["lag"])
-            both = [c["lag"] + half, c["lag"] - half] if "asymmetry" in c else [c["lag"]]
-            fields["motor_time_constant"] = torch.stack(both).exp()
-        drag = prior.linear_drag
-        xy = c["drag_xy"].exp() * mass if "drag_xy" in c else None
-        z = c["drag_z"].exp() * mass if "drag_z" in c else drag[2]
-        fields["linear_drag"] = torch.stack([drag[0] if xy is None else xy, drag[1] if xy is None else xy, z])
+        grown = k2 / prior.thrust_map[0]
+        fields["thrust_map"] = prior.thrust_map * grown
+        if "asymmetry" in c:
+            half = 0.5 * c["asymmetry"]
+            fields["motor_time_constant"] = torch.stack([c["lag"] + half, c["lag"] - half]).exp()
+        elif "lag" in c:
+            fields["motor_time_constant"] = torch.stack([c["lag"]]).exp()
+        x_drag, y_drag, z_drag = prior.linear_drag
+        if "drag_xy" in c:
+            x_drag = y_drag = c["drag_xy"].exp() * mass
+        if "drag_z" in c:
+            z_drag = c["drag_z"].exp() * mass
+        fields["linear_drag"] = torch.stack([x_drag, y_drag, z_drag])
         if "height" in c:
             fields["drag_height"] = (c["height"] * UNKNOWNS["height"].scale).reshape(1)
         # Without its own unknown an inertia keeps its ratio to the thrust, which is what motion would fix.
-        grown = k2 / prior.thrust_map[0]
         jx = arm[1] * k2 / c["roll"].exp() if "roll" in c else prior.inertia[0] * grown
         jy = arm[0] * k2 / c["pitch"].exp() if "pitch" in c else prior.inertia[1] * grown
         ratio = c["z_ratio"].exp() if "z_ratio" in c else prior.inertia[2] / prior.inertia[:2].prod().sqrt()
-        jz = ratio * (jx * jy).sqrt()
         if {"roll", "pitch", "z_ratio"} & set(c):
-            fields["inertia"] = torch.stack([jx, jy, jz])
+            fields["inertia"] = torch.stack([jx, jy, ratio * (jx * jy).sqrt()])
         if "yaw" in c:
-            inertia = fields["inertia"]
-            fields["yaw_torque_coefficient"] = (c["yaw"].exp() * inertia[2] / k2).reshape(1)
+            fields["yaw_torque_coefficient"] = (c["yaw"].exp() * fields["inertia"][2] / k2).reshape(1)
         return RawParams(**fields)
 
     def plant(self, x: Tensor, stream_delay: Tensor) -> Plant:
-        """What windows read, at coordinates (n); the stream delay (W) [s] moves with its coordinate."""
-        c = dict(zip(self.free, x, strict=True))
-        motors, like = self.motors, self.prior.mass
-        delay = c["delay"] * UNKNOWNS["delay"].scale if "delay" in c else like.new_tensor(motors.delay)
-        if "stream" in c:
-            stream_delay = stream_delay + c["stream"] * UNKNOWNS["stream"].scale
-        zero, slope = like.new_tensor(motors.speed_at_zero), like.new_tensor(motors.speed_per_volt)
-        return Plant(self.params(x), zero, slope, delay, stream_delay)
+        """What windows read, at coordinates (n), with the stream delay of each (W) [s]."""
+        plant = plant_of(self.params(x), self.motors, stream_delay)
+        if "delay" in self.free:
+            plant = plant._replace(delay=x[self.free.index("delay")] * UNKNOWNS["delay"].scale)
+        return plant
 
 
 #: What motion fixes whatever the mass is, as logarithms in the coordinates.
@@ -152,25 +146,56 @@ RATIOS: dict[str, tuple[str, str]] = {
     "kappa k2/Jz": ("yaw", "s"),
     "Jz/Jxy": ("z_ratio", ""),
 }
-# Fields by name: the unknowns whose logarithms add up to it, with their factors; unit; whether it needs the mass.
-_SUMS: dict[str, tuple[Mapping[str, float], str, bool]] = {
-    "thrust_map": ({"thrust": 1.0}, "N s2 (k2)", True),
-    "motor_time_constant": ({"lag": 1.0}, "s", False),
-    "motor_time_constant.rising": ({"lag": 1.0, "asymmetry": 0.5}, "s", False),
-    "motor_time_constant.falling": ({"lag": 1.0, "asymmetry": -0.5}, "s", False),
-    "linear_drag.xy": ({"drag_xy": 1.0}, "N s/m", True),
-    "linear_drag.z": ({"drag_z": 1.0}, "N s/m", True),
-    "drag_height": ({"height": 1.0}, "m", False),
-    "inertia.x": ({"thrust": 1.0, "roll": -1.0}, "kg m2", True),
-    "inertia.y": ({"thrust": 1.0, "pitch": -1.0}, "kg m2", True),
-    "inertia.z": ({"z_ratio": 1.0, "thrust": 1.0, "roll": -0.5, "pitch": -0.5}, "kg m2", True),
-    "yaw_torque_coefficient": ({"yaw": 1.0, "z_ratio": 1.0, "roll": -0.5, "pitch": -0.5}, "m", False),
-    "command_delay": ({"delay": 1.0}, "s", False),
-}
 
 
-def report(model: Model, x: Tensor, covariance: Tensor, quantile: float, has_mass: bool) -> tuple[dict, dict]:
-    """The parameters and the ratios by name: value, 95 % interval (low, high), unit, and the prior's value.
+class Estimate(TypedDict):
+    """A number with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+    prior: NotRequired[float]
+
+
+class _Number(NamedTuple):
+    """A number of a drone that is reported."""
+
+    factors: Mapping[str, float]  # with which coordinates add up to it; the first of them must have been fitted
+    unit: str
+    needs_mass: bool
+    of: Callable[[Plant], Tensor]
+
+
+_NUMBERS = {
+    "thrust_map": _Number({"thrust": 1.0}, "N s2 (k2)", True, lambda x: x.params.thrust_map[0]),
+    "motor_time_constant": _Number({"lag": 1.0}, "s", False, lambda x: x.params.motor_time_constant.log().mean().exp()),
+    "motor_time_constant.rising": _Number(
+        {"asymmetry": 0.5, "lag": 1.0}, "s", False, lambda x: x.params.motor_time_constant[0]
+    ),
+    "motor_time_constant.falling": _Number(
+        {"asymmetry": -0.5, "lag": 1.0}, "s", False, lambda x: x.params.motor_time_constant[-1]
+    ),
+    "linear_drag.xy": _Number({"drag_xy": 1.0}, "N s/m", True, lambda x: x.params.linear_drag[:2].mean()),
+    "linear_drag.z": _Number({"drag_z": 1.0}, "N s/m", True, lambda x: x.params.linear_drag[2]),
+    "drag_height": _Number({"height": 1.0}, "m", False, lambda x: x.params.drag_height[0]),
+    "inertia.x": _Number({"roll": -1.0, "thrust": 1.0}, "kg m2", True, lambda x: x.params.inertia[0]),
+    "inertia.y": _Number({"pitch": -1.0, "thrust": 1.0}, "kg m2", True, lambda x: x.params.inertia[1]),
+    "inertia.z": _Number(
+        {"z_ratio": 1.0, "thrust": 1.0, "roll": -0.5, "pitch": -0.5}, "kg m2", True, lambda x: x.params.inertia[2]
+    ),
+    "yaw_torque_coefficient": _Number(
+        {"yaw": 1.0, "z_ratio": 1.0, "roll": -0.5, "pitch": -0.5}, "m", False,
+        lambda x: x.params.yaw_torque_coefficient[0],
+    ),
+    "command_delay": _Number({"delay": 1.0}, "s", False, lambda x: x.delay),
+}  # fmt: skip
+
+
+def report(
+    model: Model, x: Tensor, covariance: Tensor, quantile: float, has_mass: bool
+) -> tuple[dict[str, Estimate], dict[str, Estimate]]:
+    """The parameters and the ratios by name.
 
     Args:
         model: the drone.
@@ -180,68 +205,38 @@ def report(model: Model, x: Tensor, covariance: Tensor, quantile: float, has_mas
         has_mass: whether the mass is known; without it, fields that scale with the mass are left out.
     """
     place = {name: i for i, name in enumerate(model.free)}
-    values, prior = _numbers(model, model.params(x), x), _numbers(model, RawParams(**model.prior.fields()), None)
+    fitted, prior = model.plant(x, x.new_zeros(())), model.only(()).plant(x[:0], x.new_zeros(()))
 
-    def interval(factors: Mapping[str, float], value: float, scale: float | None) -> tuple[float, float]:
+    def estimate(value: float, unit: str, factors: Mapping[str, float]) -> Estimate:
         gradient = torch.zeros_like(x)
         for name, factor in factors.items():
             if name in place:
                 gradient[place[name]] = factor
         half = quantile * float((gradient @ covariance @ gradient).clamp_min(0.0).sqrt())
-        if scale is None:
-            return value * math.exp(-half), value * math.exp(half)
-        return value - half * scale, value + half * scale
+        main = UNKNOWNS[next(iter(factors))]
+        low = value * math.exp(-half) if main.is_log else value - half * main.scale
+        high = value * math.exp(half) if main.is_log else value + half * main.scale
+        return {"value": value, "low": low, "high": high, "unit": unit}
 
-    parameters: dict[str, dict[str, Any]] = {}
-    two = "asymmetry" in place
-    for name, (factors, unit, needs_mass) in _SUMS.items():
-        main = next(reversed(factors)) if name in ("inertia.x", "inertia.y") else next(iter(factors))
-        if main not in place or (needs_mass and not has_mass):
-            continue
-        if name.startswith("motor_time_constant") and (name == "motor_time_constant") is two:
-            continue
-        low, high = interval(factors, values[name], UNKNOWNS[main].scale)
-        parameters[name] = {"value": values[name], "low": low, "high": high, "unit": unit, "prior": prior[name]}
-    ratios = {}
-    for name, (unknown, unit) in RATIOS.items():
-        if unknown in place:
-            value = math.exp(float(x[place[unknown]]))
-            low, high = interval({unknown: 1.0}, value, None)
-            ratios[name] = {"value": value, "low": low, "high": high, "unit": unit}
+    parameters: dict[str, Estimate] = {}
+    for name, number in _NUMBERS.items():
+        replaced = name == "motor_time_constant" and "asymmetry" in place  # by two of them
+        if next(iter(number.factors)) in place and (has_mass or not number.needs_mass) and not replaced:
+            found = estimate(float(number.of(fitted)), number.unit, number.factors)
+            parameters[name] = {**found, "prior": float(number.of(prior))}
+    ratios = {
+        name: estimate(math.exp(float(x[place[unknown]])), unit, {unknown: 1.0})
+        for name, (unknown, unit) in RATIOS.items()
+        if unknown in place
+    }
     return parameters, ratios
 
 
-def _numbers(model: Model, params: RawParams, x: Tensor | None) -> dict[str, float]:
-    tau = params.motor_time_constant
-    place = {} if x is None else dict(zip(model.free, x.tolist(), strict=True))
-    delay = place["delay"] * UNKNOWNS["delay"].scale if "delay" in place else model.motors.delay
-    return {
-        "thrust_map": float(params.thrust_map[0]),
-        "motor_time_constant": float(tau.log().mean().exp()),
-        "motor_time_constant.rising": float(tau[0]),
-        "motor_time_constant.falling": float(tau[-1]),
-        "linear_drag.xy": float(params.linear_drag[:2].mean()),
-        "linear_drag.z": float(params.linear_drag[2]),
-        "drag_height": float(params.drag_height[0]),
-        "inertia.x": float(params.inertia[0]),
-        "inertia.y": float(params.inertia[1]),
-        "inertia.z": float(params.inertia[2]),
-        "yaw_torque_coefficient": float(params.yaw_torque_coefficient[0]),
-        "command_delay": delay,
-    }
-
-
-def unknowns_of(fields: Sequence[str] | None) -> list[str]:
-    """The unknowns behind fields; None are all.
-
-    Raises:
-        UnknownField: one is not known.
-    """
-    if isinstance(fields, str):
-        fields = [fields]
-    fields = list(FIELDS) if fields is None else list(dict.fromkeys(fields))
+def unknowns_of(fields: str | Sequence[str] | None) -> list[str]:
+    """The unknowns behind fields; None means all."""
+    fields = [fields] if isinstance(fields, str) else list(FIELDS if fields is None else dict.fromkeys(fields))
     if not fields:
-        raise UnknownField(f"identify: fields names none. Choose from: {', '.join(FIELDS)}; None is everything.")
+        raise UnknownField(f"identify: fields is empty. Choose from: {', '.join(FIELDS)}; None is everything.")
     for name in fields:
         if name not in FIELDS:
             raise UnknownField(

@@ -9,12 +9,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.dynamics.parameters import LIMITS
+from torchrl_quad.dynamics.rigid_body import RigidBodyState
 from torchrl_quad.files import make_folder, replacing
 from torchrl_quad.identification.log import FlightLog
+from torchrl_quad.identification.parameters import Estimate
+from torchrl_quad.identification.prediction import ERRORS, PAST, differences, predict
+from torchrl_quad.identification.signals import Array
 from torchrl_quad.options import checked
 
 # Which intervals a field of the drone is randomised by.
@@ -26,6 +31,14 @@ _RANDOMISED = {
     "yaw_torque_coefficient": ("yaw_torque_coefficient",),
     "drag_height": ("drag_height",),
 }
+# Of a picture: the rows with their labels, and the seconds of a flight that are drawn.
+_ROWS = {
+    "position": "{} position [m]",
+    "velocity": "{} velocity [m/s]",
+    "tilt": "{} [deg]",
+    "body_rate": "{} rate [rad/s]",
+}
+_SECONDS = 8.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,17 +52,16 @@ class IdentificationResult:
     drone: QuadrotorParams  #: the fitted drone, float64; what was not fitted is the prior's
     prior: QuadrotorParams  #: where the fit started
     has_mass: bool  #: whether the mass was known; without it, ``drone`` has the prior's, and only ratios count
-    parameters: Mapping[str, Mapping[str, Any]]  #: by name
-    ratios: Mapping[str, Mapping[str, Any]]  #: what motion tells whatever the mass is, by name
-    stream_delay: Mapping[str, Mapping[str, Any]]  #: by log, how late its on-board clock is
-    bootstrap: Mapping[str, tuple[float, float]]  #: the same intervals, from windows drawn anew
+    parameters: Mapping[str, Estimate]  #: by name
+    ratios: Mapping[str, Estimate]  #: what motion tells whatever the mass is, by name
+    stream_delay: Mapping[str, Estimate]  #: by log, how late its on-board clock is
+    bootstrap: Mapping[str, tuple[float, float]]  #: the same intervals, from resampled windows
     names: Sequence[str]  #: of the unknowns, in the order of ``correlation``
     correlation: Sequence[Sequence[float]]  #: between the unknowns
     not_identifiable: Mapping[str, str]  #: by field, the reason
     time_constants: str  #: what the flights say about rotors that speed up and slow down at a different pace
-    errors: Mapping[
-        str, Mapping[str, Mapping[float, float]]
-    ]  #: by model, quantity and horizon [s], in held-out windows
+    #: by model, quantity and horizon [s], in held-out windows
+    errors: Mapping[str, Mapping[str, Mapping[float, float]]]
     settings: Mapping[str, Any]  #: of the fit
     logs: Sequence[str]  #: names of the flights
     flights: Sequence[FlightLog] = dataclasses.field(repr=False, default=())  #: for pictures
@@ -79,14 +91,13 @@ class IdentificationResult:
         everything = {**self.ratios, **self.parameters}
         for field, names in _RANDOMISED.items():
             own = [everything[name] for name in names if name in everything]
-            if not own:
-                continue
-            if field == "drag_height":
-                low, high = LIMITS[field]
-                found[field] = {"uniform": [max(low, float(own[0]["low"])), min(high, float(own[0]["high"]))]}
-            else:
-                low = min(x["low"] / x["value"] for x in own)
-                found[field] = {"scale": [float(low), float(max(x["high"] / x["value"] for x in own))]}
+            if field == "drag_height" and own:
+                least, most = LIMITS[field]
+                found[field] = {"uniform": [max(least, own[0]["low"]), min(most, own[0]["high"])]}
+            elif own:
+                found[field] = {
+                    "scale": [min(x["low"] / x["value"] for x in own), max(x["high"] / x["value"] for x in own)]
+                }
         return found
 
     def as_yaml(self) -> str:
@@ -94,8 +105,10 @@ class IdentificationResult:
         content: dict[str, Any] = {}
         for name, value in self.drone.fields().items():
             plain = [_rounded(x) for x in value.reshape(-1).tolist()]
-            plain = [plain[i : i + 2] for i in range(0, 8, 2)] if name == "rotor_positions" else plain
-            content[name] = plain[0] if len(plain) == 1 else plain
+            if name == "rotor_positions":
+                content[name] = [plain[i : i + 2] for i in range(0, 8, 2)]
+            else:
+                content[name] = plain[0] if len(plain) == 1 else plain
         motors = self.drone.motor_command
         if motors is not None:
             content["motor_command"] = {k: _rounded(v) for k, v in dataclasses.asdict(motors).items()}
@@ -122,19 +135,90 @@ class IdentificationResult:
             OSError: the folder cannot be made or written.
         """
         folder = make_folder(folder)
-        with replacing(folder / "drone.yaml") as path:
-            path.write_text(self.as_yaml(), encoding="utf-8")
-        with replacing(folder / "randomization.yaml") as path:
-            path.write_text(yaml.safe_dump(self.randomization(), default_flow_style=None), encoding="utf-8")
-        with replacing(folder / "report.json") as path:
-            path.write_text(json.dumps(self.report(), indent=1), encoding="utf-8")
+        for name, text in {
+            "drone.yaml": self.as_yaml(),
+            "randomization.yaml": yaml.safe_dump(self.randomization(), default_flow_style=None),
+            "report.json": json.dumps(self.report(), indent=1),
+        }.items():
+            with replacing(folder / name) as path:
+                path.write_text(text, encoding="utf-8")
         if pictures and self.flights:
-            from torchrl_quad.identification.pictures import draw_prediction, draw_residuals
-
             span = {"horizon": self.settings["horizon"], "past": self.settings["past"]}
             draw_prediction(self.flights[0], self.drone, folder / "prediction.png", prior=self.prior, **span)
             draw_residuals(self.flights, self.drone, folder / "residuals.png", **span)
         return folder
+
+
+def draw_prediction(
+    log: FlightLog, drone: Any, path: str | Path, prior: Any = None, horizon: float = 0.5, past: float = PAST
+) -> None:
+    """Draw a piece of a flight, and over it predictions from one state to the next, ``horizon`` [s] long each.
+
+    ``drone``, ``past`` and, for comparison, ``prior`` are what :func:`prediction_error` takes.
+    """
+    from torchrl_quad.render.canvas import BLUE, INK, RED, make_figure, save  # which imports the environments
+
+    figure = make_figure(figsize=(7.2, 6.4), layout="constrained")
+    axes = figure.subplots(4, 2, sharex=True)
+    for one, color, label in ((prior, RED, "before the fit"), (drone, BLUE, "fitted")):
+        if one is None:
+            continue
+        windows, flown, seen = predict([log], one, horizon, past, every=horizon)
+        count = min(len(windows), round(_SECONDS / horizon))
+        time = windows.dt * (windows.start[:count, None].numpy() + np.arange(windows.future + 1))
+        for row, pair in zip(_ROWS, axes, strict=True):
+            for k, ax in enumerate(pair):
+                real, guess = (_component(x, row, k)[:count] for x in (seen, flown))
+                if color == BLUE:
+                    ax.plot(time.T, real.T, color=INK, linewidth=1.6, alpha=0.55)
+                    margin = 0.25 * (real.max() - real.min()) + 1e-3
+                    ax.set_ylim(real.min() - margin, real.max() + margin)
+                ax.plot(time.T, guess.T, color=color, linewidth=0.9)
+                ax.plot([], [], color=color, label=label)
+    for (row, label), pair in zip(_ROWS.items(), axes, strict=True):
+        names = ("roll", "pitch") if row in ("tilt", "body_rate") else ("x", "y")
+        for ax, name in zip(pair, names, strict=True):
+            ax.set_ylabel(label.format(name), fontsize=8)
+            ax.tick_params(labelsize=7)
+            ax.grid(alpha=0.3, linewidth=0.5)
+    axes[0, 0].plot([], [], color=INK, linewidth=1.6, alpha=0.55, label="flight")
+    axes[0, 0].legend(fontsize=7, frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0))
+    for ax in axes[-1]:
+        ax.set_xlabel("time [s]", fontsize=8)
+    axes[0, 1].set_title(f"{log.name}, predictions of {horizon:g} s", fontsize=8, loc="right")
+    save(figure, path, dpi=110)
+
+
+def draw_residuals(
+    logs: Sequence[FlightLog], drone: Any, path: str | Path, horizon: float = 0.5, past: float = PAST
+) -> None:
+    """Draw how errors grow over a prediction: the median, and half and nine in ten of the windows around it."""
+    from torchrl_quad.render.canvas import BLUE, make_figure, save
+
+    windows, flown, seen = predict(logs, drone, horizon, past, every=0.1)
+    errors = differences(flown, seen).norm(dim=-1).numpy()
+    time = windows.dt * np.arange(errors.shape[1])
+    figure = make_figure(figsize=(7.2, 2.2), layout="constrained")
+    for i, (ax, (name, unit)) in enumerate(zip(figure.subplots(1, 4), ERRORS.items(), strict=True)):
+        low, lower, median, upper, high = np.quantile(errors[:, :, i], (0.05, 0.25, 0.5, 0.75, 0.95), axis=0)
+        ax.fill_between(time, low, high, color=BLUE, alpha=0.15, linewidth=0)
+        ax.fill_between(time, lower, upper, color=BLUE, alpha=0.3, linewidth=0)
+        ax.plot(time, median, color=BLUE)
+        ax.set_title(f"{name.replace('_', ' ')} [{unit}]", fontsize=8)
+        ax.tick_params(labelsize=7)
+        ax.set_xlabel("time [s]", fontsize=8)
+        ax.grid(alpha=0.3, linewidth=0.5)
+        ax.set_ylim(bottom=0.0)
+    save(figure, path, dpi=110)
+
+
+def _component(states: RigidBodyState, row: str, k: int) -> Array:
+    if row == "tilt":
+        w, x, y, z = states.quaternion.unbind(-1)
+        sine = 2.0 * (w * y - x * z) if k else 2.0 * (w * x + y * z)  # of pitch, and of a small roll
+        return np.degrees(np.arcsin(np.clip(sine.numpy(), -1.0, 1.0)))
+    values = states.angular_velocity if row == "body_rate" else getattr(states, row)
+    return values[..., k].numpy()
 
 
 def _rounded(value: float) -> float:
@@ -146,6 +230,4 @@ def _plain(value: Any) -> Any:
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return None if isinstance(value, float) and not math.isfinite(value) else value

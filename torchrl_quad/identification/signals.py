@@ -152,14 +152,14 @@ def slope(x: Array, dt: float, span: float = 0.04) -> Array:
     half = min(max(1, round(span / dt)), (len(x) - 1) // 2)
     k = np.arange(-half, half + 1)
     padded = np.concatenate((2.0 * x[0] - x[half:0:-1], x, 2.0 * x[-1] - x[-2 : -half - 2 : -1]))
-    return _convolved(padded, -k / (k @ k * dt))
+    return convolved(padded, -k / (k @ k * dt))
 
 
 def smooth(x: Array, dt: float, span: float = 0.1) -> Array:
     """The mean of the samples within ``span / 2`` [s] of each (T, n)."""
     half = min(max(0, round(span / dt / 2.0)), (len(x) - 1) // 2)
     padded = np.pad(x, ((half, half), (0, 0)), mode="edge")
-    return _convolved(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)))
+    return convolved(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)))
 
 
 def body_rates(q: Array, dt: float) -> Array:
@@ -167,5 +167,6 @@ def body_rates(q: Array, dt: float) -> Array:
     return 2.0 * multiply(conjugate(q), slope(q, dt))[:, 1:]
 
 
-def _convolved(x: Array, kernel: Array) -> Array:
+def convolved(x: Array, kernel: Array) -> Array:
+    """Each column of a series (T, n) with a kernel, where they overlap wholly."""
     return np.stack([np.convolve(column, kernel, "valid") for column in x.T], -1)

@@ -39,10 +39,9 @@ ERRORS = {"hovering": "position_error", "tracking": "tracking_rmse", "landing": 
 
 def configuration(task: str, steps: int | None, **changes: Any) -> Any:
     """What the recipes configure for a task, with changes of the environment."""
-    from hydra import compose, initialize_config_dir
+    from torchrl_quad.training.configuration import compose
 
-    with initialize_config_dir(str(Path(__file__).parents[1] / "recipes/config"), version_base=None):
-        cfg = compose("abpt", [f"task={task}"])
+    cfg = compose("abpt", [f"task={task}"])
     for name, value in {**changes, **({"max_episode_steps": steps} if steps else {})}.items():
         cfg.env[name] = value
     cfg.normalize = False

@@ -6,14 +6,7 @@ python recipes/bptt.py task=hovering seed=0
 from omegaconf import DictConfig
 
 from torchrl_quad import BPTTLoss, differentiable_rollout, restart
-from torchrl_quad.training.building import (
-    actor_parameters,
-    iterations,
-    make_optimizer,
-    set_up,
-    trust_region,
-    update_normalizer,
-)
+from torchrl_quad.training.building import Optimizer, make_loss, set_up, trust_region, update_normalizer
 from torchrl_quad.training.launch import recipe
 from torchrl_quad.training.loop import Run
 
@@ -21,20 +14,16 @@ from torchrl_quad.training.loop import Run
 @recipe("bptt")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    loss = BPTTLoss(actor, **cfg.loss).make_value_estimator(gamma=cfg.gamma)
-    optimizer, schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
-
-    bound = trust_region(cfg, actor)
-    run = Run(cfg, env, actor, loss, [optimizer, schedule])
+    loss = make_loss(BPTTLoss, cfg, env, actor)
+    optimizer, bound = Optimizer(cfg, "actor", loss), trust_region(cfg, actor)
+    run = Run(cfg, env, actor, loss, [optimizer])
     for _ in run:
         rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
         loss_actor, metrics = loss.loss_actor(rollout)
-        loss_alpha = metrics.get("loss_alpha", 0.0)
         with bound.around(rollout):
-            run.optimise("actor", optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
+            run.optimise(optimizer, loss_actor + metrics.get("loss_alpha", 0.0))
         update_normalizer(env, rollout)
         run.carry = restart(env, end, cfg.restart_fraction)
-        schedule.step()
         run.record(loss_actor=loss_actor, **metrics, **bound.metrics)
 
 

@@ -10,10 +10,9 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from torchrl_quad import differentiable_rollout, make_value, restart
-from torchrl_quad.training.building import iterations, make_optimizer, network, set_up, shuffled, update_normalizer
+from torchrl_quad.training.building import Optimizer, mean_of_all, network, set_up, shuffled, update_normalizer
 from torchrl_quad.training.launch import recipe
 from torchrl_quad.training.loop import Run
-from torchrl_quad.training.processes import mean_of_all
 
 
 @recipe("ppo")
@@ -22,11 +21,8 @@ def main(cfg: DictConfig) -> None:
     value = make_value(env, **network(cfg, "critic", env))
     advantage = GAE(gamma=cfg.gamma, lmbda=cfg.critic.lmbda, value_network=value, vectorized=False)
     loss = ClipPPOLoss(actor, value, **cfg.loss)
-    actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor.parameters(), iterations(cfg))
-    critic_optimizer, critic_schedule = make_optimizer(cfg.critic, value.parameters(), iterations(cfg))
-
-    stateful = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
-    run = Run(cfg, env, actor, loss, stateful)
+    actor_optimizer, critic_optimizer = Optimizer(cfg, "actor", actor), Optimizer(cfg, "critic", value)
+    run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer])
     for _ in run:
         with torch.no_grad():
             data, run.carry = differentiable_rollout(env, actor, run.carry, cfg.horizon)
@@ -39,18 +35,15 @@ def main(cfg: DictConfig) -> None:
                 with set_recurrent_mode(True):  # a memory, if there is one, goes through whole horizons
                     losses = loss(batch)
                 moved = mean_of_all(losses["kl_approx"]).abs()  # a mean of samples, which can be negative
-                loss_actor = losses["loss_objective"] + losses.get("loss_entropy", 0.0)
-                run.optimise("actor", actor_optimizer, loss_actor, cfg.actor.max_grad_norm)
+                run.optimise(actor_optimizer, losses["loss_objective"] + losses.get("loss_entropy", 0.0))
             else:
                 losses["loss_critic"] = loss.loss_critic(batch)[0].mean()
-            run.optimise("critic", critic_optimizer, losses["loss_critic"], cfg.critic.max_grad_norm)
+            run.optimise(critic_optimizer, losses["loss_critic"])
 
         update_normalizer(env, data)
-        if cfg.normalize:  # observe anew
+        if cfg.normalize:  # observe again, with the new statistics
             run.carry = restart(env, run.carry, 0.0)
-        actor_schedule.step()
-        critic_schedule.step()
-        run.record(**losses.apply(torch.mean))  # some are per step of the horizon where a policy remembers
+        run.record(**losses.apply(torch.mean))  # some are per step of the horizon where a policy has a memory
 
 
 if __name__ == "__main__":

@@ -6,16 +6,7 @@ python recipes/sapo.py task=hovering seed=0
 from omegaconf import DictConfig
 
 from torchrl_quad import SAPOLoss, differentiable_rollout, make_value, restart
-from torchrl_quad.training.building import (
-    actor_parameters,
-    iterations,
-    make_optimizer,
-    minibatches,
-    network,
-    set_up,
-    trust_region,
-    update_normalizer,
-)
+from torchrl_quad.training.building import Optimizer, make_loss, set_up, trust_region, update_normalizer
 from torchrl_quad.training.launch import recipe
 from torchrl_quad.training.loop import Run
 
@@ -23,35 +14,22 @@ from torchrl_quad.training.loop import Run
 @recipe("sapo")
 def main(cfg: DictConfig) -> None:
     env, actor = set_up(cfg)
-    loss = SAPOLoss(actor, make_value(env, **network(cfg, "critic", env)), **cfg.loss)
-    loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
-    actor_optimizer, actor_schedule = make_optimizer(cfg.actor, actor_parameters(loss), iterations(cfg))
-    critic_parameters = loss.value_network_params.parameters()
-    critic_optimizer, critic_schedule = make_optimizer(cfg.critic, critic_parameters, iterations(cfg))
-
-    stateful = [actor_optimizer, actor_schedule, critic_optimizer, critic_schedule]
-    bound = trust_region(cfg, actor)
-    run = Run(cfg, env, actor, loss, stateful)
+    loss, bound = make_loss(SAPOLoss, cfg, env, actor, make_value), trust_region(cfg, actor)
+    actor_optimizer, critic_optimizer = Optimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
+    run = Run(cfg, env, actor, loss, [actor_optimizer, critic_optimizer])
     for _ in run:
         # The actor: up the soft return of one horizon and the soft value of its end, through the dynamics.
         rollout, end = differentiable_rollout(env, actor, run.carry, cfg.horizon)
-        loss_actor, actor_metrics = loss.loss_actor(rollout)
-        loss_alpha = actor_metrics.get("loss_alpha", 0.0)
+        loss_actor, metrics = loss.loss_actor(rollout)
         with bound.around(rollout):
-            run.optimise("actor", actor_optimizer, loss_actor + loss_alpha, cfg.actor.max_grad_norm)
+            run.optimise(actor_optimizer, loss_actor + metrics.get("loss_alpha", 0.0))
 
         # The critics: towards TD(lambda) targets of the soft return, from the least of them.
-        data = loss.write_value_target(rollout.detach())
-        read = data.select(*loss.value_network.in_keys, loss.tensor_keys.value_target)
-        for batch in minibatches(read, cfg.critic):
-            loss_value, critic_metrics = loss.loss_value(batch)
-            run.optimise("critic", critic_optimizer, loss_value, cfg.critic.max_grad_norm)
+        critic_metrics = run.fit_critic(critic_optimizer, loss.write_value_target(rollout.detach()))
 
         update_normalizer(env, rollout)
         run.carry = restart(env, end, cfg.restart_fraction)
-        actor_schedule.step()
-        critic_schedule.step()
-        run.record(loss_actor=loss_actor, loss_value=loss_value, **actor_metrics, **bound.metrics, **critic_metrics)
+        run.record(loss_actor=loss_actor, **metrics, **bound.metrics, **critic_metrics)
 
 
 if __name__ == "__main__":

@@ -8,19 +8,21 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import ABPTLoss, BPTTLoss, HoveringEnv, SHACLoss, make_actor, make_qvalue, make_value
 from torchrl_quad.training.building import (
-    AdaptiveRate,
+    AdaptiveOptimizer,
+    Optimizer,
     TargetUpdate,
-    actor_parameters,
-    advance,
-    make_optimizer,
     minibatches,
+    parameter_groups,
     shuffled,
 )
-from torchrl_quad.training.processes import backward
+from torchrl_quad.training.loop import backward
 
 
-def adam(lr):
-    return torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr)
+def optimizer(iterations, kind=Optimizer, **options):
+    """Of a network with one parameter, in a run of so many iterations."""
+    section = {"lr": 1e-2, "final_lr": 1e-4, "betas": [0.9, 0.99], "schedule": "linear", "max_grad_norm": 1.0}
+    run = {"num_envs": 2, "horizon": 3, "total_steps": 6 * iterations, "actor": section | options}
+    return kind(OmegaConf.create(run), "actor", torch.nn.Linear(1, 1, bias=False))
 
 
 def numbered(*shape):
@@ -44,20 +46,28 @@ def test_a_target_critic_follows_as_with_torchrl_s_soft_update(kind, critic):
     torch.testing.assert_close(own, torchrl)
 
 
+@pytest.mark.parametrize(
+    ("schedule", "halfway", "last"),
+    [("constant", 1e-2, 1e-2), ("linear", 5.05e-3, 1e-4), ("exponential", 1e-3, 1e-4), ("cosine", 5.05e-3, 1e-4)],
+)
+def test_a_schedule_goes_from_the_first_to_the_last_learning_rate(schedule, halfway, last):
+    adam = optimizer(101, schedule=schedule)
+    for iteration, rate in ((0, 1e-2), (50, halfway), (100, last), (200, last)):
+        adam.anneal(iteration)
+        assert adam.param_groups[0]["lr"] == pytest.approx(rate)
+
+
 def test_a_schedule_may_be_set_between_two_iterations():
-    section = {"lr": 1e-2, "final_lr": 1e-4, "betas": [0.9, 0.99], "schedule": "linear"}
-    optimizer, schedule = make_optimizer(OmegaConf.create(section), [torch.nn.Parameter(torch.zeros(1))], 11)
-    optimizer.step()
-    for iteration, rate in ((5.5, 4.555e-3), (0, 1e-2), (10, 1e-4), (20, 1e-4)):
-        advance(schedule, iteration)
-        assert optimizer.param_groups[0]["lr"] == pytest.approx(rate)
+    adam = optimizer(11)
+    adam.anneal(5.5)
+    assert adam.param_groups[0]["lr"] == pytest.approx(4.555e-3)
 
 
 def test_the_gradient_of_alpha_takes_nothing_of_the_actor_s_norm():
     loss = BPTTLoss(make_actor(HoveringEnv(num_envs=1), return_log_prob=True), alpha="auto")
     actor = list(loss.actor_network_params.parameters())
     objective = sum(x.sum() for x in actor) + 1e6 * loss.log_alpha
-    _, norm = backward(objective, torch.optim.Adam(actor_parameters(loss)), 0.5)
+    _, norm = backward(objective, torch.optim.Adam(parameter_groups("actor", loss)), 0.5)
     gradient = torch.cat([x.grad.flatten() for x in actor])
     assert norm.item() == pytest.approx(gradient.numel() ** 0.5, rel=1e-4)
     assert gradient.norm().item() == pytest.approx(0.5, rel=1e-4)
@@ -65,21 +75,25 @@ def test_the_gradient_of_alpha_takes_nothing_of_the_actor_s_norm():
 
 
 def test_how_far_a_horizon_may_move_the_policy_falls_to_a_fiftieth():
-    rate = AdaptiveRate(adam(1e-3), 0.2, 10)
-    assert [rate.limit(iteration) for iteration in (0, 5, 9, 10)] == pytest.approx([0.3, 0.15, 0.03, 0.006])
+    adam = optimizer(10, AdaptiveOptimizer, max_kl=0.2)
+    limits = []
+    for iteration in (0, 5, 9, 10):
+        adam.anneal(iteration)
+        limits.append(adam.limit)
+    assert limits == pytest.approx([0.3, 0.15, 0.03, 0.006])
 
 
-def test_the_rate_adapts_to_how_far_the_policy_was_moved_within_its_bounds():
-    for moved, factor, end in ((0.31, 1 / 1.5, 1e-6), (0.2, 1.0, 1e-3), (0.13, 1.5, 0.02)):
-        optimizer = adam(1e-3)
-        rate = AdaptiveRate(optimizer, 0.2, 10)
-        rate.step(0, moved)
-        assert optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 * factor)
-        for _ in range(60):
-            rate.step(0, moved)
-        assert optimizer.param_groups[0]["lr"] == pytest.approx(end)
+@pytest.mark.parametrize(("moved", "factor", "end"), [(0.31, 1 / 1.5, 1e-6), (0.2, 1.0, 1e-3), (0.13, 1.5, 0.02)])
+def test_the_rate_adapts_to_how_far_the_policy_was_moved_within_its_bounds(moved, factor, end):
+    adam = optimizer(10, AdaptiveOptimizer, max_kl=0.2, lr=1e-3)
+    adam.anneal(0)
+    adam.adapt(moved)
+    assert adam.param_groups[0]["lr"] == pytest.approx(1e-3 * factor)
+    for _ in range(60):
+        adam.adapt(moved)
+    assert adam.param_groups[0]["lr"] == pytest.approx(end)
     with pytest.raises(ValueError, match="actor.max_kl=null: this recipe sets its rate by it. Write a number"):
-        AdaptiveRate(adam(1e-3), None, 10)
+        optimizer(10, AdaptiveOptimizer, max_kl=None)
 
 
 def test_minibatches_are_random_steps_of_the_rollout():
@@ -98,7 +112,7 @@ def test_shuffled_batches_hold_every_step_once_in_each_epoch():
     assert [sorted(epoch) for epoch in epochs] == [list(range(12))] * 2
 
 
-def test_the_horizons_of_a_policy_that_remembers_stay_whole():
+def test_the_horizons_of_a_policy_with_a_memory_stay_whole():
     rollout = numbered(3, 4)
     rollout["is_init"] = torch.zeros(3, 4, 1, dtype=torch.bool)
     batches = [batch["step"] for batch in shuffled(rollout, 8, 2)]

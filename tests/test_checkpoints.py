@@ -34,7 +34,7 @@ def test_no_flipped_bit_of_a_checkpoint_goes_unnoticed(content, tmp_path):
         damaged = bytearray(whole)
         damaged[at] ^= 1 << draw.randrange(8)
         path.write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"checkpoint\.pt (is damaged|cannot be read)"):
+        with pytest.raises(ValueError, match=r"checkpoint\.pt (is damaged|is cut off)"):
             read_checkpoint(path)
 
 
@@ -65,17 +65,16 @@ def test_a_file_that_is_no_checkpoint_of_this_version_is_named_with_the_reason(c
     write_checkpoint(path, content)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    fails(ValueError, "bad.pt cannot be read: it is cut off or damaged, or no checkpoint .* There is none before it")
+    foreign = "bad.pt is cut off, or no checkpoint of these recipes. There is none before it"
+    fails(ValueError, foreign)
     path.write_text("hello")
-    fails(ValueError, "bad.pt cannot be read: it is cut off or damaged, or no checkpoint of these recipes")
-    torch.save({"config": Path("anything that is pickled")}, path)
-    fails(ValueError, "anything else could run code, and is not loaded")
+    fails(ValueError, foreign)
     torch.save({"weights": torch.zeros(1)}, path)
-    fails(ValueError, "bad.pt is not a checkpoint of these recipes. Give the path of a checkpoint.pt.")
-    torch.save({"config": "", "steps": 1}, path)
-    fails(ValueError, "bad.pt has checkpoint format 0, this version reads format 4. It was written by .* or before")
-    torch.save({**content, "format": 2}, path)  # the layout before this one, which had no checksum
-    fails(ValueError, "has checkpoint format 2, .* written by torchrl_quad 0.1 at revision .*: use that version")
+    fails(ValueError, foreign)
+    write_checkpoint(path, {**content, "config": Path("anything that is pickled")})
+    fails(ValueError, "anything else could run code, and is not loaded")
+    write_checkpoint(path, {**content, "format": 2})
+    fails(ValueError, "has checkpoint format 2, this version reads format 5. It was written by torchrl_quad 0.1 at .*:")
     assert "bad.pt has checkpoint format 2" in refused("evaluate", f"checkpoint={path}")
     good = train("bptt", tmp_path)
     write_checkpoint(tmp_path / "checkpoint.pt", {**good, "processes": good["processes"] * 2})
@@ -126,7 +125,11 @@ def test_a_checkpoint_without_an_evaluated_policy_is_no_policy(refused, no_pictu
 
 
 EVIL = {  # what somebody else may have written into the configuration of a checkpoint
-    "task: evilmod.Evil": "names the task 'evilmod.Evil', which has no registered name. Code that",
+    "task: evilmod.Evil": "names evilmod.Evil. Code that a file names is not run",
+    "{task: evilmod.Evil, loss: 5}": "names evilmod.Evil. Code",
+    "env: {disturbances: [{_target_: evilmod.Evil}]}": "names evilmod.Evil. Code",
+    "env: {disturbances: evilmod.Evil}": "it must be a list",
+    "loss: {_target_: evilmod.Evil}": "names evilmod.Evil. Code",
     "task: 5": "is no mapping with a task",
     "task: &a hovering\ntags: [*a, *a]": "uses the alias",
     "task: ${oc.env:HOME}": "refers to other values by",

@@ -18,7 +18,7 @@ from test_docs import ROOT, files, importable  # noqa: F401, a fixture
 from torchrl_quad import HoveringEnv, QuadrotorEnv, available_tasks, make_env, register_task
 from torchrl_quad.envs import TASKS, registry
 from torchrl_quad.training.checkpoints import read_checkpoint
-from torchrl_quad.training.own import defaults, offer_tasks
+from torchrl_quad.training.configuration import defaults
 from torchrl_quad.training.schema import check
 
 
@@ -106,32 +106,66 @@ def test_recipes_say_in_one_line_how_a_task_that_they_do_not_know_becomes_known(
         ("env.patience=0.5", "env.patience=0.5: it must be a whole number"),
         ("+env.rech=1", "argument 'rech'. Did you mean 'reach'?"),
         ("+env.seed=1", "env.seed: recipes set it for all environments. Write seed=..., without env"),
-        ("env.wind=None", "env.wind=None: it is the word 'None' to YAML. For no value write env.wind=null"),
+        (
+            "env.wind={gust: None}",
+            "env.wind.gust=None: it is the word 'None' to YAML. For no value write env.wind.gust=null",
+        ),
     ],
 )
 def test_the_settings_of_a_task_come_from_its_signature_and_are_checked_by_it(words, message):
     assert defaults(CornerEnv) == {"reach": 0.5, "patience": None, "dt": 0.01, "max_episode_steps": 256}
     assert defaults(HoveringEnv) == {"max_episode_steps": 256}
-    task = offer_tasks(["task._target_=own_task.CornerEnv"])
-    check(composed("bptt", *task, "env.reach=1", "env.patience=3"))
-    with pytest.raises((ValueError, TypeError), match=re.escape(message)):
-        check(composed("bptt", *task, words))
-
-
-def test_a_task_of_your_own_trains_resumes_and_is_evaluated_as_those_that_ship(train, launch, refused, tmp_path):
     task = "task._target_=own_task.CornerEnv"
-    train("abpt", tmp_path, task, "env.reach=0.1")
-    saved = train("abpt", tmp_path, task, "resume=auto", "total_steps=240")
-    assert saved["iteration"] == 10 and "task: own_task.CornerEnv" in saved["config"]
+    check(composed("bptt", task, "env.reach=1", "env.patience=3"))
+    with pytest.raises((ValueError, TypeError), match=re.escape(message)):
+        check(composed("bptt", task, words))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            "env.disturbances=[own_parts.ABPTLoss]",
+            "env.disturbances=own_parts.ABPTLoss: it must be a subclass of Disturbance",
+        ),
+        (
+            "env.disturbances=[own_parts.Pull]",
+            "env.disturbances 'own_parts.Pull': the module 'own_parts' .* has no 'Pull'",
+        ),
+        ("env.disturbances=[Push]", "env.disturbances='Push': it must be the path of a class"),
+        ("env.disturbances=own_parts.Push", "env.disturbances=own_parts.Push: it must be a list"),
+        (
+            "env.disturbances=[{_target_: own_parts.Push, force: 1}]",
+            "env.disturbances: unknown key 'force'. Allowed: streng",
+        ),
+        ("loss._target_=own_parts.Push", "loss._target_=own_parts.Push: it must be a subclass of ABPTLoss"),
+        ("loss._target_=own_parts.ThriftyLoss loss.efort=1", "loss.efort is unknown.* effort, "),
+        ("loss._target_=own_parts.ThriftyLoss loss.effort=low", "loss.effort=low: it must be a number"),
+        ("loss._target_=own_parts.ThriftyLoss loss.alpha=-1", "loss.alpha=-1: it must be at least 0"),
+    ],
+)
+def test_a_disturbance_or_a_loss_of_your_own_that_does_not_fit_is_refused(words, message):
+    overrides = words.split(" loss")
+    overrides = [overrides[0], *(f"loss{word}" for word in overrides[1:])]
+    with pytest.raises((ValueError, TypeError), match=message):
+        check(composed("abpt", *overrides), overrides)
+
+
+def test_what_is_your_own_trains_resumes_and_is_evaluated_as_what_ships(train, launch, refused, tmp_path):
+    own = ["task._target_=own_task.CornerEnv", "env.disturbances=[{_target_: own_parts.Push, strength: 0.1}]"]
+    own += ["loss._target_=own_parts.ThriftyLoss", "loss.effort=0.2"]
+    first = train("abpt", tmp_path, *own, "env.reach=0.1")
+    saved = train("abpt", tmp_path, *own, "resume=auto", "total_steps=240")
+    assert (
+        saved["iteration"] == 10 and "task: own_task.CornerEnv" in saved["config"] and "effort: 0.2" in saved["config"]
+    )
+    assert first["rows"][0]["train/effort"] < 0
     assert float(rows(tmp_path)[-1]["eval/corner_error"]) > 0
-    for recipe, *words in (
-        ["evaluate", f"checkpoint={tmp_path}/checkpoint.pt"],
-        ["abpt", f"resume={tmp_path}/checkpoint.pt"],
-    ):
-        setting = "own_task" if recipe == "evaluate" else "task"
-        said = refused(recipe, *words)
-        assert said.endswith(f"Code that a file names is not run: if you trust it, write {setting}=own_task.CornerEnv.")
-    printed = launch("evaluate", f"checkpoint={tmp_path}/checkpoint.pt", "own_task=own_task.CornerEnv")
+    trust = "trust=[own_task.CornerEnv, own_parts.Push, own_parts.ThriftyLoss]"
+    for recipe, setting in ("evaluate", "checkpoint"), ("abpt", "resume"):
+        said = refused(recipe, f"{setting}={tmp_path}/checkpoint.pt")
+        assert said.endswith(f"file names is not run: if you trust it, write '{trust}'.")
+    printed = launch("evaluate", f"checkpoint={tmp_path}/checkpoint.pt", trust)
     assert "abpt on own_task.CornerEnv" in printed and "distance to the corner" in printed
     summary = json.loads((tmp_path / "evaluation.json").read_text())
     assert summary["corner_error"] == json.loads((tmp_path / "summary.json").read_text())["corner_error"]
@@ -141,19 +175,20 @@ def test_a_task_of_your_own_trains_resumes_and_is_evaluated_as_those_that_ship(t
 def test_a_recipe_outside_the_repository_is_short_and_takes_any_task(tmp_path, monkeypatch, capsys):
     """The programs of docs/writing.md, in files, as the page says."""
     assert all(len(content.splitlines()) < 60 for content in files().values())
-    small = [
+    register_task("fly_to_corner", CornerEnv)
+    sweep = [
         "--multirun",
         *SMALL,
         "hydra/launcher=basic",
         f"hydra.sweep.dir={tmp_path}/run",
-        "hydra.sweep.subdir=${algorithm}",
+        "hydra.sweep.subdir=${task}",
     ]
-    for name, *own in (("smooth", "task=shuttle.ShuttleEnv", "loss.smoothness=0.3"), ("train", "task=shuttle")):
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", *small, *own])
-        importlib.import_module(name).main()
+    own = ["task=shuttle.ShuttleEnv,fly_to_corner", "loss.smoothness=0.3"]
+    monkeypatch.setattr(sys, "argv", ["smooth.py", *sweep, *own])
+    importlib.import_module("smooth").main()
     printed = capsys.readouterr().out
-    assert "smooth on shuttle.ShuttleEnv, seed 0" in printed and "abpt on shuttle, seed 0" in printed
-    saved = read_checkpoint(tmp_path / "run/smooth/checkpoint.pt")
+    assert "smooth on shuttle.ShuttleEnv, seed 0" in printed and "smooth on fly_to_corner, seed 0" in printed
+    saved = read_checkpoint(tmp_path / "run/shuttle.ShuttleEnv/checkpoint.pt")
     assert "smoothness: 0.3" in saved["config"] and "algorithm: smooth" in saved["config"]
     assert math.isfinite(saved["best"]["return"])
 

@@ -15,7 +15,7 @@ import torch
 from small_runs import EVERYTHING, SMALL, assert_equal
 
 from torchrl_quad.training.checkpoints import read_checkpoint
-from torchrl_quad.training.processes import backward
+from torchrl_quad.training.loop import backward
 
 ROOT = Path(__file__).parent.parent
 

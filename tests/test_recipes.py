@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from torchrl_quad import LandingEnv, make_actor, restart
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.metrics import EPISODE_METRICS
-from torchrl_quad.training.building import build_env, make_optimizer
+from torchrl_quad.training.building import build_env
 from torchrl_quad.training.checkpoints import read_checkpoint
 from torchrl_quad.training.evaluation import drawing_from, evaluate
 
@@ -103,22 +103,6 @@ def test_evaluation_repeats_the_summary_of_the_run_also_with_a_normalizer(train,
         assert (tmp_path / flown).read_bytes() == (tmp_path / again).read_bytes()
     assert (tmp_path / "evaluation.mp4").read_bytes()[4:8] == b"ftyp"
     assert (tmp_path / "evaluation.pdf").read_bytes().startswith(b"%PDF")
-
-
-@pytest.mark.parametrize(
-    ("schedule", "halfway"), [("constant", 1e-2), ("linear", 5.05e-3), ("exponential", 1e-3), ("cosine", 5.05e-3)]
-)
-def test_a_schedule_goes_from_the_first_to_the_last_learning_rate(schedule, halfway):
-    cfg = OmegaConf.create({"lr": 1e-2, "final_lr": 1e-4, "betas": [0.9, 0.99], "schedule": schedule})
-    optimizer, scheduler = make_optimizer(cfg, [torch.nn.Parameter(torch.zeros(1))], 101)
-    rates = []
-    for _ in range(101):
-        rates.append(optimizer.param_groups[0]["lr"])
-        optimizer.step()
-        scheduler.step()
-    assert rates[0] == pytest.approx(1e-2)
-    assert rates[50] == pytest.approx(halfway)
-    assert rates[100] == pytest.approx(1e-2 if schedule == "constant" else 1e-4)
 
 
 def test_seeds_differ_and_the_coefficient_of_an_entropy_bonus_is_fixed_or_learned(train, no_pictures, tmp_path):

@@ -1,30 +1,66 @@
-"""Building blocks of a recipe: environment, networks, optimisers, minibatches."""
+"""Building blocks of a recipe: environment, networks, loss, optimisers, minibatches."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar, cast
 
 import torch
+import torch.distributed as dist
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
-from torch.optim import lr_scheduler
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import SoftUpdate
 
-from torchrl_quad import ObservationNormalizer, TrustRegion, make_actor, make_env, make_visual_actor
+from torchrl_quad import ObservationNormalizer, QuadrotorEnv, TrustRegion, make_actor, make_env, make_visual_actor
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives import PathwiseLoss
-from torchrl_quad.training.processes import cat_all, mean_of_all, rank, world_size
+from torchrl_quad.options import argument_names
+from torchrl_quad.training.configuration import own_disturbances, own_loss
 
 SEEDS_PER_RUN = 10_000  # the process of rank r draws from seed + r * this
+_Loss = TypeVar("_Loss", bound=PathwiseLoss)
+
+# -- several processes that train one policy, as torchrun starts them; all this also works for a single one ------------
 
 
-def set_up(cfg: DictConfig) -> tuple[EnvBase, TensorDictModuleBase]:
+def rank() -> int:
+    """Which of the processes this is; 0 logs, evaluates and saves."""
+    return dist.get_rank() if dist.is_initialized() else 0
+
+
+def world_size() -> int:
+    """How many processes train together."""
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
+def cat_all(x: Tensor) -> Tensor:
+    """The tensors of all processes, of one shape, concatenated along the first axis."""
+    if world_size() == 1:
+        return x
+    parts = [torch.empty_like(x) for _ in range(world_size())]
+    dist.all_gather(parts, x.contiguous())
+    return torch.cat(parts)
+
+
+def mean_of_all(x: Tensor) -> Tensor:
+    """The mean of a scalar over the processes."""
+    return cat_all(x.detach().view(1)).mean()
+
+
+def own_seed(cfg: DictConfig) -> int:
+    """The seed of this process."""
+    return cfg.seed + SEEDS_PER_RUN * rank()
+
+
+# -- environment, networks and loss ------------------------------------------------------------------------------------
+
+
+def set_up(cfg: DictConfig) -> tuple[EnvBase, TensorDictModule]:
     """Seed everything, and build the environment and the policy.
 
     Under ``torchrun`` each process has environments and random numbers of its own, and networks that start equal.
@@ -35,32 +71,35 @@ def set_up(cfg: DictConfig) -> tuple[EnvBase, TensorDictModuleBase]:
     return env, make_policy(cfg, env)
 
 
-def own_seed(cfg: DictConfig) -> int:
-    """The seed of this process."""
-    return cfg.seed + SEEDS_PER_RUN * rank()
-
-
 def build_env(cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = False) -> EnvBase:
     """Build the environment of a configuration, with a normaliser if it asks for one."""
-    options = OmegaConf.to_container(cfg.env, resolve=True)
+    options = cast("dict[str, Any]", OmegaConf.to_container(cfg.env, resolve=True))
+    if (disturbances := own_disturbances(options.pop("disturbances", None))) is not None:
+        options["disturbances"] = disturbances
     env = make_env(cfg.task, num_envs=num_envs, device=cfg.device, seed=seed, compile=compile, **options)
     return TransformedEnv(env, ObservationNormalizer(env)) if cfg.normalize else env
 
 
-def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModuleBase:
+def task_of(env: EnvBase) -> QuadrotorEnv:
+    """The task under a normaliser, or the environment itself."""
+    return cast("QuadrotorEnv", env.base_env if isinstance(env, TransformedEnv) else env)
+
+
+def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModule:
     """Build the policy of a configuration; it writes log-probabilities if the loss needs them.
 
-    It sees where the environment has a camera, unless the configuration blinds it.
+    It reads the depth images of a camera, unless the environment has none or ``actor.vision`` is false.
     """
     log_prob = "entropy_bonus" in cfg.loss or cfg.loss.get("alpha", 0) != 0  # of PPO, or of an entropy bonus
-    noise = {name: cfg.actor[name] for name in ("scale_init", "noise_correlation", "learn_scale")}
-    if not sees(cfg, env):
-        return make_actor(env, **network(cfg, "actor"), **noise, return_log_prob=log_prob)
-    sight = {name: cfg.actor[name] for name in ("recurrent", "hidden_size")} | {"channels": list(cfg.actor.channels)}
-    return make_visual_actor(env, **network(cfg, "actor"), **noise, **sight, return_log_prob=log_prob)
+    options = network(cfg, "actor")
+    options |= {name: cfg.actor[name] for name in ("scale_init", "noise_correlation", "learn_scale")}
+    if not is_visual(cfg, env):
+        return make_actor(env, **options, return_log_prob=log_prob)
+    options |= {name: cfg.actor[name] for name in ("recurrent", "hidden_size")} | {"channels": list(cfg.actor.channels)}
+    return make_visual_actor(env, **options, return_log_prob=log_prob)
 
 
-def sees(cfg: DictConfig, env: EnvBase) -> bool:
+def is_visual(cfg: DictConfig, env: EnvBase) -> bool:
     """Whether the policy of a configuration reads the images of a camera."""
     return cfg.actor.vision and "depth" in env.observation_spec
 
@@ -68,7 +107,7 @@ def sees(cfg: DictConfig, env: EnvBase) -> bool:
 def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str, Any]:
     """The options of a network as keywords of ``make_actor``, ``make_value`` and ``make_qvalue``.
 
-    A critic, which is given the environment, also reads where the nearest obstacle is, of which a policy has images.
+    A critic, which is given the environment, also reads where the nearest obstacle is; a policy has images of it.
     """
     section = cfg[name]
     scale = 1.0 if cfg.normalize else section.input_scale
@@ -79,10 +118,38 @@ def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str,
     return options
 
 
-def actor_parameters(loss: PathwiseLoss) -> list[dict[str, Any]]:
-    """The policy's parameters and, if it is learned, the entropy coefficient: groups that are clipped apart."""
-    learned = [loss.log_alpha] if loss.automatic_alpha else []
-    return [{"params": own} for own in (list(loss.actor_network_params.parameters()), learned) if own]
+def make_loss(
+    kind: type[_Loss],
+    cfg: DictConfig,
+    env: EnvBase,
+    actor: TensorDictModule,
+    make_critic: Callable[..., Any] | None = None,
+    **more: Any,
+) -> _Loss:
+    """Build the loss of a recipe, or the one that ``loss._target_`` names, with critic and discounts as configured.
+
+    A loss of your own gets those settings of the recipe's loss that it knows, too.
+
+    Args:
+        kind: the class of the recipe's loss.
+        cfg: the configuration.
+        env: the environment.
+        actor: the policy.
+        make_critic: ``make_value`` or ``make_qvalue``, for a loss with a critic.
+        **more: arguments of the loss that are no settings.
+    """
+    options = cast("dict[str, Any]", OmegaConf.to_container(cfg.loss, resolve=True)) | more
+    if path := options.pop("_target_", None):
+        kind = cast("type[_Loss]", own_loss(path, kind))
+        known = argument_names(kind)
+        options = {name: value for name, value in options.items() if name in known}
+    networks = [actor] if make_critic is None else [actor, make_critic(env, **network(cfg, "critic", env))]
+    loss = kind(*networks, **options)
+    loss.make_value_estimator(gamma=cfg.gamma, **({"lmbda": cfg.critic.lmbda} if "critic" in cfg else {}))
+    return loss
+
+
+# -- optimisers and averages -------------------------------------------------------------------------------------------
 
 
 def iterations(cfg: DictConfig) -> int:
@@ -90,57 +157,76 @@ def iterations(cfg: DictConfig) -> int:
     return max(cfg.total_steps // (cfg.num_envs * cfg.horizon * world_size()), 1)
 
 
-def make_optimizer(
-    cfg: DictConfig, parameters: Iterable[nn.Parameter] | list[dict[str, Any]], iterations: int
-) -> tuple[torch.optim.Adam, lr_scheduler.LRScheduler]:
-    """Build Adam, and the schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run."""
-    optimizer = torch.optim.Adam(parameters, cfg.lr, betas=tuple(cfg.betas), fused=True)
-    last, decay = max(iterations - 1, 1), cfg.final_lr / cfg.lr
-    factor = {  # a function of the finished share of the run, so that a run can be resumed and made longer
-        "constant": lambda share: 1.0,
-        "linear": lambda share: 1.0 + share * (decay - 1.0),
-        "exponential": lambda share: decay**share,
-        "cosine": lambda share: decay + (1.0 - decay) * 0.5 * (1.0 + math.cos(math.pi * share)),
-    }[cfg.schedule]
-    return optimizer, lr_scheduler.LambdaLR(optimizer, lambda iteration: factor(min(iteration / last, 1.0)))
+def parameter_groups(name: str, module: nn.Module) -> list[dict[str, Any]]:
+    """The parameters of a loss's "actor" or "critic", or of a network; groups are clipped apart.
+
+    An entropy coefficient that is learned is a group of the actor's.
+    """
+    if not isinstance(module, PathwiseLoss):
+        return [{"params": list(module.parameters())}]
+    if name == "critic":
+        return [{"params": list(getattr(module, f"{module.critic_name}_params").parameters())}]
+    learned = [{"params": [module.log_alpha]}] if module.automatic_alpha else []
+    return [{"params": list(module.actor_network_params.parameters())}, *learned]
 
 
-def advance(schedule: lr_scheduler.LRScheduler, iteration: float) -> None:
-    """Set a schedule to an iteration, counted from 0, which may lie between two of them."""
-    schedule.last_epoch = iteration - 1
-    schedule.step()
+class Optimizer(torch.optim.Adam):
+    """Adam, a schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run, and a bound on gradients.
+
+    Args:
+        cfg: the configuration.
+        name: of its section for the network, "actor" or "critic".
+        module: the loss that holds the network, or the network itself.
+    """
+
+    def __init__(self, cfg: DictConfig, name: str, module: nn.Module) -> None:
+        section = cfg[name]
+        super().__init__(parameter_groups(name, module), section.lr, betas=tuple(section.betas), fused=True)
+        self.name, self.max_grad_norm, self.iterations = name, section.max_grad_norm, iterations(cfg)
+        self.first_lr, decay = section.lr, section.final_lr / section.lr
+        factors: dict[str, Callable[[float], float]] = {
+            "constant": lambda share: 1.0,
+            "linear": lambda share: 1.0 + share * (decay - 1.0),
+            "exponential": lambda share: decay**share,
+            "cosine": lambda share: decay + (1.0 - decay) * 0.5 * (1.0 + math.cos(math.pi * share)),
+        }
+        self.factor = factors[section.schedule]
+
+    def anneal(self, iteration: float) -> None:
+        """Set the learning rate of an iteration, counted from 0, which may lie between two of them."""
+        # A function of the finished share of the run, so that a run can be resumed and made longer.
+        share = min(iteration / max(self.iterations - 1, 1), 1.0)
+        for group in self.param_groups:
+            group["lr"] = self.first_lr * self.factor(share)
 
 
-class AdaptiveRate:
-    """The learning rate of a policy that a horizon moves by about ``max_kl``, which falls to 2 % over the run.
+class AdaptiveOptimizer(Optimizer):
+    """Adam for a policy that a horizon moves by about ``max_kl`` (KL divergence), which falls to 2 % over the run.
 
     A horizon that moves it beyond 1.5 of the bound divides the rate by 1.5, and one that stays below 2/3 of it
     multiplies it. The rate keeps between 1e-6 and 20 times the first one.
 
-    Args:
-        optimizer: of the policy.
-        max_kl: the KL divergence.
-        iterations: of the run.
+    Attributes:
+        limit: how far the horizon of this iteration may move the policy.
     """
 
-    def __init__(self, optimizer: torch.optim.Optimizer, max_kl: float, iterations: int) -> None:
-        if max_kl is None:
-            raise UserValueError("actor.max_kl=null: this recipe sets its rate by it. Write a number; 0.25 is usual.")
-        self.optimizer, self.max_kl, self.iterations = optimizer, max_kl, iterations
-        self.bounds = (1e-6, 20.0 * optimizer.param_groups[0]["lr"])
+    def __init__(self, cfg: DictConfig, name: str, module: nn.Module) -> None:
+        super().__init__(cfg, name, module)
+        if cfg[name].max_kl is None:
+            raise UserValueError(f"{name}.max_kl=null: this recipe sets its rate by it. Write a number; 0.25 is usual.")
+        self.max_kl = cfg[name].max_kl
 
-    def limit(self, iteration: int) -> float:
-        """How far the horizon of an iteration, counted from 0, may move the policy."""
-        return 1.5 * self.max_kl * max(1.0 - iteration / self.iterations, 0.02)
+    def anneal(self, iteration: float) -> None:
+        """Set the limit of an iteration, counted from 0."""
+        self.limit = 1.5 * self.max_kl * max(1.0 - iteration / self.iterations, 0.02)
 
-    def step(self, iteration: int, moved: float) -> None:
-        """Adapt the rate, which the optimizer keeps, to how far the horizon has moved the policy."""
-        low, high = self.bounds
-        for group in self.optimizer.param_groups:
-            if moved > self.limit(iteration):
-                group["lr"] = max(group["lr"] / 1.5, low)
-            elif moved < self.limit(iteration) / 2.25:
-                group["lr"] = min(group["lr"] * 1.5, high)
+    def adapt(self, moved: float) -> None:
+        """Adapt the learning rate to how far the horizon has moved the policy."""
+        for group in self.param_groups:
+            if moved > self.limit:
+                group["lr"] = max(group["lr"] / 1.5, 1e-6)
+            elif moved < self.limit / 2.25:
+                group["lr"] = min(group["lr"] * 1.5, 20.0 * self.first_lr)
 
 
 class TargetUpdate(SoftUpdate):
@@ -169,16 +255,19 @@ def average_policy(cfg: DictConfig, actor: TensorDictModuleBase) -> AveragedMode
     return AveragedModel(actor, multi_avg_fn=update)
 
 
-def trust_region(cfg: DictConfig, actor: TensorDictModuleBase) -> TrustRegion:
+def trust_region(cfg: DictConfig, actor: TensorDictModule) -> TrustRegion:
     """The bound of a configuration on what an update does to the policy; all processes shorten alike."""
     return TrustRegion(actor, cfg.actor.max_kl, average=mean_of_all)
+
+
+# -- data --------------------------------------------------------------------------------------------------------------
 
 
 def update_normalizer(env: EnvBase, rollout: TensorDictBase) -> None:
     """Update the normaliser, if there is one, with the observations of a horizon from all processes."""
     if isinstance(env, TransformedEnv):
         seen = cat_all(rollout["next", "observation"].detach())
-        env.transform.update(TensorDict({("next", "observation"): seen}))
+        cast("ObservationNormalizer", env.transform).update(TensorDict({("next", "observation"): seen}))
 
 
 def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDictBase]:
@@ -189,7 +278,7 @@ def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDict
 
 
 def shuffled(rollout: TensorDictBase, batch_size: int, epochs: int) -> Iterator[TensorDictBase]:
-    """All steps of a rollout ``epochs`` times, in random batches; of a policy that remembers, whole horizons."""
+    """All steps of a rollout ``epochs`` times, in random batches; of a policy with a memory, whole horizons."""
     remembers, horizon = "is_init" in rollout, rollout.shape[-1]
     steps = rollout if remembers else rollout.reshape(-1)
     size = max(batch_size // horizon, 1) if remembers else batch_size

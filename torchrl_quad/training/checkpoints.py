@@ -1,4 +1,4 @@
-"""Checkpoints: files with a checksum, which say what is wrong with them, and from which a run goes on."""
+"""Checkpoints: files with a checksum, which say what is wrong with them, and from which a run continues."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import io
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +18,21 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_quad.dynamics import presets
-from torchrl_quad.envs import available_tasks
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import replacing
-from torchrl_quad.training.own import CONFIG
+from torchrl_quad.training.configuration import CONFIG, named_code
 from torchrl_quad.training.schema import check
 
-FORMAT = 4  # of the content; raise it when older files can no longer be read
+FORMAT = 5  # of the content; raise it when older files can no longer be read
 MARK = b"\ntorchrl_quad checkpoint, sha256 "  # then 64 digits: the checksum of all bytes before the mark
 CONTENT = {  # and its types
     **{"version": str, "revision": str, "config": str, "best": dict, "logger": (dict, type(None)), "seconds": tuple},
     **{"iteration": int, "steps": int, "skipped": int, "rows": list, "stateful": list, "processes": list},
 }
-FREE_ON_RESUME = ("resume", "total_steps", "threads", "compile", "max_skipped", "diagnostics", "eval", "logger")
+FREE_ON_RESUME = (
+    *("resume", "trust", "total_steps", "threads", "compile"),
+    *("max_skipped", "diagnostics", "eval", "logger"),
+)
 
 
 def previous(path: Path) -> Path:
@@ -69,27 +71,25 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"No checkpoint at {path}. Train one first: python recipes/abpt.py")
     payload, mark, checksum = path.read_bytes().rpartition(MARK)
-    if mark and hashlib.sha256(payload).hexdigest().encode() != checksum:
+    if not mark:
+        raise UserValueError(f"{path} is cut off, or no checkpoint of these recipes. {_way_out(path)}")
+    if hashlib.sha256(payload).hexdigest().encode() != checksum:
         raise UserValueError(f"{path} is damaged: its checksum does not fit its content. {_way_out(path)}")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
     except Exception as error:
         said = (str(error) or repr(error)).splitlines()[0]
         raise UserValueError(
-            f"{path} cannot be read: it is cut off or damaged, or no checkpoint of these recipes, which hold tensors "
-            f"and plain values only (anything else could run code, and is not loaded). {_way_out(path)} torch says: "
-            f"{said}"
+            f"{path} cannot be read. Checkpoints hold only tensors and plain values; anything else could run code, and "
+            f"is not loaded. {_way_out(path)} torch says: {said}"
         ) from error
-    if not isinstance(content, dict) or "config" not in content:
-        raise UserValueError(f"{path} is not a checkpoint of these recipes. Give the path of a checkpoint.pt.")
+    content = content if isinstance(content, dict) else {}
     if content.get("format") != FORMAT:
         raise UserValueError(
-            f"{path} has checkpoint format {content.get('format', 0)}, this version reads format {FORMAT}. It was "
-            f"written by torchrl_quad {content.get('version', '0.1.0 or before')} at revision "
-            f"{content.get('revision', 'unknown')}: use that version, or train again."
+            f"{path} has checkpoint format {content.get('format')}, this version reads format {FORMAT}. It was written "
+            f"by torchrl_quad {content.get('version')} at revision {content.get('revision')}: use that version, or "
+            "train again."
         )
-    if not mark:
-        raise UserValueError(f"{path} is damaged: its checksum is missing. {_way_out(path)}")
     wrong = [name for name, kind in CONTENT.items() if not isinstance(content.get(name), kind)]
     if wrong:
         raise UserValueError(f"{path} lacks {', '.join(wrong)}, or has it in another type. {_way_out(path)}")
@@ -99,7 +99,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 def _way_out(path: Path) -> str:
     if previous(path).exists():
         return f"Go on from the checkpoint before it: resume={previous(path)}"
-    return "There is none before it to go on from: train again."
+    return "There is none before it to continue from: train again."
 
 
 def take_over(cfg: DictConfig, folder: Path) -> None:
@@ -110,7 +110,7 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
 
     Raises:
         FileExistsError: the folder holds another run, and ``resume`` does not name it.
-        ValueError: the command line contradicts the checkpoint.
+        UserValueError: the command line contradicts the checkpoint.
     """
     own = folder / "checkpoint.pt"
     if cfg.resume == "auto":
@@ -121,12 +121,12 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
         )
     if cfg.resume is None:
         return
-    overrides = [override.partition("=") for override in HydraConfig.get().overrides.task]
-    asked = {name.lstrip("+~"): OmegaConf.select(cfg, name.lstrip("+~")) for name, _, _ in overrides}
+    overrides = [override.lstrip("+~").partition("=") for override in HydraConfig.get().overrides.task]
+    asked = {name: OmegaConf.select(cfg, name) for name, _, _ in overrides}
     path = Path(cfg.resume)
-    saved = saved_config(path, read_checkpoint(path), cfg.task if "task" in asked else None)
+    saved = saved_config(path, read_checkpoint(path), [*cfg.trust, *named_code(OmegaConf.to_container(cfg))])
     for name, _, value in overrides:
-        if name.lstrip("+") == "tuned" and value != "null":
+        if name == "tuned" and value != "null":
             asked |= _leaves(OmegaConf.load(CONFIG / f"tuned/{value}.yaml"))
     for key, value in ({"algorithm": cfg.algorithm} | asked).items():
         was = OmegaConf.select(saved, key)
@@ -143,31 +143,31 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
         cfg.update(saved)
 
 
-def saved_config(path: Path, content: Mapping[str, Any], task: str | None, setting: str = "task") -> DictConfig:
+def saved_config(path: Path, content: Mapping[str, Any], trust: Collection[str] = ()) -> DictConfig:
     """The configuration in a checkpoint, which has passed the schema like a command line.
 
-    Nothing that it names is imported: a task that has no registered name is taken if the command line names it, too, by
-    ``setting``.
+    Args:
+        path: of the checkpoint.
+        content: of the checkpoint.
+        trust: the paths of the classes that it may name; nothing else that a file names is imported.
 
     Raises:
-        UserValueError: it would not pass as a command line, or its task is not named.
+        UserValueError: it would not pass as a command line, or names a class that is not trusted.
     """
     source = f"{path}: the configuration in it"
-    text = content["config"]
-    values = presets.parse(text.encode(), source) if isinstance(text, str) else text
+    values = presets.parse(content["config"].encode(), source)
     if not isinstance(values, Mapping) or not isinstance(values.get("task"), str):
         raise UserValueError(f"{source} is no mapping with a task. Give the path of a checkpoint.pt.")
-    if "${" in text:
+    if "${" in content["config"]:
         raise UserValueError(f"{source} refers to other values by ${{...}}, which no run writes. It is not read.")
-    if values["task"] not in (*available_tasks(), task):
+    named = named_code(values)
+    if not set(named) <= set(trust):
         raise UserValueError(
-            f"{source} names the task {values['task']!r}, which has no registered name. Code that a file names is not "
-            f"run: if you trust it, write {setting}={values['task']}."
+            f"{source} names {', '.join(named)}. Code that a file names is not run: if you trust it, write "
+            f"'trust=[{', '.join(named)}]'."
         )
-    if task not in (None, values["task"]):
-        raise UserValueError(f"{setting}={task} contradicts {path}, which was trained with task={values['task']}.")
     try:
-        cfg = OmegaConf.create(values)
+        cfg = OmegaConf.create(dict(values))
         check(cfg)
     except UserError as error:
         raise UserValueError(f"{source}: {error}") from error
@@ -190,7 +190,7 @@ def fits(path: Path, what: str) -> Iterator[None]:
         raise UserValueError(f"{path}: {what} in it does not fit its configuration: {said} {_way_out(path)}") from error
 
 
-def _leaves(node: DictConfig, section: str = "") -> dict[str, Any]:
+def _leaves(node: Any, section: str = "") -> dict[str, Any]:
     """The settings of a YAML file by their whole names."""
     found = {}
     for name in node:
@@ -201,13 +201,15 @@ def _leaves(node: DictConfig, section: str = "") -> dict[str, Any]:
 
 
 def revision() -> str:
-    """The git commit of the code, with "-dirty" when the code differs from it; "unknown" outside a repository."""
+    """The git commit of the code, with "-dirty" when the code differs from it; "unknown" outside its repository."""
+    here = Path(__file__)
 
     def git(*words: str) -> str:
         command = ("git", "--no-optional-locks", *words)
-        return subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True).stdout
+        return subprocess.run(command, cwd=here.parent, capture_output=True, text=True, check=True).stdout
 
     with contextlib.suppress(OSError, subprocess.CalledProcessError):
-        changed = git("status", "--porcelain", "--", "..", "../../torchrl_quad")
+        git("ls-files", "--error-unmatch", here.name)  # an installed package may lie in a repository of something else
+        changed = git("status", "--porcelain", "--", "..", "../../recipes")
         return git("rev-parse", "HEAD").strip() + ("-dirty" if changed else "")
     return "unknown"

@@ -5,10 +5,13 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import itertools
 import os
+import socket
 import sys
 import traceback
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,29 +19,34 @@ import hydra
 import joblib
 import omegaconf
 import torch
+import torch.distributed as dist
 import yaml
+from filelock import Timeout
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, read_write
+from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 import torchrl_quad
 from torchrl_quad.dynamics import presets
-from torchrl_quad.envs import available_tasks, task_class
 from torchrl_quad.errors import UserError, UserValueError
-from torchrl_quad.training.arguments import hydra_argument
+from torchrl_quad.files import locked, make_folder
+from torchrl_quad.training.building import rank, world_size
 from torchrl_quad.training.checkpoints import take_over
-from torchrl_quad.training.folders import own_folder
-from torchrl_quad.training.own import CONFIG, OWN, offer_tasks, own_recipe
-from torchrl_quad.training.processes import from_the_first, joined, rank
+from torchrl_quad.training.configuration import CONFIG, OWN, command_line, named_code, own_recipe
 from torchrl_quad.training.schema import check
 
-MAX_DEPTH = 20  # of lists and mappings within each other, as in a YAML file
+LOCK = "run.lock"  # names the process that writes into the folder of a run
 FOLDER_SETTINGS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
 NO_MEMORY = "the memory is full. Lower num_envs, horizon, batch_size, or the size of the networks."
-THEIRS = tuple(str(Path(module.__file__).parent) for module in (hydra, omegaconf, joblib))
+THEIRS = tuple(str(Path(str(module.__file__)).parent) for module in (hydra, omegaconf, joblib))
+
+# A run that resumes continues in the folder of its checkpoint; hydra.run.dir asks for it by this name.
+OmegaConf.register_new_resolver(
+    "folder_of", lambda resume, new: new if resume in (None, "auto") else str(Path(resume).parent), replace=True
+)
 
 
 class Refused(BaseException):
@@ -50,7 +58,7 @@ class RefusedInSweep(Exception):
 
 
 class Stopped(KeyboardInterrupt):
-    """Ctrl-C, with a message that says how to go on."""
+    """Ctrl-C, with a message that says how to continue."""
 
 
 class CheckBeforeFolder(Callback):
@@ -69,7 +77,7 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
     ``@recipe("bptt", algorithm="smooth", loss={"smoothness": 0.1})``. ``algorithm`` names its runs.
 
     Errors that have an explanation end in one line and exit status 2, Ctrl-C in one line and 130; with
-    ``HYDRA_FULL_ERROR=1`` in a traceback. While a training recipe runs, it alone writes into its folder,
+    ``HYDRA_FULL_ERROR=1`` in a traceback. While a training recipe runs, no other process writes into its folder,
     ``HydraConfig.get().runtime.output_dir``.
     """
 
@@ -85,16 +93,15 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
             if settings:
                 OWN[name] = config, settings
             try:
-                with _explained():
+                with _explained(), contextlib.ExitStack() as stack:
                     _check(cfg, HydraConfig.get())
-                    if "algorithm" not in cfg:
-                        flies.append(name)
-                        main(cfg)
-                        return
-                    with joined(cfg), _run_folder(cfg.resume) as folder, _resumable(folder, cfg.task):
+                    if "algorithm" in cfg:
+                        stack.enter_context(_joined(cfg))
+                        folder = stack.enter_context(_run_folder(cfg.resume))
+                        stack.enter_context(_resumable(folder, cfg))
                         take_over(cfg, folder)
-                        flies.append(name)
-                        main(cfg)
+                    flies.append(name)
+                    main(cfg)
             except Refused as error:
                 if HydraConfig.get().mode == RunMode.MULTIRUN:
                     raise RefusedInSweep(str(error)) from error
@@ -104,7 +111,6 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
         def program() -> None:
             full = os.environ.get("HYDRA_FULL_ERROR", "0") not in ("", "0")
             os.environ["HYDRA_FULL_ERROR"] = "1"  # hydra then leaves all exceptions to us
-            sys.argv[1:] = map(hydra_argument, sys.argv[1:])
             if os.getcwd() not in sys.path:
                 sys.path.append(os.getcwd())  # where tasks of your own may be
             registered.update(torchrl_quad.envs.TASKS)
@@ -112,9 +118,7 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
                 with _explained():
                     for path in sorted(CONFIG.rglob("*.yaml")):
                         presets.parse(path.read_bytes(), str(path))
-                    sys.argv[1:] = offer_tasks(sys.argv[1:])
-                    for argument in sys.argv[1:]:
-                        _require_flat(argument)
+                    sys.argv[1:] = command_line(sys.argv[1:])
                 job()
             except (Refused, RefusedInSweep) as error:
                 _end(error, 2, full)
@@ -141,23 +145,16 @@ def _end(error: BaseException, status: int, full: bool) -> None:
         said += str(error.__cause__).splitlines()[:1]
     if isinstance(error, OSError) and error.filename:
         said = [f"{error.filename}: {error.strerror}. Choose another hydra.run.dir."]
-    if isinstance(error, MissingConfigException) and str(error.missing_cfg_file).startswith("task/"):
-        try:
-            task_class(error.missing_cfg_file.removeprefix("task/"))
-        except ValueError as unknown:
-            said = [str(unknown)]
     message = " ".join(line.strip() for line in said if line.strip())
     print(message if status == 130 else f"Error: {message}", file=sys.stderr)
     raise SystemExit(status) from None
 
 
-def _check(cfg: DictConfig, hydra_config: DictConfig) -> None:
+def _check(cfg: DictConfig, hydra_config: Any) -> None:
     """Check a configuration, and that the command line takes effect."""
     name, overrides = hydra_config.job.config_name, hydra_config.overrides
     if cfg.get("algorithm", name) != name:
-        raise UserValueError(
-            f"algorithm={cfg.algorithm}: this recipe is {name}, whatever it is called. Run the recipe of that name."
-        )
+        raise UserValueError(f"algorithm={cfg.algorithm}: this recipe is {name}. Run the recipe of that name.")
     check(cfg, overrides.task)
     if cfg.get("resume") not in (None, "auto") and hydra_config.mode != RunMode.MULTIRUN:
         asked = Path(hydra_config.run.dir)
@@ -165,16 +162,6 @@ def _check(cfg: DictConfig, hydra_config: DictConfig) -> None:
             raise UserValueError(
                 f"hydra.run.dir={asked} has no effect: resume={cfg.resume} goes on in the folder of that checkpoint. "
                 "Leave it out."
-            )
-
-
-def _require_flat(argument: str) -> None:
-    depth = 0
-    for letter in argument:
-        depth += (letter in "[{(") - (letter in ")}]")
-        if depth > MAX_DEPTH:
-            raise UserValueError(
-                f"{argument[:40]}... nests more than {MAX_DEPTH} lists or mappings. Give the path of a YAML file."
             )
 
 
@@ -192,12 +179,34 @@ def _explained() -> Iterator[None]:
         yield
     except (UserError, OSError) as error:
         raise Refused(str(error)) from error
-    except (MemoryError, torch.OutOfMemoryError) as error:
-        raise Refused(NO_MEMORY) from error
-    except RuntimeError as error:
-        if "can't allocate memory" not in str(error):
+    except (MemoryError, RuntimeError) as error:
+        full = isinstance(error, MemoryError | torch.OutOfMemoryError) or "can't allocate memory" in str(error)
+        if not full:
             raise
         raise Refused(NO_MEMORY) from error
+
+
+@contextlib.contextmanager
+def _joined(cfg: DictConfig) -> Iterator[None]:
+    """Join the processes that torchrun has started, if it has, and leave them at the end.
+
+    Raises:
+        UserValueError: the configuration names one GPU for all of them.
+    """
+    if "RANK" in os.environ:
+        if ":" in cfg.device:
+            raise UserValueError(
+                f"device={cfg.device}: under torchrun each process takes its own GPU. Write device=cuda."
+            )
+        if cfg.device == "cuda":
+            torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+        dist.init_process_group("nccl" if cfg.device == "cuda" else "gloo")
+    yield
+    if dist.is_initialized():  # after an error the others may wait for this one: torchrun ends them
+        dist.destroy_process_group()
+
+
+# -- the folder of a run -----------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -207,35 +216,83 @@ def _run_folder(resume: str | None) -> Iterator[Path]:
     That is the checkpoint's if one is named, otherwise the one that hydra has made; or one beside it, if another run
     has got hydra's and the user has not named it.
     """
-    hydra_config = HydraConfig.instance().cfg.hydra
+    hydra_config: Any = HydraConfig.get()
     made = Path(hydra_config.runtime.output_dir)
     goes_on = resume not in (None, "auto")
     named = goes_on or any(x.lstrip("+").startswith(FOLDER_SETTINGS) for x in hydra_config.overrides.hydra)
     with contextlib.ExitStack() as stack:
-        folder = Path(resume).resolve().parent if goes_on else made
-        folder = stack.enter_context(own_folder(folder, named)) if rank() == 0 else None
-        folder = from_the_first(folder)
-        if folder != made:
+        folder = Path(str(resume)).resolve().parent if goes_on else made
+        values = [stack.enter_context(own_folder(folder, named)) if rank() == 0 else folder]
+        if world_size() > 1:
+            dist.broadcast_object_list(values)  # that of the first process
+        if values[0] != made:
             with contextlib.suppress(OSError):  # not empty
                 made.rmdir()
         with read_write(hydra_config):
-            hydra_config.runtime.output_dir = str(folder)
-        yield folder
+            hydra_config.runtime.output_dir = str(values[0])
+        yield values[0]
 
 
 @contextlib.contextmanager
-def _resumable(folder: Path, task: str) -> Iterator[None]:
-    """Say how to go on when the run is stopped, or when the disk is full."""
+def own_folder(folder: Path, named: bool) -> Iterator[Path]:
+    """Hold a folder that no other process writes into, and give it back at the end.
+
+    A folder that the user has named is taken as it is. Otherwise its name is only a proposal: when another run has it,
+    the next free one of ``folder_2``, ``folder_3`` and so on is made.
+
+    Raises:
+        FileExistsError: another process runs in the folder that was named.
+    """
+    with contextlib.ExitStack() as stack:
+        folder = _claim(folder, named, stack)
+        try:
+            yield folder
+        finally:
+            stack.close()
+            if not named:
+                with contextlib.suppress(OSError):  # not empty: it has results
+                    folder.rmdir()
+
+
+def _claim(folder: Path, named: bool, stack: contextlib.ExitStack) -> Path:
+    for number in itertools.count(1):
+        path = make_folder(folder if number == 1 else folder.with_name(f"{folder.name}_{number}"))
+        with contextlib.ExitStack() as claim:
+            try:
+                lock = claim.enter_context(locked(path / LOCK, wait=False))
+            except Timeout:
+                if not named:
+                    continue
+                holder = "another process"
+                with contextlib.suppress(OSError):  # it has ended just now
+                    holder = (path / LOCK).read_text().strip() or holder
+                raise FileExistsError(
+                    f"{path} is in use by {holder}. Wait for it, stop it, or choose another hydra.run.dir."
+                ) from None
+            if not named and any(other.name != LOCK for other in path.iterdir()):  # a run that is over
+                continue
+            lock.write_text(
+                f"process {os.getpid()} on {socket.gethostname()} since {datetime.now():%Y-%m-%d %H:%M:%S}\n"
+            )
+            stack.push(claim.pop_all())
+            return path
+    raise AssertionError
+
+
+@contextlib.contextmanager
+def _resumable(folder: Path, cfg: DictConfig) -> Iterator[None]:
+    """Say how to continue when the run is stopped, or when the disk is full."""
     checkpoint = folder / "checkpoint.pt"
-    named = "" if task in available_tasks() else f" task={task}"
-    how = f"Go on with: python {sys.argv[0]} resume={checkpoint}{named}"
     try:
         yield
-    except KeyboardInterrupt as error:
-        saved = how if checkpoint.exists() else "Nothing was saved yet: the first evaluation writes a checkpoint."
-        raise Stopped(f"Stopped. {saved}") from error
-    except OSError as error:
+    except (KeyboardInterrupt, OSError) as error:
+        trust = ", ".join(named_code(OmegaConf.to_container(cfg)))
+        how = f"Go on with: python {sys.argv[0]} resume={checkpoint}" + (f" 'trust=[{trust}]'" if trust else "")
+        is_saved = checkpoint.exists()
+        if isinstance(error, KeyboardInterrupt):
+            why = how if is_saved else "Nothing was saved yet: the first evaluation writes a checkpoint."
+            raise Stopped(f"Stopped. {why}") from error
         if error.errno != errno.ENOSPC:
             raise
-        saved = f"The last checkpoint is intact. Make room. {how}" if checkpoint.exists() else "Nothing was saved yet."
-        raise Refused(f"the disk is full: {error.filename or folder}. {saved}") from error
+        why = f"The last checkpoint is intact. Make room. {how}" if is_saved else "Nothing was saved yet."
+        raise Refused(f"the disk is full: {error.filename or folder}. {why}") from error

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torch.distributed as dist
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from tqdm import tqdm
@@ -32,7 +33,17 @@ from torchrl_quad.errors import Diverged, UserValueError
 from torchrl_quad.files import replacing
 from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.training import drawing
-from torchrl_quad.training.building import average_policy, iterations, own_seed
+from torchrl_quad.training.building import (
+    Optimizer,
+    TargetUpdate,
+    average_policy,
+    iterations,
+    minibatches,
+    own_seed,
+    rank,
+    task_of,
+    world_size,
+)
 from torchrl_quad.training.checkpoints import fits, read_checkpoint, revision, write_checkpoint
 from torchrl_quad.training.evaluation import (
     best_policy,
@@ -45,7 +56,6 @@ from torchrl_quad.training.evaluation import (
     write_summary,
 )
 from torchrl_quad.training.logs import Logs
-from torchrl_quad.training.processes import backward, gather, rank, wait_for_all, world_size
 
 CELL = 0.5  # [m]: train/start_cells counts the cubes of this size in which horizons have started
 
@@ -58,6 +68,8 @@ class Run:
     far, which is flown at the end from other starts: the one that solved most episodes in these evaluations, and of
     those the one with the greatest return. With ``actor.average`` evaluations fly the average of the policy's weights,
     and the best policy is one of these averages.
+
+    Before each iteration every :class:`Optimizer` gets its learning rate, by the steps of the run so far.
 
     Leaves in the run's folder: ``config.yaml``, ``metrics.csv``, ``checkpoint.pt`` and the one before it,
     ``summary.json``, ``learning_curve.png``, and the flight as ``flight.png``, ``flight.mp4`` or .gif,
@@ -72,7 +84,7 @@ class Run:
         env: the environment.
         actor: the policy, whose parameters are those of the loss.
         loss: holds everything that is trained.
-        stateful: optimisers, schedules, and whatever else has a ``state_dict`` that changes in training.
+        stateful: optimisers, and whatever else has a ``state_dict`` that changes in training.
         buffer: of visited states, if the algorithm has one.
 
     Raises:
@@ -89,12 +101,13 @@ class Run:
         self,
         cfg: DictConfig,
         env: EnvBase,
-        actor: TensorDictModuleBase,
+        actor: TensorDictModule,
         loss: nn.Module,
         stateful: Sequence[Any],
         buffer: VisitedStateBuffer | None = None,
     ) -> None:
         self.cfg, self.env, self.actor, self.loss, self.buffer = cfg, env, actor, loss, buffer
+        self.task = task_of(env)
         self.average = average_policy(cfg, actor)
         self.flown = actor if self.average is None else self.average.module  # what evaluations fly
         averages = [] if self.average is None else [self.average]
@@ -133,7 +146,7 @@ class Run:
             return
         if self.cfg.compile and self.steps < self.total_steps:
             self._warm_up()
-        inside = self.env.flies_inside(self.actor)
+        inside = self.task.flies_inside(self.actor)
         way = "policy inside the step" if inside else "policy before the step"
         with tqdm(
             total=self.total_steps,
@@ -145,6 +158,8 @@ class Run:
         ) as bar:
             while self.steps < self.total_steps:
                 self.starts.append(self.carry["state", "position"].clone())
+                for optimizer in (x for x in self.stateful if isinstance(x, Optimizer)):
+                    optimizer.anneal(self.steps / self.drones / self.cfg.horizon)
                 start, processor_start = time.perf_counter(), time.process_time()
                 yield self.done
                 if self.average is not None:
@@ -165,7 +180,7 @@ class Run:
         if rank() == 0:
             self._finish()
 
-    def optimise(self, name: str, optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
+    def optimise(self, optimizer: Optimizer, loss: Tensor) -> None:
         """Take one step down a loss with its clipped gradient, averaged over all processes; record the norm.
 
         The step is skipped if the loss or its gradient is not finite.
@@ -173,27 +188,49 @@ class Run:
         Raises:
             Diverged: more than ``max_skipped`` steps were skipped; the run is saved as it is.
         """
-        value, norm = torch.stack(backward(loss, optimizer, max_grad_norm)).tolist()  # waits for a GPU once
-        finite = math.isfinite(value) and math.isfinite(norm)
-        if finite:
-            self.record(**{f"grad_{name}": norm})
-        else:
-            self.skipped += 1
-            parameters = self.loss.named_parameters()
-            broken = [key for key, p in parameters if p.grad is not None and not p.grad.isfinite().all()]
-            optimizer.zero_grad()  # without gradients a step changes nothing
-        optimizer.step()
-        if finite or self.skipped <= self.cfg.max_skipped:
+        both = torch.stack(backward(loss, optimizer, optimizer.max_grad_norm))
+        value, norm = both.tolist()  # in one call, so that it waits for a GPU once
+        if math.isfinite(value) and math.isfinite(norm):
+            self.record(**{f"grad_{optimizer.name}": norm})
+            optimizer.step()
+            return
+        self.skipped += 1
+        parameters = self.loss.named_parameters()
+        broken = [key for key, p in parameters if p.grad is not None and not p.grad.isfinite().all()]
+        optimizer.zero_grad()
+        if self.skipped <= self.cfg.max_skipped:
             return
         path = self.folder / "failure.pt"
         self._save(path)
         raise Diverged(
             f"{self.skipped} updates were skipped because their loss or gradient was not finite; the limit is "
-            f"max_skipped={self.cfg.max_skipped}. The last: {name}, iteration {self.done}, loss {value:g}, gradient "
-            f"norm {norm:g}, not finite in {', '.join(broken[:3]) or 'no parameter'}. Networks and the state in which "
-            f'the horizon started are saved: {path}, ["processes"][{rank()}]["carry"]. Look for an infinite derivative '
-            "there, or lower the learning rate; raise max_skipped if the run recovers by itself."
+            f"max_skipped={self.cfg.max_skipped}. The last: {optimizer.name}, iteration {self.done}, loss {value:g}, "
+            f"gradient norm {norm:g}, not finite in {', '.join(broken[:3]) or 'no parameter'}. Networks and the state "
+            f'in which the horizon started are saved: {path}, ["processes"][{rank()}]["carry"]. Look for an infinite '
+            "derivative there, or lower the learning rate; raise max_skipped if the run recovers without help."
         )
+
+    def fit_critic(
+        self, optimizer: Optimizer, data: TensorDictBase, target: TargetUpdate | None = None
+    ) -> dict[str, Any]:
+        """Take ``critic.updates`` steps of the critic towards the value targets in ``data``, on random minibatches.
+
+        Args:
+            optimizer: of the critic.
+            data: a rollout with value targets.
+            target: moves the target critic after each step, if there is one.
+
+        Returns:
+            the loss and the metrics of the last minibatch.
+        """
+        loss = self.loss
+        read = data.select(*getattr(loss, loss.critic_name).in_keys, loss.tensor_keys.value_target)
+        for batch in minibatches(read, self.cfg.critic):
+            loss_critic, metrics = getattr(loss, loss.critic_loss_key)(batch)
+            self.optimise(optimizer, loss_critic)
+            if target is not None:
+                target.step()
+        return {loss.critic_loss_key: loss_critic, **metrics}
 
     def record(self, **metrics: Tensor | float) -> None:
         """Keep what this iteration measured; a row holds the mean since the row before."""
@@ -270,7 +307,7 @@ class Run:
         summary |= {"steps": self.steps, "best_steps": self.best["steps"], "seconds": round(self.seconds, 2)}
         summary |= {"revision": self.revision}
         write_summary(self.folder / "summary.json", summary)
-        print_summary(summary, self.env.metric_info, self.folder)
+        print_summary(summary, self.task.metric_info, self.folder)
         picture, figure, page = (self.folder / name for name in ("flight.png", "episode.pdf", "flight.html"))
         drawing.draw_flight(flight, picture, self.env, title(summary))
         drawing.publish_flight(flight, figure, page, self.env, title(summary))
@@ -283,17 +320,18 @@ class Run:
     def _save(self, path: Path) -> None:
         """Write all that the run needs to go on, of all processes."""
         clip = getattr(self.loss, "clip", None)
-        processes = gather(
-            {
-                "torch": torch.get_rng_state(),
-                "cuda": torch.cuda.get_rng_state(self.env.device) if self.env.device.type == "cuda" else None,
-                "env": self.env.random_state(),
-                "carry": self.carry.cpu().to_dict(),
-                "buffer": None if self.buffer is None else self.buffer.state_dict(),
-                "clip": None if clip is None else clip.state_dict(),  # each clips by the median of its own drones
-                "parameters": sum(p.detach().double().sum().item() for p in self.loss.parameters()),
-            }
-        )
+        own = {
+            "torch": torch.get_rng_state(),
+            "cuda": torch.cuda.get_rng_state(self.env.device) if self.env.device.type == "cuda" else None,
+            "env": self.task.random_state(),
+            "carry": self.carry.cpu().to_dict(),
+            "buffer": None if self.buffer is None else self.buffer.state_dict(),
+            "clip": None if clip is None else clip.state_dict(),  # each clips by the median of its own drones
+            "parameters": sum(p.detach().double().sum().item() for p in self.loss.parameters()),
+        }
+        processes = [own] * world_size()
+        if world_size() > 1:
+            dist.gather_object(own, processes if rank() == 0 else None)  # the others keep their own
         if len({process["parameters"] for process in processes}) > 1:
             raise RuntimeError("The parameters of the processes differ: take every step with run.optimise.")
         if rank() == 0:
@@ -314,7 +352,8 @@ class Run:
             is_failure = path.name == "failure.pt"
             write_checkpoint(path, content, None if is_failure else self.saved)
             self.saved = self.saved if is_failure else path
-        wait_for_all()  # nobody goes on, or gives up, before the file is there
+        if world_size() > 1:
+            dist.barrier()  # none continues, or gives up, before the file is there
 
     def _load(self, path: Path) -> dict[str, Any] | None:
         """Take everything from a checkpoint, and return the state of the logger.
@@ -338,7 +377,7 @@ class Run:
                 self.loss.clip.load_state_dict(own["clip"])
             carry = TensorDict(own["carry"], self.env.batch_size).to(self.env.device)
             self.carry = self.env.reset(carry.exclude("_reset"), set_state=True).update(carry)
-            self.env.set_random_state(own["env"])
+            self.task.set_random_state(own["env"])
             torch.set_rng_state(own["torch"])
             if own["cuda"] is not None:
                 torch.cuda.set_rng_state(own["cuda"], self.env.device)
@@ -349,3 +388,22 @@ class Run:
         before = saved["revision"]
         self.revision = before if self.revision in before else f"{before}, then {self.revision}"
         return saved["logger"]
+
+
+def backward(loss: Tensor, optimizer: torch.optim.Optimizer, max_grad_norm: float) -> tuple[Tensor, Tensor]:
+    """Compute the gradient of a loss, average it over the processes, and clip that of each group of parameters.
+
+    Returns:
+        the loss and the norm of the gradient of the first group before clipping, both averaged over the processes.
+    """
+    optimizer.zero_grad()
+    loss.backward()
+    groups = [[p for p in group["params"] if p.grad is not None] for group in optimizer.param_groups]
+    loss = loss.detach()
+    if world_size() > 1:
+        tensors = [loss, *(p.grad for group in groups for p in group)]
+        flat = nn.utils.parameters_to_vector(tensors)
+        dist.all_reduce(flat)
+        nn.utils.vector_to_parameters(flat / world_size(), tensors)
+    norms = [nn.utils.clip_grad_norm_(group, max_grad_norm, foreach=True) for group in groups]
+    return loss, norms[0]

@@ -1,8 +1,8 @@
 """The schema of the configuration: the type and the range of every setting, checked before a run makes its folder.
 
-A setting is refused with its name, its value, what it must be, and the sentence that describes it. The settings in
-``env`` and ``loss`` are declared by the signatures of the task and of the loss, all others here. Which of them a recipe
-has, its YAML files say.
+A setting is refused with its name, its value, what it must be, and the sentence that describes it. The signatures of
+task and loss declare the settings in ``env`` and ``loss``, this file all others. The YAML files of a recipe say which
+of them it has.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 import torch
 from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
@@ -31,12 +32,14 @@ from torchrl_quad.options import (
     Real,
     Share,
     Size,
+    argument_names,
     check_known,
     declared,
     must,
 )
-from torchrl_quad.training.own import CONFIG, OWN, SET_BY_RECIPES
+from torchrl_quad.training.configuration import CONFIG, OWN, SET_BY_RECIPES, own_disturbances, own_loss
 
+TRUST = "The paths of your own classes that a checkpoint names, and that may be imported."
 MAX_ROLLOUT = 100_000_000  # control steps of a rollout: with a graph they take more than 50 GB
 
 
@@ -71,6 +74,9 @@ class Section(BaseModel):
     """A section of the configuration: nothing is converted, and no setting is unknown."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
+
+
+_Section = TypeVar("_Section", bound=Section)
 
 
 class Optimised(Section):
@@ -124,12 +130,18 @@ class Actor(Optimised):
 
 
 class Critic(Optimised):
-    """The critic; that of PPO has no target network."""
+    """The critic; some recipes add the settings of ``CRITIC``."""
 
     lmbda: Fraction = Field(description="The lambda of the TD(lambda) targets; 0.95 is usual.")
-    updates: int = Field(None, ge=1, le=100_000, description="Gradient steps of the critic per iteration.")
-    batch_size: Size = Field(None, description="Control steps in a minibatch of the critic.")
-    tau: Share = Field(None, description="The share of the critic that its target network takes over in each update.")
+
+
+CRITIC: dict[str, Any] = {
+    "updates": Annotated[int, Field(ge=1, le=100_000, description="Gradient steps of the critic per iteration.")],
+    "batch_size": Annotated[Size, Field(description="Control steps in a minibatch of the critic.")],
+    "tau": Annotated[
+        Share, Field(description="The share of the critic that its target network takes over in each update.")
+    ],
+}
 
 
 class Buffer(Section):
@@ -158,25 +170,21 @@ class Logger(Section):
 
 
 class Training(Section):
-    """The configuration of a training run."""
+    """The configuration of a training run; some recipes add the settings of ``TRAINING``."""
 
     algorithm: str
     task: str
     seed: Seed = Field(description="Torch, the environment and the buffer draw from it.")
     resume: Annotated[str, AfterValidator(existing_checkpoint)] | None
+    trust: list[str] = Field(description=TRUST)
     device: Device
     threads: Threads = Field(description="Torch threads; 1 is the fastest for tensors as small as these.")
-    num_envs: Size = Field(description="Drones of each process; more than these fit into no memory.")
+    num_envs: Size = Field(description="Drones of each process; no memory holds more than these.")
     horizon: int = Field(ge=1, le=100_000, description="Control steps in a rollout.")
     total_steps: int = Field(ge=1, le=10**15, description="Control steps of all drones together, in the whole run.")
     compile: bool
     normalize: bool
     actor: Actor
-    critic: Critic = Field(None)
-    buffer: Buffer = Field(None)
-    restart_fraction: Fraction = Field(None, description="The share of flights that each iteration gives up.")
-    epochs: int = Field(None, ge=1, le=10_000, description="Passes over each rollout.")
-    batch_size: Size = Field(None, description="Control steps in a minibatch.")
     gamma: Fraction = Field(description="The discount of future rewards per control step; 0.99 is usual.")
     diagnostics: Count = Field(description="Evaluations between audits of reward and gradient; 0 for none.")
     max_skipped: Count = Field(description="Updates that may be left out for not being finite; 0 stops at the first.")
@@ -190,28 +198,33 @@ class Training(Section):
         return self
 
 
-OWN_TASK = Field(description="The class of the checkpoint's task, where that has no registered name.")
-
-
-class Flying(Section):
-    """The configuration of evaluate.py."""
-
-    checkpoint: str
-    own_task: str | None = OWN_TASK
-    episodes: Size = Field(description="Fresh episodes to fly, side by side.")
-    seed: Seed
-    threads: Threads
-    device: Device
+TRAINING: dict[str, Any] = {
+    "buffer": Buffer,
+    "restart_fraction": Annotated[Fraction, Field(description="The share of flights that each iteration gives up.")],
+    "epochs": Annotated[int, Field(ge=1, le=10_000, description="Passes over each rollout.")],
+    "batch_size": Annotated[Size, Field(description="Control steps in a minibatch.")],
+}
 
 
 class Exporting(Section):
     """The configuration of export.py."""
 
     checkpoint: str
-    own_task: str | None = OWN_TASK
+    trust: list[str] = Field(description=TRUST)
     folder: str | None = Field(description="The folder to write; null: policy, beside the checkpoint.")
     episodes: Size = Field(description="Fresh episodes to fly, side by side.")
     threads: Threads
+
+
+class Flying(Section):
+    """The configuration of evaluate.py."""
+
+    checkpoint: str
+    trust: list[str] = Field(description=TRUST)
+    episodes: Size = Field(description="Fresh episodes to fly, side by side.")
+    seed: Seed
+    threads: Threads
+    device: Device
 
 
 class Identifying(Section):
@@ -219,7 +232,7 @@ class Identifying(Section):
 
     logs: list[str] = Field(min_length=1, description="The paths of flights of one drone, in a list.")
     drone: str | dict[str, Any] = Field(description="Where the fit starts: a preset, a YAML file, or a mapping.")
-    mass: Positive | None = Field(description="The mass in kg, from a scale; null where it is not known.")
+    mass: Positive | None = Field(description="The mass in kg, from a scale; null if unknown.")
     known: dict[str, Any] | None = Field(description="Fields of the drone that are known by measurement.")
     fields: list[str] | None = Field(description="What to fit; null for everything.")
     folder: str = Field(description="The folder to write.")
@@ -287,15 +300,18 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
 
 
 def settings(algorithm: str) -> dict[str, Any] | None:
-    """What the YAML files of a recipe set, without those for a task; None for a recipe that is not known here."""
+    """What the YAML files of a recipe set, without those for a task; None for a recipe that is unknown here."""
     config, own = OWN.get(algorithm, (algorithm, {}))
-    if not (CONFIG / f"{config}.yaml").is_file() or config not in LOSSES:
+    if config not in LOSSES:
         return None
-    recipe = OmegaConf.load(CONFIG / f"{config}.yaml")
-    shared = [OmegaConf.load(CONFIG / f"{x}.yaml") for x in recipe.pop("defaults") if x in ("common", "critic")]
-    merged = OmegaConf.merge(*shared, recipe, own)
-    known = OmegaConf.to_container(OmegaConf.masked_copy(merged, [name for name in merged if name != "hydra"]))
-    return {"task": None} | known
+    recipe = OmegaConf.create(OmegaConf.load(CONFIG / f"{config}.yaml"))
+    shared = [OmegaConf.load(CONFIG / f"{x}.yaml") for x in recipe["defaults"] if x in ("common", "critic")]
+    merged = _plain(OmegaConf.merge(*shared, recipe, own))
+    return {"task": None} | {name: value for name, value in merged.items() if name not in ("defaults", "hydra")}
+
+
+def _plain(cfg: Any, **options: bool) -> dict[str, Any]:
+    return cast("dict[str, Any]", OmegaConf.to_container(cfg, **options))
 
 
 # -- the check ---------------------------------------------------------------------------------------------------------
@@ -306,18 +322,18 @@ def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
 
     Raises:
         UserValueError: the first setting that is unknown, has the wrong type, is out of its range, or has no effect.
-        UserTypeError: the task has no such option.
+        UserTypeError: the task has no such option, or a path leads to a class of another kind.
     """
     try:
-        chosen = OmegaConf.masked_copy(cfg, [name for name in cfg if name != "hydra"])
-        values = OmegaConf.to_container(chosen, resolve=True, throw_on_missing=True)
+        chosen = OmegaConf.masked_copy(cfg, [str(name) for name in cfg if name != "hydra"])
+        values = _plain(chosen, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
         name = error.full_key or "a setting"
         raise UserValueError(f"{name} is missing: write {name}=... on the command line.") from None
     except OmegaConfBaseException as error:
         raise UserValueError(f"{error.full_key or 'the configuration'}: {str(error).splitlines()[0]}") from None
-    _refuse_none(values)
-    kinds = {"logs": Identifying, "folder": Exporting, "checkpoint": Flying}
+    _check_none(values)
+    kinds: dict[str, type[Section]] = {"logs": Identifying, "folder": Exporting, "checkpoint": Flying}
     asked = {name.lstrip("+~"): value for name, _, value in (override.partition("=") for override in overrides)}
     schema = next((kind for name, kind in kinds.items() if name in values), None) or schema_of(values, asked)
     try:
@@ -325,33 +341,36 @@ def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
     except ValidationError as error:
         raise UserValueError(_sentence(schema, error.errors()[0])) from None
     if "algorithm" in values:
-        _refuse_idle(values, asked)
+        own_disturbances(values["env"].get("disturbances"))
+        _check_effects(values, asked)
 
 
-def schema_of(values: dict[str, Any], asked: Mapping[str, str]) -> type[Training]:
-    """The schema of a training run, of its recipe, its task and its loss, if these have what was asked for."""
+def schema_of(values: dict[str, Any], asked: Mapping[str, str] = MappingProxyType({})) -> type[Training]:
+    """The schema of a training run, of its recipe, its task and its loss."""
     for name in ("algorithm", "task"):
         if not isinstance(values.get(name), str):
             raise UserValueError(f"{name}={shown(values.get(name))}: it must be a name.")
     known = settings(values["algorithm"])
-    _refuse_unread(known or values, asked)
-    if known is None:  # of a recipe that is somebody's own, in another program
-        return create_model("Training", __base__=Training, env=(_environment(values), ...), loss=(dict[str, Any], ...))
-    _require_all(values, known)
-    sections = {"env": _environment(values), "loss": _loss(values["algorithm"], values["loss"])}
-    return create_model("Training", __base__=Training, **{name: (kind, ...) for name, kind in sections.items()})
+    if known is None:  # of a recipe that is somebody's own, in another program, which may have any of these
+        loss, critic = dict[str, Any], _extended(Critic, {name: (kind, None) for name, kind in CRITIC.items()})
+        more = {name: (kind, None) for name, kind in {**TRAINING, "critic": critic}.items()}
+    else:
+        loss, more = _loss(values["algorithm"], values["loss"], asked), {}
+        if "critic" in known:
+            fields = {name: kind for name, kind in CRITIC.items() if name in known["critic"]}
+            # What the tuned file of another recipe sets, which this one starts from, is left alone.
+            rest = {name: (kind, None) for name, kind in CRITIC.items() if f"critic.{name}" not in asked}
+            more = {"critic": _extended(Critic, rest | fields)}
+        more |= {name: kind for name, kind in TRAINING.items() if name in known}
+    return _extended(Training, {"env": _environment(values), "loss": loss, **more})
 
 
-def _require_all(values: Mapping[str, Any], known: Mapping[str, Any], section: str = "") -> None:
-    """Refuse to go without settings that the files of the recipe have, and the command line has deleted."""
-    for name in known:
-        if name not in values:
-            raise UserValueError(f"{section}{name} is missing: do not delete it. Set it to another value instead.")
-        if name not in ("env", "loss") and isinstance(known[name], Mapping) and isinstance(values[name], Mapping):
-            _require_all(values[name], known[name], f"{section}{name}.")
+def _extended(base: type[_Section], fields: Mapping[str, Any]) -> type[_Section]:
+    """A section with more settings: each a type, which makes it a must, or a type and a default."""
+    return cast("Any", create_model)(base.__name__, __base__=base, **fields)
 
 
-def _environment(values: dict[str, Any]) -> Any:
+def _environment(values: dict[str, Any]) -> type[Section]:
     """The schema of the section env, from the signature of the task."""
     cls, env = task_class(values["task"]), values.get("env")
     for name in env if isinstance(env, dict) else ():
@@ -359,84 +378,85 @@ def _environment(values: dict[str, Any]) -> Any:
             raise UserValueError(f"env.{name}: recipes set it for all environments. Write {name}=..., without env.")
     if isinstance(env, dict):
         check_known(cls, sorted(map(str, env)))
-    return _section("Env", declared(cls), inspect.signature(cls).parameters)
+    kinds = declared(cls) | {"disturbances": (list[str | dict[str, Any]] | None, "")}
+    return _section("Env", kinds, inspect.signature(cls).parameters)
 
 
-def _loss(algorithm: str, values: Any) -> Any:
-    """The schema of the section loss, from the signature of the loss, and from what a recipe of one's own adds."""
+def _loss(algorithm: str, values: Any, asked: Mapping[str, str]) -> type[Section]:
+    """The schema of the section loss, from the signature of the loss, and from what a recipe of your own adds."""
     config, own = OWN.get(algorithm, (algorithm, {}))
-    options = {name: kind for name, kind in declared(LOSSES[config]).items() if name not in SET_BY_LOOPS}
-    added = {name: (type(x) if isinstance(x, bool | str) else Any, "") for name, x in (own.get("loss") or {}).items()}
-    options = {**added, **options}
-    for name in values if isinstance(values, dict) else ():
-        if name not in options:
+    kind, values = LOSSES[config], values if isinstance(values, dict) else {}
+    options = declared(kind)
+    names = {name: None for name in options if name not in SET_BY_LOOPS} | dict(own.get("loss") or {})
+    if path := values.get("_target_"):
+        if not isinstance(kind, type):
+            raise UserValueError(f"loss._target_={path}: this recipe takes only TorchRL's loss. Write your own recipe.")
+        kind = own_loss(path, kind)
+        options |= declared(kind)
+        known = {*argument_names(kind), "_target_"} - SET_BY_LOOPS
+        # A setting of the recipe's own loss that this one lacks is left out, but the command line must not name it.
+        names = {name: None for name in (*known, *values) if name in known or f"loss.{name}" not in asked}
+    options = {name: (type(x) if isinstance(x, bool | str) else Any, "") for name, x in names.items()} | options
+    for name in values:
+        if name not in names:
             raise UserValueError(
-                f"loss.{name} is unknown, or set by the recipe. Choose from: {', '.join(sorted(options))}."
+                f"loss.{name} is unknown, or set by the recipe. Choose from: {', '.join(sorted(names))}."
             )
-    return _section("Loss", options, options)
+    return _section("Loss", options, names)
 
 
-def _section(name: str, kinds: Mapping[str, tuple[Any, str]], names: Iterable[str]) -> Any:
+def _section(name: str, kinds: Mapping[str, tuple[Any, str]], names: Iterable[str]) -> type[Section]:
     """A section with these options, all of which may be left out; what has no declared type its owner checks."""
     fields = {}
     for option in names:
         kind, described = kinds.get(option, (Any, ""))
-        fields[option] = (kind, Field(None, description=re.sub(r"\bNone\b", "null", described) or None))
-    return create_model(name, __base__=Section, **fields)
+        # The alias allows _target_, since a field must not start with an underscore.
+        fields[option.strip("_")] = (
+            kind,
+            Field(None, alias=option, description=re.sub(r"\bNone\b", "null", described) or None),
+        )
+    return cast("Any", create_model)(name, __base__=Section, **fields)
 
 
-def _refuse_unread(known: dict[str, Any], asked: Mapping[str, str]) -> None:
-    """Refuse settings on the command line that the recipe has not, and a file in tuned/ that is not there."""
-    node = OmegaConf.create(known)
-    for name in asked:
-        section, *inner = name.split(".")
-        is_known = section in ("env", "loss", "tuned") or "/" in name or OmegaConf.select(node, name, default="") != ""
-        if not is_known:
-            among = known.get(section, {}) if inner else known
-            close = difflib.get_close_matches(name.split(".")[-1], map(str, among), 1)
-            hint = f"Did you mean {'.'.join([section, *close] if inner else close)}?" if close else "Leave it out."
-            raise UserValueError(f"{name} is unknown: this recipe has no such setting. {hint}")
-    tuned = asked.get("tuned", "null")
-    files = sorted(path.stem for path in (CONFIG / "tuned").glob("*.yaml"))
+def _check_effects(values: dict[str, Any], asked: Mapping[str, str]) -> None:
+    """Refuse what the command line sets and another setting switches off, and a file in tuned/ that is not there."""
+    tuned, files = asked.get("tuned", "null"), sorted(path.stem for path in (CONFIG / "tuned").glob("*.yaml"))
     if tuned not in ("null", *files):
         close = difflib.get_close_matches(tuned, files, 1) or files
-        raise UserValueError(
-            f"tuned={tuned}: there is no such file in recipes/config/tuned. Choose from: {', '.join(close)}."
-        )
-
-
-def _refuse_idle(values: dict[str, Any], asked: Mapping[str, str]) -> None:
-    """Refuse what the command line sets and another setting switches off."""
+        raise UserValueError(f"tuned={tuned}: {CONFIG / 'tuned'} has no such file. Choose from: {', '.join(close)}.")
     for names, is_idle, why in IDLE:
         for name in set(names.split()) & asked.keys():
             if is_idle(values):
                 raise UserValueError(f"{name}={asked[name]} has no effect: {why}. Leave it out, or change that.")
 
 
-def _refuse_none(values: Any, name: str = "") -> None:
+def _check_none(values: Any, name: str = "") -> None:
     """Refuse the word None, which YAML reads as a string."""
     if isinstance(values, dict):
         for key, value in values.items():
-            _refuse_none(value, f"{name}.{key}" if name else str(key))
+            _check_none(value, f"{name}.{key}" if name else str(key))
     elif values in ("None", "none"):
         raise UserValueError(f"{name}={values}: it is the word {values!r} to YAML. For no value write {name}=null.")
 
 
-def _sentence(schema: type[BaseModel], error: Any) -> str:
+def _sentence(schema: type[BaseModel] | None, error: Any) -> str:
     """One refusal: the setting, its value, what it must be, and its description."""
-    name, field, value = "", None, error["input"]
+    name, field, value, known = "", None, error["input"], []
     for key in error["loc"]:
         if isinstance(key, int):  # an entry of a list
             name += f"[{key}]"
         elif schema is not None and (key in schema.model_fields or error["type"] == "extra_forbidden"):
-            name += f".{key}" if name else key
+            name, known = f"{name}.{key}" if name else key, list(schema.model_fields)
             field = schema.model_fields.get(key)
             kinds = [] if field is None else [field.annotation, *getattr(field.annotation, "__args__", ())]
             schema = next((x for x in kinds if isinstance(x, type) and issubclass(x, BaseModel)), None)
     if error["type"] == "extra_forbidden":
-        return f"{name} is unknown: there is no such setting. Look for a misspelling."
+        section, _, key = name.rpartition(".")
+        close = [f"{section}.{x}".lstrip(".") for x in difflib.get_close_matches(key, known, 1)]
+        hint = f"Did you mean {close[0]}?" if close else "Leave it out."
+        return f"{name} is unknown: this recipe has no such setting. {hint}"
     if error["type"] == "missing":
-        return f"{name} is missing: write {name}=... on the command line."
+        return f"{name} is missing: do not delete it. Set it to another value instead."
     said = value[:100] if isinstance(value, str) else "null" if value is None else shown(value)
     text = "" if isinstance(value, dict) else f"={said}"
     described = "" if field is None or not field.description else field.description

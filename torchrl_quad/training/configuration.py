@@ -1,0 +1,190 @@
+"""Where a configuration comes from: YAML files, the signatures of tasks, recipes and classes of your own.
+
+Command lines may be written as sweeps of wandb do, ``--env.wind={'mean': [1, 0, 0]}`` and ``env.randomize=None``, as
+Python prints them. hydra reads ``env.wind={mean: [1, 0, 0]}`` and ``env.randomize=null``.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from types import NoneType
+from typing import Any
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_quad import BPTTLoss, QuadrotorEnv, available_tasks
+from torchrl_quad.envs import TASKS, task_class
+from torchrl_quad.envs.disturbances import Disturbance
+from torchrl_quad.envs.registry import imported
+from torchrl_quad.errors import UserTypeError, UserValueError, shown
+from torchrl_quad.objectives import PathwiseLoss
+from torchrl_quad.options import build
+
+CONFIG = Path(__file__).parent / "config"  # in the repository a link to recipes/config
+SET_BY_RECIPES = ("num_envs", "device", "seed", "compile")  # settings outside ``env``
+OWN: dict[str, tuple[str, Mapping[str, Any]]] = {}  # recipes of your own: the configuration each is made from, and more
+MAX_DEPTH = 20  # of lists and mappings within each other, as in a YAML file
+# hydra's own options that take a value are these, and some with a hyphen in their name.
+_SETTING = re.compile(r"--(?!cfg=|package=|info=)([\w.@/]+=.*)", re.DOTALL)
+
+
+def compose(recipe: str, overrides: Iterable[str] = ()) -> DictConfig:
+    """The configuration of a recipe with a command line. Not for several threads: hydra holds one folder at a time."""
+    with hydra.initialize_config_dir(str(CONFIG), version_base=None):
+        return hydra.compose(recipe, command_line(overrides))
+
+
+def command_line(arguments: Iterable[str]) -> list[str]:
+    """A command line in hydra's grammar, with a configuration on offer for each task that ships or is named on it.
+
+    Raises:
+        UserValueError: a task is unknown, or an argument nests too deeply.
+        UserTypeError: a path leads to what is no task.
+    """
+    arguments = [re.sub(r"^task\._target_=", "task=", hydra_argument(argument)) for argument in arguments]
+    for argument in arguments:
+        _check_depth(argument)
+    if any(argument.startswith("loss._target_=") for argument in arguments):
+        arguments = [re.sub(r"^loss\.", "++loss.", argument) for argument in arguments]  # the files lack its options
+    asked = [argument.removeprefix("task=") for argument in arguments if argument.startswith("task=")]
+    for name in {*TASKS, *re.findall(r"[\w.]+", " ".join(asked))}:
+        if name in asked or name in available_tasks() or "." in name:  # others are words of a sweep, such as choice
+            node = {"task": name, "env": defaults(task_class(name))}
+            ConfigStore.instance().store(group="task", name=name, node=node, package="_global_")
+    return arguments
+
+
+def defaults(cls: type[QuadrotorEnv]) -> dict[str, Any]:
+    """The options of a task that ``common.yaml`` lacks, or has with another value; ??? where one must be given."""
+    base, settings = inspect.signature(QuadrotorEnv).parameters, {}
+    for name, argument in inspect.signature(cls).parameters.items():
+        default = "???" if argument.default is argument.empty else argument.default
+        is_plain = isinstance(default, (bool, int, float, str, NoneType, list, tuple, Mapping))
+        differs = name not in base or name == "max_episode_steps" or default != base[name].default
+        if is_plain and differs and name not in (*SET_BY_RECIPES, "disturbances"):
+            settings[name] = default
+    return settings
+
+
+# -- classes and recipes of your own -----------------------------------------------------------------------------------
+
+
+def own_class(path: Any, base: type, setting: str) -> type:
+    """Import a class of your own by its path, such as "mypackage.Gust".
+
+    Raises:
+        UserValueError: the path leads to nothing.
+        UserTypeError: it leads to what is no subclass of ``base``.
+    """
+    if not (isinstance(path, str) and re.fullmatch(r"\w+(\.\w+)+", path)):
+        raise UserValueError(f"{setting}={shown(path)}: it must be the path of a class, such as mypackage.Mine.")
+    cls = imported(path, setting)
+    if not (isinstance(cls, type) and issubclass(cls, base)):
+        raise UserTypeError(f"{setting}={path}: it must be a subclass of {base.__name__}.")
+    return cls
+
+
+def own_loss(path: Any, kind: type) -> type:
+    """The loss that ``loss._target_`` names, for a recipe whose loss is of a kind."""
+    return own_class(path, PathwiseLoss if kind is BPTTLoss else kind, "loss._target_")
+
+
+def own_disturbances(specs: Sequence[str | Mapping[str, Any]] | None) -> list[Disturbance] | None:
+    """The disturbances that ``env.disturbances`` names: paths of classes, or mappings with ``_target_`` and arguments.
+
+    Raises:
+        UserValueError: a path leads to nothing, or an argument is unknown or out of its range.
+        UserTypeError: a path leads to what is no disturbance.
+    """
+    if specs is None:
+        return None
+    found, setting = [], "env.disturbances"
+    for spec in specs:
+        options: dict[str, Any] = {"_target_": spec} if isinstance(spec, str) else dict(spec)
+        found.append(build(own_class(options.pop("_target_", None), Disturbance, setting), setting, options))
+    return found
+
+
+def named_code(values: Any) -> list[str]:
+    """The paths of the classes of your own that a configuration names, valid or not: task, disturbances and loss."""
+    env, loss = ({**values[name]} if isinstance(values.get(name), dict) else {} for name in ("env", "loss"))
+    disturbances = env.get("disturbances") if isinstance(env.get("disturbances"), list) else []
+    targets = [{"_target_": x} if isinstance(x, str) else x for x in (*disturbances, loss)]
+    paths = [str(x["_target_"]) for x in targets if isinstance(x, dict) and x.get("_target_") is not None]
+    return [*(name for name in [values["task"]] if name not in available_tasks()), *paths]
+
+
+def own_recipe(config: str, settings: Mapping[str, Any]) -> str:
+    """Store the configuration of a recipe of your own: ``config``, and then these settings. Returns its name.
+
+    Raises:
+        UserValueError: the settings lack a name, or a recipe that ships has it.
+    """
+    name = settings.get("algorithm")
+    if not isinstance(name, str) or (CONFIG / f"{name}.yaml").exists():
+        raise UserValueError(
+            f"A recipe of your own needs its own name: @recipe({config!r}, algorithm='my_{config}', ...); got {name!r}."
+        )
+    OWN[name] = config, settings
+    node = OmegaConf.load(CONFIG / f"{config}.yaml")
+    overrides = [str(entry).startswith("{'override ") for entry in node.defaults]
+    node.defaults.insert(overrides.index(True), f"{name}_settings")  # after the task and what is tuned
+    ConfigStore.instance().store(name=name, node=node)
+    ConfigStore.instance().store(name=f"{name}_settings", node=dict(settings))
+    return name
+
+
+# -- the grammar of hydra ----------------------------------------------------------------------------------------------
+
+
+def hydra_argument(argument: str) -> str:
+    """One argument of a command line: without hyphens, if it is a setting, and with its value as hydra writes it."""
+    if match := _SETTING.fullmatch(argument):
+        argument = match[1]
+    name, equals, value = argument.partition("=")
+    return name + equals + _rewritten(value) if equals and not name.startswith("-") else argument
+
+
+def _rewritten(value: str) -> str:
+    """A value, or several with commas between them; those that Python and JSON cannot read stay as they are."""
+    if not re.search(r"[\[{]|\bNone\b", value):
+        return value
+    readers: tuple[Callable[[str], Any], ...] = (ast.literal_eval, json.loads)
+    for read in readers:
+        try:
+            content = read(value.strip())
+            if isinstance(content, tuple):
+                return ",".join(map(_written, content))
+            if isinstance(content, dict | list | None):
+                return _written(content)
+        except (ValueError, SyntaxError, RecursionError, MemoryError):
+            continue
+    return value
+
+
+def _written(content: Any) -> str:
+    if isinstance(content, dict):
+        pairs = {re.sub(r"([^\w./+-])", r"\\\1", str(key)): _written(x) for key, x in content.items()}
+        return f"{{{', '.join(f'{key}: {x}' for key, x in pairs.items())}}}"
+    if isinstance(content, list | tuple):
+        return f"[{', '.join(map(_written, content))}]"
+    if isinstance(content, str):  # hydra reads \' as a quotation mark, and backslashes before one in pairs
+        return "'" + re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + match[2].replace("'", r"\'"), content) + "'"
+    return json.dumps(content, default=str)
+
+
+def _check_depth(argument: str) -> None:
+    depth = 0
+    for letter in argument:
+        depth += (letter in "[{(") - (letter in ")}]")
+        if depth > MAX_DEPTH:
+            raise UserValueError(
+                f"{argument[:40]}... nests more than {MAX_DEPTH} lists or mappings. Give the path of a YAML file."
+            )

@@ -127,5 +127,5 @@ def test_wrong_numbers_are_refused_with_what_to_write_instead():
     for no_env in (nn.Linear(3, 4), lambda: None, 3):
         with pytest.raises(TypeError, match="env must be a TorchRL environment, such as make_env.*; got "):
             DifferentiableCollector(no_env, make_actor(env), frames_per_batch=8)
-    with pytest.raises(TypeError, match="goes on for ever, and has no length"):
+    with pytest.raises(TypeError, match="never ends, and has no length"):
         len(make())

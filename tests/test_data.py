@@ -257,7 +257,7 @@ def test_what_was_never_written_stays_out_of_files(flight, tmp_path, way):
             torch.save(buffer.state_dict(), folder / "buffer.pt")
         files.append((folder / "buffer.pt").read_bytes())
     assert files[0] == files[1] and len(files[0]) < 20_000
-    assert all(len(x) == 8 for x in buffer.state_dict()["_storage"]["_storage"].values())
+    assert all(len(x) == 8 for x in buffer.state_dict()["states"].values())
 
 
 def test_a_smaller_buffer_is_loaded_with_its_oldest_state_first_to_go(flight):
@@ -278,42 +278,33 @@ def test_a_smaller_buffer_is_loaded_with_its_oldest_state_first_to_go(flight):
     assert kept == {tuple(x) for x in positions[4:14].tolist()}
 
 
-def _set(*path):
-    *groups, name, value = path
-
-    def change(state):
-        for group in groups:
-            state = state[group]
-        state[name] = value
-
-    return change
+POSITION = "state.position"
 
 
-ENTRIES, POSITION = ("_storage", "_storage"), "state.position"
-NAN = torch.full((20, 3), float("nan"))
+def put(name, value):
+    return lambda content: content["states"].update({name: value})
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda state: state.pop("_writer"), "it lacks the storage, the writer or the random generator"),
-        (lambda state: state["_storage"]["_storage"].pop(POSITION), "other states .*position.* differ in name"),
-        (_set(*ENTRIES, "state.extra", torch.ones(20, 1)), "other states .* 'extra'.* differ in name"),
-        (_set(*ENTRIES, "else", torch.ones(20, 1)), "it lacks or adds .'else'"),
-        (_set(*ENTRIES, POSITION, torch.ones(20, 2)), "other states .*position"),
-        (_set(*ENTRIES, POSITION, torch.ones(20, 3, dtype=torch.float64)), "other states .*position"),
-        (_set(*ENTRIES, POSITION, torch.ones(19, 3)), r"state.position has shape \(19, 3\)"),
-        (_set(*ENTRIES, POSITION, NAN), "state.position is not finite"),
-        (_set(*ENTRIES, POSITION, torch.ones(20, 3, device="meta")), "state.position has shape"),
-        (_set(*ENTRIES[:1], "_storage", [1, 2]), "its storage is no mapping"),
-        (_set("_storage", "_len", 31), "of 30 states: it has 31 states"),
-        (_set("_storage", "_len", True), "its numbers of states are none"),
-        (_set("_writer", "_cursor", 21), "its cursor is 21 and its count 20, with 20 states"),
-        (_set("_writer", "_cursor", -1), "its numbers of states are none"),
-        (_set("_writer", "_write_count", 19), "its count 19"),
-        (_set("_rng", (torch.ones(3), "cpu")), "its random generator is none"),
-        (_set("_rng", (None, "mars")), "its random generator is none"),
-        (_set("_rng", None), "it lacks"),
+        (lambda content: content.pop("cursor"), "it lacks the states, the cursor or the random generator"),
+        (lambda content: content["states"].pop(POSITION), "other states .*position.* differ in name"),
+        (put("state.extra", torch.ones(20, 1)), "other states .* 'extra'.* differ in name"),
+        (put("else", torch.ones(20, 1)), "it lacks or adds .'else'"),
+        (put(POSITION, torch.ones(20, 2)), "other states .*position"),
+        (put(POSITION, torch.ones(20, 3, dtype=torch.float64)), "other states .*position"),
+        (put(POSITION, torch.ones(19, 3)), r"state.position has shape \(19, 3\)"),
+        (put(POSITION, torch.full((20, 3), float("nan"))), "state.position is not finite"),
+        (put(POSITION, torch.ones(20, 3, device="meta")), "state.position has shape"),
+        (put(POSITION, torch.ones(31, 3)), "of 30 states: it has 31 states"),
+        (lambda content: content.update(states=[1, 2]), "its states are no tensors by name"),
+        (put(POSITION, None), "its states are no tensors by name"),
+        (lambda content: content.update(cursor=21), "its cursor is 21, with 20 states"),
+        (lambda content: content.update(cursor=-1), "its cursor is -1, with 20 states"),
+        (lambda content: content.update(cursor=True), "its cursor is True"),
+        (lambda content: content.update(random=torch.ones(3)), "its random generator is none"),
+        (lambda content: content.update(random=None), "its random generator is none"),
     ],
 )
 def test_content_that_does_not_fit_is_refused_and_changes_nothing(flight, change, message):

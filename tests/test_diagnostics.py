@@ -105,7 +105,7 @@ def test_the_actions_of_a_rollout_may_be_the_inputs():
 def test_the_table_and_the_metrics_agree():
     rollout, actor = make_rollout()
     audit = audit_reward(rollout, actor)
-    lines = str(audit).splitlines()
+    lines = repr(audit).splitlines()
     row = next(line for line in lines if line.startswith("linear"))
     assert row.split() == ["linear", "36", "36.0%", "18", "24.3%", "differentiable"]
     assert lines[-1] == "partially differentiable: all but bonus, 5.0% of the return"
@@ -198,6 +198,12 @@ def test_the_terminal_value_of_shac_pulls_with_the_rewards_or_against_them(criti
     assert comparison.cosine == pytest.approx(cosine)
     assert comparison.first_order_norm == 1 + 2 / 2 + 3 / 4  # of w s
     assert comparison.value_norm == 4 * 3 / 8  # gamma^3 V(s + w s) at s = 3
+    header, row = repr(comparison).splitlines()
+    assert header.split() == ["cosine", "first_order_norm", "value_norm"] and row.split() == [
+        f"{cosine:g}",
+        "2.75",
+        "1.5",
+    ]
 
 
 def test_gradients_in_different_parameters_are_orthogonal():
@@ -343,7 +349,7 @@ def test_a_rollout_without_any_gradient_is_refused_with_advice():
 def test_one_environment_has_no_variance():
     rollout, actor = make_rollout()
     loss = BPTTLoss(actor)
-    with pytest.raises(ValueError, match="at least two of them, got 1. Fly more side by side, or raise max_envs=1"):
+    with pytest.raises(ValueError, match="at least two of them, got 1. Fly more at once, or raise max_envs=1"):
         gradient_statistics(loss, rollout, max_envs=1)
     with pytest.raises(ValueError, match="got 1. Fly more"):
         gradient_statistics(loss, rollout[:1])

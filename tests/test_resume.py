@@ -60,8 +60,7 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(recipe, options, train,
 def test_equal_runs_have_equal_checkpoints_which_hold_no_memory_that_was_never_written(train, tmp_path):
     one, other = (train("abpt", tmp_path / name, "total_steps=96", *EVERYTHING, *ENTROPY) for name in ("one", "other"))
     assert_equal(one, other)
-    storage = one["processes"][0]["buffer"]["_storage"]
-    assert storage["_len"] == 96 and all(len(x) == 96 for x in storage["_storage"].values())
+    assert {len(x) for x in one["processes"][0]["buffer"]["states"].values()} == {96}
     sizes = [(tmp_path / name / "checkpoint.pt").stat().st_size for name in ("one", "other")]
     assert sizes[0] == sizes[1]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -15,14 +15,24 @@ from torch.autograd.graph import GradientEdge
 from torchrl.envs import EnvBase
 
 from torchrl_quad.data import differentiable_rollout
-from torchrl_quad.data.unwrap import check_env, check_tensordict
+from torchrl_quad.data.unwrap import check_env, check_tensordict, group, leaf
 from torchrl_quad.errors import UserTypeError, UserValueError, WrongState, shown
 from torchrl_quad.objectives.action_gradients import sources_of_steps
-from torchrl_quad.objectives.calls import discounts
+from torchrl_quad.objectives.calls import discounts, total
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, check_value, checked
 
 Inputs = nn.Module | Tensor | Iterable[Tensor]
+
+
+class _Row:
+    """Numbers that are shown as a table of one row."""
+
+    def __repr__(self) -> str:
+        cells = {name: f"{value:.4g}" for name, value in asdict(cast(Any, self)).items()}
+        widths = [max(len(name), len(value)) for name, value in cells.items()]
+        rows = (list(cells), list(cells.values()))
+        return "\n".join("  ".join(f"{x:>{n}}" for x, n in zip(row, widths, strict=True)) for row in rows)
 
 
 @dataclass(frozen=True)
@@ -36,7 +46,7 @@ class TermAudit:
     gradient in time only  its value is zero in every step, and its gradient is not: that of an event's time
     no gradient            it was paid, and its gradient is exactly zero: a first-order method does not climb it
     constant               every step pays the same: only the length of the episode changes its return
-    not seen               this rollout never paid it, which leaves its gradient unknown
+    not seen               this rollout never paid it, so its gradient is unknown
     not finite             its gradient is NaN or infinite
     =====================  ===========================================================================================
     """
@@ -49,7 +59,7 @@ class TermAudit:
 
 
 class RewardAudit(dict[str, TermAudit]):
-    """The audit of each reward term by name; ``print`` shows a table."""
+    """The audit of each reward term by name, which shows as a table."""
 
     @property
     def without_gradient(self) -> list[str]:
@@ -61,7 +71,7 @@ class RewardAudit(dict[str, TermAudit]):
         shares = ("return_share", "gradient_share")
         return {f"{name}_{share}": getattr(term, share) for name, term in self.items() for share in shares}
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         width = max(map(len, self), default=0)
         lines = [f"{'term':{width}}     return  share   gradient  share  verdict"]
         lines += [
@@ -94,9 +104,9 @@ def audit_reward(
 
     Args:
         rollout: (*, horizon) with its graph, as ``differentiable_rollout`` returns it.
-        inputs: the inputs to differentiate with respect to. The actor or a loss of it mean the actor's parameters;
-            tensors that the reward depends on are taken as they are. ``rollout["action"]`` means the actions before
-            TorchRL stacked them.
+        inputs: to differentiate with respect to. The actor or a loss of it mean the actor's parameters; tensors that
+            the reward depends on are taken as they are. ``rollout["action"]`` means the actions before TorchRL stacked
+            them.
         gamma: discount of the returns, from 1 at the start of each episode in the rollout.
         terms_key: the weighted terms by name, each (*, horizon, 1); or a reward that is a single term.
         reward_key: their sum, (*, horizon, 1).
@@ -115,24 +125,23 @@ def audit_reward(
                 f"audit_reward reads {key!r}, which is not in the rollout. Name the terms, the reward and the ends of "
                 "episodes as the rollout does: terms_key, reward_key, done_key."
             )
-    reward, entry = rollout.get(reward_key), rollout.get(terms_key)
-    done = rollout.get(done_key)
+    reward, done = leaf(rollout, reward_key), leaf(rollout, done_key)
     if not (isinstance(reward, Tensor) and reward.numel() and reward.is_floating_point() and reward.ndim > 1):
         raise UserValueError(f"{reward_key!r} must be floating-point numbers (*, horizon, 1) of at least one step.")
     if not (isinstance(done, Tensor) and done.dtype == torch.bool and done.shape == reward.shape):
         raise UserValueError(f"{done_key!r} must be the ends of episodes, bool {tuple(reward.shape)}.")
-    if isinstance(entry, Tensor):
-        terms = {terms_key if isinstance(terms_key, str) else terms_key[-1]: entry}
+    if isinstance(entry := rollout.get(terms_key), Tensor):
+        terms: dict[str, Tensor] = {terms_key if isinstance(terms_key, str) else terms_key[-1]: entry}
     else:
-        terms = dict(entry.flatten_keys("/").items())
-    _require_sum(terms, reward, terms_key, tolerance)
+        terms = dict(cast(Any, group(rollout, terms_key).flatten_keys("/").items()))
+    _check_sum(terms, reward, terms_key, tolerance)
     if not reward.requires_grad:
         raise WrongState(
             f"{reward_key!r} carries no gradient. Collectors, ParallelEnv, replay buffers, .detach() and "
             "torch.no_grad() cut it. Use differentiable_rollout(env, actor, carry, horizon) with gradients enabled."
         )
     sources = _sources(inputs)
-    if all(g is None for g in torch.autograd.grad(reward.sum(), sources, retain_graph=True, allow_unused=True)):
+    if not any(g is not None for g in _gradients(reward.sum(), sources)):
         raise UserValueError(
             f"{reward_key!r} does not depend on the inputs. Give the actor that flew this rollout, or tensors "
             "from which its actions were computed."
@@ -155,9 +164,9 @@ def audit_reward(
     )
 
 
-@dataclass(frozen=True)
-class GradientComparison:
-    """The gradient of the return from the simulator, beside that from a critic."""
+@dataclass(frozen=True, repr=False)
+class GradientComparison(_Row):
+    """The gradient of the return from the simulator, compared with that from a critic."""
 
     cosine: float  #: between the two, -1 to 1; NaN where one is zero or does not exist
     first_order_norm: float
@@ -170,24 +179,22 @@ def compare_gradients(loss: PathwiseLoss, rollout: TensorDictBase) -> GradientCo
 
     With ABPT they are the gradients of the N-step and of the 0-step return, with SHAC those of the rewards of the
     horizon and of the terminal value. Both carry their weights in the objective, so that their sum is its gradient, and
-    both are means over environments. BPTT has no value gradient: its cosine and norm are NaN, as they are where ABPT
-    has one of its returns switched off. ABPT samples actions for this, as its loss does. ``clip_action_gradient``
-    has no part in it. No ``.grad`` changes.
+    both are means over environments. Without one of them, as with BPTT, its norm and the cosine are NaN. ABPT samples
+    actions for this, as its loss does. ``clip_action_gradient`` is not applied. No ``.grad`` changes.
 
     Args:
         loss: a loss of the actor that flew the rollout.
         rollout: (*, horizon) with its graph.
 
     Raises:
-        ValueError: the loss cannot use the rollout.
-        TypeError: it is no pathwise loss, or the rollout no tensordict.
+        TypeError: ``loss`` is no pathwise loss, or the rollout no tensordict.
         RuntimeError: the rollout has lost its graph.
     """
-    _require_loss(loss)
+    _check_loss(loss)
     parts, sources = loss.objective_parts(rollout), _sources(loss)
     value = [parts.pop(loss.value_part)] if loss.value_part in parts else []
     first_order, value = (
-        _gradient(sum(part).mean(), sources) if part else torch.full((1,), math.nan, dtype=torch.float64)
+        _gradient(total(part).mean(), sources) if part else torch.full((1,), math.nan, dtype=torch.float64)
         for part in (parts.values(), value)
     )
     norms = first_order.norm().item(), value.norm().item()
@@ -195,8 +202,8 @@ def compare_gradients(loss: PathwiseLoss, rollout: TensorDictBase) -> GradientCo
     return GradientComparison(cosine, *norms)
 
 
-@dataclass(frozen=True)
-class GradientStatistics:
+@dataclass(frozen=True, repr=False)
+class GradientStatistics(_Row):
     """Mean and spread of the policy gradients of single environments."""
 
     norm: float  #: of their mean
@@ -209,22 +216,17 @@ class GradientStatistics:
 def gradient_statistics(loss: PathwiseLoss, rollout: TensorDictBase, *, max_envs: Size = 16) -> GradientStatistics:
     """Mean and spread of the policy gradients of single environments, without the entropy bonus.
 
-    Each environment takes a backward pass through the whole rollout. No ``.grad`` changes.
-
-    Args:
-        loss: a loss of the actor that flew the rollout.
-        rollout: (*, horizon) with its graph.
-        max_envs: the number of environments to look at, the first ones.
+    Each of the first ``max_envs`` takes a backward pass through the whole rollout. No ``.grad`` changes.
 
     Raises:
-        ValueError: there are fewer than two environments, or the loss cannot use the rollout.
+        ValueError: there are fewer than two environments.
         RuntimeError: the rollout has lost its graph.
     """
-    _require_loss(loss)
-    objectives = sum(loss.objective_parts(rollout).values()).flatten()[:max_envs]
+    _check_loss(loss)
+    objectives = total(loss.objective_parts(rollout).values()).flatten()[:max_envs]
     if len(objectives) < 2:
         raise UserValueError(
-            f"A variance over environments needs at least two of them, got {len(objectives)}. Fly more side by side, "
+            f"A variance over environments needs at least two of them, got {len(objectives)}. Fly more at once, "
             f"or raise max_envs={max_envs}."
         )
     sources = _sources(loss)
@@ -251,26 +253,19 @@ def gradient_by_horizon(
         loss: BPTTLoss, SHACLoss, ABPTLoss or another pathwise loss.
         horizons: numbers of control steps.
         start: a reset tensordict of at least two environments; ``env.reset()`` by default.
-        max_envs: as for :func:`gradient_statistics`.
-
-    Raises:
-        ValueError: as ``differentiable_rollout`` and :func:`gradient_statistics` do.
-        TypeError: ``env`` is no environment, the policy not a TensorDictModule, or the loss no pathwise one.
-        RuntimeError: the rollout has lost its graph.
+        max_envs: as for :func:`gradient_statistics`, whose errors it raises.
     """
-    horizons = _listed(horizons, "horizons must be numbers of control steps, such as (8, 32)")
-    horizons = {
-        check_value("horizons", horizon, Horizon, "They are numbers of control steps."): None for horizon in horizons
-    }
+    listed = _listed(horizons, "horizons must be numbers of control steps, such as (8, 32)")
+    steps = [check_value("horizons", x, Horizon, "They are numbers of control steps.") for x in listed]
     check_env(env)
     start = env.reset() if start is None else start
     return {
         horizon: gradient_statistics(loss, differentiable_rollout(env, actor, start, horizon)[0], max_envs=max_envs)
-        for horizon in horizons
+        for horizon in dict.fromkeys(steps)
     }
 
 
-def _require_loss(loss: PathwiseLoss) -> None:
+def _check_loss(loss: PathwiseLoss) -> None:
     if not isinstance(loss, PathwiseLoss):
         raise UserTypeError(
             f"loss must be a pathwise loss of the actor, such as BPTTLoss(actor); got {type(loss).__name__}."
@@ -288,11 +283,11 @@ def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
     """The tensors to differentiate with respect to; of a loss or an actor, the actor's parameters."""
     if isinstance(inputs, nn.Module):
         inputs = [p for p in getattr(inputs, "actor_network_params", inputs).parameters() if p.requires_grad]
-    if isinstance(inputs, Tensor) and (steps := sources_of_steps(inputs)) is not None:
-        return [steps] if isinstance(steps, Tensor) else steps
-    sources = (
-        [inputs] if isinstance(inputs, Tensor) else _listed(inputs, "inputs must be the actor, its loss, or tensors")
-    )
+    steps = sources_of_steps(inputs) if isinstance(inputs, Tensor) else None
+    if steps is not None:
+        return [steps] if isinstance(steps, Tensor) else [*steps]
+    inputs = [inputs] if isinstance(inputs, Tensor) else inputs
+    sources = _listed(inputs, "inputs must be the actor, its loss, or tensors")
     if not sources or not all(isinstance(x, Tensor) and x.requires_grad for x in sources):
         raise UserValueError(
             "There is nothing to differentiate with respect to: give the actor or its loss with parameters that "
@@ -301,14 +296,20 @@ def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
     return sources
 
 
+def _gradients(value: Tensor, sources: list[Tensor | GradientEdge]) -> list[Tensor | None]:
+    if not value.requires_grad:
+        return [None] * len(sources)
+    return [*torch.autograd.grad(value, cast(Any, sources), retain_graph=True, allow_unused=True)]
+
+
 def _gradient(value: Tensor, sources: list[Tensor | GradientEdge]) -> Tensor:
     """The gradient of a scalar as one vector, in double precision: squares of small numbers are not lost."""
-    grads = [None] * len(sources)
-    if value.requires_grad:
-        grads = torch.autograd.grad(value, sources, retain_graph=True, allow_unused=True)
-    known = zip(grads, sources, strict=True)
-    grads = [torch.zeros_like(x) if g is None else g for g, x in known if g is not None or isinstance(x, Tensor)]
-    return torch.cat([g.flatten().double() for g in grads]) if grads else value.new_zeros(1, dtype=torch.float64)
+    grads = [
+        torch.zeros_like(x) if g is None and isinstance(x, Tensor) else g
+        for g, x in zip(_gradients(value, sources), sources, strict=True)
+    ]
+    known = [g.flatten().double() for g in grads if g is not None]
+    return torch.cat(known) if known else value.new_zeros(1, dtype=torch.float64)
 
 
 def _share(sizes: dict[str, float], name: str) -> float:
@@ -325,14 +326,14 @@ def _verdict(term: Tensor, gradient_norm: float) -> str:
     return "constant" if term.min() == term.max() else "no gradient"
 
 
-def _require_sum(terms: dict[str, Tensor], reward: Tensor, terms_key: Entry, tolerance: float) -> None:
+def _check_sum(terms: dict[str, Tensor], reward: Tensor, terms_key: Entry, tolerance: float) -> None:
     for name, term in terms.items():
         if term.shape != reward.shape:
             raise UserValueError(
                 f"The term {name!r} has shape {tuple(term.shape)}, and the reward {tuple(reward.shape)}."
             )
-    gap = (sum(terms.values()) - reward).detach().abs()
-    worst = (gap / (1.0 + sum(term.detach().abs() for term in terms.values()))).max().item()
+    gap = (total(terms.values()) - reward).detach().abs()
+    worst = (gap / (1.0 + total(term.detach().abs() for term in terms.values()))).max().item()
     if not worst <= tolerance:
         raise UserValueError(
             f"The terms under {terms_key!r}, {', '.join(terms)}, do not add up to the reward: they are off by up to "

@@ -1,7 +1,7 @@
 """Experience: differentiable horizons, the states they visited, and normalised observations.
 
-Everything here, the losses and the networks work on any TorchRL environment. They learn what they need from three
-attributes of the environment under all transforms. TorchRL defines the first; the other two are optional.
+Everything here, the losses and the networks work on any TorchRL environment. They read three attributes of the
+environment under all transforms; the first is TorchRL's, the other two are optional.
 
 ==================  ==================================================================================================
 attribute           meaning
@@ -16,9 +16,8 @@ attribute           meaning
 ==================  ==================================================================================================
 """
 
-from torchrl_quad.data.collector import DifferentiableCollector
 from torchrl_quad.data.normalizer import ObservationNormalizer
-from torchrl_quad.data.rollout import differentiable_rollout
+from torchrl_quad.data.rollout import DifferentiableCollector, differentiable_rollout
 from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.data.visited_states import VisitedStateBuffer, restart
 

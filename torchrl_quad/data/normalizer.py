@@ -1,8 +1,8 @@
-"""Observations normalised by running statistics, in a way that gradients survive."""
+"""Observations normalised by running statistics that gradients can pass."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ObservationNorm
 
-from torchrl_quad.data.unwrap import base_env, check_env
+from torchrl_quad.data.unwrap import check_env, leaf, observed, state_keys
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.options import Entry, Positive, checked
 
@@ -20,8 +20,8 @@ class ObservationNormalizer(ObservationNorm):
     """Subtracts the mean and divides by the standard deviation of all observations seen, fixed within a horizon.
 
     TorchRL's VecNorm changes its statistics in place at every step, which breaks backward through a rollout. Here
-    :meth:`update` changes them between horizons, and a graph that is still to be differentiated keeps the values that
-    it was made with. The statistics are buffers and therefore part of ``state_dict``.
+    :meth:`update` changes them between horizons, and a graph that is not differentiated yet keeps its values. The
+    statistics are buffers and therefore part of ``state_dict``.
 
     .. code-block:: python
 
@@ -30,7 +30,7 @@ class ObservationNormalizer(ObservationNorm):
         actor = make_actor(env, input_scale=1.0)  # the normalizer scales already
         rollout, carry = differentiable_rollout(env, actor, env.reset(), 64)
         normalizer.update(rollout)
-        carry = env.reset(carry.select("state"), set_state=True)  # observe anew, with the new statistics
+        carry = env.reset(carry.select("state"), set_state=True)  # observe with the new statistics
 
     Args:
         env: the environment to wrap, for size, device and floating-point type of the observation.
@@ -38,24 +38,24 @@ class ObservationNormalizer(ObservationNorm):
         min_scale: the least standard deviation to divide by, in the observation's unit.
 
     Raises:
-        ValueError: the environment does not observe the key, its state holds the key, its entry is no vector of
-            floating-point numbers, or min_scale is not positive.
-        TypeError: ``env`` is no environment.
+        ValueError: the environment does not observe the key, its state holds the key, or its entry is no vector of
+            floating-point numbers.
     """
 
     def __init__(self, env: EnvBase, key: Entry = "observation", *, min_scale: Positive = 0.01) -> None:
         check_env(env)
-        if key not in env.observation_spec.keys(True, True):
+        specs = observed(env)
+        known = [*specs.keys(True, True)]
+        if key not in known:
             raise UserValueError(
-                f"The environment does not observe {key!r}. Choose from: "
-                f"{', '.join(map(str, env.observation_spec.keys(True, True)))}."
+                f"The environment does not observe {key!r}. Choose from: {', '.join(map(str, known))}."
             )
-        if key in base_env(env).state_keys:
+        if key in state_keys(env):
             raise UserValueError(
                 f"{key!r} is part of the state from which the next step starts, and cannot be overwritten. Copy it: "
                 f'CatTensors([{key!r}], "features", del_keys=False), and normalise "features".'
             )
-        spec = env.observation_spec[key]
+        spec = specs[key]
         if not spec.shape or not spec.dtype.is_floating_point:
             raise UserValueError(
                 f"{shown(key)} is {tuple(spec.shape)}, {spec.dtype}, and the normalizer takes floating-point vectors "
@@ -68,7 +68,7 @@ class ObservationNormalizer(ObservationNorm):
         self.register_buffer("count", torch.zeros_like(loc[0], dtype=torch.float64))
 
     def normalize(self, observation: Tensor) -> Tensor:
-        """The observation (*, k) as the policy sees it."""
+        """The observation (*, k) as the policy reads it."""
         return (observation - self.loc) / self.scale
 
     def undo(self, observation: Tensor) -> Tensor:
@@ -79,22 +79,23 @@ class ObservationNormalizer(ObservationNorm):
     def update(self, rollout: TensorDictBase) -> None:
         """Add the next observations of a rollout (any batch size), as this transform wrote them, to the statistics.
 
-        Observations that are not finite are left out. Those written before, such as a carry's, do not change; reset to
-        their state to observe them anew.
+        Observations that are not finite are left out. Those written before, such as a carry's, do not change: reset to
+        their state to observe them again.
         """
         entry = ("next", self.out_keys[0])
         if not isinstance(rollout, TensorDictBase) or entry not in rollout:
             raise UserTypeError(
                 f"The normalizer reads {entry!r} of a rollout, the tensordict that differentiable_rollout returns."
             )
-        written = rollout.get(entry).reshape(-1, self.loc.shape[-1]).to(self.loc)
-        seen = self.undo(written[written.isfinite().all(-1)])
-        if len(seen) == 0:
+        written = leaf(rollout, entry).reshape(-1, self.loc.shape[-1]).to(self.loc)
+        raw = self.undo(written[written.isfinite().all(-1)])
+        if len(raw) == 0:
             return
-        count = self.count + len(seen)
-        share = (len(seen) / count).to(seen.dtype)
-        gap = seen.mean(0) - self.loc
-        spread = torch.lerp(self.variance, seen.var(0, correction=0), share) + share * (1.0 - share) * gap.square()
+        count = cast(Tensor, self.count) + len(raw)
+        share = (len(raw) / count).to(raw.dtype)
+        gap = raw.mean(0) - self.loc
+        variance = cast(Tensor, self.variance)
+        spread = torch.lerp(variance, raw.var(0, correction=0), share) + share * (1.0 - share) * gap.square()
         # New tensors: those of before may belong to a graph.
         self.count, self.loc, self.variance = count, self.loc + share * gap, spread
         self.scale = spread.sqrt().clamp_min(self.min_scale)
@@ -111,14 +112,14 @@ class NormalizedPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the policy writes, and leave the observation as it is."""
         (key,) = self.normalizer.in_keys
-        seen = tensordict.copy()
-        if key in seen:  # otherwise the policy complains, if it reads it
-            seen.set(key, self.normalizer.normalize(seen.get(key)))
-        return tensordict.update(self.policy(seen).select(*self.out_keys, strict=False))
+        read = tensordict.copy()
+        if key in read:  # otherwise the policy complains, if it reads it
+            read.set(key, self.normalizer.normalize(leaf(read, key)))
+        return tensordict.update(self.policy(read).select(*self.out_keys, strict=False))
 
     def plain(self) -> Any:
-        """The same on plain tensors, where the policy gives itself so and can normalise; None elsewhere."""
-        plain = self.policy.plain() if hasattr(self.policy, "plain") else None
+        """The same on plain tensors, if the policy has such a form that can normalise; None otherwise."""
+        plain = cast(Any, self.policy).plain() if hasattr(self.policy, "plain") else None
         (key,) = self.normalizer.in_keys
         if plain is None or key not in plain.in_keys:
             return plain

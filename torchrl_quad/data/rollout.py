@@ -1,20 +1,43 @@
-"""Rollouts that keep their graph."""
+"""Rollouts that keep their graph, one by one or from a collector."""
 
 from __future__ import annotations
 
+import inspect
 import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Annotated, Any, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import expand_as_right, unravel_key
+from tensordict.utils import NestedKey, expand_as_right, unravel_key
+from torch import Tensor, nn
+from torchrl.collectors import BaseCollector
+from torchrl.data import Composite
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.normalizer import NormalizedPolicy, ObservationNormalizer
-from torchrl_quad.data.unwrap import base_env, check_env, check_whole_state, memory_keys
-from torchrl_quad.errors import UserTypeError, UserValueError, shown
-from torchrl_quad.options import Horizon, checked
+from torchrl_quad.data.unwrap import (
+    base_env,
+    check_actor,
+    check_env,
+    check_whole_state,
+    leaf,
+    memory_keys,
+    observed,
+)
+from torchrl_quad.data.visited_states import restart
+from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.options import Field, Fraction, Horizon, accepted, checked
+
+Exploration = Annotated[
+    Any,
+    accepted(
+        lambda kind: isinstance(kind, ExplorationType),
+        f"one of {', '.join(f'ExplorationType.{x.name}' for x in ExplorationType)}",
+    ),
+]
 
 
 @checked
@@ -24,14 +47,14 @@ def differentiable_rollout(
     carry: TensorDictBase | None,
     horizon: Horizon,
     *,
-    exploration_type: ExplorationType = ExplorationType.RANDOM,
+    exploration_type: Exploration = ExplorationType.RANDOM,
 ) -> tuple[TensorDictBase, TensorDictBase]:
     """Fly a horizon, and keep the graph from every reward back to every action.
 
-    Environments that finish are reset on the way. The gradient is cut exactly there, and ``"next"`` keeps the true last
+    Environments that finish are reset on the way: the gradient is cut exactly there, and ``"next"`` keeps the true last
     state. The rollout is the environment's own ``rollout``, so this works for any differentiable TorchRL environment
-    and any stack of transforms. The gradient also goes through the memory of a recurrent actor, which is cleared where
-    an episode begins, and cut there.
+    and any stack of transforms. The gradient also goes through the memory of a recurrent actor, which is cleared, and
+    the gradient cut, at the start of an episode.
 
     Args:
         env: the environment.
@@ -42,17 +65,16 @@ def differentiable_rollout(
         exploration_type: RANDOM samples the policy, DETERMINISTIC takes its mode.
 
     Returns:
-        the rollout, of batch size (*env.batch_size, horizon), and the carry to go on from: detached, and reset in the
-        environments whose last step was done.
+        the rollout, of batch size (*env.batch_size, horizon), and the carry to continue from: detached, and reset in
+        the environments whose last step was done.
 
     Raises:
-        ValueError: the horizon is out of its range, or its rollout larger than the memory; the actor reads an entry
-            that nobody writes, or a transform overwrites or leaves out a part of the state.
-        TypeError: ``env`` is no environment, the actor is not a TensorDictModule, or the carry is not a tensordict.
+        ValueError: the rollout is larger than the memory; the actor reads an entry that is missing, or a transform
+            overwrites or leaves out a part of the state.
+        TypeError: an argument is no environment, no TensorDictModule or no tensordict.
     """
     check_env(env)
-    require_exploration(exploration_type)
-    require_actor(actor, "actor")
+    check_actor(actor, "actor")
     if not (carry is None or isinstance(carry, TensorDictBase)):
         raise UserTypeError(
             f"carry must be the tensordict to start from, or None to reset the environment; got {type(carry).__name__}."
@@ -60,9 +82,9 @@ def differentiable_rollout(
     try:
         check_whole_state(env)
         carry = env.reset() if carry is None else carry.copy()
-        _require_start(env, actor, carry)
+        _check_start(env, actor, carry)
         if carry.numel() * horizon > 1_000_000:
-            _require_memory(carry, horizon)
+            _check_memory(carry, horizon)
         with set_exploration_type(exploration_type):
             rollout = _rollout(env, actor, carry, horizon)
     except KeyError as error:
@@ -81,7 +103,7 @@ def differentiable_rollout(
             ) from error
         raise UserValueError(
             f"The actor reads {missing[0]!r}, which is not in the tensordict it starts from. Choose its in_keys from "
-            f"what env.reset() writes: {', '.join(map(str, env.observation_spec.keys(True, True)))}."
+            f"what env.reset() writes: {', '.join(map(str, observed(env).keys(True, True)))}."
         ) from error
     base = base_env(env)
     # Transforms such as CatFrames keep past observations in buffers, with their graph.
@@ -90,30 +112,34 @@ def differentiable_rollout(
             buffer.detach_()
     if (shared := getattr(base, "shared_tensordict_parent", None)) is not None:  # of SerialEnv
         shared.detach_()
-    end = env.step_mdp(rollout[..., -1]).detach().clone()
-    specs = (*env.observation_spec.keys(True, True), *env.state_spec.keys(True, True), *env.action_keys)
+    end = env.step_mdp(cast(TensorDictBase, rollout[..., -1])).detach().clone()
+    state = cast(Composite, env.state_spec)
+    specs = (*observed(env).keys(True, True), *state.keys(True, True), *cast(Iterable[NestedKey], env.action_keys))
     known = set(map(unravel_key, specs))
     written = end.select(*(key for key in actor.out_keys if unravel_key(key) not in known), strict=False).clone()
     # A reset keeps nothing that it does not know, such as noise, and an environment with a state of its own its graph.
     carry = env.maybe_reset(end).detach().update(written)
-    done = rollout["next", "done"][..., -1, :]
+    done = leaf(rollout, ("next", "done"))[..., -1, :]
     for key in memory_keys(actor):
-        memory = rollout[..., -1].get(unravel_key(("next", key))).detach()
-        carry.set(key, torch.where(expand_as_right(done.squeeze(-1), memory), 0.0, memory))
+        memory = leaf(cast(TensorDictBase, rollout[..., -1]), unravel_key(("next", key))).detach()
+        carry.set(key, torch.where(cast(Tensor, expand_as_right(done.squeeze(-1), memory)), 0.0, memory))
         carry.set("is_init", done.clone())
     return rollout, carry
 
 
-def _require_start(env: EnvBase, actor: TensorDictModuleBase, carry: TensorDictBase) -> None:
-    """Refuse a tensordict of another batch size, device or precision than those of the environment."""
-    if env.batch_locked and carry.batch_size != env.batch_size:
+def _check_start(env: EnvBase, actor: TensorDictModuleBase, carry: TensorDictBase) -> None:
+    """Raise a UserValueError for a tensordict whose batch size, device or precision is not the environment's."""
+    size = cast(torch.Size, env.batch_size)
+    if env.batch_locked and carry.batch_size != size:
         raise UserValueError(
-            f"carry has batch size {tuple(carry.batch_size)}, and the environment {tuple(env.batch_size)}. Start from "
+            f"carry has batch size {tuple(carry.batch_size)}, and the environment {tuple(size)}. Start from "
             "the tensordict of its own reset(), or of its last rollout."
         )
     for key in actor.in_keys:
-        x, spec = carry.get(key, None), env.observation_spec.get(key, None)
-        if x is None or spec is None or (x.dtype == spec.dtype and (env.device is None or x.device == env.device)):
+        if key not in carry or key not in observed(env).keys(True, True):
+            continue
+        x, spec = leaf(carry, key), observed(env)[key]
+        if x.dtype == spec.dtype and (env.device is None or x.device == env.device):
             continue
         raise UserValueError(
             f"{key!r} of the carry is {x.dtype} on {x.device}, and that of the environment {spec.dtype} on "
@@ -121,9 +147,9 @@ def _require_start(env: EnvBase, actor: TensorDictModuleBase, carry: TensorDictB
         )
 
 
-def _require_memory(carry: TensorDictBase, horizon: int) -> None:
-    """Refuse a rollout whose entries alone, without their graph, are larger than the memory."""
-    needed = 2 * horizon * sum(x.numel() * x.element_size() for x in carry.values(True, True))
+def _check_memory(carry: TensorDictBase, horizon: int) -> None:
+    """Raise a UserValueError for a rollout whose entries, without their graph, are larger than the memory."""
+    needed = 2 * horizon * sum(x.numel() * x.dtype.itemsize for x in cast(Iterable[Tensor], carry.values(True, True)))
     if carry.device is not None and carry.device.type == "cuda":
         has = torch.cuda.get_device_properties(carry.device).total_memory
     elif hasattr(os, "sysconf"):
@@ -138,36 +164,11 @@ def _require_memory(carry: TensorDictBase, horizon: int) -> None:
         )
 
 
-def require_actor(actor: TensorDictModuleBase, name: str) -> None:
-    """Refuse what is no policy.
-
-    Raises:
-        TypeError: it is not a TensorDictModule.
-    """
-    if hasattr(actor, "_orig_mod"):
-        raise UserTypeError(
-            f"torch.compile({name}) is no TensorDictModule. Write {name}.compile() instead, which compiles it in "
-            "place, or give the environment compile=True, which compiles the whole horizon."
-        )
-    if not isinstance(actor, TensorDictModuleBase):
-        raise UserTypeError(
-            f"{name} must be a TensorDictModule that writes the action, got {type(actor).__name__}. "
-            'Wrap a plain module: TensorDictModule(module, in_keys=["observation"], out_keys=["action"]).'
-        )
-
-
-def require_exploration(kind: ExplorationType) -> None:
-    """Refuse what is no way to explore."""
-    if not isinstance(kind, ExplorationType):
-        names = ", ".join(f"ExplorationType.{x.name}" for x in ExplorationType)
-        raise UserValueError(f"exploration_type must be one of {names}; got {shown(kind)}.")
-
-
 def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> TensorDictBase:
     """The environment's own rollout.
 
-    Where its only transform is our normaliser, the environment inside flies, which may do so compiled, and what it
-    observed is normalised afterwards.
+    If its only transform is our normaliser, the environment inside flies, compiled if it can, and what it observed is
+    normalised afterwards.
     """
     options = {"auto_reset": False, "break_when_any_done": False}
     if not (isinstance(env, TransformedEnv) and type(env.transform) is ObservationNormalizer):
@@ -175,8 +176,142 @@ def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, h
     normalizer = env.transform
     (key,) = normalizer.in_keys
     if key in start:  # otherwise the environment complains
-        start.set(key, normalizer.undo(start.get(key)))
+        start.set(key, normalizer.undo(leaf(start, key)))
     rollout = env.base_env.rollout(horizon, NormalizedPolicy(actor, normalizer), tensordict=start, **options)
     for name in (key, ("next", key)):
-        rollout.set(name, normalizer.normalize(rollout.get(name)))
+        rollout.set(name, normalizer.normalize(leaf(rollout, name)))
     return rollout
+
+
+@checked
+class DifferentiableCollector(BaseCollector):
+    """Horizons with their graph, for ``torchrl.trainers.Trainer`` and for loops written around collectors.
+
+    Each batch is what :func:`differentiable_rollout` returns, (*env.batch_size, horizon), and begins where the one
+    before it has ended, or at a fresh start. TorchRL's own collectors cut the graph. Take one step of the optimizer for
+    each batch (``optim_steps_per_batch=1``): ``backward`` frees its graph. The policy is not copied: a step of the
+    optimizer affects the next batch.
+
+    Args:
+        env: any differentiable environment, also under transforms; or a function that builds it.
+        policy: a TensorDictModule that writes the action.
+        frames_per_batch: control steps of all environments together in a batch, a multiple of their number.
+        total_frames: control steps of all environments together with which the iteration ends; -1 for never. The batch
+            that reaches them is the last.
+        restart_fraction: the share of flights that each batch gives up for a fresh start; see :func:`restart`.
+        exploration_type: RANDOM samples the policy, DETERMINISTIC takes its mode.
+
+    Attributes:
+        carry: the tensordict from which the next batch starts; None resets the environment. It may be set, such as to
+            ``buffer.initial_state(env, 0.9)`` of a :class:`VisitedStateBuffer`.
+    """
+
+    init_random_frames = 0
+    trajs_per_batch = None
+
+    def __init__(
+        self,
+        env: EnvBase | Callable[[], EnvBase],
+        policy: TensorDictModuleBase,
+        *,
+        frames_per_batch: Annotated[int, Field(ge=1, le=10**12)],
+        total_frames: Annotated[int, Field(ge=-1, le=10**15)] = -1,
+        restart_fraction: Fraction = 0.0,
+        exploration_type: ExplorationType = ExplorationType.RANDOM,
+    ) -> None:
+        super().__init__()
+        self.env = cast(EnvBase, env if isinstance(env, EnvBase) or not _needs_nothing(env) else env())
+        check_env(self.env)
+        check_actor(policy, "policy")
+        self.policy, self.exploration_type, self.restart_fraction = policy, exploration_type, restart_fraction
+        self.horizon, rest = divmod(frames_per_batch, self.env.numel())
+        if rest or self.horizon < 1:
+            nearest = max(self.horizon, 1) * self.env.numel()
+            raise UserValueError(
+                f"frames_per_batch={frames_per_batch} must be a multiple of the number of environments, "
+                f"{self.env.numel()}. Try {nearest}, a horizon of {nearest // self.env.numel()} control steps."
+            )
+        self.frames_per_batch = self.requested_frames_per_batch = frames_per_batch
+        self.total_frames: Any = float("inf") if total_frames < 0 else total_frames
+        self.carry: TensorDictBase | None = None
+        self._frames = 0
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        """Fly one batch after the other."""
+        while self._frames < self.total_frames:
+            start = self.carry
+            if start is not None and self.restart_fraction and self._frames:
+                start = restart(self.env, start, self.restart_fraction)
+            batch, self.carry = differentiable_rollout(
+                self.env, self.policy, start, self.horizon, exploration_type=self.exploration_type
+            )
+            self._frames += batch.numel()
+            yield batch
+
+    def __len__(self) -> int:
+        if self.total_frames == float("inf"):
+            raise UserTypeError("A collector without total_frames never ends, and has no length.")
+        return -(self.total_frames // -self.frames_per_batch)
+
+    def update_policy_weights_(
+        self,
+        policy_or_weights: TensorDictBase | nn.Module | Mapping[str, Any] | None = None,
+        *,
+        weights: TensorDictBase | Mapping[str, Any] | None = None,
+        policy: nn.Module | None = None,
+        weights_dict: Mapping[str, Any] | None = None,
+        **_: Any,
+    ) -> None:
+        """Copy weights into the policy: those of a module, or a tensordict of them; without any it is up to date."""
+        several = (policy_or_weights, weights, policy, (weights_dict or {}).get("policy"))
+        given = next((x for x in several if x is not None), None)
+        if given is not None and given is not self.policy:
+            is_module = isinstance(given, nn.Module)
+            given = TensorDict.from_module(given) if is_module else TensorDict(cast(dict, given)).unflatten_keys(".")
+            TensorDict.from_module(self.policy).data.update_(given.data)
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        """Seed the environment; the next batch begins with a reset. Returns the seed for another environment."""
+        self.carry = None
+        return cast(int, self.env.set_seed(seed, static_seed=static_seed))
+
+    def state_dict(self) -> dict[str, Any]:  # pyrefly: ignore[bad-override]  # TorchRL's is an OrderedDict
+        """All that the collector needs to continue exactly, but torch's own random numbers, which the policy draws."""
+        random = getattr(base_env(self.env), "random_state", dict)
+        return {
+            "frames": self._frames,
+            "carry": None if self.carry is None else self.carry.to_dict(),
+            "policy": self.policy.state_dict(),
+            "env": self.env.state_dict(),
+            "random": random(),
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], **_: Any) -> None:
+        """Continue from what :meth:`state_dict` returned."""
+        self._frames = state_dict["frames"]
+        carry = state_dict["carry"]
+        size = cast(torch.Size, self.env.batch_size)
+        self.carry = None if carry is None else TensorDict(carry, size, device=self.env.device)
+        self.policy.load_state_dict(state_dict["policy"])
+        self.env.load_state_dict(state_dict["env"])
+        if state_dict["random"]:
+            cast(Any, base_env(self.env)).set_random_state(state_dict["random"])
+
+    def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:
+        """Close the environment."""
+        if close_env and not self.env.is_closed:
+            self.env.close(raise_if_closed=raise_on_error)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(env={self.env}, horizon={self.horizon}, total_frames={self.total_frames})"
+
+
+def _needs_nothing(function: Any) -> bool:
+    """Whether something that is no network can be called without arguments."""
+    if isinstance(function, nn.Module):
+        return False
+    try:
+        inspect.signature(function).bind()
+    except (TypeError, ValueError):
+        return False
+    return True

@@ -1,5 +1,6 @@
 """What lies under an environment's transforms and in a policy's memory, and entries with their types."""
 
+from collections.abc import Iterable
 from typing import Any, cast
 
 from tensordict import TensorDictBase
@@ -27,11 +28,30 @@ def observed(env: EnvBase) -> Composite:
     return cast(Composite, env.observation_spec)
 
 
+def state_keys(env: EnvBase) -> list[NestedKey]:
+    """The entries that make up the Markov state of an environment, under all transforms."""
+    return list(cast(Iterable[NestedKey], base_env(env).state_keys))
+
+
 def check_env(env: EnvBase) -> None:
     """Raise a UserTypeError for what is no environment."""
     if not isinstance(env, EnvBase):
         raise UserTypeError(
             f"env must be a TorchRL environment, such as make_env('hovering', num_envs=64); got {type(env).__name__}."
+        )
+
+
+def check_actor(actor: TensorDictModuleBase, name: str) -> None:
+    """Raise a UserTypeError for what is no policy."""
+    if hasattr(actor, "_orig_mod"):
+        raise UserTypeError(
+            f"torch.compile({name}) is no TensorDictModule. Write {name}.compile() instead, which compiles it in "
+            "place, or give the environment compile=True, which compiles the whole horizon."
+        )
+    if not isinstance(actor, TensorDictModuleBase):
+        raise UserTypeError(
+            f"{name} must be a TensorDictModule that writes the action, got {type(actor).__name__}. "
+            'Wrap a plain module: TensorDictModule(module, in_keys=["observation"], out_keys=["action"]).'
         )
 
 
@@ -56,7 +76,7 @@ def check_whole_state(env: EnvBase) -> None:
     No transform may leave out a part of it, or overwrite one without undoing that before the step.
     """
     base = base_env(env)
-    state = set(map(unravel_key, base.state_keys))
+    state = set(map(unravel_key, state_keys(base)))
     lost = state & {*observed(base).keys(True, True)} - {*observed(env).keys(True, True)}
     if lost:
         raise UserValueError(

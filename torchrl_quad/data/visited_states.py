@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
@@ -14,9 +14,18 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
-from torchrl_quad.data.rollout import require_actor
-from torchrl_quad.data.unwrap import base_env, check_env, memory_keys
-from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
+from torchrl_quad.data.unwrap import (
+    base_env,
+    check_actor,
+    check_env,
+    check_tensordict,
+    group,
+    leaf,
+    memory_keys,
+    observed,
+    state_keys,
+)
+from torchrl_quad.errors import UserTypeError, UserValueError, WrongState, one_line
 from torchrl_quad.options import Device, Entries, Fraction, Seed, Size, checked
 
 Kinds = dict[NestedKey, tuple[torch.Size, torch.dtype]]  # of the entries of one state
@@ -27,23 +36,18 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
     """States that the policy has visited, from which horizons and episodes can start.
 
     The buffer keeps states and no transitions, so it is no replay for off-policy learning. A state is the complete
-    Markov state, including commands on their way and whatever the task keeps, detached from any graph.
-
-    ``state_dict`` and ``load_state_dict``, ``dumps(path)`` and ``loads(path)`` save and load the states, n of them, and
-    the buffer's random generator, which draws the states and decides which environments get one.
+    Markov state, including commands on their way and whatever the task keeps, detached from any graph. ``state_dict``
+    and ``dumps(path)`` save the states and the buffer's random generator, which draws them and decides which
+    environments get one.
 
     Args:
         capacity: visited states kept; the oldest go first.
         env: the environment whose Markov state is kept; see :mod:`torchrl_quad.data`.
         state_keys: the entries that make up the Markov state. By default those of ``env``, and "state" without one.
-        actor: a recurrent policy, whose memory is kept beside the state. Without it, and in :meth:`source`, it begins
-            empty in a visited state.
+        actor: a recurrent policy, whose memory is kept with the state. Without it, and in :meth:`source`, a visited
+            state has an empty memory.
         device: where the states are stored.
         seed: of the buffer's own random generator.
-
-    Raises:
-        ValueError: an option has the wrong type or is out of its range.
-        TypeError: ``env`` is no environment, or ``actor`` no policy.
     """
 
     def __init__(
@@ -59,7 +63,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         if env is not None:
             check_env(env)
         if actor is not None:
-            require_actor(actor, "actor")
+            check_actor(actor, "actor")
         generator = torch.Generator(device=device).manual_seed(seed)
         # Of each part of a state, as far as it is known.
         self.kinds: dict[NestedKey, Kinds] = {} if env is None else _kinds_of(env)
@@ -71,22 +75,15 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         super().__init__(storage=LazyTensorStorage(capacity, device=device), generator=generator)
 
     def extend(self, tensordicts: TensorDictBase) -> Tensor:
-        """Add the states in which the steps of a rollout (any batch size) started.
+        """Add the states in which the steps of a rollout (any batch size) started, and return the indices written.
 
         Terminated states and states that are not finite are left out.
 
-        Returns:
-            the indices written.
-
         Raises:
             ValueError: the rollout lacks an entry of the state, or its states differ in kind from the buffer's.
-            TypeError: it is no tensordict.
         """
-        if not isinstance(tensordicts, TensorDictBase):
-            raise UserTypeError(
-                f"The visited-state buffer takes a rollout, a tensordict; got {type(tensordicts).__name__}."
-            )
-        missing = [key for key in (*self.state_keys, *self.memory_keys) if key not in tensordicts]
+        check_tensordict("The visited-state buffer", tensordicts)
+        missing = [key for key in self.names if key not in tensordicts]
         if missing:
             raise UserValueError(
                 f"The visited-state buffer keeps {self.state_keys}, and the rollout lacks {missing[0]!r}. Give the "
@@ -94,39 +91,36 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             )
         if tensordicts.batch_size.numel() == 0:
             return torch.zeros(0, dtype=torch.int64)
-        states = tensordicts.select(*self.state_keys, *self.memory_keys).detach().reshape(-1)
+        states = tensordicts.select(*self.names).detach().reshape(-1)
         keep = torch.ones(states.shape[0], dtype=torch.bool, device=states.device)
         for value in states.values(include_nested=True, leaves_only=True):
             keep &= value.reshape(states.shape[0], -1).isfinite().all(-1)
-        terminated = tensordicts.get("terminated", None)
-        if terminated is not None:
-            keep &= ~terminated.reshape(-1).bool()
+        if "terminated" in tensordicts:
+            keep &= ~leaf(tensordicts, "terminated").reshape(-1).bool()
         if not keep.any():
             return torch.zeros(0, dtype=torch.int64)
-        self._require_same(states)
+        self._check_same(states)
         self.kinds = {name: _kinds(states, name) for name in self.names}
         return super().extend(states[keep].clone())
 
     @checked
     def initial_state(self, env: EnvBase, fraction: Fraction = 0.9) -> TensorDictBase:
-        """Reset an environment: a fraction of its batch to visited states, the rest to fresh starts.
+        """Reset an environment for a rollout: a fraction of its batch to visited states, the rest to fresh starts.
 
         Args:
             env: an environment that can be set to a state, also under transforms.
             fraction: the share of horizons that start in visited states, a probability for each member of the batch.
 
-        Returns:
-            the tensordict of the reset, the carry of the next rollout.
-
         Raises:
-            ValueError: the fraction is not in [0, 1], or the environment's states differ in kind from the buffer's.
+            ValueError: the environment's states differ in kind from the buffer's.
             RuntimeError: the buffer is empty.
         """
         check_env(env)
         mixed, visited, pick = self._mixed(_fresh(env, self.state_keys), fraction)
         start = env.reset(mixed, set_state=True)
-        for key, x in visited.select(*self.memory_keys).items(True, True):
-            start.set(key, torch.where(expand_as_right(pick, x), x, 0.0))
+        for key in self.memory_keys:
+            x = leaf(visited, key)
+            start.set(key, torch.where(cast(Tensor, expand_as_right(pick, x)), x, 0.0))
             start.set("is_init", ~pick.unsqueeze(-1))
         return start
 
@@ -139,16 +133,14 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             fraction: the share of starts that are visited states, a probability for each.
 
         Returns:
-            a function from n to n states: the tensordict (n) that ``env`` keeps under its one state key, or, where the
-            state has several keys, a tensordict (n) with all of them.
+            a function from n to n states: the tensordict (n) that ``env`` keeps under its one state key, or a
+            tensordict (n) with all of several keys. It raises what :meth:`initial_state` does.
 
         Raises:
             TypeError: the environment has no ``sample_start``.
-            ValueError: the fraction is not in [0, 1]; (in use) as :meth:`initial_state`.
-            RuntimeError: (in use) the buffer is empty.
         """
         check_env(env)
-        base = base_env(env)
+        base: Any = base_env(env)
         if not _draws_starts(base):
             raise UserTypeError(
                 f"{type(base).__name__} has no sample_start(n), from which a source takes its fresh starts. Define it, "
@@ -157,7 +149,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
 
         def draw(n: int) -> TensorDictBase:
             states, *_ = self._mixed(base.sample_start(n).select(*self.state_keys), fraction)
-            return states.get(self.state_keys[0]) if len(self.state_keys) == 1 else states
+            return group(states, self.state_keys[0]) if len(self.state_keys) == 1 else states
 
         return draw
 
@@ -167,15 +159,16 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             raise WrongState(
                 "The visited-state buffer is empty. Fly a first horizon from env.reset() and extend the buffer with it."
             )
-        visited = self.sample(fresh.numel()).select(*self.state_keys, *self.memory_keys).to(fresh.device)
-        states = visited.select(*self.state_keys)
-        self._require_same(fresh.reshape(-1), exact=False)  # a transform may have changed the precision of a rollout
+        visited = cast(TensorDictBase, self.sample(fresh.numel())).select(*self.names).to(fresh.device)
+        # A transform may have changed the precision of a rollout.
+        self._check_same(cast(TensorDictBase, fresh.reshape(-1)), exact=False)
         pick = torch.rand(fresh.shape, generator=self._rng, device=self._rng.device) < fraction
         pick = pick.to(fresh.device)
-        return states.reshape(fresh.shape).where(pick, fresh), visited.reshape(fresh.shape), pick
+        visited = cast(TensorDictBase, visited.reshape(fresh.shape))
+        return visited.select(*self.state_keys).where(pick, fresh), visited, pick
 
-    def _require_same(self, states: TensorDictBase, exact: bool = True) -> None:
-        """Refuse states (n) of another kind than those that are kept, before they are mixed or broadcast in silence."""
+    def _check_same(self, states: TensorDictBase, exact: bool = True) -> None:
+        """Raise a UserValueError for states (n) of another kind than the kept ones, which would broadcast silently."""
         different: set[str] = set()
         for name in filter(states.__contains__, self.names):
             theirs = _kinds(states, name)
@@ -195,13 +188,13 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
     # -- saving and loading --------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        """What the buffer holds: of its storage what is filled, (n) of each entry."""
-        state = super().state_dict()
-        storage = state["_storage"]
-        storage["_storage"] = {
-            name: x[: len(self)].clone() if isinstance(x, Tensor) else x for name, x in storage["_storage"].items()
+        """The states (n), in their places, the place of the next one, and the random generator."""
+        states = self._storage[: len(self)].select(*self.names).flatten_keys(".") if len(self) else TensorDict()
+        return {
+            "states": {name: x.clone() for name, x in states.items()},
+            "cursor": cast(Any, self._writer)._cursor,
+            "random": self._rng.get_state(),
         }
-        return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Hold what :meth:`state_dict` has returned, also that of a smaller buffer.
@@ -209,14 +202,15 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         Raises:
             ValueError: the content does not fit the buffer, which stays as it is.
         """
-        states, cursor, count, generator = self._read(state_dict)
-        self._storage._empty()
+        states, cursor, generator = self._read(state_dict)
+        storage = cast(LazyTensorStorage, self._storage)
+        storage._empty()
         if len(states):
-            states = states.to(self._storage.device)
+            states = states.to(storage.device)
             self.kinds = {name: _kinds(states, name) for name in self.names}
-            index = torch.arange(len(states), device=self._storage.device)
-            self._storage.set(index, states.set("index", index))
-        self._writer.load_state_dict({"_cursor": cursor, "_write_count": count})
+            index = torch.arange(len(states), device=states.device)
+            cast(Any, storage).set(index, states.set("index", index))
+        self._writer.load_state_dict({"_cursor": cursor, "_write_count": len(states)})
         self.set_rng(generator)
 
     def dumps(self, path: str | Path) -> None:
@@ -236,103 +230,99 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             try:
                 content = torch.load(opened, map_location="cpu", weights_only=True)
             except Exception as error:
-                said = (str(error) or repr(error)).splitlines()[0]
+                said = one_line(error) or type(error).__name__
                 raise UserValueError(f"{file} is damaged, or no buffer that dumps wrote: {said}") from None
         self.load_state_dict(content)
 
-    def _read(self, state: Mapping[str, Any]) -> tuple[TensorDict, int, int, torch.Generator]:
-        """The states, the cursor, the number of states ever written, and the generator of a content that fits."""
+    def _read(self, content: Mapping[str, Any]) -> tuple[TensorDict, int, torch.Generator]:
+        """The states, the place of the next one and the generator of a content that fits."""
+        most = self._storage.max_size
 
-        def require(condition: bool, what: str) -> None:
-            if not condition:
-                raise UserValueError(
-                    f"The content does not fit this visited-state buffer of {self._storage.max_size:,} states: {what}. "
-                    "Take what a buffer of the same task and options has saved."
-                )
+        def refuse(what: str) -> NoReturn:
+            raise UserValueError(
+                f"The content does not fit this visited-state buffer of {most:,} states: {what}. Take what a buffer of "
+                "the same task and options has saved."
+            )
 
         try:
-            entries, n, written = state["_storage"]["_storage"], state["_storage"]["_len"], state["_writer"]
-            cursor, count, (random, device) = written["_cursor"], written["_write_count"], state["_rng"]
+            entries, cursor, random = content["states"], content["cursor"], content["random"]
         except (TypeError, KeyError, ValueError, IndexError):
-            require(False, "it lacks the storage, the writer or the random generator")
-        require(isinstance(entries, Mapping), "its storage is no mapping")
-        require(all(type(x) is int and x >= 0 for x in (n, cursor, count)), "its numbers of states are none")
-        most = self._storage.max_size
-        require(n <= most, f"it has {n:,} states")
-        require(cursor <= n and count >= n, f"its cursor is {cursor} and its count {count}, with {n} states")
-        rows = {str(name): x for name, x in entries.items() if isinstance(x, Tensor) and name != "index"} if n else {}
-        for name, x in rows.items():
-            usable = x.layout is torch.strided and not x.is_meta and x.ndim > 0 and len(x) >= n
-            require(usable, f"{name} has shape {tuple(x.shape)}")
-            require(bool(x[:n].isfinite().all()), f"{name} is not finite")
-        states = TensorDict({name: x[:n].detach() for name, x in rows.items()}, [n]).unflatten_keys(".")
+            refuse("it lacks the states, the cursor or the random generator")
+        if not isinstance(entries, Mapping) or not all(isinstance(x, Tensor) for x in entries.values()):
+            refuse("its states are no tensors by name")
+        n = max((len(x) for x in entries.values() if x.ndim), default=0)
+        if n > most:
+            refuse(f"it has {n:,} states")
+        if type(cursor) is not int or not 0 <= cursor <= n:
+            refuse(f"its cursor is {cursor!r}, with {n} states")
+        for name, x in entries.items():
+            if x.layout is not torch.strided or x.is_meta or x.ndim == 0 or len(x) != n:
+                refuse(f"{name} has shape {tuple(x.shape)}")
+            if not x.isfinite().all():
+                refuse(f"{name} is not finite")
+        states = TensorDict({str(name): x.detach() for name, x in entries.items()}, [n]).unflatten_keys(".")
         if n:
             lost = [name for name in self.names if name not in states]
             more = set(states.keys(True, True)) - set(states.select(*self.names, strict=False).keys(True, True))
-            require(not lost and not more, f"it lacks or adds {(*lost, *more)[:1]}")
-            self._require_same(states)
-        if cursor < n < most:  # a smaller buffer that was full: its oldest state is where it would have written
-            order = torch.arange(n).roll(-cursor)
-            states, cursor = states[order], n
+            if lost or more:
+                refuse(f"it lacks or adds {(*lost, *more)[:1]}")
+            self._check_same(states)
+        if cursor < n < most:  # of a smaller buffer that was full: its oldest state is at the cursor
+            states, cursor = states[torch.arange(n).roll(-cursor)], n
+        generator = torch.Generator(device=self._rng.device)
         try:
-            generator = torch.Generator(device=device)
             generator.set_state(random)
         except (RuntimeError, TypeError) as error:
-            require(False, f"its random generator is none ({str(error).splitlines()[0]})")
-        require(generator.device.type == self._rng.device.type, f"its random generator is on {device}")
-        return states, cursor % most, count, generator
+            refuse(f"its random generator is none ({one_line(error)})")
+        return states, cursor % most, generator
 
 
 @checked
 def restart(env: EnvBase, carry: TensorDictBase, fraction: Fraction) -> TensorDictBase:
-    """Start a random fraction of the environments afresh, and let the others go on from where they are.
+    """Give a random fraction of the environments fresh starts, and let the others continue; the carry for a rollout.
 
-    Beside visited states this is the other way to choose where the next horizon starts: most flights go on through many
-    horizons, and some begin anew. The choice draws from torch's global generator, the fresh starts from the
-    environment's own. Those that go on keep the memory of a recurrent policy. In all environments transforms that
-    remember, such as StepCounter or a primer, begin anew, and so does the correlated noise of a policy without memory.
+    Most flights then last for many horizons. The choice draws from torch's global generator, the fresh starts from the
+    environment's own. The flights that continue keep the memory of a recurrent policy. Transforms with a memory, such
+    as StepCounter or a primer, begin again in all environments, and so does the correlated noise of a policy without
+    memory.
 
     Args:
         env: an environment that can be set to a state, also under transforms.
         carry: where the environments are, as ``differentiable_rollout`` returns it.
         fraction: the share of flights that are given up for a fresh start, a probability for each.
 
-    Returns:
-        the tensordict of the reset, the carry of the next rollout.
-
     Raises:
-        ValueError: the fraction is not in [0, 1], or the carry lacks an entry of the state or has another batch size.
-        TypeError: ``env`` is no environment, or the carry is no tensordict.
+        ValueError: the carry lacks an entry of the state or has another batch size.
     """
     check_env(env)
     if not isinstance(carry, TensorDictBase):
         raise UserTypeError(f"carry must be the tensordict that a rollout ended with; got {type(carry).__name__}.")
     keys = _state_keys(env)
-    missing = [key for key in base_env(env).state_keys if key not in carry]
+    missing = [key for key in state_keys(env) if key not in carry]
     if missing:
         raise UserValueError(f"restart needs the whole state, {keys}, and the carry lacks {missing[0]!r}.")
-    if carry.shape != env.batch_size:
+    size = cast(torch.Size, env.batch_size)
+    if carry.shape != size:
         raise UserValueError(
-            f"The carry has batch size {tuple(carry.shape)}, and the environment {tuple(env.batch_size)}. Build one of "
-            "that batch size, such as num_envs=..., to start flights of it afresh."
+            f"The carry has batch size {tuple(carry.shape)}, and the environment {tuple(size)}. Build one of "
+            "that batch size, such as num_envs=..., to restart flights of it."
         )
     fresh = _fresh(env, keys)
     chosen = torch.rand(carry.shape, device=carry.device) < fraction
     start = env.reset(fresh.where(chosen, carry.select(*keys)), set_state=True)
-    if "is_init" in carry and "is_init" not in start:  # a policy remembers, and no transform does it for it
-        start = carry.copy().update(start).set("is_init", carry["is_init"] | chosen.unsqueeze(-1))
+    if "is_init" in carry and "is_init" not in start:  # of a recurrent policy without a primer
+        start = carry.copy().update(start).set("is_init", leaf(carry, "is_init") | chosen.unsqueeze(-1))
     return start
 
 
 def _state_keys(env: EnvBase) -> tuple[NestedKey, ...]:
     """The first names of the entries that make up the Markov state."""
-    keys = base_env(env).state_keys
-    return tuple(dict.fromkeys(key if isinstance(key, str) else key[0] for key in keys))
+    return tuple(dict.fromkeys(key if isinstance(key, str) else key[0] for key in state_keys(env)))
 
 
 def _fresh(env: EnvBase, keys: Sequence[NestedKey]) -> TensorDictBase:
     """Fresh starts (env.batch_size), whatever the environment's resets draw from."""
-    base = base_env(env)
+    base: Any = base_env(env)
     states = base.sample_start(env.numel()).reshape(env.batch_size) if _draws_starts(base) else env.reset()
     return states.select(*keys)
 
@@ -348,10 +338,10 @@ def _kinds(states: TensorDictBase, name: NestedKey) -> Kinds:
 
 
 def _kinds_of(env: EnvBase) -> dict[NestedKey, Kinds]:
-    """The same of the states of an environment as its rollouts hold them, by name, where they do."""
+    """The same for each part of an environment's state that its rollouts hold."""
     kinds: dict[NestedKey, Kinds] = {}
-    for key, spec in env.observation_spec.items(True, True):
-        if key in base_env(env).state_keys:
+    for key, spec in observed(env).items(True, True):
+        if key in state_keys(env):
             name = key if isinstance(key, str) else key[0]
             kinds.setdefault(name, {})[unravel_key(key)] = (spec.shape[env.ndim :], spec.dtype)
     return kinds

@@ -130,13 +130,13 @@ class ControlStep:
         env = self.env
         with torch.no_grad():
             metrics = env.metrics(state)
-        outputs: dict[str, Any] = {"observation": self.observe(state)}
+        more = {}  # before the observation: gradients add up in the order of what is computed
         if isinstance(camera := env.disturbances.get("camera"), MountedCamera):
-            outputs["depth"] = camera.image(state)
+            more["depth"] = camera.image(state)
         if env.scene is not None:  # for critics, which may know more than policies
             distance, away = env.scene.nearest(state)
-            outputs["obstacle"] = torch.cat((distance, quaternion.rotate_inverse(state["quaternion"], away)), -1)
-        return {**outputs, "metrics": metrics}
+            more["obstacle"] = torch.cat((distance, quaternion.rotate_inverse(state["quaternion"], away)), -1)
+        return {"observation": self.observe(state), **more, "metrics": metrics}
 
     def observe(self, state: State) -> Tensor:
         """The observation (n, k) that the policy gets: through sensors, with the commands on their way if wanted."""

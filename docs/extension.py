@@ -13,6 +13,7 @@ from unicodedata import lookup
 from docutils import nodes
 from latex2mathml.converter import convert
 from myst_parser.parsers.sphinx_ import MystParser
+from plotly.offline import get_plotlyjs
 from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
@@ -22,6 +23,7 @@ from sphinx.util.docstrings import prepare_docstring
 from sphinx.writers.html5 import HTML5Translator
 
 import torchrl_quad
+from torchrl_quad.render.replay import page_of
 
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".toml": "toml"}  # of linked files, by suffix
 ACRONYMS = {"abpt", "ppo", "sac", "shac", "bptt", "skrl"}
@@ -211,6 +213,14 @@ def describe_all_arguments(app: Sphinx, what: str, name: str, value: Any, option
         lines[begin:end] = ["Args:", *(line for text in own.values() for line in text), ""]
 
 
+def write_race(app: Sphinx, error: Exception | None) -> None:
+    """Write the page of docs/replay.md, from a flight without the 5 MB of plotly.js."""
+    if error is None:
+        content = Path(app.srcdir, "docs/images/race.json").read_text()
+        page = page_of(content, "four drones race through four gates", get_plotlyjs())
+        Path(app.outdir, "race.html").write_text(page.html, encoding="utf-8")
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Sphinx calls this before it reads the sources."""
     app.add_html_math_renderer("mathml", (write_formula, None), (write_formula, None))
@@ -220,6 +230,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("doctree-read", link_to_sources, priority=400)  # before downloads are collected
     app.connect("doctree-read", leave_out_of_navigation, priority=400)
     app.connect("html-collect-pages", source_pages)
+    app.connect("build-finished", write_race)
     app.connect("html-page-context", share_navigation, priority=400)  # before the theme asks for it
     app.connect("autodoc-process-docstring", describe_all_arguments, priority=400)  # before napoleon
     app.connect("autodoc-process-docstring", keep_shapes)

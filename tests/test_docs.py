@@ -49,7 +49,7 @@ def name_of(path):
 def public_names():
     for module in map(importlib.import_module, PUBLIC):
         yield from (f"{module.__name__}.{name}" for name in module.__all__)
-    for module in map(importlib.import_module, ("torchrl_quad.diagnostics", "torchrl_quad.adapters.gym")):
+    for module in map(importlib.import_module, ("torchrl_quad.diagnostics",)):
         for name, value in vars(module).items():
             if getattr(value, "__module__", None) == module.__name__ and not name.startswith("_"):
                 yield f"{module.__name__}.{name}"
@@ -131,6 +131,15 @@ def test_the_reference_begins_with_a_table_of_what_the_package_exports():
 def test_every_example_is_listed():
     text = (ROOT / "examples/README.md").read_text()
     assert {example.name for example in EXAMPLES} == set(re.findall(r"\d\d_\w+\.py", text))
+
+
+def test_the_first_program_is_the_same_everywhere():
+    """The program of example 3 (which test_examples.py runs) is the first of each of these pages."""
+    program = (ROOT / "examples/03_train.py").read_text().split('"""\n\n', 1)[1]
+    for name in ("README.md", "docs/index.md", "docs/first_flight.md"):
+        text = (ROOT / name).read_text()
+        assert code(ROOT / name, "python")[0][1] == program, name
+        assert "about 40 s on one CPU" in text
 
 
 def test_the_readme_is_short():

@@ -7,13 +7,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import StepCounter, TransformedEnv
 
-from torchrl_quad import (
-    HoveringEnv,
-    differentiable_rollout,
-    load_drone,
-    make_actor,
-    make_env,
-)
+from torchrl_quad import HoveringEnv, differentiable_rollout, load_drone, make_actor, make_env
 from torchrl_quad.envs import Event
 
 nan = float("nan")
@@ -79,10 +73,7 @@ def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them(task,
         ({"action_delay": 0.5}, "action_delay must be a whole number, got 0.5"),
         ({"dt": "fast"}, "dt must be a number, got 'fast'. The physics step, 1e-6 to 0.1 s"),
         ({"dt": -0.01}, "dt must be at least 0.000001, got -0.01. The physics step"),
-        (
-            {"control_dt": 0.002},
-            "control_dt must be a whole multiple of dt, .* 0.002 and 0.005. Try control_dt=0.005.",
-        ),
+        ({"control_dt": 0.002}, "control_dt must be a whole multiple of dt, .* 0.002 and 0.005. Try control_dt=0.005."),
         (
             {"seed": "lucky"},
             "seed must be a whole number, got 'lucky'. Of the environment's own random generator, from 0; None takes",
@@ -135,33 +126,17 @@ def test_an_unknown_task_is_refused_with_the_known_ones(task):
 @pytest.mark.parametrize(
     ("method", "wrong", "message"),
     [
-        (
-            "observe",
-            lambda _, s: s["position"][:, 0],
-            r"observe\(state\) must be a tensor \(4, k\), torch.float32",
-        ),
+        ("observe", lambda _, s: s["position"][:, 0], r"observe\(state\) must be a tensor \(4, k\), torch.float32"),
         ("observe", lambda _, s: s["position"].double(), r"got \(4, 3\), torch.float64"),
         ("reward_terms", lambda _, s: {"near": -s["position"]}, r"reward_terms\(state\)\['near'\] must .* keepdim"),
         ("reward_terms", lambda _, s: {"near": -s["position"][:, 0]}, r"\['near'\] must .*; got \(4,\)"),
         ("reward_terms", lambda _, s: -s["position"], r"reward_terms\(state\) must be a mapping .*; got Tensor"),
         ("advance", lambda _, p, s: None, r"advance\(previous, state\) must be a mapping .*; got NoneType"),
         ("reward_terms", lambda _, s: {"near": 0.1}, r"\['near'\] must be a tensor \(4, 1\), .*; got float"),
-        (
-            "metrics",
-            lambda _, s: {"far": s["position"]},
-            r"metrics\(state\)\['far'\] must be a tensor \(4, 1\)",
-        ),
-        (
-            "is_crash",
-            lambda _, s: s["position"][:, :1],
-            r"is_crash\(state\) must be a tensor \(4, 1\), torch.bool",
-        ),
+        ("metrics", lambda _, s: {"far": s["position"]}, r"metrics\(state\)\['far'\] must be a tensor \(4, 1\)"),
+        ("is_crash", lambda _, s: s["position"][:, :1], r"is_crash\(state\) must be a tensor \(4, 1\), torch.bool"),
         ("is_success", lambda _, s: s["position"] > 0, r"is_success\(state\) must .* got \(4, 3\), torch.bool"),
-        (
-            "advance",
-            lambda _, p, s: {"position": s["position"]},
-            "advance must return the whole state, and 'target'",
-        ),
+        ("advance", lambda _, p, s: {"position": s["position"]}, "advance must return the whole state, and 'target'"),
         ("advance", lambda _, p, s: {**s, "target": s["target"].double()}, "float32.; got .* torch.float64"),
         ("events", lambda _, p, s: {"near": 0.5}, r"\['near'\] must be an Event; got float"),
         ("events", lambda _, p, s: {"near": near(s, happened=s["step"])}, r"\.happened must be .* torch.bool; got"),

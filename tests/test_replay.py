@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -13,9 +14,9 @@ from torchrl_quad import HoveringEnv, RacingEnv, differentiable_rollout, make_ac
 from torchrl_quad.render import write_replay
 
 
-def read(path):
-    """What a page shows, as it is stored."""
-    text = path.read_text()
+def written(rollout, **options):
+    """What the page of a flight shows, as it is stored."""
+    text = write_replay(rollout, **options).html
     content = json.loads(re.search(r'<script type="application/json" id="flight">(.*?)</script>', text, re.DOTALL)[1])
 
     def numbers(name, *shape):
@@ -24,73 +25,64 @@ def read(path):
     return content, numbers
 
 
-def test_what_is_not_known_of_the_start_is_left_out_there(tmp_path):
+def test_what_is_not_known_of_the_start_is_left_out_there():
     rollout = HoveringEnv(num_envs=2).rollout(3)
-    write_replay(rollout.exclude(("state", "target"), ("state", "velocity")), tmp_path / "replay.html")
-    _, numbers = read(tmp_path / "replay.html")
+    _, numbers = written(rollout.exclude(("state", "target"), ("state", "velocity")))
     target = numbers("target", 2, 4, 3)
     assert target[:, 0].isnan().all() and torch.equal(target[:, 1:], rollout["next", "state", "target"])
     torch.testing.assert_close(numbers("position", 2, 4, 3)[:, 0], rollout["state", "position"][:, 0])
 
 
-def test_drones_of_other_environments_than_those_shown_are_refused(tmp_path):
+def test_drones_of_other_environments_than_those_shown_are_refused():
     env = HoveringEnv(num_envs=2)
     env = HoveringEnv(num_envs=2, drone=env.params.replace(mass=torch.tensor([[0.3], [0.4]])))
-    write_replay(env.rollout(2), tmp_path / "replay.html", env=env)
+    write_replay(env.rollout(2), env=env)
     with pytest.raises(ValueError, match="env has a mass for each of its 2 environments, and the page would show 3"):
-        write_replay(HoveringEnv(num_envs=3).rollout(2), tmp_path / "replay.html", env=env)
+        write_replay(HoveringEnv(num_envs=3).rollout(2), env=env)
 
 
-def test_a_rollout_with_its_graph_in_double_precision_is_written_under_transforms_too(tmp_path):
+def test_a_rollout_with_its_graph_in_double_precision_is_written_under_transforms_too():
     env = TransformedEnv(HoveringEnv(num_envs=3, dtype=torch.float64, dt=0.01, control_dt=0.04), RewardSum())
     rollout, _ = differentiable_rollout(env, make_actor(env), None, 5)
     assert rollout["next", "reward"].requires_grad
-    write_replay(rollout, tmp_path / "replay.html", env=env, num_envs=2, control_dt=0.5)
-    content, numbers = read(tmp_path / "replay.html")
+    content, numbers = written(rollout, env=env, num_envs=2, control_dt=0.5)
     assert content["control_dt"] == 0.04
     torch.testing.assert_close(numbers("position", 2, 6, 3)[:, 1:], rollout["next", "state", "position"][:2].float())
 
 
-def test_randomised_drones_are_drawn_with_their_own_rotors(tmp_path):
+def test_randomised_drones_are_drawn_with_their_own_rotors():
     randomize = {"rotor_positions": {"scale": [0.5, 2.0]}, "mass": {"scale": [0.5, 2.0]}}
     env = HoveringEnv(num_envs=3, randomize=randomize)
     rollout = env.rollout(5, break_when_any_done=False)
-    write_replay(rollout, tmp_path / "replay.html", env=env)
-    _, numbers = read(tmp_path / "replay.html")
+    _, numbers = written(rollout, env=env)
     drone = rollout["state", "drone"][:, 0]
     torch.testing.assert_close(numbers("rotors", 3, 4, 2), drone["rotor_positions"])
     thrust = env.dynamics.controller.rotors.thrust(rollout["state", "rotor_speed"][:, 0])
     torch.testing.assert_close(numbers("lift", 3, 6, 4)[:, 0], 4 * thrust / (drone["mass"] * 9.81), rtol=1e-4, atol=0)
 
 
-def test_the_gate_of_a_frame_is_the_one_that_the_drone_flies_to(tmp_path):
+def test_the_gate_of_a_frame_is_the_one_that_the_drone_flies_to():
     env = RacingEnv(num_envs=3)
     rollout = env.rollout(4, break_when_any_done=False)
-    write_replay(rollout, tmp_path / "replay.html", env=env)
-    gates = read(tmp_path / "replay.html")[1]("gate", 3, 5)
+    gates = written(rollout, env=env)[1]("gate", 3, 5)
     assert torch.equal(gates[:, 1:], rollout["next", "state", "gate"][..., 0].float())
     assert torch.equal(gates[:, 0], rollout["state", "gate"][:, 0, 0].float())
-    write_replay(rollout, tmp_path / "replay.html")
-    content = read(tmp_path / "replay.html")[0]
+    content, _ = written(rollout)
     assert content["gates"] is content["gate"] is None
 
 
-def test_rings_face_along_the_course(tmp_path):
+def test_rings_face_along_the_course():
     env = RacingEnv(num_envs=1, track={"gates": [[0, 0, 2], [4, 0, 2], [4, 0, 6], [0, 0, 6]], "gate_radius": 0.5})
-    write_replay(env.rollout(2), tmp_path / "replay.html", env=env)
-    rings = read(tmp_path / "replay.html")[1]("gates", 4, 33, 3) - env.gates[:, None]
+    rings = written(env.rollout(2), env=env)[1]("gates", 4, 33, 3) - env.gates[:, None]
     torch.testing.assert_close(rings.norm(dim=-1), torch.full((4, 33), 0.5))
     along = env.gates.roll(-1, 0) - env.gates.roll(1, 0)  # of a square, between the edges before and after
     torch.testing.assert_close((rings * along[:, None]).sum(-1), torch.zeros(4, 33), atol=1e-5, rtol=0)
 
 
-def test_a_page_of_twelve_long_flights_is_small(tmp_path):
-    from plotly.offline import get_plotlyjs
-
+def test_a_page_of_twelve_long_flights_is_small():
     env = make_env("tracking", num_envs=14)
-    write_replay(env.rollout(512, break_when_any_done=False), tmp_path / "replay.html", env=env)
-    assert read(tmp_path / "replay.html")[0]["environments"] == 12
-    assert (tmp_path / "replay.html").stat().st_size - len(get_plotlyjs().encode()) < 1_500_000
+    content, _ = written(env.rollout(512, break_when_any_done=False), env=env)
+    assert content["environments"] == 12 and len(json.dumps(content)) < 1_500_000
 
 
 def test_a_page_that_cannot_be_finished_leaves_the_old_one(tmp_path, monkeypatch):
@@ -107,14 +99,10 @@ def test_a_page_that_cannot_be_finished_leaves_the_old_one(tmp_path, monkeypatch
     assert [file.name for file in tmp_path.iterdir()] == ["replay.html"] and path.read_text() == "old"
 
 
-def test_a_rollout_without_attitudes_is_refused(tmp_path):
+def test_a_rollout_without_attitudes_and_a_machine_without_plotly_are_refused(monkeypatch):
     rollout = HoveringEnv(num_envs=2).rollout(3)
     with pytest.raises(ValueError, match=r"write_replay: the rollout lacks .*'quaternion'"):
-        write_replay(rollout.exclude(("next", "state", "quaternion")), tmp_path / "replay.html")
-    assert not list(tmp_path.iterdir())
-
-
-def test_without_plotly_it_says_what_to_install(monkeypatch, tmp_path):
-    monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
+        write_replay(rollout.exclude(("next", "state", "quaternion")))
+    monkeypatch.setitem(sys.modules, "plotly.offline", None)
     with pytest.raises(ImportError, match=r"pip install '.\[render\]'"):
-        write_replay(HoveringEnv(num_envs=1).rollout(2), tmp_path / "replay.html")
+        write_replay(rollout)

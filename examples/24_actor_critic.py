@@ -1,4 +1,4 @@
-"""A policy that hovers, learnt by short-horizon actor-critic: all of it, in 40 lines of code."""
+"""A policy that learns to hover by short-horizon actor-critic: actor, critic, target network and visited states."""
 
 import torch
 from torchrl.envs.utils import ExplorationType

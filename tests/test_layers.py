@@ -40,7 +40,7 @@ LIBRARIES = {
     "dynamics": {"torch", "numpy", "yaml"},
     "engine": {"torch", "tensordict"},
     "vision": {"torch"},
-    "envs": TORCHRL | {"numpy", "pydantic"},
+    "envs": TORCHRL | {"gymnasium", "numpy", "pydantic"},
     "controllers": TORCHRL,
     "render": TORCHRL | {"matplotlib", "mpl_toolkits", "plotly", "PIL", "imageio_ffmpeg", "numpy"},
     "modules": TORCHRL,

@@ -81,8 +81,8 @@ __all__ = [
 
 
 _PARTS = ("dynamics", "engine", "data", "modules", "objectives", "envs", "vision", "controllers", "diagnostics")
-# The tasks that ship, and their control steps: what gymnasium registers needs no torch.
-_TASKS = {"forest": 900, "hovering": 256, "landing": 256, "racing": 512, "tracking": 512}
+# What gymnasium registers needs no torch; envs/registry.py adds the episode lengths, which only the signatures have.
+_TASKS = ("forest", "hovering", "landing", "racing", "tracking")
 
 
 def __getattr__(name: str) -> Any:
@@ -103,10 +103,10 @@ def __dir__() -> list[str]:
 def register_envs(*tasks: str) -> None:
     """Register tasks with gymnasium, as ``torchrl_quad/Hovering-v0`` and so on; importing the package does it.
 
-    A task of your own, ``register_task("fly_through", ...)``, is ``torchrl_quad/FlyThrough-v0``.
+    Your own task, ``register_task("fly_through", ...)``, is ``torchrl_quad/FlyThrough-v0``.
 
     Args:
-        *tasks: their names; by default those that ship, and those of installed packages.
+        *tasks: their names; by default those of this package, and those of installed packages.
     """
     import gymnasium
 
@@ -116,7 +116,7 @@ def register_envs(*tasks: str) -> None:
         if name not in gymnasium.registry:
             classes = {"entry_point": f"{module}:GymEnv", "vector_entry_point": f"{module}:GymVectorEnv"}
             own = {} if task in _TASKS else {"max_episode_steps": None}  # a task of yours ends its episodes itself
-            gymnasium.register(name, **classes, max_episode_steps=_TASKS.get(task), kwargs={"task": task, **own})
+            gymnasium.register(name, **classes, kwargs={"task": task, **own})
 
 
 try:

@@ -120,3 +120,17 @@ def _checked_class(cls: Any, source: str) -> type[QuadrotorEnv]:
 
 def _path(cls: type) -> str:
     return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def _set_time_limits() -> None:
+    """Give gymnasium's ids of this package the episode lengths, where there is gymnasium."""
+    try:
+        from gymnasium import registry
+    except ModuleNotFoundError:
+        return
+    for name, cls in TASKS.items():
+        if spec := registry.get(f"torchrl_quad/{name.capitalize()}-v0"):
+            spec.max_episode_steps = inspect.signature(cls).parameters["max_episode_steps"].default
+
+
+_set_time_limits()

@@ -26,8 +26,6 @@ from torchrl_quad.vision import has_way
 DIFFICULTIES = {"easy": (0.04, 1.5), "middle": (0.08, 1.2), "hard": (0.12, 0.9)}
 CAMERA = {"width": 16, "height": 12, "range": 10.0}
 PLACES = 12  # that are tried for a tree before it is left out
-
-
 Density = Annotated[float, between(0.0, 2.0)]
 Gap = Annotated[float, between(0.1, 10.0)]
 Length = Annotated[float, between(1.0, 1_000.0)]
@@ -94,15 +92,8 @@ class ForestEnv(QuadrotorEnv):
     start_half_width = 4.0  # [m]
     cruise_height, start_height = 1.5, 0.3  # [m], of the target, and how far from it drones start
     margin, softness, nearness = 0.3, 0.1, 0.5  # [m], of the rewards for clearance and for the closing speed
-    weights = {
-        "speed": 0.1,
-        "clearance": 0.3,
-        "closing": 0.15,
-        "smoothness": 0.005,
-        "heading": 0.05,
-        "collision": 10.0,
-        "finish": 10.0,
-    }
+    weights = {"speed": 0.1, "clearance": 0.3, "closing": 0.15, "smoothness": 0.005, "heading": 0.05}
+    weights |= {"collision": 10.0, "finish": 10.0}
     ends_on_success = True
     metric_info = {
         **EPISODE_METRICS,
@@ -139,10 +130,9 @@ class ForestEnv(QuadrotorEnv):
     def set_up(self) -> None:
         self.centre = self.tensor([0.5 * (self.length - self.before), 0.0, 0.0])
         self.extent = self.tensor([0.5 * (self.length + self.before) + 1.0, self.half_width])
-        fixed, top = self.scene.touchable, self.ceiling
+        fixed, radius, top = self.scene.touchable, self.scene.radius, self.ceiling
         if not fixed.total:
             return
-        radius = self.scene.radius
         start = self.tensor([-self.run_up[0], 0.0, self.cruise_height])
         goal = self.tensor([self.length, 0.0, self.cruise_height])
         low = self.tensor([-self.before, -self.half_width, radius])

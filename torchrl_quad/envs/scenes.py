@@ -41,7 +41,6 @@ _FIELDS = {
     "walls": {"point": 3, "normal": 3},
 }
 _OPTIONAL = {"yaw", "quaternion"}
-_LENGTHS = ("radius", "height", "size")
 
 
 @checked
@@ -127,20 +126,11 @@ class Scene(Disturbance):
         source, values = presets.read("scene", spec)
         return build(Scene, source, values, source=source)
 
-    @property
-    def is_random(self) -> bool:
-        """Whether each episode has obstacles of its own."""
-        return self.is_drawn_elsewhere or any(self.random.values())
-
     def bound(self, nominal: QuadrotorParams) -> Scene:
         """A copy for a drone, with its tensors in the drone's precision and on its device."""
         own, like = copy.copy(self), nominal.mass
-        own.constants = Primitives(
-            *(
-                torch.tensor(self.fixed[kind], dtype=like.dtype, device=like.device).reshape(1, -1, size)
-                for kind, size in SIZES.items()
-            )
-        )
+        fixed = {kind: like.new_tensor(self.fixed[kind]).reshape(1, -1, size) for kind, size in SIZES.items()}
+        own.constants = Primitives(**fixed)
         own.touchable = own.constants._replace(planes=own.constants.planes[:, int(self.ground) :])
         own.radius = drone_radius(nominal) if self.drone_radius is None else self.drone_radius
         return own
@@ -177,9 +167,8 @@ class Scene(Disturbance):
     def solids(self, state: State, ground: bool = True) -> Primitives:
         """All obstacles of the scenes of a state, with the ground or without it."""
         constants = self.constants if ground else self.touchable
-        own = (state.get(("scene", kind)) for kind in SIZES)
-        own = (c[:, :0] if x is None else x for x, c in zip(own, constants, strict=True))
-        return join(constants, Primitives(*own))
+        own = {kind: state.get(("scene", kind), x[:, :0]) for kind, x in constants._asdict().items()}
+        return join(constants, Primitives(**own))
 
     def nearest(self, state: State) -> tuple[Tensor, Tensor]:
         """How far the drone's surface is from the nearest obstacle (n, 1) [m], and the direction (n, 3) away from it.
@@ -237,11 +226,9 @@ class Scene(Disturbance):
             for name, size in fields.items()
             if name in obstacle and name != "count"
         }
-        for name in _LENGTHS:
-            if name in ranges and min(ranges[name][0]) < SMALLEST:
-                raise UserValueError(
-                    f"{kind}: {name} must be at least {SMALLEST:g} m, got {shown(obstacle.get(name))}."
-                )
+        for name in ranges.keys() & {"radius", "height", "size"}:
+            if min(ranges[name][0]) < SMALLEST:
+                raise UserValueError(f"{kind}: {name} must be at least {SMALLEST:g} m, got {shown(obstacle[name])}.")
         if not is_random:
             self.fixed[solids].append(_numbers(kind, {name: low for name, (low, _) in ranges.items()}))
             return

@@ -14,13 +14,7 @@ from torchrl_quad.dynamics import quaternion
 from torchrl_quad.engine.simulation import State
 
 # Of the reward of hovering, tracking and racing (paper, table I); distances in m, speeds in m/s and rad/s.
-TARGET_WEIGHTS = {
-    "survival": 0.1,
-    "position": 0.1 / 9,
-    "attitude": 1e-5,
-    "velocity": 0.002,
-    "angular_velocity": 0.002,
-}
+TARGET_WEIGHTS = {"survival": 0.1, "position": 0.1 / 9, "attitude": 1e-5, "velocity": 0.002, "angular_velocity": 0.002}
 # Magnitudes of body_observation() that no useful flight exceeds: the quaternion's are exact.
 BODY_BOUNDS = (*4 * (10.0,), *3 * (50.0,), *3 * (50.0,))  # velocity in m/s, angular velocity in rad/s
 # Derivatives of passes that graze a surface, and of those who stand before it, would have no bound. The way across the

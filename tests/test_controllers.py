@@ -9,8 +9,8 @@ from torch import nn
 
 from torchrl_quad import MPC, ActionSequence, GeometricController, HoveringEnv, LandingEnv, RacingEnv, TrackingEnv
 from torchrl_quad.controllers import follow
-from torchrl_quad.controllers.laps import basis, plan_lap
-from torchrl_quad.controllers.riccati import feedback
+from torchrl_quad.controllers.mpc import feedback
+from torchrl_quad.controllers.references import basis, plan_lap
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs import TASKS
 
@@ -235,7 +235,7 @@ def test_what_they_cannot_fly_is_refused_and_a_reference_of_ones_own_is_flown():
     for env, message in (
         (HoveringEnv(num_envs=1, dynamics="point_mass"), "dynamics='quadrotor'"),
         (HoveringEnv(num_envs=1, control="velocity"), "control='rates'"),
-        (own, "knows no reference for OwnTask"),
+        (own, "has no reference for OwnTask"),
     ):
         for controller in (GeometricController, MPC):
             with pytest.raises(ValueError, match=message):

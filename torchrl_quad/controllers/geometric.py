@@ -19,9 +19,7 @@ from torchrl_quad.options import between
 LEAST_LIFT = 0.3  # vertical part of the thrust, in weights: the drone never turns over to dive
 GREATEST_LIFT = 0.9  # of the greatest thrust: there is always some left to go sideways
 
-
 Gain = Annotated[float, between(1e-3, 1e3)]
-Heading = Annotated[float, between(-2.0 * math.pi, 2.0 * math.pi)]
 
 
 class GeometricController(Controller):
@@ -39,19 +37,15 @@ class GeometricController(Controller):
     .. math:: \Omega_c = R^T R_d \Omega_d - k_R e_R, \qquad
               M = J K (\Omega_c - \Omega) - D \dot\Omega + \Omega \times J \Omega.
 
-    So the moments are Lee's, with the gains :math:`J K k_R` of :math:`e_R` and :math:`J K` of :math:`e_\Omega`. Missing
-    is his term with :math:`\dot\Omega_d`; the damping D of the rate loop comes in addition. :math:`\Omega_d` follows
-    from the jerk of the reference alone, as the rate at which :math:`a_d + g\,e_3` turns: errors contribute nothing.
+    So the moments are Lee's, with the gains :math:`J K k_R` of :math:`e_R` and :math:`J K` of :math:`e_\Omega`, without
+    his term of :math:`\dot\Omega_d`, and with the damping D of the rate loop. :math:`\Omega_d` is the rate at which
+    :math:`a_d + g\,e_3` turns, from the jerk of the reference.
 
-    Limits are those of the environment. The error of the position counts up to ``max_error``; F keeps within the
-    greatest thrust and tilt, its vertical part first, and at least 0.3 of the weight; the action is clamped.
-
-    .. code-block:: python
-
-        flight = env.rollout(256, GeometricController(env))
+    F keeps within the greatest thrust and tilt, its vertical part first, and at least 0.3 of the weight; the action is
+    clamped. ``env.rollout(256, GeometricController(env))`` flies it.
 
     Args:
-        env: as for :class:`~torchrl_quad.controllers.policy.Controller`.
+        env: as for :class:`~torchrl_quad.controllers.policy.Controller`, which gives the errors, too.
         reference: likewise; its derivatives are taken by central differences.
         position_gain: :math:`k_x`, 0.001 to 1000 per s2.
         velocity_gain: :math:`k_v`, 0.001 to 1000 per s.
@@ -60,10 +54,6 @@ class GeometricController(Controller):
         max_error: greatest error of the position that counts, 0.001 to 1000 m.
         max_tilt: greatest angle of F from the vertical, 0.01 to 1.5 rad, 86 degrees.
         heading: angle of :math:`b_1` from world x, -2 pi to 2 pi rad; None leaves it where it is.
-
-    Raises:
-        TypeError: this is no quadrotor environment.
-        ValueError: its dynamics or its actions are others, its task has no reference, or a number is not positive.
     """
 
     def __init__(
@@ -76,7 +66,7 @@ class GeometricController(Controller):
         attitude_gain: Gain | None = None,
         max_error: Gain = 1.0,
         max_tilt: Tilt = 1.3,
-        heading: Heading | None = None,
+        heading: Annotated[float, between(-2.0 * math.pi, 2.0 * math.pi)] | None = None,
     ) -> None:
         super().__init__(env, reference)
         self.position_gain, self.velocity_gain, self.max_error = position_gain, velocity_gain, max_error
@@ -89,18 +79,18 @@ class GeometricController(Controller):
     def act(self, state: State, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action for the drone as it will be when the action takes effect."""
         attitude, times = state["quaternion"], state["position"].new_full((1,), self.lead)
-        wanted = [x[:, 0] for x in follow(self.reference, state, times)]
-        position_error, velocity_error = wanted[0] - state["position"], wanted[1] - state["velocity"]
+        position, velocity, acceleration, jerk = (x[:, 0] for x in follow(self.reference, state, times))
+        position_error, velocity_error = position - state["position"], velocity - state["velocity"]
         far = torch.linalg.vector_norm(position_error, dim=-1, keepdim=True)
         position_error = position_error * (self.max_error / far.clamp_min(self.max_error))
         correction = self.position_gain * position_error + self.velocity_gain * velocity_error
-        force = self.within_limits(correction + wanted[2] + self.gravity)  # per mass [m/s2]
+        force = self.within_limits(correction + acceleration + self.gravity)  # per mass [m/s2]
         up = normalize(force, dim=-1)
         axes = torch.eye(3).to(attitude).expand(len(attitude), 3, 3)
         rotation = quaternion.rotate(attitude.unsqueeze(1), axes).mT
         error = attitude_error(rotation, wanted_rotation(up, self.first_axis(rotation)))
-        steady = wanted[2] + self.gravity
-        turn = torch.linalg.cross(steady, wanted[3]) / steady.square().sum(-1, keepdim=True).clamp_min(1e-6)
+        steady = acceleration + self.gravity
+        turn = torch.linalg.cross(steady, jerk) / steady.square().sum(-1, keepdim=True).clamp_min(1e-6)
         rates = quaternion.rotate_inverse(attitude, turn) - self.attitude_gain * error
         thrust = self.nominal.mass * (force * rotation[..., 2]).sum(-1, keepdim=True)
         action = self.dynamics.controller.encode(torch.cat((thrust, rates), -1))
@@ -116,7 +106,7 @@ class GeometricController(Controller):
         return torch.cat((force[..., :2] * (room / torch.maximum(sideways, room)), lift), -1)
 
     def first_axis(self, rotation: Tensor) -> Tensor:
-        """What body x shall be next to, (n, 3): the heading, or where it is now."""
+        """The direction that body x keeps close to, (n, 3): the heading, or its present one."""
         if self.heading is None:
             return rotation[..., 0]
         ahead = (math.cos(self.heading), math.sin(self.heading), 0.0)

@@ -12,7 +12,6 @@ from torch.nn.functional import normalize, pad
 
 from torchrl_quad.controllers.policy import Controller, State
 from torchrl_quad.controllers.references import Reference, follow
-from torchrl_quad.controllers.riccati import feedback
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import between
@@ -30,15 +29,10 @@ SHORTENED = (1.0, 0.5, 0.2, 0.05)  # shares of a step of Gauss-Newton that are t
 ROWS = 4096  # states whose derivatives are taken at once: what fits into the cache of a processor
 
 
-Plan = Annotated[int, between(1, 1_000)]
-Iterations = Annotated[int, between(1, 100)]
-Weights = Mapping[str, Annotated[float, between(0.0, 1e6)]]
-
-
 class MPC(Controller):
     r"""Model predictive control: at each step, plan actions through the physics of the environment, and fly the first.
 
-    The plan minimises the squares of what the drone is away from the reference, over a horizon of H control steps,
+    The plan minimises the squared distance from the reference over a horizon of H control steps,
 
     .. math:: \tfrac12 \sum_{t=1}^{H} |x_t - \bar x_t|^2_{Q_t} + \tfrac12 \sum_{t=0}^{H-1} |u_t - \bar u_t|^2_R,
         \qquad x_{t+1} = f(x_t, u_t), \quad |u_t| \le 1,
@@ -50,33 +44,27 @@ class MPC(Controller):
     A step of Gauss-Newton linearises f along the plan by automatic differentiation, and solves the linear-quadratic
     problem that is left by Riccati's recursion, within the bounds of the actions: iLQR (Li and Todorov 2004) with
     control limits (Tassa, Mansard and Todorov 2014). Of some lengths of the step it takes the best, and none where all
-    are worse. The next control step starts from the plan of this one, moved by one step. So a single iteration is
-    usual ("real-time iteration", Diehl 2001).
-
-    The plan stands in the tensordict, under ``plan`` (num_envs, H, 4). A rollout carries it on; in a loop of your own
-    use ``step_mdp``. Where it is missing, or an episode begins, a plan starts from what the reference needs.
+    are worse. The next control step starts from this plan, moved by one step, so that a single iteration is usual
+    ("real-time iteration", Diehl 2001). The plan stands in the tensordict under ``plan`` (num_envs, H, 4), which a
+    rollout hands on, as ``step_mdp`` does. Where it is missing, or an episode begins, the reference gives the first.
 
     Args:
-        env: as for :class:`~torchrl_quad.controllers.policy.Controller`.
+        env: as for :class:`~torchrl_quad.controllers.policy.Controller`, which gives the errors, too.
         horizon: control steps of a plan, 1 to 1000.
         iterations: steps of Gauss-Newton in each control step, 1 to 100.
         reference: as for :class:`~torchrl_quad.controllers.policy.Controller`.
-        weights: others than the usual ones, 0 to 1e6, by name: position, attitude, velocity, angular_velocity,
+        weights: changes of the default weights by name, 0 to 1e6: position, attitude, velocity, angular_velocity,
             terminal, and action, which is 1e-6 or more.
-
-    Raises:
-        TypeError: this is no quadrotor environment.
-        ValueError: its dynamics or its actions are others, its task has no reference, or an argument is out of range.
     """
 
     def __init__(
         self,
         env: Any,
         *,
-        horizon: Plan = 20,
-        iterations: Iterations = 1,
+        horizon: Annotated[int, between(1, 1_000)] = 20,
+        iterations: Annotated[int, between(1, 100)] = 1,
         reference: Reference | None = None,
-        weights: Weights | None = None,
+        weights: Mapping[str, Annotated[float, between(0.0, 1e6)]] | None = None,
     ) -> None:
         super().__init__(env, reference)
         for name in weights or {}:
@@ -109,7 +97,7 @@ class MPC(Controller):
         return tensordict.set("action", actions[0].clone())
 
     def goal(self, state: State) -> tuple[Tensor, Tensor]:
-        """Where the states at the end of each step shall be, (H, n, 17), and the actions (H, n, 4) that suit them."""
+        """The wanted states at the end of each step, (H, n, 17), and the actions (H, n, 4) that suit them."""
         attitude = state["quaternion"]
         motion = follow(self.reference, state, self.times)
         force = (motion.acceleration + pad(self.nominal.gravity, (2, 0)).view(-1, 1, 3)).transpose(0, 1)
@@ -117,11 +105,8 @@ class MPC(Controller):
         up = normalize(force, dim=-1)
         turn = torch.cat((1.0 + (now * up).sum(-1, keepdim=True), torch.linalg.cross(now, up)), -1)
         wanted = quaternion.multiply(quaternion.normalize(turn), attitude.expand(*up.shape[:-1], 4))
-        still = torch.zeros_like(up)
-        goal = torch.cat(
-            (motion.position.transpose(0, 1), wanted, motion.velocity.transpose(0, 1), still, torch.ones_like(wanted)),
-            -1,
-        )
+        position, velocity = motion.position.transpose(0, 1), motion.velocity.transpose(0, 1)
+        goal = torch.cat((position, wanted, velocity, torch.zeros_like(up), torch.ones_like(wanted)), -1)
         thrust = self.nominal.mass * torch.linalg.vector_norm(force, dim=-1, keepdim=True)
         neutral = self.dynamics.controller.encode(pad(thrust, (0, 3))).clamp(-1.0, 1.0)
         return goal[1:], neutral[:-1]
@@ -145,15 +130,16 @@ class MPC(Controller):
             -1.0 - actions,
             1.0 - actions,
         )
-        state, tried, acted = states[0].expand(len(SHORTENED), -1, -1), [], []
+        state = states[0].expand(len(SHORTENED), -1, -1)
+        tried, acted = [], []
         for t in range(self.horizon):
             deviation = (gains[t] @ (state - states[t]).unsqueeze(-1)).squeeze(-1)
             action = (actions[t] + self.shares * steps[t] + deviation).clamp(-1.0, 1.0)
             state = self.step(state, action)
             tried.append(state)
             acted.append(action)
-        tried, acted = torch.stack(tried, 1), torch.stack(acted, 1)
-        new = torch.cat((tried, states[None, 1:])), torch.cat((acted, actions[None]))  # the last is the old one
+        # The last of those to choose from is the old plan.
+        new = torch.cat((torch.stack(tried, 1), states[None, 1:])), torch.cat((torch.stack(acted, 1), actions[None]))
         best = self.cost(*new, goal, neutral).nan_to_num(torch.inf).argmin(0)
         states_best, actions_best = (x[best, :, torch.arange(len(best))].transpose(0, 1) for x in new)
         return torch.cat((states[:1], states_best)), actions_best
@@ -163,12 +149,11 @@ class MPC(Controller):
         away = (self.state_cost.unsqueeze(1) * (states - goal).square()).sum(-1)
         return 0.5 * (away + (self.action_cost * (actions - neutral).square()).sum(-1)).sum(-2)
 
-    # -- the model -----------------------------------------------------------------------------------------------------
-
     def pack(self, state: Mapping[Any, Tensor]) -> Tensor:
         """The drone's entries as one state (*, 17), with rotor speeds in units of that of hovering."""
-        entries = {**{name: state[name] for name in self.sizes}, "rotor_speed": state["rotor_speed"] / self.hover_speed}
-        return torch.cat(tuple(entries.values()), -1)
+        entries = {name: state[name] for name in self.sizes}
+        entries["rotor_speed"] = entries["rotor_speed"] / self.hover_speed
+        return torch.cat(list(entries.values()), -1)
 
     def step(self, state: Tensor, action: Tensor) -> Tensor:
         """A control step of the nominal drone, from states (*, n, 17) and actions (*, n, 4)."""
@@ -199,3 +184,53 @@ class MPC(Controller):
                 which = torch.eye(k).to(part)[:, None, None].expand_as(end)
                 rows.append(torch.autograd.grad(end, copies, which)[0])
         return torch.cat(rows, 1).permute(1, 2, 0, 3).contiguous()
+
+
+def feedback(
+    transition: Tensor,
+    state_cost: Tensor,
+    state_slope: Tensor,
+    action_cost: Tensor,
+    action_slope: Tensor,
+    low: Tensor,
+    high: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """The actions u_t = k_t + K_t x_t that minimise a quadratic cost, by Riccati's recursion, for a batch of drones.
+
+    The cost is the sum over t = 1..T of x_t' Q_t x_t / 2 + q_t' x_t, and over t = 0..T-1 of u_t' R u_t / 2 + r_t' u_t,
+    where x_{t+1} = A_t x_t + B_t u_t. Where k_t would leave its bounds, it stops there, and the gains of that entry are
+    zero; the other entries are optimal given that (control-limited DDP, with one round of its active set).
+
+    ``transition`` (T, n, s, s + m) holds A_t and B_t side by side, ``state_cost`` (T, s) and ``action_cost`` (m) the
+    diagonals of Q and R, and ``state_slope`` (T, n, s) and ``action_slope`` (T, n, m) q and r. ``low`` and ``high``
+    (T, n, m) are the bounds of k. Returns k (T, n, m) and K (T, n, m, s).
+    """
+    s = transition.shape[-2]
+    eye, penalty = torch.eye(len(action_cost)).to(transition), torch.diag(action_cost)
+    value, slope = torch.diag(state_cost[-1]), state_slope[-1]
+    steps, gains = [], []
+    for t in reversed(range(len(transition))):
+        pulled = transition[t].mT
+        hessian = pulled @ value @ transition[t]
+        gradient = (pulled @ slope.unsqueeze(-1)).squeeze(-1)
+        of_actions, mixed = hessian[:, s:, s:] + penalty, hessian[:, s:, :s]
+        slope_actions = gradient[:, s:] + action_slope[t]
+        # Once without bounds; then with those entries held that have left theirs.
+        step = -torch.linalg.solve_ex(of_actions, slope_actions.unsqueeze(-1))[0].squeeze(-1)
+        held = ((step <= low[t]) | (step >= high[t])).unsqueeze(-1)
+        stop = torch.where(held, step.clamp(low[t], high[t]).unsqueeze(-1), 0.0)
+        wanted = torch.cat((slope_actions.unsqueeze(-1) + of_actions @ stop, mixed), -1)
+        reduced = torch.where(held | held.mT, eye, of_actions)
+        solution = -torch.linalg.solve_ex(reduced, torch.where(held, 0.0, wanted))[0]
+        step = (solution[..., :1] + stop).squeeze(-1).clamp(low[t], high[t])
+        gain = solution[..., 1:]
+        steps.append(step)
+        gains.append(gain)
+        if t > 0:
+            left = slope_actions.unsqueeze(-1) + of_actions @ step.unsqueeze(-1)
+            slope = gradient[:, :s] + (mixed.mT @ step.unsqueeze(-1) + gain.mT @ left).squeeze(-1) + state_slope[t - 1]
+            crossed = gain.mT @ mixed
+            value = hessian[:, :s, :s] + gain.mT @ of_actions @ gain + crossed + crossed.mT
+            # What rounding makes unsymmetric would grow from step to step.
+            value = 0.5 * (value + value.mT) + torch.diag(state_cost[t - 1])
+    return torch.stack(steps[::-1]), torch.stack(gains[::-1])

@@ -1,9 +1,9 @@
-"""What all controllers share: which environments they fly, what they read, and where the drone will be."""
+"""What all controllers share: which environments they fly, what they read, and how they allow for delayed actions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_quad.controllers.references import Reference, check_reference, task_reference
-from torchrl_quad.data.unwrap import base_env
+from torchrl_quad.data.unwrap import base_env, leaf
 from torchrl_quad.dynamics import FlightController, Quadrotor
 from torchrl_quad.envs import QuadrotorEnv
 from torchrl_quad.errors import UserTypeError, UserValueError
@@ -23,15 +23,14 @@ State = dict[Any, Tensor]
 class Controller(TensorDictModuleBase):
     """A controller as a deterministic policy: it reads ``("state", ...)`` and writes ``action``, without gradients.
 
-    It believes to fly the nominal drone, as the flight controller below it does: randomised parameters and wind stand
-    in the state, and it leaves them alone. Position, attitude, velocity and body rates are those that the sensors of
-    the environment give; the rotor speeds are the true ones. It flies the nominal drone through the commands that are
-    still on their way, and acts on where they lead: an action delay costs it no phase. ``observation_delay`` does.
+    Its model is the nominal drone, as for the flight controller below it: it does not read randomised parameters and
+    wind, which stand in the state. Position, attitude, velocity and body rates are those of the environment's sensors;
+    the rotor speeds are the true ones. It simulates the commands that are still on their way, and acts on where they
+    lead: an action delay costs it no phase. ``observation_delay`` does.
 
     Args:
-        env: what it will fly, with or without transforms; what it reads of it once are its drone, its task and its
-            control step. After ``env.to(device)``, build another one.
-        reference: where the drone shall be, a function from the state, a mapping of names to tensors (num_envs, ...),
+        env: what it will fly, with or without transforms. After ``env.to(device)``, build another one.
+        reference: where the drone is wanted, a function from the state, a mapping of names to tensors (num_envs, ...),
             and times (T) [s] from now to positions (num_envs, T, 3) [m], made of torch operations. By default that of
             the task, if it is one that ships.
 
@@ -46,7 +45,8 @@ class Controller(TensorDictModuleBase):
             checked(cls)
 
     def __init__(self, env: Any, reference: Reference | None = None) -> None:
-        env, name = base_env(env), type(self).__name__
+        env = base_env(env)
+        name: Any = type(self).__name__
         if not isinstance(env, QuadrotorEnv):
             raise UserTypeError(
                 f"{name} flies a QuadrotorEnv, such as HoveringEnv(num_envs=64); got {type(env).__name__}."
@@ -61,22 +61,22 @@ class Controller(TensorDictModuleBase):
                 f"{name} commands thrust and body rates, and actions here are {', '.join(env.action_units)}. Build the "
                 "environment with control='rates'."
             )
-        self.in_keys = [("state", *(key if isinstance(key, tuple) else (key,))) for key in env.control_step.safe_state]
-        self.out_keys = ["action"]
+        names = [key if isinstance(key, tuple) else (key,) for key in env.control_step.safe_state]
+        self.in_keys, self.out_keys = cast(list[Any], [("state", *key) for key in names]), cast(list[Any], ["action"])
         super().__init__()
         self.dynamics, self.nominal, self.control_dt = env.dynamics, env.nominal, env.control_dt
         self.lead = env.action_delay * env.control_dt  # [s], from a command to its effect
         self.reference = task_reference(env, self.lead, name) if reference is None else reference
         if reference is not None:
             check_reference(reference, env)
-        self._see: list[Callable[[State], State]] = [x.observe for x in env.disturbances.values()]
+        self._measure: list[Callable[[State], State]] = [x.observe for x in env.disturbances.values()]
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action (num_envs, 4) in [-1, 1]."""
-        state = {key[1] if len(key) == 2 else key[1:]: tensordict[key].detach() for key in self.in_keys}
-        for see in self._see:
-            state = see(state)
+        state = {key[1] if len(key) == 2 else key[1:]: leaf(tensordict, key).detach() for key in self.in_keys}
+        for measure in self._measure:
+            state = measure(state)
         drone = {name: state[name] for name in self.dynamics.sizes}
         for action in state["action_queue"].unbind(1) if "action_queue" in state else ():
             drone = self.dynamics.control_step(drone, action, self.nominal, None)

@@ -57,10 +57,6 @@ class FlightController:
 
     setpoint_type: type[Any] = Setpoint
     setpoint_sizes: tuple[int, ...] = (1, 3)
-    constants: tuple[str, ...] = (  # of its tensors, those that each physics step reads
-        "thrust_min", "thrust_max", "gain", "tiny", "share", "per_share", "middle", "half_span",
-        "yaw_share", "yaw_sign", "yaw_reach",
-    )  # fmt: skip
 
     def __init__(self, nominal: Nominal) -> None:
         nominal = nominal.detach()
@@ -90,11 +86,12 @@ class FlightController:
     def unbind(self) -> FlightController:
         """The same on components: its numbers become constants of the code that is compiled with it."""
         apart = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                setattr(apart, name, unbind(value, constant=True))
         fields = {k: unbind(x, constant=True) for k, x in self.nominal.fields().items() if k != "rotor_positions"}
         apart.nominal = RawParams(**fields)
         apart.rotors, apart.mixer = self.rotors.unbind(), unbind_rows(self.mixer)
-        for name in self.constants:
-            setattr(apart, name, unbind(getattr(self, name), constant=True))
         return apart
 
     def decode(self, action: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Protocol
 import torch
 from torch import Tensor
 
+from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController
 from torchrl_quad.dynamics.modes import make_controller
 from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
@@ -88,6 +89,11 @@ class ControlledModel:
         self.action_units = self.controller.action_units
         self.dt, self.substeps, self.integrator = dt, substeps, integrator
         self.limits: dict[str, Tensor] = {}
+
+    def rest(self, position: Tensor) -> dict[str, Tensor]:
+        """Level and still, at the positions (n, 3) [m]."""
+        still = {name: position.new_zeros(len(position), width) for name, width in self.sizes.items()}
+        return {**still, "position": position, "quaternion": quaternion.identity(position)}
 
     def plant(self, params: QuadrotorParams, controller: FlightController) -> Any:
         """What physics steps read of the drone that flies, worked out once in a control step."""

@@ -47,8 +47,6 @@ class VelocitySetpoint(NamedTuple):
 class TiltController(FlightController):
     """What the controllers of attitude and velocity share: a loop that tilts the drone."""
 
-    constants = (*FlightController.constants, "tilt_gain", "tilt_rate")
-
     def __init__(self, nominal: QuadrotorParams, max_tilt: float) -> None:
         super().__init__(nominal)
         self.max_tilt = float(max_tilt)
@@ -131,7 +129,6 @@ class VelocityController(TiltController):
 
     action_units = {"velocity x": "m/s", "velocity y": "m/s", "velocity z": "m/s", "yaw rate": "rad/s"}
     setpoint_type, setpoint_sizes = VelocitySetpoint, (3, 1)
-    constants = (*TiltController.constants, "velocity_gain", "max_climb", "full_thrust")
 
     def __init__(
         self, nominal: Nominal, *, max_tilt: Tilt = math.pi / 6, max_speed: Annotated[float, between(0.01, 100.0)] = 3.0

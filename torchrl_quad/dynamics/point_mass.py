@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Nominal
 from torchrl_quad.dynamics.model import ControlledModel, PhysicsStep, Substeps
@@ -58,12 +55,6 @@ class PointMass(ControlledModel):
                 'dynamics="point_mass" has no rotors, so control="rotor_thrusts" commands nothing. Use '
                 'dynamics="quadrotor", or another control.'
             )
-
-    def rest(self, position: Tensor) -> dict[str, Tensor]:
-        """Level and still, at the positions (n, 3) [m]."""
-        still = torch.zeros_like(position)
-        level = quaternion.identity(position)
-        return {"position": position, "quaternion": level, "velocity": still, "angular_velocity": still.clone()}
 
     def physics_step(
         self, state: Sequence[Vector], setpoint: Any, plant: Any, controller: FlightController, wind: Vector | None

@@ -25,7 +25,7 @@ def names(folder: Traversable) -> list[str]:
 
 
 def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = None) -> tuple[str, Mapping[str, Any]]:
-    """What a preset says, and its name in errors: a file by its name in a folder of the package, its path, or a mapping.
+    """What a preset says, and its name in errors: a file by its name in a folder or its path, or a mapping.
 
     Raises:
         ValueError: the name is unknown, or :func:`parse` refuses the file, or it is no mapping.

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
 
-from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Nominal
 from torchrl_quad.dynamics.model import ControlledModel, PhysicsStep, Substeps
 from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams
@@ -56,13 +54,7 @@ class Quadrotor(ControlledModel):
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
         """Level, still, rotors at hover speed, at the positions (n, 3) [m]."""
-        return {
-            "position": position,
-            "quaternion": quaternion.identity(position),
-            "velocity": torch.zeros_like(position),
-            "angular_velocity": torch.zeros_like(position),
-            "rotor_speed": self.controller.hover_speed.expand(len(position), 4).clone(),
-        }
+        return {**super().rest(position), "rotor_speed": self.controller.hover_speed.expand(len(position), 4).clone()}
 
     def plant(self, params: QuadrotorParams, controller: FlightController) -> tuple[QuadrotorParams, Rotors]:
         """The parameters and the rotors."""

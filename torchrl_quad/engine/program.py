@@ -29,11 +29,7 @@ class StepProgram:
     ``adjoint(*start, *others, *states, *grads)`` takes the gradients in the floats of the end (state, outputs,
     observation), and returns those in the floats of the start (state, action), and in the parameters.
 
-    Args:
-        simulation: what happens in a step.
-        layout: the rows of a state.
-        output_layout: the rows of the outputs of a step.
-        options: keywords of ``torch.compile``.
+    ``options`` are keywords of ``torch.compile``.
     """
 
     def __init__(self, simulation: Simulation, layout: Layout, output_layout: Layout, options: dict[str, Any]) -> None:
@@ -46,7 +42,8 @@ class StepProgram:
             grad_x, grad_inputs = vjp(lambda x, inputs: substep(x, *inputs), x, inputs)[1](grad)
             return (grad_x, *_flat(grad_inputs))  # a flat tuple: only such a region is traced once for all
 
-        self.substep, self.pull = _region(substep), _region(pull)
+        region: Any = torch.compiler.nested_compile_region  # compiled once for all its calls in a step
+        self.substep, self.pull = region(substep), region(pull)
         self.forward = Compiled(self._forward, options)
         self.adjoint = Compiled(self._adjoint, options)
 
@@ -101,11 +98,7 @@ class PolicyProgram:
 
     ``forward(*weights, *inputs, drawn)`` returns what the policy keeps, and what it writes, in the order of its
     ``out_keys``. ``adjoint(*weights, *inputs, drawn, *kept, *grads)`` takes the gradients of what it wrote, and returns
-    the traces, and the gradients of its inputs and of what was drawn.
-
-    Args:
-        policy: all policies of its signature can use the program.
-        options: keywords of ``torch.compile``.
+    the traces, and the gradients of its inputs and of what was drawn. All policies of one signature share a program.
     """
 
     def __init__(self, policy: PlainPolicy, options: dict[str, Any]) -> None:
@@ -141,11 +134,6 @@ def policy_inputs(policy: PlainPolicy | GivenActions, state: State, observation:
 def name_in_state(key: tuple[str, ...]) -> Any:
     """The name within the state of a key ("state", ...)."""
     return key[1] if len(key) == 2 else key[1:]
-
-
-def _region(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, compiled once for all of its calls in a step."""
-    return torch.compiler.nested_compile_region(function)
 
 
 def _vjp(function: Callable[..., Any], *primals: Any) -> tuple[Any, Callable[..., Any], Any]:

@@ -9,11 +9,14 @@ import sys
 from pathlib import Path
 
 import ziamath
+from matplotlib.figure import Figure
 
 import torchrl_quad
+from torchrl_quad.render import figures
 
 sys.path.insert(0, str(Path(__file__).parent))  # extension.py
 
+vars(figures)["Figure"] = Figure  # which annotations name, and only type checkers import
 shutil.rmtree(Path(__file__).parent / "_api", ignore_errors=True)  # pages of classes, which may be there no more
 
 project = "torchrl_quad"
@@ -45,7 +48,7 @@ napoleon_use_rtype = False  # "Returns:" is a sentence here; its types are in th
 
 # Foreign names are not looked up, since a build needs no network.
 nitpick_ignore_regex = [
-    (r"py:.*", r"(torch|torchrl|tensordict|gymnasium|numpy|np)\..*"),
+    (r"py:.*", r"(torch|torchrl|tensordict|gymnasium|numpy|np|matplotlib)\..*"),
     (r"py:.*", r"(collections\.abc|pathlib|dataclasses|enum)\..*"),
     (r"py:class", r"Path|State|Tensor|TensorDictBase|Vector"),  # in annotations that keep the name alone
     (r"py:class", r"torchrl_quad\.(engine\.\w+|deploy\.reading|options)\.\w+"),  # their own

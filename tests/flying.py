@@ -19,6 +19,14 @@ def hold(env, steps):
     return [env.hover_action.expand(env.num_envs, 4)] * steps
 
 
+def start(env, **entries):
+    """A reset with some entries of the state set."""
+    td = env.reset()
+    for key, value in entries.items():
+        td["state", key] = torch.as_tensor(value, dtype=td["state", key].dtype).expand_as(td["state", key]).clone()
+    return env.reset(td, set_state=True)
+
+
 def look_at_nothing(patch):
     """Let the code believe that its tensors are on an accelerator, which it must not wait for."""
     for name in ("engine.horizon", "envs.randomness", "envs.guard"):

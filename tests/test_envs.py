@@ -5,7 +5,7 @@ import pickle
 
 import pytest
 import torch
-from flying import fly, hold
+from flying import fly, hold, start
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
@@ -31,9 +31,8 @@ def test_specs_hold_with_the_other_options():
 
 
 def test_a_drone_that_hovers_stays_and_succeeds(env64):
-    td = env64.reset()
-    td["state", "position"] = td["state", "target"]
-    flight = fly(env64, env64.reset(td, set_state=True), hold(env64, 100))
+    td = start(env64, position=env64.tensor(env64.target))
+    flight = fly(env64, td, hold(env64, 100))
     torch.testing.assert_close(flight["next", "state", "position"][:, -1], td["state", "target"])
     assert flight["next", "success"].all()
     assert not flight["next", "done"].any()
@@ -73,16 +72,8 @@ def test_starts_lie_in_their_box_level_and_at_rest():
 def test_the_observation_is_ten_times_the_papers(env64):
     td = env64.rollout(3)[:, -1]
     state = td["state"]
-    expected = torch.cat(
-        (
-            state["target"] - state["position"],
-            10 * state["quaternion"],
-            state["velocity"],
-            state["angular_velocity"],
-        ),
-        -1,
-    )
-    torch.testing.assert_close(td["observation"], expected)
+    seen = state["target"] - state["position"], 10 * state["quaternion"], state["velocity"], state["angular_velocity"]
+    torch.testing.assert_close(td["observation"], torch.cat(seen, -1))
 
 
 def test_running_out_of_time_truncates_and_does_not_terminate():
@@ -139,8 +130,7 @@ def test_a_rollout_resets_only_those_that_are_done():
 
 def test_a_state_that_is_set_goes_on_as_if_it_had_never_stopped(env64):
     actions = [torch.rand(4, 4, dtype=torch.float64) * 0.4 - 0.5 for _ in range(8)]
-    start = env64.reset()
-    whole = fly(env64, start, actions)
+    whole = fly(env64, env64.reset(), actions)
     middle = TensorDict({"state": whole["next", "state"][:, 3].clone()}, [4])
     rest = fly(env64, env64.reset(middle, set_state=True), actions[4:])
     for key, value in rest["next"].items(include_nested=True, leaves_only=True):
@@ -219,10 +209,8 @@ def test_the_drone_that_flies_can_be_set_through_transforms_and_takes_precision_
 def test_an_environment_can_be_pickled_and_flies_the_same(task):
     env = make_env(task, num_envs=2)
     assert type(env) is TASKS[task]
-    again = pickle.loads(pickle.dumps(env))
-    start = env.reset()
-    action = env.hover_action.expand(2, 4)
-    ends = [e.step(start.copy().set("action", action))["next"] for e in (env, again)]
+    again, td = pickle.loads(pickle.dumps(env)), env.reset()
+    ends = [fly(e, td, hold(env, 1))["next"] for e in (env, again)]
     assert (ends[0] == ends[1]).all()
 
 
@@ -265,3 +253,48 @@ def test_episode_metrics_judge_the_first_episode_by_its_last_second():
     assert metrics["crash"].tolist() == [0.0, 0.0, 1.0]
     assert metrics["position_error"].tolist() == pytest.approx([0.0, 0.2, 4.6], abs=0.1)
     assert metrics["return"].tolist() == pytest.approx([6.0, 60 * (0.1 - 0.2 * 0.1 / 9), 0.04], abs=0.01)
+
+
+# -- moving: the device cpu:0 stands for any other one, whose generator restarts ---------------------------------------
+
+OPTIONS = {"num_envs": 4, "seed": 5, "dtype": torch.float64, "randomize": {"mass": {"scale": [0.8, 1.2]}}}
+OPTIONS |= {"wind": {"mean": [1.0, 0.0, 0.0], "gust": 0.5}, "observation_noise": {"position": 0.01}}
+OPTIONS |= {"scene": {"spheres": [{"count": 2, "low": [-1, -1, 0], "high": [1, 1, 3], "radius": 0.1}]}}
+OPTIONS |= {"camera": {"width": 3, "height": 2, "noise": 0.01}}
+
+
+def assert_equal(one, other):
+    one, other = (dict(td.items(include_nested=True, leaves_only=True)) for td in (one, other))
+    assert one.keys() == other.keys()
+    assert [key for key, x in one.items() if not torch.equal(x.cpu(), other[key].cpu())] == []
+
+
+def fly_on(env, steps):
+    return env.rollout(steps, lambda td: td.set("action", env.hover_action.expand(env.num_envs, 4)))
+
+
+def test_an_environment_that_moves_keeps_its_drone_and_restarts_from_its_seed():
+    moved, fresh = HoveringEnv(**OPTIONS), HoveringEnv(**OPTIONS)
+    for env in (moved, fresh):
+        env.params = env.params.replace(mass=0.5)
+    fly_on(moved, 3)
+    assert moved.to("cpu:0") is moved
+    assert moved.device == moved.randomness.device == torch.device("cpu:0")
+    assert moved.params.mass.item() == 0.5 != moved.nominal.mass.item() == fresh.nominal.mass.item()
+    for _ in range(2):  # the second episode draws on
+        assert_equal(fly_on(moved, 5), fly_on(fresh, 5))
+    check_env_specs(moved)
+
+
+def test_an_environment_that_flies_its_nominal_drone_does_so_where_it_moves():
+    env = HoveringEnv(num_envs=2, max_episode_steps=7).to("cpu:0")
+    assert env.params is env.nominal
+    assert env.rollout(9)["next", "state", "step"].flatten().max() == 7
+
+
+def test_an_environment_stays_compiled_where_it_moves_until_it_is_made_eager():
+    env, fresh = (HoveringEnv(num_envs=2, camera={"width": 3, "height": 2}, scene={"ground": True}) for _ in range(2))
+    assert env.compile(backend="eager") is env and env.is_compiled
+    assert env.to("cpu:0").is_compiled and env.disturbances["camera"].is_compiled
+    assert env.eager() is env and not (env.is_compiled or env.disturbances["camera"].is_compiled)
+    assert_equal(fly_on(env, 3), fly_on(fresh, 3))

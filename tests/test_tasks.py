@@ -4,27 +4,10 @@ import math
 
 import pytest
 import torch
+from flying import fly, hold, start
 from torchrl.envs import check_env_specs
 
 from torchrl_quad import LandingEnv, RacingEnv, TrackingEnv, load_track
-
-
-def fly(env, td, steps):
-    """Fly on with the hover action."""
-    flight = []
-    for _ in range(steps):
-        flight.append(env.step(td.copy().set("action", env.hover_action.expand(env.num_envs, 4))))
-        td = env.step_mdp(flight[-1])
-    return torch.stack(flight, 1)
-
-
-def start(env, **entries):
-    """A reset with some entries of the state set."""
-    td = env.reset()
-    for key, value in entries.items():
-        td["state", key] = torch.as_tensor(value, dtype=td["state", key].dtype).expand_as(td["state", key]).clone()
-    return env.reset(td, set_state=True)
-
 
 # -- tracking ----------------------------------------------------------------------------------------------------------
 
@@ -33,7 +16,7 @@ def test_the_point_moves_along_the_circle_and_the_next_ten_are_observed():
     env = TrackingEnv(num_envs=4, dtype=torch.float64)
     td = env.reset()
     phase = td["state", "phase"]
-    flight = fly(env, td, 50)["next", "state"]
+    flight = fly(env, td, hold(env, 50))["next", "state"]
     angle = phase.unsqueeze(1) + 0.2 * math.pi * 0.02 * torch.arange(1, 51, dtype=torch.float64).view(1, 50, 1)
     expected = torch.cat((2 + 2 * angle.cos(), 2 * angle.sin(), torch.ones_like(angle)), -1)
     torch.testing.assert_close(flight["target"], expected)
@@ -47,7 +30,7 @@ def test_the_point_moves_along_the_circle_and_the_next_ten_are_observed():
 
 def test_the_tracking_error_is_the_root_mean_square_since_two_seconds():
     env = TrackingEnv(num_envs=2, dtype=torch.float64)
-    flight = fly(env, env.reset(), 130)["next"]
+    flight = fly(env, env.reset(), hold(env, 130))["next"]
     error = flight["metrics", "position_error"]
     rmse = flight["metrics", "tracking_rmse"]
     torch.testing.assert_close(rmse[:, 129], error[:, 100:].square().mean(1).sqrt())
@@ -61,9 +44,9 @@ def test_an_episode_of_tracking_succeeds_below_ten_centimetres_without_a_crash()
         return torch.stack((torch.zeros_like(phase), torch.zeros_like(phase), 1 + 0.001 * phase.cos()), -1)
 
     env = TrackingEnv(num_envs=3, curve=still, period=10.0, max_episode_steps=120)
-    td = start(env, position=torch.tensor([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.0, 0.0, 5.99]]))
-    td["state", "velocity"][2, 2] = 5.0
-    metrics = env.episode_metrics(fly(env, env.reset(td, set_state=True), 120))
+    velocity = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 5.0]]
+    td = start(env, position=[[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.0, 0.0, 5.99]], velocity=velocity)
+    metrics = env.episode_metrics(fly(env, td, hold(env, 120)))
     assert metrics["solved"].tolist() == [1.0, 0.0, 0.0]
     assert metrics["crash"].tolist() == [0.0, 0.0, 1.0]
     assert metrics["tracking_rmse"][:2].tolist() == pytest.approx([0.0, 0.2], abs=2e-3)
@@ -162,13 +145,13 @@ def test_a_landing_succeeds_crashes_or_does_neither():
     positions = [(2.0, 0.0, 0.15), (2.29, -0.29, 0.19), (2.4, 0.0, 0.1), (2.0, 0.0, 0.1), (2.4, 0.0, -0.01), (2, 0, 3)]
     velocities = [(0.0, 0.0, -0.2), (0.1, 0.0, 0.0), (0, 0, 0), (0.0, 0.0, -0.5), (0, 0, 0), (0, 0, 0)]
     td = start(env, position=torch.tensor(positions), velocity=torch.tensor(velocities))
-    ends = fly(env, td, 1)["next"]
+    ends = fly(env, td, hold(env, 1))["next"]
     assert ends["success"].flatten().tolist() == [True, True, False, False, False, False]
     assert ends["crash"].flatten().tolist() == [False, False, False, False, True, False]
     assert ends["terminated"].flatten().tolist() == [True, True, False, False, True, False]
     assert ends["reward_terms", "success"].flatten().tolist() == [20.0, 20.0, 0.0, 0.0, 0.0, 0.0]
     assert ends["reward_terms", "crash"].flatten().tolist() == pytest.approx([0.0, 0.0, 0.0, 0.0, -0.1, 0.0])
-    metrics = env.episode_metrics(fly(env, td, 1))
+    metrics = env.episode_metrics(fly(env, td, hold(env, 1)))
     assert metrics["solved"].tolist() == [1.0, 1.0, 0.0, 0.0, 0.0, 0.0]
     assert metrics["crash"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
     assert metrics["landing_speed"].isnan().tolist() == [False] * 5 + [True]
@@ -179,7 +162,7 @@ def test_a_landing_succeeds_crashes_or_does_neither():
 def test_a_landing_beyond_its_bounds_pays_the_crash_term_like_any_crash():
     env = LandingEnv(num_envs=4)
     positions = torch.tensor([[8.0, 0.0, 2.0], [2.0, -5.1, 2.0], [2.0, 0.0, 6.1], [2.0, 0.0, 2.0]])
-    ends = fly(env, start(env, position=positions), 1)["next"]
+    ends = fly(env, start(env, position=positions), hold(env, 1))["next"]
     assert ends["crash"].flatten().tolist() == [True, True, True, False]
     assert ends["reward_terms", "crash"].flatten().tolist() == pytest.approx([-0.1, -0.1, -0.1, 0.0])
 
@@ -207,7 +190,7 @@ def test_gates_are_passed_in_order_along_the_straight_line_of_a_step():
     offset = [[-1.0, 0.0, 0.0], [-1.0, 0.35, 0.0], [-2.0, 0.0, 0.0], [4.0 - 1.0, -4.0, 1.0]]
     velocity = torch.tensor([[100.0, 0.0, 0.0]] * 2 + [[1.0, 0.0, 0.0]] + [[100.0, 0.0, 0.0]], dtype=torch.float64)
     td = start(env, position=gate + torch.tensor(offset, dtype=torch.float64), velocity=velocity, gate=0, target=gate)
-    state = fly(env, td, 1)["next"]
+    state = fly(env, td, hold(env, 1))["next"]
     assert state["state", "gate_passed"].flatten().tolist() == [True, False, False, False]
     assert state["state", "gates_passed"].flatten().tolist() == [1, 0, 0, 0]
     assert state["state", "gate"].flatten().tolist() == [1, 0, 0, 0]
@@ -219,7 +202,7 @@ def test_gates_are_passed_in_order_along_the_straight_line_of_a_step():
 def test_a_lap_is_timed_from_a_gate_to_the_same_gate_and_eight_gates_succeed():
     gates = [[0.1 * i, 0.0, 1.0] for i in range(2)]
     env = RacingEnv(num_envs=1, track={"gates": gates, "gate_radius": 5.0}, max_episode_steps=9)
-    flight = fly(env, env.reset(), 9)
+    flight = fly(env, env.reset(), hold(env, 9))
     ends = flight["next"]
     assert ends["state", "gates_passed"].flatten().tolist() == list(range(1, 10))
     assert ends["metrics", "lap_time"].flatten().tolist() == pytest.approx([0.0, 0.0] + [0.04] * 7)
@@ -235,7 +218,7 @@ def test_a_lap_is_timed_from_a_gate_to_the_same_gate_and_eight_gates_succeed():
 def test_a_racer_that_crashes_after_eight_gates_has_no_success():
     env = RacingEnv(num_envs=1)
     td = start(env, gates_passed=[[9]], position=[[5.0, 0.0, 0.01]], velocity=[[0.0, 0.0, -5.0]])
-    metrics = env.episode_metrics(fly(env, td, 1))
+    metrics = env.episode_metrics(fly(env, td, hold(env, 1)))
     assert (metrics["solved"].item(), metrics["crash"].item(), metrics["gates_passed"].item()) == (0.0, 1.0, 9.0)
 
 

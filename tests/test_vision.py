@@ -62,10 +62,10 @@ def test_every_pixel_is_where_mujoco_sees_it_or_at_a_silhouette(dtype):
         scene = solids(seed)
         attitude = quaternion.from_axis_angle(torch.tensor([[0.2, -0.1, 0.3 * seed]], dtype=torch.float64))
         position = torch.tensor([[-0.5, 0.2, 1.5 + 0.3 * seed]], dtype=torch.float64)
-        eye, look = camera.pose(position, attitude)
+        place, look = camera.pose(position, attitude)
         plane = camera.plane(position)
         rays = torch.cat((torch.ones(1, camera.pixels, dtype=torch.float64), plane)).T
-        truth = mujoco_depth(scene, eye[0], quaternion.rotate(look, rays)).reshape(60, 80).clip(max=20.0)
+        truth = mujoco_depth(scene, place[0], quaternion.rotate(look, rays)).reshape(60, 80).clip(max=20.0)
         seen = camera.depth(Primitives(*(x.to(dtype) for x in scene)), position.to(dtype), attitude.to(dtype))
         wrong = np.abs(seen[0, 0].double().numpy() - truth) > 1e-3
         around = np.lib.stride_tricks.sliding_window_view(np.pad(truth, 1, mode="edge"), (3, 3))
@@ -197,7 +197,7 @@ def test_a_way_is_found_through_a_gap_and_none_through_a_wall():
         ({"width": 0}, "width must be at least 1, got 0. Pixels of a row"),
         ({"field_of_view": math.radians(171)}, "field_of_view must be at most 2.967, got 2.98"),
         ({"field_of_view": 90}, "got 90. The horizontal .*; 90 degrees are 1.571 rad"),
-        ({"width": 10, "height": 300, "field_of_view": 1.0}, "10 square pixels see 173"),
+        ({"width": 10, "height": 300, "field_of_view": 1.0}, "10 square pixels span 173"),
         ({"rate": 0}, "rate must be at least 1, got 0. Control steps from"),
         ({"dropout": 1.0}, "dropout must be less than 1, got 1.0. The probability"),
         ({"quaternion": (1.0, 1.0, 0.0, 0.0)}, "of unit norm"),

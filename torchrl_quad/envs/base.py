@@ -221,7 +221,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
 
     def flies_inside(self, policy: Any) -> bool:
         """Whether :meth:`rollout` flies a policy inside the compiled step, which is fastest, or calls it before each
-        step. It ignores transforms: under them, but for an ObservationNormalizer alone, policies are called."""
+        step. It ignores transforms: under them, except a single ObservationNormalizer, policies are called."""
         return flies_inside(self._stepper, policy)
 
     def eager(self) -> QuadrotorEnv:

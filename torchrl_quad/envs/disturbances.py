@@ -50,7 +50,7 @@ class Disturbance:
         return 0
 
     def start(self, random: Randomness, state: State) -> State:
-        """The entries that it adds to the start of an episode, or changes there; it draws from ``random`` alone."""
+        """The entries that it adds to the start of an episode, or changes there; it draws only from ``random``."""
         return {}
 
     def advance(self, state: State, noise: Tensor | None, dt: float) -> State:

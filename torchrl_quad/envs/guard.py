@@ -29,7 +29,7 @@ MAX_STEPS = 2**31  # since the start of an episode
 class Guard:
     """Replaces meaningless states: what is not finite, or beyond the bounds of the model.
 
-    The task's own entries are replaced only where they themselves are out of bounds. Selecting before the physics keeps
+    The task's own entries are replaced only where they are out of bounds. Selecting before the physics keeps
     gradients clean: a gradient of zero never meets an infinite derivative.
 
     Args:
@@ -104,7 +104,7 @@ class Containment:
     def enter(
         self, state: State, action: Tensor, params: QuadrotorParams
     ) -> tuple[State, Tensor, QuadrotorParams | RawParams]:
-        """The same values, whose gradients come back from meaningful environments alone."""
+        """The same values, whose gradients come back only from meaningful environments."""
         keys = [key for key, x in state.items() if x.requires_grad]
         if not (keys or action.requires_grad or params.requires_grad):
             return state, action, params

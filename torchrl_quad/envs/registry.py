@@ -82,7 +82,7 @@ def task_class(task: str) -> type[QuadrotorEnv]:
     if isinstance(task, str) and re.fullmatch(r"\w+(\.\w+)+", task):
         return _checked_class(imported(task), f"task {task!r}")
     raise UserValueError(
-        f"Unknown task {shown(task)}. Choose from: {', '.join(available_tasks())}. For one of your own give the path "
+        f"Unknown task {shown(task)}. Choose from: {', '.join(available_tasks())}. For your own task give the path "
         "of its class, such as 'mypackage.WindowEnv', or call register_task(name, WindowEnv) before."
     )
 
@@ -90,7 +90,7 @@ def task_class(task: str) -> type[QuadrotorEnv]:
 def make_env(task: str, **kwargs: Any) -> QuadrotorEnv:
     """Build a task by its name: ``make_env("hovering", num_envs=64)``; the keywords go to the environment.
 
-    :func:`register_task` says how a task of your own gets a name.
+    :func:`register_task` names your own task.
 
     Raises:
         ValueError: the task is unknown, or an argument is out of its range.

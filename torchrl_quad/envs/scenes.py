@@ -246,15 +246,15 @@ class Scene(Disturbance):
         for tries in range(TRIES):
             if tries:
                 drawn = torch.where(blocked.unsqueeze(-1), _draw(random, kind, group, n), drawn)
-            alone = Primitives(**{**none, kind: drawn})
-            blocked = (distances(alone, points) < self.radius + self.clearance).any(1)
+            group_only = Primitives(**{**none, kind: drawn})
+            blocked = (distances(group_only, points) < self.radius + self.clearance).any(1)
             if looks_are_free(points.device) and not blocked.any():
                 return drawn
         return left_out(drawn, blocked)
 
 
 def left_out(solids: Tensor, who: Tensor) -> Tensor:
-    """Solids (n, m, k) that are not planes, those of a mask (n, m) out of everybody's way."""
+    """Solids (n, m, k) that are not planes, those of a mask (n, m) moved out of the way."""
     elsewhere = torch.cat((solids[..., :2], torch.full_like(solids[..., :1], ELSEWHERE), solids[..., 3:]), -1)
     return torch.where(who.unsqueeze(-1), elsewhere, solids)
 

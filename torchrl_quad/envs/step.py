@@ -265,7 +265,7 @@ class ControlStep:
         outputs = {name: x for name, x in outputs.items() if not isinstance(x, Mapping) or x}
         state = nested(self.safe_state)
         return {
-            # A key that is in the state spec alone would never be carried on: it has to be in both.
+            # TorchRL carries no key to the next step that is only in the state spec: it has to be in both.
             "observation_spec": spec({**outputs, "state": state}),
             "state_spec": spec({"state": state}),
             "action_spec": Bounded(-1.0, 1.0, torch.Size((*n, 4)), device=device, dtype=example.dtype),

@@ -1,4 +1,4 @@
-"""Obstacles: solids, the distance to them, and what a camera sees of them. Pure functions on plain tensors."""
+"""Obstacles: solids, the distance to them, and images of them. Pure functions on plain tensors."""
 
 from torchrl_quad.vision.camera import DepthCamera
 from torchrl_quad.vision.primitives import Primitives, closest_approach, has_way, nearest

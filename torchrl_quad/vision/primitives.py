@@ -75,7 +75,7 @@ def nearest(solids: Primitives, position: Tensor) -> tuple[Tensor, Tensor]:
 def closest_approach(solids: Primitives, start: Tensor, end: Tensor) -> Tensor:
     """The least signed distance (n, 1) [m] on the straight way between two positions (n, 3), without gradient.
 
-    The distance to a convex solid is a convex function of the way, so its least value lies beside the least of some
+    The distance to a convex solid is a convex function of the way, so its least value lies next to the least of some
     samples. It is sampled twice, the second time between the neighbours of the least. For a way of length L that passes
     a surface at a distance d, what is found is at most (L / 64)^2 / d too large, and never more than L / 64: at 10 m/s,
     with control steps of 0.02 s and d = 0.1 m, 0.1 mm.

@@ -40,7 +40,7 @@ class DepthCamera:
     Args:
         width: pixels of a row, at most 10,000; an image has at most a million.
         height: rows of pixels, at most 10,000.
-        field_of_view: the horizontal angle from edge to edge, 0.01 to 2.967 rad, which is 170 degrees; 90 degrees are 1.571 rad.
+        field_of_view: the horizontal angle from edge to edge, 0.01 to 2.967 rad; 90 degrees are 1.571 rad.
         position: of the camera [m], x, y and z in the body frame, each within 10 m.
         pitch: by which the camera looks upwards [rad], -pi to pi.
         quaternion: (w, x, y, z) of unit norm, from camera to body; replaces the pitch.

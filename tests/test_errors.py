@@ -37,23 +37,19 @@ def near(state, **other):
         (
             "hovering",
             {"num_env": 3},
-            r"HoveringEnv got an unexpected keyword argument 'num_env'. Did you mean 'num_envs'\? Choose from: ",
+            r"HoveringEnv got .* 'num_env'. Did you mean 'num_envs'\? Choose from: ",
         ),
         ("landing", {"max_episode_step": 3}, r"LandingEnv .* Did you mean 'max_episode_steps'\?"),
-        (
-            "racing",
-            {"gate_bonsu": "log"},
-            r"RacingEnv got an unexpected keyword argument 'gate_bonsu'. Did you mean 'gate_bonus'\?",
-        ),
+        ("racing", {"gate_bonsu": "log"}, r"RacingEnv got an unexpected .* 'gate_bonsu'. Did you mean 'gate_bonus'\?"),
         (
             "tracking",
-            {"curves": "circle"},
-            r"Did you mean 'curve'\? Choose from: action_delay, camera, compile, control, control_dt, cur",
+            {"curves": 1},
+            r"Did you mean 'curve'\? Choose from: action_delay, camera, compile, control,",
         ),
         (
             "hovering",
             {"xyz": 1},
-            r"unexpected keyword argument 'xyz'. Choose from: action_delay, camera, compile, .* seed, weights, wind.$",
+            r"argument 'xyz'. Choose from: action_delay, camera, .* seed, weights, wind.$",
         ),
     ],
 )

@@ -41,7 +41,7 @@ def test_one_drone_s_action_is_refused_in_its_own_words():
 def test_unknown_options_are_refused_with_those_that_exist():
     with pytest.raises(ValueError, match="autoreset_mode must be 'NextStep', 'SameStep' or 'Disabled', got 'same'"):
         GymVectorEnv("hovering", autoreset_mode="same")
-    with pytest.raises(ValueError, match="num_envs is for many drones, .* Write gymnasium.make_vec instead."):
+    with pytest.raises(ValueError, match="num_envs is for many drones: write gymnasium.make_vec."):
         gymnasium.make(HOVERING, num_envs=2)
     for build in (GymEnv, GymVectorEnv):
         with pytest.raises(ValueError, match="render_mode must be 'rgb_array', got 'human'"):

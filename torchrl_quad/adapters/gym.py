@@ -44,16 +44,10 @@ class Closed(WrongState, gymnasium.error.ClosedEnvironmentError):
 class GymVectorEnv(VectorEnv):
     """All drones of a task in one batched environment: ``gymnasium.make_vec("torchrl_quad/Hovering-v0", num_envs=64)``.
 
-    Observations are float32 (num_envs, k), actions floats (num_envs, 4), clipped to [-1, 1], as
-    :class:`~torchrl_quad.envs.QuadrotorEnv` has them, rewards float64 (num_envs). ``info`` holds ``success``,
-    ``crash``, ``reward_terms`` and ``metrics`` by name, each (num_envs), with a mask ``_name`` for every name as in
-    gymnasium's own vector environments.
-
-    With a ``camera``, as "torchrl_quad/Forest-v0" has one, the observation is a dictionary of ``observation``, the
-    vector, and ``depth`` (num_envs, 1, height, width) [m].
-
-    Observations are clipped to the bounds of their space: the box of the task, 10 for ten times the quaternion, 50 m/s
-    and 50 rad/s; 1e6 for a task without ``observation_bounds``.
+    Observations are float32 (num_envs, k), clipped to the bounds of their space: the task's ``observation_bounds`` or
+    1e6. With a ``camera`` they are a dictionary of ``observation`` and ``depth`` (num_envs, 1, height, width) [m].
+    Actions are floats (num_envs, 4), clipped to [-1, 1], rewards float64 (num_envs). ``info`` holds ``success``,
+    ``crash``, ``reward_terms`` and ``metrics`` by name, each (num_envs), with a mask ``_name`` for every name.
 
     The time limit is the task's ``max_episode_steps``. With "NextStep" an episode that has ended resets at the next
     step, which ignores the action and has no reward; with "SameStep" in the same step, with ``final_obs`` and
@@ -68,14 +62,14 @@ class GymVectorEnv(VectorEnv):
         num_envs: number of drones.
         autoreset_mode: "NextStep", "SameStep" or "Disabled", or the ``AutoresetMode``.
         render_mode: "rgb_array" for pictures, which need matplotlib; None for none.
-        **kwargs: for the task's environment. Without ``seed`` the first starts differ from run to run, as is usual in
+        **kwargs: of the task's environment. Without ``seed`` the first starts differ from run to run, as is usual in
             gymnasium.
 
     Raises:
         TypeError: an argument is unknown, or an action or the options have another type.
         ValueError: an argument is out of its range, or an action has another shape or is not finite. A call that is
             refused leaves the flight as it was.
-        ResetNeeded: a step before the first reset, or, with "Disabled", after an episode's end.
+        ResetNeeded: a step or a picture before the first reset; a step, with "Disabled", after an episode's end.
         ClosedEnvironmentError: a call after ``close()``, which may be called twice.
     """
 
@@ -156,11 +150,7 @@ class GymVectorEnv(VectorEnv):
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture (336, 336, 3) of each drone, uint8; None without ``render_mode="rgb_array"``.
 
-        After the end of an episode, with "SameStep", it shows the start of the next, as gymnasium's own do.
-
-        Raises:
-            ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close()``.
+        With "SameStep" it shows the start of the next episode after the end of one, as gymnasium's own do.
         """
         self._check_open()
         if self.render_mode is None:
@@ -215,18 +205,13 @@ class GymVectorEnv(VectorEnv):
 class GymEnv(gymnasium.Env):
     """One drone of a task: ``gymnasium.make("torchrl_quad/Hovering-v0")``; see :class:`GymVectorEnv`.
 
-    To train, fly a batch, ``gymnasium.make_vec``: it makes hundreds of times as many steps per second.
-
-    The time limit is gymnasium's: ``gymnasium.make`` adds that of the task, or its own ``max_episode_steps``. Built
-    without it, ``GymEnv("hovering")`` flies until ``max_episode_steps``, by default ten million.
+    To train, fly a batch, ``gymnasium.make_vec``: it makes hundreds of times as many steps per second. The time limit
+    is gymnasium's: ``gymnasium.make`` adds that of the task. ``GymEnv("hovering")`` flies until ``max_episode_steps``,
+    by default ten million. Errors are those of :class:`GymVectorEnv` with "Disabled".
 
     Args:
         task: "forest", "hovering", "landing", "racing" or "tracking".
         **kwargs: as for :class:`GymVectorEnv`, but ``num_envs`` and ``autoreset_mode``.
-
-    Raises:
-        TypeError, ValueError, ClosedEnvironmentError: as :class:`GymVectorEnv`.
-        ResetNeeded: a step before the first reset, or after the end of an episode.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
@@ -234,9 +219,7 @@ class GymEnv(gymnasium.Env):
     def __init__(self, task: str, **kwargs: Any) -> None:
         for name in ("num_envs", "autoreset_mode"):
             if name in kwargs:
-                raise UserValueError(
-                    f"{name} is for many drones, and GymEnv flies one. Write gymnasium.make_vec instead."
-                )
+                raise UserValueError(f"{name} is for many drones: write gymnasium.make_vec. GymEnv flies one.")
         kwargs.setdefault("max_episode_steps", _NO_LIMIT)
         self._drones = GymVectorEnv(task, autoreset_mode=AutoresetMode.DISABLED, **kwargs)
         self.torchrl_env, self.render_mode = self._drones.torchrl_env, self._drones.render_mode
@@ -269,12 +252,7 @@ class GymEnv(gymnasium.Env):
 
 
 def check_action(action: Any, space: Space) -> np.ndarray:
-    """An action as a float64 array of the shape of its space, a copy, clipped to the bounds.
-
-    Raises:
-        TypeError: it is no array of floats, nor can be read as one.
-        ValueError: it has another shape, or is not finite.
-    """
+    """A finite action of floats as a float64 array of the shape of its space, a copy, clipped to the bounds."""
     given, space = _as_array(action), cast("Box", space)
     if given is None or given.dtype.kind != "f":
         got = type(action).__name__ + ("" if given is None else f" of {given.dtype}")
@@ -301,12 +279,7 @@ def check_numbers(action: np.ndarray | Tensor, shape: Sequence[int]) -> None:
 
 
 def check_options(options: Any, *known: str) -> Mapping[str, Any]:
-    """The options of a reset, none for None.
-
-    Raises:
-        TypeError: they are no mapping.
-        ValueError: one is unknown.
-    """
+    """The options of a reset, a mapping of those that are known; none for None."""
     if options is None:
         return {}
     choice = f"Choose from: {', '.join(known)}." if known else "There are none: leave options out."

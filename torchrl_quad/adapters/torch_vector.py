@@ -76,12 +76,7 @@ class TorchVectorEnv:
         return self
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Tensor, dict[str, Any]]:
-        """Begin an episode with all drones: observations (num_envs, k), and an empty ``info``; there are no options.
-
-        Raises:
-            TypeError, ValueError: the seed is not a whole number from 0, or there are options.
-            ClosedEnvironmentError: after ``close()``.
-        """
+        """Begin an episode with all drones: observations (num_envs, k), and an empty ``info``; there are no options."""
         seed = check_value("seed", seed, Seed | None)
         check_options(options)
         self._check_open()
@@ -97,12 +92,7 @@ class TorchVectorEnv:
         Returns:
             observations (num_envs, k); rewards, and bool ``terminated`` and ``truncated``, each (num_envs); ``info``.
 
-        Raises:
-            ResetNeeded: before the first reset.
-            ClosedEnvironmentError: after ``close()``.
-            TypeError: the actions are no tensor of floats.
-            ValueError: the actions have another shape, are on another device, or are not finite. A call that is refused
-                leaves the flight as it was.
+        Raises as :class:`~torchrl_quad.adapters.GymVectorEnv`; actions must be on the environment's device.
         """
         self._check_open()
         if self.now is None:

@@ -34,23 +34,11 @@ def near(state, **other):
 @pytest.mark.parametrize(
     ("task", "kwargs", "message"),
     [
-        (
-            "hovering",
-            {"num_env": 3},
-            r"HoveringEnv got .* 'num_env'. Did you mean 'num_envs'\? Choose from: ",
-        ),
+        ("hovering", {"num_env": 3}, r"HoveringEnv got .* 'num_env'. Did you mean 'num_envs'\? Choose from: "),
         ("landing", {"max_episode_step": 3}, r"LandingEnv .* Did you mean 'max_episode_steps'\?"),
         ("racing", {"gate_bonsu": "log"}, r"RacingEnv got an unexpected .* 'gate_bonsu'. Did you mean 'gate_bonus'\?"),
-        (
-            "tracking",
-            {"curves": 1},
-            r"Did you mean 'curve'\? Choose from: action_delay, camera, compile, control,",
-        ),
-        (
-            "hovering",
-            {"xyz": 1},
-            r"argument 'xyz'. Choose from: action_delay, camera, .* seed, weights, wind.$",
-        ),
+        ("tracking", {"curves": 1}, r"Did you mean 'curve'\? Choose from: action_delay, camera, compile, control,"),
+        ("hovering", {"xyz": 1}, r"argument 'xyz'. Choose from: action_delay, camera, .* seed, weights, wind.$"),
     ],
 )
 def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them(task, kwargs, message):

@@ -33,18 +33,7 @@ from torchrl.objectives.value import GAE
 
 from benchmarks.paper.flights import about
 from benchmarks.paper.running import composed, kept
-from torchrl_quad import (
-    ABPTLoss,
-    AHACLoss,
-    BPTTLoss,
-    HybridLoss,
-    SAPOLoss,
-    SHACLoss,
-    differentiable_rollout,
-    make_actor,
-    make_qvalue,
-    make_value,
-)
+from torchrl_quad import differentiable_rollout, make_actor, make_qvalue, make_value, objectives
 from torchrl_quad.files import add_rows
 from torchrl_quad.training.building import AdaptiveOptimizer, Optimizer, make_policy, network, shuffled
 from torchrl_quad.training.loop import backward
@@ -53,12 +42,12 @@ ENVS, HORIZON, EPISODE, EPISODES = 256, 16, 200, 256
 STEPS = 1_024_000  # of all environments together
 LEARNING_RATE = 1e-2  # of actor and critics; it falls to a fiftieth
 LOSSES = {
-    "bptt": lambda env, actor: BPTTLoss(actor),
-    "shac": lambda env, actor: SHACLoss(actor, make_value(env)),
-    "sapo": lambda env, actor: SAPOLoss(actor, make_value(env), alpha_init=1e-2),
-    "ahac": lambda env, actor: AHACLoss(actor, make_value(env), horizon=HORIZON),
-    "abpt": lambda env, actor: ABPTLoss(actor, make_qvalue(env)),
-    "abpt-simulated": lambda env, actor: ABPTLoss(actor, make_qvalue(env), simulated_steps=1),
+    "bptt": lambda env, actor: objectives.BPTTLoss(actor),
+    "shac": lambda env, actor: objectives.SHACLoss(actor, make_value(env)),
+    "sapo": lambda env, actor: objectives.SAPOLoss(actor, make_value(env), alpha_init=1e-2),
+    "ahac": lambda env, actor: objectives.AHACLoss(actor, make_value(env), horizon=HORIZON),
+    "abpt": lambda env, actor: objectives.ABPTLoss(actor, make_qvalue(env)),
+    "abpt-simulated": lambda env, actor: objectives.ABPTLoss(actor, make_qvalue(env), simulated_steps=1),
 }
 NAMES = (*LOSSES, "hybrid", "ppo")
 
@@ -252,7 +241,7 @@ def set_up(
 def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
     """Train with the settings and the loop of recipes/hybrid.py."""
     cfg, place, actor, value = set_up("hybrid", environment, seed)
-    loss = HybridLoss(actor, value, **cfg.loss)
+    loss = objectives.HybridLoss(actor, value, **cfg.loss)
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     actor_optimizer, critic_optimizer = AdaptiveOptimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
 

@@ -7,7 +7,7 @@ Three statistics carry most claims:
 - the end of a curve: the mean of its last tenth of evaluations. A run that diverged ends where it began.
 
 Each is a ``Part`` with a bootstrap over seeds and over sets of starts. All runs are judged from the same starts, so
-seeds alone cannot tell what other starts would give. starts.py has flown policies from many sets. A draw of the
+seeds alone cannot tell what other starts would give. ``reproduce starts`` flies policies from many sets. A draw of the
 bootstrap takes one set for all methods, and shifts each by as much as its policy returned more from that set than from
 all of them. What two methods have in common of this leaves their difference alone.
 """
@@ -15,7 +15,7 @@ all of them. What two methods have in common of this leaves their difference alo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,11 +24,25 @@ import numpy as np
 from benchmarks.paper.matrix import SEEDS, TASKS
 from torchrl_quad.files import read_rows
 
+Row = Mapping[str, str]
 RESAMPLES = 4_000
 STARTS = {"hovering": 64, "tracking": 64, "landing": 64, "racing": 128}  # of an evaluation along a curve
 PPO_STARTS = 256  # of PPO's, which trains more drones
 Shift = Callable[[np.random.Generator, np.ndarray], np.ndarray]  # from drawn sets (n) to what they add to a mean (n)
 LEVEL = {"hovering": 0.98, "tracking": 0.98, "landing": 0.9, "racing": 0.9}
+
+
+def column(rows: Sequence[Row], name: str) -> list[float]:
+    """Read a column, as numbers; what was not measured is left out."""
+    return [float(row[name]) for row in rows if row.get(name)]
+
+
+def grouped(rows: Sequence[Row], *names: str) -> dict[tuple[str, ...], list[Row]]:
+    """Group the rows by columns."""
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    return groups
 
 
 class Judged(np.ndarray):
@@ -58,12 +72,10 @@ class Starts:
         """
         rows = [row for row in self.rows if row["task"] == task and row.get(name)]
         rows = [row for row in rows if row["algorithm"] == algorithm] or rows
-        runs: dict[tuple[str, str], list[float]] = {}
-        for row in rows:
-            runs.setdefault((row["algorithm"], row["seed"]), []).append(float(row[name]))
+        runs = [column(x, name) for x in grouped(rows, "algorithm", "seed").values()]
         if not runs:
             return None
-        off = np.array([np.array(x) - np.mean(x) for x in runs.values()])  # (policies, sets)
+        off = np.array([np.array(x) - np.mean(x) for x in runs])  # (policies, sets)
         policies, count = off.shape
         off *= math.sqrt(count / (count - 1) * int(rows[0]["starts"]) / starts)
         return lambda rng, sets: off[rng.integers(policies, size=len(sets)), sets % count]
@@ -128,10 +140,11 @@ class Results:
 
     def __init__(self, data: Path, alias: dict[tuple[str, str], str] | None = None) -> None:
         self.data, self.alias = data, alias or {}
-        self.curves: dict[tuple[str, str], dict[int, list[dict[str, str]]]] = {}
-        for task in TASKS:
-            for row in read_rows(data / f"curves/{task}.csv"):
-                self.curves.setdefault((task, row["variant"]), {}).setdefault(int(row["seed"]), []).append(row)
+        self.curves = {
+            (task, variant): {int(seed): points for (seed,), points in grouped(own, "seed").items()}
+            for task in TASKS
+            for (variant,), own in grouped(read_rows(data / f"curves/{task}.csv"), "variant").items()
+        }
         self.all_finals = read_rows(data / "final.csv")
         self.finals = [row for row in self.all_finals if not row["lr"]]
         self.starts = Starts(data)

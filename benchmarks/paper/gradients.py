@@ -29,46 +29,22 @@ from tqdm import tqdm
 from benchmarks.paper.flights import overrides
 from benchmarks.paper.matrix import VARIANTS
 from benchmarks.paper.running import QUICK, kept, run, side_by_side
-from torchrl_quad import (
-    ABPTLoss,
-    BPTTLoss,
-    HybridLoss,
-    SHACLoss,
-    audit_reward,
-    differentiable_rollout,
-    make_actor,
-    make_env,
-    make_qvalue,
-    make_value,
-)
+from torchrl_quad import audit_reward, differentiable_rollout, make_actor, make_env, make_qvalue, make_value, objectives
 from torchrl_quad.envs.metrics import first_episode
 from torchrl_quad.files import add_rows, replacing
-from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again
 from torchrl_quad.objectives.calls import discounts
 from torchrl_quad.training.building import build_env, make_policy, network
 from torchrl_quad.training.checkpoints import read_checkpoint
 
-CRITICS = {"abpt": (ABPTLoss, make_qvalue), "shac": (SHACLoss, make_value), "hybrid": (HybridLoss, make_value)}
+LOSSES = {"bptt": objectives.BPTTLoss, "shac": objectives.SHACLoss, "abpt": objectives.ABPTLoss}
+LOSSES |= {"hybrid": objectives.HybridLoss}
 SEED = 3_000_000
-
-
-def load_loss(saved: dict, cfg: DictConfig, env: EnvBase) -> PathwiseLoss:
-    """Build the loss of a checkpoint, with its last policy and critics."""
-    actor = make_policy(cfg, env)
-    if cfg.algorithm == "bptt":
-        loss = BPTTLoss(actor, **cfg.loss).make_value_estimator(gamma=cfg.gamma)
-    else:
-        kind, make_critic = CRITICS[cfg.algorithm]
-        loss = kind(actor, make_critic(env, **network(cfg, "critic", env)), **cfg.loss)
-        loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
-    loss.load_state_dict(saved["stateful"][0])
-    return loss
 
 
 def flown_on(
     saved: dict, cfg: DictConfig, states: int, repeats: int
-) -> tuple[EnvBase, PathwiseLoss, TensorDictBase, TensorDictBase]:
+) -> tuple[EnvBase, objectives.PathwiseLoss, TensorDictBase, TensorDictBase]:
     """Let the policy of a checkpoint fly a horizon from states that it visits, each ``repeats`` times.
 
     Returns:
@@ -76,7 +52,12 @@ def flown_on(
     """
     torch.manual_seed(SEED)
     env = build_env(cfg, states * repeats, SEED)
-    loss = load_loss(saved, cfg, env)
+    actor = make_policy(cfg, env)
+    make_critic = make_qvalue if cfg.algorithm == "abpt" else make_value
+    critics = [] if cfg.algorithm == "bptt" else [make_critic(env, **network(cfg, "critic", env))]
+    loss = LOSSES[cfg.algorithm](actor, *critics, **cfg.loss)
+    loss.make_value_estimator(gamma=cfg.gamma, **({"lmbda": cfg.critic.lmbda} if critics else {}))
+    loss.load_state_dict(saved["stateful"][0])
     scout = build_env(cfg, states, SEED)
     with torch.no_grad():
         flight, _ = differentiable_rollout(scout, loss.actor_network, None, env.max_episode_steps // 2)
@@ -85,7 +66,7 @@ def flown_on(
     return env, loss, start, differentiable_rollout(env, loss.actor_network, start, cfg.horizon)[0]
 
 
-def return_of(env: EnvBase, loss: PathwiseLoss, start: TensorDictBase, steps: int) -> Tensor:
+def return_of(env: EnvBase, loss: objectives.PathwiseLoss, start: TensorDictBase, steps: int) -> Tensor:
     """Fly the action in ``start`` (envs), and then the policy, with the same noise in each call: the discounted return.
 
     Noise that is correlated in time goes on from ``start["noise"]``, if it is there.
@@ -104,7 +85,7 @@ def return_of(env: EnvBase, loss: PathwiseLoss, start: TensorDictBase, steps: in
 @torch.no_grad()
 def slopes(
     env: EnvBase,
-    loss: PathwiseLoss,
+    loss: objectives.PathwiseLoss,
     start: TensorDictBase,
     changed: Callable[[Tensor], dict[str, Tensor]],
     steps: int,
@@ -174,7 +155,7 @@ def examine(saved: dict, cfg: DictConfig, states: int, repeats: int, steps: int,
     return {name: f"{x:.4g}" for name, x in row.items()}
 
 
-def estimates(loss: PathwiseLoss, rollout: TensorDictBase) -> dict[str, Tensor]:
+def estimates(loss: objectives.PathwiseLoss, rollout: TensorDictBase) -> dict[str, Tensor]:
     """Compute the gradients of the objective and of its parts in the first action: each (envs, 4)."""
     parts = loss.objective_parts(rollout)
     parts |= {"objective": sum(parts.values())}
@@ -272,7 +253,7 @@ def in_the_mean(first: TensorDictBase, rho: float) -> Callable[[Tensor], dict[st
     return lambda change: {"action": (first["latent"] + change).tanh(), "noise": first["noise"] + change / deviation}
 
 
-def weight_gradient(loss: HybridLoss, data: TensorDictBase, direction: Tensor) -> Tensor:
+def weight_gradient(loss: objectives.HybridLoss, data: TensorDictBase, direction: Tensor) -> Tensor:
     """The gradient in the policy's weights (parameters) from that in the means of its actions, (envs, 4)."""
     loc, _ = distribution_again(loss.actor_network, loss.actor_network_params, data)
     weights = list(loss.actor_network_params.parameters())

@@ -21,20 +21,9 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from benchmarks.paper import elsewhere, flights, gradients
+from benchmarks.paper import elsewhere, flights, gradients, matrix
 from benchmarks.paper.evidence import best_learning_rate
-from benchmarks.paper.matrix import (
-    DYNAMICS,
-    EVALUATIONS,
-    EXPERIMENTS,
-    LEARNING_RATES,
-    SEEDS,
-    TASKS,
-    VARIANTS,
-    Job,
-    jobs,
-    search_jobs,
-)
+from benchmarks.paper.matrix import EXPERIMENTS, LEARNING_RATES, SEEDS, TASKS, VARIANTS, Job
 from benchmarks.paper.running import DATA, QUICK, composed, kept, run, ships, side_by_side
 from torchrl_quad.envs import task_class
 from torchrl_quad.files import add_rows, machine, read_rows, write_rows
@@ -48,8 +37,8 @@ KEY = ("variant", "lr", "seed")  # what tells one run on a task from another
 def trial(args: Namespace) -> None:
     """The paper's methods and their variants, after a search for their learning rates; and an audit of the rewards."""
     rates = LEARNING_RATES[1:2] if args.quick else LEARNING_RATES
-    reported = jobs(tuple(args.experiments), tuple(args.tasks), tuple(args.seeds))
-    search = search_jobs(tuple(args.tasks), {job.rate_of for job in reported}, rates)
+    reported = matrix.jobs(tuple(args.experiments), tuple(args.tasks), tuple(args.seeds))
+    search = matrix.search_jobs(tuple(args.tasks), {job.rate_of for job in reported}, rates)
     done = kept(args.data / "final.csv", "task", *KEY)
     search, reported = ([job for job in some if (job.task, *job.key) not in done] for some in (search, reported))
 
@@ -76,7 +65,7 @@ def overrides(job: Job, lr: float, quick: bool) -> list[str]:
     if quick:
         return [*(x for x in job.overrides(lr) if not x.startswith(("total_steps", "horizon"))), *QUICK]
     cfg = configuration(job, lr)
-    interval = math.ceil(cfg.total_steps // (cfg.num_envs * cfg.horizon) / EVALUATIONS)
+    interval = math.ceil(cfg.total_steps // (cfg.num_envs * cfg.horizon) / matrix.EVALUATIONS)
     return [*job.overrides(lr), f"eval.interval={interval}"]
 
 
@@ -98,7 +87,7 @@ def keep(job: Job, folder: Path, data: Path) -> None:
     add_rows(path, [{**own, **row} for row in curve], same=KEY)
     summary = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in summary.items()}
     flown = datetime.date.fromtimestamp(end.stat().st_mtime).isoformat()
-    about = {"task": job.task, **own, "machine": machine(), "flown": flown, "dynamics": DYNAMICS}
+    about = {"task": job.task, **own, "machine": machine(), "flown": flown, "dynamics": matrix.DYNAMICS}
     add_rows(data / "final.csv", [about | {k: v for k, v in summary.items() if k not in about}])
 
 
@@ -151,13 +140,8 @@ def command_line() -> argparse.ArgumentParser:
     own.add_argument("--tasks", nargs="+", default=list(TASKS), type=known_task, help=OWN)
     own = add(flights.shipped, range(10), methods=flights.METHODS)
     own.add_argument("--tasks", nargs="+", default=list(flights.TASKS), type=known_variant, help=OWN)
-    add(
-        flights.ablations,
-        range(5),
-        tasks=flights.CHANGED_TASKS,
-        methods=flights.CHANGED_METHODS,
-        changes=flights.CHANGES,
-    )
+    of = {"tasks": flights.CHANGED_TASKS, "methods": flights.CHANGED_METHODS, "changes": flights.CHANGES}
+    add(flights.ablations, range(5), **of)
     add(flights.rates, (101, 102, 103), tasks=flights.TASKS, methods=flights.METHODS, factors=flights.FACTORS)
     add(flights.starts, (0,), tasks=flights.TASKS, methods=flights.METHODS)
     own = add(flights.forest, range(5), policies=flights.POLICIES, difficulties=flights.DIFFICULTIES)

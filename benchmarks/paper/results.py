@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Iterable, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,10 @@ from matplotlib.figure import Figure
 
 from benchmarks.paper import flights, tables
 from benchmarks.paper.claims import METHODS
-from benchmarks.paper.evidence import NotRunError, Results
+from benchmarks.paper.evidence import Results, Row, column, grouped
 from benchmarks.paper.matrix import EXPERIMENTS, TASKS, VARIANTS
 from benchmarks.paper.running import DATA, ships
-from benchmarks.paper.tables import ENOUGH, LABELS, Row, Table, column, grouped, interquartile_mean, interval
+from benchmarks.paper.tables import ENOUGH, LABELS, Table, interquartile_mean, interval
 from torchrl_quad.files import make_folder, read_rows, replacing, write_rows
 
 ROOT = DATA.parents[2]
@@ -103,61 +104,56 @@ def draw(
         figure.savefig(temporary, format="png", dpi=110)
 
 
-def on_a_grid(curves: Iterable[Sequence[np.ndarray]], band: Callable[[np.ndarray], np.ndarray], unit: float) -> Curve:
-    """Bring the curves (x, y) of all seeds to common times: with their mean, least and greatest by ``band``."""
-    curves = list(curves)
-    grid = np.linspace(0.0, np.median([x[-1] for x, _ in curves]), 100)
-    values = np.array([np.interp(grid, x, y, left=np.nan) for x, y in curves])
-    grid, values = (x[..., np.isfinite(values).all(0)] for x in (grid, values))
-    return grid / unit, *band(values)
+def draw_training(
+    path: Path, runs: dict[str, dict[str, list[list[Row]]]], name: str, band: Callable[[np.ndarray], Any], **axes: Any
+) -> None:
+    """Draw a column over steps and over seconds, at common times of all seeds.
+
+    Args:
+        runs: by task and label, the points of each seed.
+        band: from values (seeds, times) their middle, and the least and the greatest of their band.
+    """
+
+    def curve(seeds: list[list[Row]], axis: str, unit: float) -> Curve:
+        times, values = ([np.array(column(points, x)) for points in seeds] for x in (axis, name))
+        grid = np.linspace(0.0, np.median([x[-1] for x in times]), 100)
+        each = np.array([np.interp(grid, x, y, left=np.nan) for x, y in zip(times, values, strict=True)])
+        grid, each = (x[..., np.isfinite(each).all(0)] for x in (grid, each))
+        return grid / unit, *band(each)
+
+    rows = [
+        [{label: curve(seeds, axis, unit) for label, seeds in of.items()} for of in runs.values()]
+        for axis, (_, unit) in AXES.items()
+    ]
+    titles = [LABELS.get(task, task) for task in runs]
+    draw(path, rows, titles, [x for x, _ in AXES.values()], name.replace("_", " "), **axes)
 
 
 def draw_experiment(path: Path, results: Results, experiment: str) -> None:
-    """Draw the curves of an experiment and of its methods: means over seeds, and bands from the least to the greatest.
-
-    Returns of other rewards do not compare; gates do.
-    """
-    name = "gates_passed" if experiment in ("relaxation", "reward") else "return"
+    """Draw an experiment of the trial and its methods: means over seeds, and bands from the least to the greatest."""
     of = EXPERIMENTS[experiment]
-    variants = dict.fromkeys((*(VARIANTS[x].algorithm for x in of), *of))
-    tasks = [task for task in TASKS if any(task in some for some in of.values())]
-
-    def panel(task: str, axis: str) -> Panel:
-        curves = {}
-        for variant in variants:
-            try:
-                seeds = zip(*(results.column(task, variant, x) for x in (axis, name)), strict=True)
-            except NotRunError:
-                continue
-            band = on_a_grid(seeds, lambda x: np.array([x.mean(0), x.min(0), x.max(0)]), AXES[axis][1])
-            curves[VARIANTS[variant].label] = band
-        return curves
-
-    rows = [[panel(task, axis) for task in tasks] for axis in AXES]
-    draw(path, rows, tasks, [x for x, _ in AXES.values()], name.replace("_", " "), xscale="log")
+    runs: dict[str, dict[str, list[list[Row]]]] = {}
+    for task, variant in product(TASKS, dict.fromkeys((*(VARIANTS[x].algorithm for x in of), *of))):
+        if (task, variant) in results.curves and any(task in tasks for tasks in of.values()):
+            seeds = list(results.curves[task, variant].values())
+            runs.setdefault(task, {})[VARIANTS[variant].label] = seeds
+    name = "gates_passed" if experiment in ("relaxation", "reward") else "return"  # their returns do not compare
+    draw_training(path, runs, name, lambda x: (x.mean(0), x.min(0), x.max(0)), xscale="log")
 
 
 def draw_shipped(path: Path, points: Sequence[Row]) -> None:
     """Draw the return of each method: interquartile means over the seeds, and their intervals."""
+    runs = {
+        task: {flights.METHODS[x]: list(grouped(own, "seed").values()) for x, own in of.items()}
+        for task, of in tables.in_order(points).items()
+    }
 
-    def band(values: np.ndarray) -> np.ndarray:
+    def band(values: np.ndarray) -> Any:
         means = interquartile_mean(values.T)
         few = len(values) < ENOUGH
-        return np.array([means, *((means, means) if few else np.transpose([interval(x) for x in values.T]))])
+        return means, *((means, means) if few else np.transpose([interval(x) for x in values.T]))
 
-    def panel(of: dict[str, list[Row]], axis: str) -> Panel:
-        return {
-            flights.METHODS[method]: on_a_grid(
-                [[np.array(column(own, x)) for x in (axis, "return")] for own in grouped(runs, "seed").values()],
-                band,
-                AXES[axis][1],
-            )
-            for method, runs in of.items()
-        }
-
-    of_task = tables.in_order(points)
-    rows = [[panel(of, axis) for of in of_task.values()] for axis in AXES]
-    draw(path, rows, [LABELS.get(x, x) for x in of_task], [x for x, _ in AXES.values()], "return")
+    draw_training(path, runs, "return", band)
 
 
 def draw_forest(path: Path, rows: Sequence[Row]) -> None:

@@ -9,7 +9,7 @@ alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 
@@ -19,14 +19,13 @@ from scipy.stats import trim_mean
 
 from benchmarks.paper import elsewhere, flights
 from benchmarks.paper.claims import METHODS, Verdict, try_all
-from benchmarks.paper.evidence import NotRunError, Results, Starts, bootstrap, judged, probability
+from benchmarks.paper.evidence import NotRunError, Results, Row, Starts, bootstrap, column, grouped, judged, probability
 from benchmarks.paper.gradients import GRADIENTS
 from benchmarks.paper.matrix import EXPERIMENTS, TASKS, VARIANTS
 from torchrl_quad.envs import task_class
 from torchrl_quad.envs.metrics import EPISODE_METRICS
 from torchrl_quad.files import read_rows
 
-Row = Mapping[str, str]
 Table = list[dict[str, str]]
 RELIABLE = 0.99  # of the episodes, solved by the worst seed
 ENOUGH, WANTED = 3, 10  # seeds: for an interval, and of each method
@@ -73,19 +72,6 @@ def spread(values: ArrayLike, factor: float = 1.0, digits: int = 2) -> str:
     if len(values) == 0:
         return ""
     return f"{values.mean():.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
-
-
-def column(rows: Sequence[Row], name: str) -> list[float]:
-    """Read a column, as numbers; what was not measured is left out."""
-    return [float(row[name]) for row in rows if row.get(name)]
-
-
-def grouped(rows: Sequence[Row], *names: str) -> dict[tuple[str, ...], list[Row]]:
-    """Group the rows by columns."""
-    groups: dict[tuple[str, ...], list[Row]] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[name] for name in names), []).append(row)
-    return groups
 
 
 def seeds(count: int) -> str:
@@ -270,7 +256,7 @@ def reached_tables(rows: Sequence[Row], starts: Starts) -> dict[str, Table]:
             returns, solved, metric = returns_of(own, starts), *(column(own, x) for x in ("solved", name))
             mean = f"{interquartile_mean(returns):.4g}"
             if len(returns) >= ENOUGH:
-                mean += " ({:.4g}–{:.4g})".format(*interval(returns))
+                mean += " [{:.4g}, {:.4g}]".format(*interval(returns))
             row = {"task": LABELS.get(task, task), "method": flights.METHODS[method], "seeds": str(len(own))}
             row |= {"return (95 % interval)": mean}
             row |= {"solved (worst seed)": f"{np.mean(solved):.1%} ({min(solved):.1%})"}

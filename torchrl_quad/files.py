@@ -1,4 +1,4 @@
-"""Every file and folder that the package writes: complete or not there, never in place of what is neither.
+"""Every file and folder that the package writes: complete or not there, and never replacing anything else.
 
 Nothing here follows a link in the last part of a path, or replaces a pipe, a socket or a device. What several processes
 write, on one machine or on a shared disk, they write one after the other.
@@ -31,9 +31,9 @@ _WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EINVAL)  # wh
 def replacing(path: str | Path) -> Iterator[Path]:
     """Write a file atomically: ``with replacing(path) as temporary: temporary.write_text(...)``.
 
-    The temporary file sits beside ``path``, is named after this process, and keeps the suffix. It replaces ``path``
-    when the block ends, and disappears when the block raises. What a killed process of this machine left behind is
-    deleted by the next one that writes the same path.
+    The temporary file is in the same folder, named after this process, with the same suffix. It replaces ``path`` when
+    the block ends, and disappears when the block raises. What a killed process of this machine left behind is deleted
+    by the next one that writes the same path.
 
     Raises:
         FileExistsError: ``path`` is a folder, a link, or anything else but a plain file.
@@ -128,7 +128,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[Path]:
     try:
         yield path
     finally:
-        path.unlink(missing_ok=True)  # while it is held: who waits for it makes another
+        path.unlink(missing_ok=True)  # while it is held: a process that waits for it makes another
         lock.release()
 
 
@@ -193,12 +193,12 @@ def add_rows(path: str | Path, rows: Sequence[Mapping[str, Any]], same: Sequence
 
 
 def _temporary(path: Path) -> Path:
-    """A name beside a path that no other process, thread or machine uses."""
+    """A name in the folder of a path that no other process, thread or machine uses."""
     return path.with_name(f"{_prefix(path)}{os.getpid()}.{next(_NUMBERS)}{path.suffix}")
 
 
 def _prefix(path: Path) -> str:
-    """How this machine's temporaries of a path begin. Containers, whose process numbers overlap, are machines."""
+    """How this machine's temporaries of a path begin. Containers count as machines: their pids overlap."""
     try:
         space = os.readlink("/proc/self/ns/pid")
     except OSError:
@@ -208,7 +208,7 @@ def _prefix(path: Path) -> str:
 
 
 def _left_behind(path: Path) -> Iterator[tuple[Path, bool]]:
-    """What processes of this machine have made beside a path, and whether they have died."""
+    """Temporaries that processes of this machine have made for a path, and whether those have died."""
     name = re.compile(rf"{re.escape(_prefix(path))}(\d+)\.\d+{re.escape(path.suffix)}(\.old)?")
     for other in path.parent.glob(".*"):
         if match := name.fullmatch(other.name):
@@ -232,7 +232,7 @@ def _is_running(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except (PermissionError, OverflowError):  # it belongs to somebody else, or is none of ours
+    except (PermissionError, OverflowError):  # it belongs to another user, or is no process of this system
         return True
     return True
 

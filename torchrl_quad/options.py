@@ -54,7 +54,7 @@ Delay = Annotated[int, Field(ge=0, le=1_000)]  # in control steps
 
 
 class Explained(UserValueError):
-    """What a validator of an annotation raises whose message says all that there is to say."""
+    """Raised by a validator of an annotation; its message needs no further explanation."""
 
 
 def between(least: float, most: float) -> Any:
@@ -156,7 +156,7 @@ def check_value(name: str, value: Any, kind: Any, description: str = "") -> Any:
 
 
 def build(cls: type[_T], name: str, spec: Any, **more: Any) -> _T:
-    """An object from a mapping of its arguments, or the object itself, with what is given (not zero) beside it.
+    """An object from a mapping of its arguments, or the object itself, with the arguments ``more`` that are not zero.
 
     Raises:
         UserValueError: it is neither, has an unknown key, lacks one, or has a value that does not fit.
@@ -248,7 +248,7 @@ def _checked(name: str, value: Any, adapter: TypeAdapter[Any], description: str)
     try:
         plain = _without_numpy(value)
     except RecursionError:
-        raise UserValueError(f"{name} holds lists in more lists than anything needs. Write it flatter.") from None
+        raise UserValueError(f"{name} holds too many nested lists. Write it flatter.") from None
     try:
         valid = adapter.validate_python(plain)
     except ValidationError as refused:
@@ -259,7 +259,7 @@ def _checked(name: str, value: Any, adapter: TypeAdapter[Any], description: str)
         choices = [must(error) for error in (first, *others) if error["input"] is first["input"]]
         said = f"{name}{place} must {' or '.join(dict.fromkeys(choices))}, got {shown(first['input'])}."
         raise UserValueError(" ".join(filter(None, (said, description)))) from None
-    # What is a number to Python alone, such as a tensor of one element or a Decimal, computes with no other number.
+    # A tensor of one element or a Decimal passes as a number, but would not compute with others: it becomes a float.
     return valid if type(valid) is float and not isinstance(plain, int | float) else plain
 
 

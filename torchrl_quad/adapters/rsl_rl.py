@@ -40,7 +40,7 @@ class RslRlVecEnv(VecEnv):
         self.drones = TorchVectorEnv(env)
         if not hasattr(env, "max_episode_steps"):
             raise UserTypeError(
-                f"RslRlVecEnv needs a task, whose episodes have a time limit, and {type(env).__name__} is none: build "
+                f"RslRlVecEnv needs a task, which has a time limit, and got {type(env).__name__}: build "
                 "HoveringEnv(num_envs=512), or derive your task from QuadrotorEnv."
             )
         self.num_envs, self.device = self.drones.num_envs, self.drones.device

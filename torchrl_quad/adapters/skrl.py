@@ -53,7 +53,7 @@ class SkrlEnv(Wrapper):
         return observation, *(x.unsqueeze(-1) for x in ends), info
 
     def state(self) -> None:
-        """No state beside the observation."""
+        """None: the observation is all there is."""
 
     def render(self, *args: Any, **kwargs: Any) -> None:
         """Nothing: trainers call it at each step. ``env.torchrl_env.render()`` draws."""

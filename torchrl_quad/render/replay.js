@@ -20,7 +20,7 @@ const TRAIL = Math.min(Math.round(2 / flight.control_dt), frames - 1); // steps 
 const everyone = Array.from({ length: environments }, (_, i) => i);
 const colors = everyone.map((i) => viridis(environments > 1 ? 0.05 + (0.8 * i) / (environments - 1) : 0.3));
 
-// What is seen: at which frame (between two while it plays), of whom, how large, and how fast it goes on.
+// The view: the frame (between two while it plays), the chosen drone, the drone size, and the speed of play.
 let frame = 0, chosen = null, size = 1, speed = 1, playing = false, last = null;
 
 // -- the state between two frames -------------------------------------------------------------------------------------

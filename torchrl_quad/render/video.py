@@ -61,7 +61,7 @@ class View:
         points: (*, 3) [m]; the finite ones, and the ground below, are in view.
         num_drones: how many drones a frame shows.
         size: width and height of a frame [pixels].
-        markers: what to draw beside the drones.
+        markers: what to draw with the drones.
         image: the height and width of a camera's images [pixels], if a frame shows one.
     """
 

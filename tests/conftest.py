@@ -9,7 +9,7 @@ import torch
 pytest.register_assert_rewrite("browsing", "deploying", "flying", "log_writers", "small_runs")
 
 from browsing import browser, open_page  # noqa: E402, F401, fixtures
-from deploying import export_once  # noqa: E402, F401, a fixture
+from deploying import export_once, trace_once  # noqa: E402, F401, fixtures
 
 from torchrl_quad import HoveringEnv  # noqa: E402
 from torchrl_quad.envs.markers import Markers, Shape  # noqa: E402

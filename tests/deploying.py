@@ -7,11 +7,12 @@ import subprocess
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 from torch import nn
 from torchrl.envs import TransformedEnv
 
 from torchrl_quad import ObservationNormalizer, make_actor, make_env, make_visual_actor
-from torchrl_quad.deploy import export_policy
+from torchrl_quad.deploy import export, export_policy
 
 GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
 CAMERA = {"width": 6, "height": 5, "pitch": 0.2, "rate": 2, "delay": 1, "noise": 0.02, "dropout": 0.05}
@@ -37,7 +38,7 @@ TASKS = {  # with all that policies may read, spread over the tasks
     "hovering, without memory": {"camera": {"width": 5, "height": 4, "position": [0.1, 0, 0], "along_ray": True}},
 }
 NORMALIZED = ("tracking", "racing", "forest")
-FLOWN = ("hovering", "tracking", "racing", "landing", "forest")  # of each rule one
+FLOWN = ("hovering", "tracking", "racing", "landing", "forest")  # of each task one
 
 
 def build(name, num_envs=16):
@@ -58,13 +59,35 @@ def build(name, num_envs=16):
     return env, actor
 
 
+def pilot(env, sink=2.0, after=0, beyond=0.0):
+    """A policy by hand, a single layer: fly to the first point that is observed, level and without turning.
+
+    ``sink`` is the stiffness of the height; ``after`` numbers come behind the body's in the observation;
+    it flies ``beyond`` the point [m], along x.
+    """
+    actor = make_actor(env, ())
+    (layer,) = (x for x in actor[0].module.mlp if isinstance(x, nn.Linear))
+    with torch.no_grad():
+        weight = torch.zeros_like(layer.weight)
+        x, q, v, w = 0, *(weight.shape[1] - after - k for k in (10, 6, 3))  # where the quantities begin
+        weight[0, x + 2], weight[0, v + 2] = 0.2 * sink, -0.4
+        for axis, along, sign in ((1, 1, -1.0), (2, 0, 1.0)):  # roll moves along -y, pitch along x
+            weight[axis, x + along], weight[axis, v + along] = sign * 0.8, sign * -1.0
+            weight[axis, q + axis] = -0.6
+        weight[3, q + 3] = -0.3
+        weight[1:4, w : w + 3] += -0.02 * torch.eye(3)
+        layer.weight.copy_(weight)
+        layer.bias[1:4] = torch.tensor([0.0, 0.8 * beyond, 0.0])
+    return actor
+
+
 def resting(**changes):
     """A level drone at rest near the target of hovering, as a bundle takes it."""
     still = {"position": [1, 0, 1.4], "quaternion": [1, 0, 0, 0], "velocity": [0, 0, 0], "angular_velocity": [0, 0, 0]}
     return {**still, "age": 0.0, **changes}
 
 
-def seen_by(bundle, **changes):
+def measured(bundle, **changes):
     """A state that the policy of a bundle can fly from."""
     camera = bundle.contract["camera"]
     images = {"depth": np.full((camera["height"], camera["width"]), 3.0), "depth_age": 0.0} if camera else {}
@@ -72,14 +95,35 @@ def seen_by(bundle, **changes):
 
 
 @pytest.fixture(scope="session")
-def export_once(tmp_path_factory):
+def export_once(tmp_path_factory, worker_id):
+    """Environment, policy and bundle of one of TASKS, exported once for all processes, since tracing takes seconds."""
+    base = tmp_path_factory.getbasetemp()
+    shared = (base if worker_id == "master" else base.parent) / "bundles"
+    shared.mkdir(exist_ok=True)
+
     @functools.cache
     def export_once(task):
         torch.set_num_threads(1)
         env, actor = build(task)
-        return env, actor, export_policy(actor, env, tmp_path_factory.mktemp(task) / "policy")
+        with FileLock(shared / f"{task}.lock"):
+            if not (shared / task).exists():
+                export_policy(actor, env, shared / task)
+        return env, actor, shared / task
 
     return export_once
+
+
+@pytest.fixture
+def trace_once(monkeypatch):
+    """Trace each environment once in a test that exports it several times."""
+    trace, traced = export.trace, {}
+
+    def once(env, state):
+        if env not in traced:
+            traced[env] = trace(env, state)
+        return traced[env]
+
+    monkeypatch.setattr(export, "trace", once)
 
 
 def compiled(folder, out):
@@ -103,7 +147,7 @@ def by_hand(actor, observation, depth=None, memory=None):
     if depth is None:
         return torch.tanh(actor[0].module.mlp(observation)[:, :4]), None
     sight, x = actor[0][0].module, 1 / depth.clamp(min=0.3)
-    for eye in list(sight.eyes)[:-1:2]:
+    for eye in list(sight.convolutions)[:-1:2]:
         x = nn.functional.elu(nn.functional.conv2d(x, eye.weight, eye.bias, 2, 1))
     (layer,), last = sight.trunk.mlp, actor[0][-1].module.mlp[-1]
     x = nn.functional.elu(layer(torch.cat((x.flatten(1), 0.3 * observation), 1)))

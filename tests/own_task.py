@@ -1,4 +1,4 @@
-"""A task of somebody's own, as it would stand in a package of theirs."""
+"""Tasks of somebody's own, as they would stand in a package of theirs."""
 
 import torch
 
@@ -39,3 +39,58 @@ class CornerEnv(QuadrotorEnv):
 
     def metrics(self, state):
         return {"corner_error": self.error(state)}
+
+
+class RelayEnv(QuadrotorEnv):
+    """Visit points in turn, over and over.
+
+    It reads all that a state may have: commands on their way, the number of the step, whole numbers, flags, and nested
+    entries.
+    """
+
+    ends_on_success = True
+    weights = {"distance": 0.1}
+    metric_info = {**EPISODE_METRICS, "visited": Metric("points visited"), "nearest": Metric("nearest", "cm", 100.0)}
+
+    def set_up(self):
+        self.points = self.tensor([[0.1, 0.0, 1.5], [0.0, 0.2, 1.5], [-0.1, 0.0, 1.4]])
+
+    def initial_state(self, n):
+        stage = self.integers(3, n, 1)
+        start = self.hover_state(self.points[stage[:, 0]] + 0.1 * self.uniform(n, 3))
+        own = {"stage": stage, "visited": torch.zeros_like(stage), "is_near": torch.zeros_like(stage, dtype=torch.bool)}
+        return {**start, **own, ("record", "gap"): torch.full_like(start["position"][:, :1], 99.0)}
+
+    def gap(self, state, stage):
+        return norm(state["position"] - self.points[stage[:, 0]])
+
+    def advance(self, previous, state):
+        gap = self.gap(state, previous["stage"])
+        is_near = gap < 0.1
+        stage = torch.where(is_near, (previous["stage"] + 1) % 3, previous["stage"])
+        nearest = torch.minimum(gap, previous["record", "gap"])
+        visited = previous["visited"] + (is_near & ~previous["is_near"])
+        return {**state, "stage": stage, "visited": visited, "is_near": is_near, ("record", "gap"): nearest}
+
+    def observe(self, state):
+        to_point = self.points[state["stage"][:, 0]] - state["position"]
+        late = state["step"] > 20
+        parts = [to_point, *body_observation(state), late.to(self.dtype), state["is_near"].to(self.dtype)]
+        return torch.cat((*parts, state["action_queue"][:, -1]), -1)
+
+    def reward_terms(self, state):
+        return {"distance": -self.weights["distance"] * self.gap(state, state["stage"])}
+
+    def is_crash(self, state):
+        return outside(state["position"], self.points[0], 0.6, 4.0)
+
+    def is_success(self, state):
+        return state["visited"] >= 3
+
+    def metrics(self, state):
+        metrics = {"visited": state["visited"].to(self.dtype), "nearest": state["record", "gap"]}
+        return metrics | {"spin": state["rotor_speed"].mean(-1, keepdim=True)}
+
+    def episode_metrics(self, rollout):
+        metrics = super().episode_metrics(rollout)
+        return {**metrics, "solved": metrics["solved"] * (metrics["nearest"] < 0.09)}

@@ -27,7 +27,7 @@ from torchrl_quad.deploy import (
 )
 from torchrl_quad.deploy import TamperedBundle as Tampered
 from torchrl_quad.deploy.network import ACTIVATIONS, Layer, Network, write_c, write_onnx
-from torchrl_quad.deploy.tasks import PROGRESS, progress_of
+from torchrl_quad.deploy.tracing import name_of
 
 
 @pytest.fixture(params=TASKS)
@@ -85,8 +85,8 @@ def test_a_bundle_flies_the_environment_as_the_actor_does(exported):
     two steps change neither task nor memory."""
     env, actor, folder = exported
     base, bundle, draw = getattr(env, "base_env", env), load_bundle(folder), np.random.default_rng(0)
-    td, rule = env.reset(), bundle.contract["task"]["rule"]
-    bundle.reset(**progress_of(rule, {key: td["state", key][0].numpy() for key in PROGRESS[rule]}))
+    td, keys = env.reset(), {name_of(key): key for key in base.task_entries}
+    bundle.reset(**{name: td["state", keys[name]][0].numpy() for name in bundle.progress})
     memory, actions = torch.zeros(16, 1, bundle.contract["memory"]), []
     for t in range(40):
         seen = {key: td["state", key] for key in base.control_step.safe_state}
@@ -114,12 +114,28 @@ def test_a_bundle_flies_the_environment_as_the_actor_does(exported):
 
 def test_a_gate_that_is_passed_during_a_fault_counts_afterwards(export_once):
     bundle = load_bundle(export_once("racing")[2], on_fault="hover")
-    gate = np.array(bundle.contract["task"]["gates"][0])
-    bundle(resting(position=gate - (1, 0, 0)))
-    bundle(resting(position=[np.nan] * 3))
-    assert bundle.rule.passed == 0
-    bundle(resting(position=gate + (1, 0, 0)))
-    assert (bundle.rule.gate, bundle.rule.passed) == (1, 1)
+    gates = export_once("racing")[0].base_env.gates.numpy()
+    for faults in (1, 3):
+        bundle.reset(gate=1)
+        bundle(resting(position=gates[1] - (1, 0, 0)))
+        for _ in range(faults):
+            bundle(resting(position=[np.nan] * 3))
+        assert (bundle.progress["gate"], bundle.progress["gates_passed"]) == (1, 0)
+        bundle(resting(position=gates[1] + (1, 0, 0)))
+        assert (bundle.progress["gate"], bundle.progress["gates_passed"]) == (2, 1)
+
+
+def test_the_time_of_a_task_goes_on_during_faults_once_a_flight_has_begun(export_once):
+    env, _, folder = export_once("tracking")
+    bundle, step = load_bundle(folder, on_fault="hover"), env.base_env.phase_rate * env.base_env.control_dt
+    for begun in (False, True):
+        bundle.reset(phase=1.0)
+        if begun:
+            bundle(resting())
+        for _ in range(3):
+            bundle(resting(age=9.0))
+        bundle(resting())
+        assert bundle.progress["phase"] == pytest.approx(1.0 + (4 * step if begun else 0.0), abs=1e-5)
 
 
 def test_a_drone_that_turns_round_keeps_the_sign_of_its_quaternion(hovering):
@@ -199,27 +215,29 @@ def test_the_same_policy_gives_the_same_bytes_and_leaves_the_environment_as_it_w
     again = export_policy(actor, env, tmp_path / "again")
     assert torch.equal(before, base.randomness.generator.get_state())
     names = sorted(path.name for path in folder.iterdir())
-    assert names == sorted([*contract.FILES, "contract.json"])
+    about = json.loads((folder / "contract.json").read_text())
+    assert names == sorted([*contract.files(about), "contract.json"])
     for name in names:
         assert (folder / name).read_bytes() == (again / name).read_bytes(), name
 
 
 def test_a_contract_says_what_the_environment_is(hovering):
     about = json.loads((hovering / "contract.json").read_text())
-    keys = ("name", "start", "stop", "unit", "frame", "scale")
-    assert [tuple(x[k] for k in keys) for x in about["inputs"]] == [
-        ("to_target", 0, 3, "m", "world", 1.0),
-        ("quaternion", 3, 7, "1", "body to world", 10.0),
-        ("velocity", 7, 10, "m/s", "world", 1.0),
-        ("angular_velocity", 10, 13, "rad/s", "body", 1.0),
-    ]
-    assert about["inputs"][1]["seen"]["greatest"][0] == 1.0
+    assert (about["task"]["name"], about["task"]["unjudged"]) == ("hovering", None)
+    assert about["task"]["about"] == HoveringEnv.__doc__.splitlines()[0]
+    assert about["task"]["entries"] == {"target": {"shape": [3], "dtype": "float32", "low": None, "high": None}}
+    assert list(about["graphs"]["observe"]["reads"]) == [*contract.MEASURED, "target"]
+    assert about["graphs"]["observe"]["writes"] == {"observation": {"shape": [13], "dtype": "float32"}}
+    assert "advance" not in about["graphs"] and not (hovering / "advance.onnx").exists()
+    assert (about["observation"]["size"], about["observation"]["seen"]["greatest"][3]) == (13, 10.0)
     assert about["output"]["thrust"]["range"] == pytest.approx([0, 3 * 0.46 * 9.81])
     assert about["output"]["body_rate"]["range"] == [[-2, 2]] * 3
     assert about["output"]["hover_action"] == pytest.approx([-1 / 3, 0, 0, 0])
     assert (about["control_dt"], about["action_delay"], about["drone"]["mass"]) == (0.02, 1, 0.46)
-    assert about["safety"]["position"] == {"low": [-4, -5, 0], "high": [6, 5, 6]}
-    assert "(action + 1) / 2 x 13.5378 N" in (hovering / "README.md").read_text()
+    low, high = about["envelope"]["low"], about["envelope"]["high"]
+    assert 0 < low[2] < high[2] < 6 and about["envelope"]["max_speed"] > 0.1
+    page = (hovering / "README.md").read_text()
+    assert "(action + 1) / 2 x 13.5378 N" in page and "target - position           3     m, world frame" in page
 
 
 def test_the_rate_loop_of_a_contract_is_that_of_the_simulator(hovering):
@@ -241,7 +259,7 @@ def test_the_rate_loop_of_a_contract_is_that_of_the_simulator(hovering):
         assert abs(w * w / (s * s + 2 * z * w * s + w * w)) == pytest.approx(0.5**0.5, rel=1e-4)
 
 
-@pytest.mark.parametrize("name", [*contract.FILES, "contract.json"])
+@pytest.mark.parametrize("name", [*contract.OTHERS, "policy.onnx", "observe.onnx", "episode.onnx", "contract.json"])
 def test_a_file_that_was_changed_or_is_missing_is_named(hovering, tmp_path, name):
     folder = tmp_path / "policy"
     folder.mkdir()
@@ -265,35 +283,28 @@ def test_a_contract_of_another_version_is_refused(hovering, tmp_path):
         path.write_text(text)
         with pytest.raises(Tampered, match="is no contract of a policy"):
             load_bundle(tmp_path)
-    path.write_text(json.dumps(about | {"version": 1}))
+    path.write_text(json.dumps(about | {"version": 3}))
     with pytest.raises(
-        UnknownContract, match="has version 1, and this torchrl_quad reads version 3. It was written by"
+        UnknownContract, match="has version 3, and this torchrl_quad reads version 4. It was written by torchrl_quad"
     ):
         load_bundle(tmp_path)
-    about["task"]["rule"] = "dance"  # of a later package, with checksums that fit
-    path.write_text(json.dumps(about | {"digest": contract.digest(about)}))
-    for name in contract.FILES:
+    for name in contract.files(about):
         (tmp_path / name).write_bytes((hovering / name).read_bytes())
-    with pytest.raises(
-        UnknownContract, match="contract.json: task.rule is 'dance', and must be one of target, curve, gates, course"
-    ):
-        load_bundle(tmp_path)
-    about["task"]["rule"], about["inputs"][0]["name"] = "target", "smell"
+    reads = about["graphs"]["observe"]["reads"]
+    reads["smell"] = reads["target"]  # of a later package, with checksums that fit
     path.write_text(json.dumps(about | {"digest": contract.digest(about)}))
-    with pytest.raises(
-        UnknownContract, match="contract.json: the policy reads 'smell', and known are to_target, quaternion"
-    ):
+    with pytest.raises(UnknownContract, match="graphs.observe.reads.smell is .*, and must be nothing of that name"):
         load_bundle(tmp_path)
 
 
-def test_another_runtime_that_computes_otherwise_is_found(hovering):
+def test_another_runtime_that_gives_different_results_is_found(hovering):
     bundle = load_bundle(hovering)
     bundle._vectors["action"] += np.float32(1e-3)
-    with pytest.raises(WrongActions, match="policy/policy.onnx: the policy differs by 0.001"):
+    with pytest.raises(WrongActions, match="hovering/policy.onnx: the policy differs by 0.001"):
         bundle.check()
 
 
-def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_path, monkeypatch):
+def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_path, monkeypatch, trace_once):
     env, actor = build("hovering")
     folder = shutil.copytree(hovering, tmp_path / "policy")
     old = (folder / "contract.json").read_bytes()
@@ -307,7 +318,7 @@ def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_pa
             folder.mkdir()  # by somebody who missed it
             (tmp_path / f"{dead}.1").mkdir()
         with monkeypatch.context() as patch:
-            patch.setattr("torchrl_quad.deploy.export._require_the_same_flight", lambda *_: 1 / 0)
+            patch.setattr("torchrl_quad.deploy.export._check_the_flight", lambda *_: 1 / 0)
             with pytest.raises(ZeroDivisionError):
                 export_policy(actor, env, folder)
         assert (folder / "contract.json").read_bytes() == old
@@ -330,7 +341,7 @@ def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_pa
     (tmp_path / "link").symlink_to(folder)
     os.mkfifo(tmp_path / "pipe")
     for name in ("link", "pipe"):
-        with pytest.raises(FileExistsError, match=f"{name} is a {name}, and no folder: it is not replaced"):
+        with pytest.raises(FileExistsError, match=f"{name} is a {name}, and no plain folder: it is not replaced"):
             export_policy(actor, env, tmp_path / name)
         assert (tmp_path / "pipe").is_fifo() and (tmp_path / "link").is_symlink()
     (folder / "policy.h").unlink()

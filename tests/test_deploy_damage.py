@@ -12,7 +12,7 @@ import zipfile
 import numpy as np
 import onnx
 import pytest
-from deploying import FLOWN, resting, seen_by
+from deploying import FLOWN, measured, resting
 from onnx import TensorProto, helper
 
 from torchrl_quad.deploy import (
@@ -39,7 +39,7 @@ def copied(export_once, tmp_path):
 
 def fit(folder, about):
     """Write a contract with checksums that fit, as somebody who changes a bundle does."""
-    about["sha256"] = {name: contract.sha256((folder / name).read_bytes()) for name in contract.FILES}
+    about["sha256"] = {name: contract.sha256((folder / name).read_bytes()) for name in contract.files(about)}
     rest = json.dumps({k: v for k, v in about.items() if k != "digest"}, sort_keys=True, separators=(",", ":"))
     (folder / "contract.json").write_text(json.dumps({**about, "digest": contract.sha256(rest.encode())}))
 
@@ -53,7 +53,7 @@ def put(about, path, value):
 
 def require_sane_flight(bundle):
     for k in range(5):
-        thrust, rates = bundle(seen_by(bundle, position=[0.3 * k, 0.0, 10.0**k], velocity=[0.0, 10.0**k, 0.0]))
+        thrust, rates = bundle(measured(bundle, position=[0.3 * k, 0.0, 10.0**k], velocity=[0.0, 10.0**k, 0.0]))
         assert 0.0 <= thrust <= 20 * bundle.contract["output"]["thrust"]["weight"] <= 600_000
         assert np.abs(rates).max() <= 100
 
@@ -135,27 +135,52 @@ CONTRADICTIONS = [
     ("hovering", {"output.hover_action.0": 0.5}, "hover_action.* is 1.5, and must be 0.666667"),
     ("hovering", {"output.hover_action.3": 0.5}, "hover_action .* must not turn"),
     ("hovering", {"output.order": ["thrust"] * 4}, "output.order .* must be thrust, roll_rate, pitch_rate, yaw_rate"),
-    ("hovering", {"action_queue.length": 7}, "action_queue.length is 7, and must be 1"),
-    ("hovering", {"action_queue.observed": True}, "action_queue.observed is True, and the inputs say otherwise"),
+    (
+        "tracking",
+        {"action_delay": 7},
+        r"reads.action_queue is \(\(2, 4\), 'float32'\), and must be \(\(7, 4\), 'float32'\)",
+    ),
     ("hovering", {"action_delay": 101}, "action_delay is 101, and must be at most 100"),
     ("hovering", {"limits.max_state_age": 5}, "limits.max_state_age is 5, and must be 0.02"),
     ("forest", {"limits.max_depth_age": None}, "limits.max_depth_age is 0, and must be 0.06"),
     ("forest", {"camera.quaternion": [0.5, 0, 0, 0]}, "the norm of camera.quaternion is 0.5"),
     ("forest", {"memory": 4.0}, "memory is 4.0, and must be of type integer"),
-    ("forest", {"memory": 5}, r"vectors.npz: memory has shape \(256, 4\), and must have \(n, 5\)"),
-    ("forest", {"task.speeds": [9, 1]}, "task.speeds is .9, 1., and must rise"),
-    ("tracking", {"task.sine": []}, "task.cosine and task.sine must have one length"),
-    ("tracking", {"task.lookahead": 9}, r"inputs\[0\] must go from 0 to 27"),
-    ("racing", {"task.gates": []}, "task.gates is .., and must be of a length of at least 1"),
-    ("racing", {"task.gates": [[0, 0, 1]]}, r"starts.npz: no flight starts with the gate \[[1-3]\]"),
+    ("forest", {"memory": 5}, r"policy.reads.memory is \(\(4,\), 'float32'\), and must be \(\(5,\), 'float32'\)"),
+    (
+        "tracking",
+        {"task.dtype": "float64"},
+        r"reads.position is .*'float32'\), and must be .*'float64'\)",
+    ),
+    (
+        "racing",
+        {"task.entries.gate.dtype": "bool"},
+        r"reads.gate is .*'int64'\), and must be .*'bool'\)",
+    ),
+    ("racing", {"task.entries.gate.high": 0}, r"starts.npz: no flight starts with the gate \[[1-3]\]"),
+    (
+        "racing",
+        {"task.entries.step": {"shape": [1], "dtype": "int64", "low": 0, "high": 1}},
+        "has 'step', which is not",
+    ),
+    ("racing", {"graphs.advance.writes.wind": {"shape": [3], "dtype": "bool"}}, "writes.wind .* nothing of that name"),
+    ("hovering", {"graphs.observe.reads": {}}, "graphs.observe.reads is empty"),
+    ("hovering", {"graphs.observe.reads.target.shape": [2]}, "observe.reads.target is .*, and must be"),
+    ("hovering", {"graphs.judge.writes": {}}, "graphs.judge.writes lacks 'crash'"),
+    (
+        "hovering",
+        {"graphs.episode.reads.weather": {"shape": [], "dtype": "bool"}},
+        "reads.weather .* nothing of",
+    ),
+    ("hovering", {"task.metrics": {}}, "graphs.episode.writes.crash is .*, and must be nothing of that name"),
+    ("hovering", {"task.unjudged": "no"}, "graphs must have judge and episode, or task.unjudged say why not"),
+    ("forest", {"task.unjudged": None}, "graphs must have judge and episode, or task.unjudged say why not"),
+    ("hovering", {"graphs.fly": {"reads": {}, "writes": {}}}, "graphs has 'fly', which is unknown"),
+    ("hovering", {"observation.size": 12}, "observation.seen must hold lists of 12 numbers"),
     ("hovering", {"control_dt": 0.0201}, "limits.max_state_age|whole multiple of simulator.dt"),
     ("hovering", {"simulator.dt": 0.003}, "control_dt is 0.02, and must be a whole multiple of simulator.dt"),
     ("hovering", {"simulator.integrator": "rk9"}, "simulator.integrator is 'rk9', and must be one of euler"),
-    ("hovering", {"safety.position.low.2": 7}, "safety.position.low .* must be below high"),
-    ("hovering", {"inputs.1.start": 4}, r"inputs\[1\] must go from 3 to 7"),
-    ("hovering", {"inputs.1.seen.p99": [1]}, r"inputs\[1\].seen must hold lists of 4 numbers"),
-    ("hovering", {"inputs.0.seen.least": [9, 9, 9]}, r"inputs\[0\].seen must rise from least to greatest"),
-    ("hovering", {"task.name": "racing"}, "task lacks gates|task.rule is 'target', and must be gates"),
+    ("hovering", {"observation.seen.p99": [1]}, r"observation.seen must hold lists of 13 numbers"),
+    ("hovering", {"observation.seen.least": [9] * 13}, r"observation.seen must rise from least to greatest"),
     ("hovering", {"drone.thrust_map": [1e-9, 0, 0]}, "drone: to hover each rotor must give"),
     (
         "hovering",
@@ -195,9 +220,9 @@ def test_the_ranges_of_the_schema_lie_within_those_of_the_simulated_drones():
         (b'{"version": NaN}', "NaN is no finite number"),
         (b'{"version": 1e400}', "1e400 is no finite number"),
         (b'{"version": ' + b"9" * 5000 + b"}", "more than 20 digits"),
-        (b'{"version": 3, "version": 3}', "a key stands twice"),
+        (b'{"version": 4, "version": 4}', "a key stands twice"),
         (b"[" * 100_000, "it nests too deep"),
-        (json.dumps({"version": 3}).encode("utf-16"), "'utf-8' codec can't decode"),
+        (json.dumps({"version": 4}).encode("utf-16"), "'utf-8' codec can't decode"),
         (b"\xef\xbb\xbf{}", "BOM"),
         (b" " * 2**21, "is larger than 1 MiB, the most that is read"),
         (b"", "Expecting value"),
@@ -210,7 +235,7 @@ def test_a_contract_that_is_no_plain_json_is_refused(copied, text, why):
         load_bundle(folder)
 
 
-@pytest.mark.parametrize("name", contract.FILES)
+@pytest.mark.parametrize("name", [*contract.OTHERS, "policy.onnx", "judge.onnx"])
 def test_no_file_is_read_that_is_huge_or_never_ends(copied, name):
     folder, _ = copied()
     os.truncate(folder / name, 2**40)  # of holes
@@ -257,7 +282,7 @@ def test_arrays_that_do_not_fit_the_contract_are_refused(copied, file):
         "is damaged: ": npz(arrays, name, huge(x)),
         "it must hold .* alone, and not compressed": npz(arrays, name, how=zipfile.ZIP_DEFLATED),
         "must hold .* alone": npz({**arrays, "more": x}, name),
-        f"{name} must hold finite numbers": npz({**arrays, name: np.full_like(x, np.nan)}, name),
+        f"{name} must hold finite numbers in float32": npz({**arrays, name: np.full_like(x, np.nan)}, name),
         f"{name} has shape": npz({**arrays, name: x[:, :2]}, name),
         rf"{name} has shape \(0, ": npz({key: y[:0] for key, y in arrays.items()}, name),
         rf"has shape \({count}, ": npz({**arrays, name: x[:1]}, name),
@@ -266,7 +291,9 @@ def test_arrays_that_do_not_fit_the_contract_are_refused(copied, file):
     }
     if file == "starts.npz":
         wrongs["no flight starts with the quaternion"] = npz({**arrays, "quaternion": 2 * arrays["quaternion"]}, name)
-        wrongs["no flight starts with the velocity"] = npz({**arrays, "velocity": 1e7 * np.ones((count, 3))}, name)
+        wrongs["no flight starts with the velocity"] = npz(
+            {**arrays, "velocity": np.full((count, 3), 1e7, np.float32)}, name
+        )
     for message, content in wrongs.items():
         (folder / file).write_bytes(content)
         fit(folder, about)
@@ -329,15 +356,31 @@ NETWORKS = {
 }
 
 
-@pytest.mark.parametrize("message", NETWORKS)
-def test_a_network_that_no_export_writes_is_refused_and_reads_no_other_file(copied, message, monkeypatch, capfd):
+RULES = {
+    "keeps weights in another file": NETWORKS["keeps weights in another file"],
+    "computes 'Loop', and no task": NETWORKS["computes 'Loop', and no policy"],
+    "computes 'RandomNormal', and no task": lambda: model([helper.make_node("RandomNormal", [], ["x"], shape=[1])]),
+    "computes 'com.microsoft.Gelu'": NETWORKS["computes 'com.microsoft.Gelu'"],
+    "reads {'observation': .*, and the contract says .*'position'": NETWORKS[
+        "writes {'thrust': .*, and the contract says"
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("file", "message", "made"),
+    [*(("policy.onnx", *x) for x in NETWORKS.items()), *(("observe.onnx", *x) for x in RULES.items())],
+)
+def test_a_graph_that_no_export_writes_is_refused_and_reads_no_other_file(
+    copied, file, message, made, monkeypatch, capfd
+):
     folder, about = copied()
     monkeypatch.chdir(folder.parent)
     (folder.parent / "secret.bin").write_bytes(np.ones((4, 13), np.float32).tobytes())
-    made = NETWORKS[message]()
-    (folder / "policy.onnx").write_bytes(made if isinstance(made, bytes) else made.SerializeToString())
+    content = made()
+    (folder / file).write_bytes(content if isinstance(content, bytes) else content.SerializeToString())
     fit(folder, about)
-    with pytest.raises(TamperedBundle, match=f"policy.onnx {message}|policy.onnx: {message}") as refused:
+    with pytest.raises(TamperedBundle, match=f"{file} {message}|{file}: {message}") as refused:
         load_bundle(folder)
     assert str(refused.value).isprintable() and capfd.readouterr() == ("", "")
 
@@ -349,7 +392,7 @@ def test_a_network_that_leaves_its_limits_or_its_shape_in_flight_is_a_fault(copi
         (model([gemm()], [weight(scale=9.0)]), r"policy: The action leaves -1 to 1, which no exported policy does"),
         (
             model([gemm("sum"), twice], [weight()]),
-            r"policy: The policy answered arrays of the shapes \(2, 4\)",
+            r"policy: policy.onnx answered arrays of the shapes \(2, 4\)",
         ),
     ):
         (folder / "policy.onnx").write_bytes(made.SerializeToString())

@@ -71,9 +71,14 @@ def schema() -> dict[str, Any]:
     return json.loads((resources.files(__package__) / "contract.schema.json").read_text())
 
 
-def schema_table() -> str:
-    """The fields of the contract with their meaning, and what numbers they may hold, as a table in Markdown."""
-    rows = [f"| `{name}` | {entry['description']} | {_range(entry)} |" for name, entry in _fields(schema())]
+def schema_table(deep: bool = True) -> str:
+    """The fields of the contract with their meaning, and what numbers they may hold, as a table in Markdown.
+
+    Args:
+        deep: whether it also shows the fields of fields.
+    """
+    fields = [(name, entry) for name, entry in _fields(schema()) if deep or "." not in name]
+    rows = [f"| `{name}` | {entry['description']} | {_range(entry)} |" for name, entry in fields]
     return "\n".join(("| field | meaning | numbers |", "|---|---|---|", *rows))
 
 

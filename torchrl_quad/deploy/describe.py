@@ -114,7 +114,8 @@ def _task(env: QuadrotorEnv, rules: Rules) -> dict[str, Any]:
     entries = {}
     for name, key in rules.entries.items():
         x, ends = env.control_step.safe_state[key], bounds.get(key, (-math.inf, math.inf))
-        low, high = (float(end) if math.isfinite(end) else None for end in ends)
+        # In the precision of the entry: in float32 a phase may be a little above 2 pi.
+        low, high = (torch.tensor(end, dtype=x.dtype).item() if math.isfinite(end) else None for end in ends)
         entries[name] = {
             "shape": [*x.shape[1:]],
             "dtype": str(x.dtype).removeprefix("torch."),

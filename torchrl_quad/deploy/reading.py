@@ -186,4 +186,5 @@ def _starts(path: Path, content: bytes, contract: Mapping[str, Any]) -> dict[str
 def within(values: NDArray[Any], about: Mapping[str, Any]) -> NDArray[np.bool_]:
     """Which values of an entry of the task are between the bounds that the contract gives for it."""
     low, high = (np.inf * sign if about[end] is None else about[end] for end, sign in (("low", -1), ("high", 1)))
+    values = values.astype(float)  # bounds of a damaged contract may be beyond float32
     return (values >= low) & (values <= high)

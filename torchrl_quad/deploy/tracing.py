@@ -13,11 +13,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchrl_quad.deploy.contract import ENDS, MEASURED
 from torchrl_quad.deploy.graphs import IR_VERSION, NOT_IN_TASKS, OPSET
 from torchrl_quad.envs import QuadrotorEnv
+from torchrl_quad.envs.guard import is_unit
 from torchrl_quad.errors import UserValueError, one_line
 
 Tensors = dict[str, Tensor]
@@ -61,10 +63,6 @@ def name_of(key: Any) -> str:
 
 
 # -- rules as functions of tensors by name -----------------------------------------------------------------------------
-
-
-class _Missing(Exception):
-    """A rule reads what a bundle does not have."""
 
 
 class _Methods:
@@ -122,7 +120,7 @@ class _Methods:
     def judge(self, x: Tensors) -> Tensors:
         """How a state ends the episode, if it does; where the guard would replace it, it is a crash."""
         state, step = self.state(x), self.env.control_step
-        keep = step.guard._is_unit(state["quaternion"]).unsqueeze(1)
+        keep = is_unit(state["quaternion"]).unsqueeze(1)
         for key in MEASURED:
             low, high = (bound[:1] for bound in step.guard.bounds[key])
             keep = keep & ((state[key] >= low) & (state[key] <= high)).all(1, keepdim=True)
@@ -135,46 +133,15 @@ class _Methods:
 
     def sum_up(self, x: Tensors) -> Tensors:
         """The metrics of the first episode of each flight; none where they need what a flight lacks."""
-        flight = _Flight()
+        flight = TensorDict({}, x["flight.next.done"].shape[:2])
         for name, path in self.flight.items():
-            flight.put(path, x[name])
+            flight[path] = x[name]
         try:
             found = self.env.episode_metrics(flight)
-            return {f"episode.{name}": value.to(self.env.dtype) for name, value in found.items()}
-        except _Missing as missing:
-            self.unjudged = str(missing)
+        except KeyError as missing:
+            self.unjudged = f"episode_metrics reads what no flight has: {one_line(missing)}"
             return {}
-
-
-class _Flight(dict[str, Any]):
-    """Takes the place of the rollout in ``episode_metrics``: a mapping whose keys are names, or tuples of names."""
-
-    def put(self, path: tuple[str, ...], value: Tensor) -> None:
-        """Set an entry, and make the mappings on the way to it."""
-        first, *rest = path
-        if rest:
-            self.setdefault(first, _Flight()).put(tuple(rest), value)
-        else:
-            self[first] = value
-        self.batch_size = self.shape = value.shape[:2]
-
-    def __getitem__(self, key: Any) -> Any:
-        first, *rest = (key,) if isinstance(key, str) else key
-        if first not in self.keys():
-            raise _Missing(f"episode_metrics reads {first!r}, which a bundle does not know")
-        value = super().__getitem__(first)
-        return value[tuple(rest)] if rest else value
-
-    def __contains__(self, key: object) -> bool:
-        with contextlib.suppress(_Missing):
-            return self[key] is not None
-        return False
-
-    def get(self, key: Any, default: Any = None) -> Any:
-        """The entry of this name, or the default."""
-        with contextlib.suppress(_Missing):
-            return self[key]
-        return default
+        return {f"episode.{name}": value.to(self.env.dtype) for name, value in found.items()}
 
 
 # -- from functions to one ONNX model ----------------------------------------------------------------------------------
@@ -324,9 +291,9 @@ class _Cut:
         """The graphs, with the entries that they need, and none of what they do not."""
         task = type(rules.env).__name__
         if why := self._why_not("observation"):
-            known = ", ".join(rules.known)
             raise UserValueError(
-                f"export_policy: {task}: its observation cannot be computed: {why}. Known are {known}."
+                f"export_policy: {task}: its observation cannot be exported: {why}. A drone knows "
+                f"{', '.join(rules.known)}."
             )
         unjudged = rules.unjudged
         for name in [] if unjudged else [*(f"judge.{x}" for x in ENDS), "episode.solved", "episode.crash"]:

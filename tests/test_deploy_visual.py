@@ -1,4 +1,4 @@
-"""Policies that see and remember, exported: images and their faults, the memory, and what is refused."""
+"""Visual policies that remember, exported: images and their faults, the memory, and what is refused."""
 
 import ctypes
 import math
@@ -23,11 +23,10 @@ from torchrl_quad.deploy import (
     transfer,
 )
 from torchrl_quad.deploy.bundle import Bundle
-from torchrl_quad.deploy.judging import judge
-from torchrl_quad.deploy.replaying import environment
+from torchrl_quad.deploy.judging import Judge
 
 
-def a_policy_that_sees():
+def a_visual_policy():
     """A small one that remembers, with its environment."""
     env = HoveringEnv(num_envs=64, max_episode_steps=16, camera={"width": 3, "height": 2, "rate": 3, "delay": 2})
     actor = make_visual_actor(env, num_cells=(4,), channels=(2,), hidden_size=2)
@@ -37,10 +36,10 @@ def a_policy_that_sees():
 
 
 @pytest.fixture(scope="module")
-def seeing(tmp_path_factory):
+def visual(tmp_path_factory):
     torch.manual_seed(0)
-    env, actor = a_policy_that_sees()
-    return export_policy(actor, env, tmp_path_factory.mktemp("seeing") / "policy")
+    env, actor = a_visual_policy()
+    return export_policy(actor, env, tmp_path_factory.mktemp("visual") / "policy")
 
 
 IMAGE = [[0.0, 2.0, 12.0], [1.0, 3.0, 10.0]]
@@ -67,8 +66,8 @@ def pixel(value):
         (StaleState, "The state is 1 s old", {"age": 1}),
     ],
 )
-def test_each_fault_of_an_image_has_a_name_and_leaves_the_memory_as_it_was(seeing, kind, message, changes):
-    bundle, untouched = load_bundle(seeing, on_fault="hover"), load_bundle(seeing)
+def test_each_fault_of_an_image_has_a_name_and_leaves_the_memory_as_it_was(visual, kind, message, changes):
+    bundle, untouched = load_bundle(visual, on_fault="hover"), load_bundle(visual)
     state = resting(depth=IMAGE, depth_age=0.1)
     first = bundle(state)
     assert not np.array_equal(bundle.memory, [0, 0]) and bundle.memory.dtype == np.float32
@@ -97,8 +96,8 @@ def test_c_leaves_the_memory_as_it_was_where_it_reads_what_is_not_finite(export_
     assert memory[3] != 0.5
 
 
-def test_a_bundle_that_acts_or_remembers_otherwise_than_its_policy_is_not_written(tmp_path, monkeypatch):
-    env, actor = a_policy_that_sees()
+def test_a_bundle_that_acts_or_remembers_differently_from_its_policy_is_not_written(tmp_path, monkeypatch, trace_once):
+    env, actor = a_visual_policy()
 
     def forgets(self, *given, read=Bundle._read):
         return read(self, *given) | {"memory": np.zeros_like(self.memory)}
@@ -108,7 +107,10 @@ def test_a_bundle_that_acts_or_remembers_otherwise_than_its_policy_is_not_writte
         *layers, last = network.layers
         return network._replace(layers=[*layers, last._replace(bias=last.bias + np.float32(1e-3))])
 
-    wrongs = ((Bundle, "_read", forgets, ValueError, "acts otherwise"), (export, "fold", off, WrongActions, "by 0.001"))
+    wrongs = (
+        (Bundle, "_read", forgets, ValueError, "acts differently"),
+        (export, "fold", off, WrongActions, "by 0.001"),
+    )
     for owner, name, wrong, error, said in wrongs:
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, wrong)
@@ -118,17 +120,17 @@ def test_a_bundle_that_acts_or_remembers_otherwise_than_its_policy_is_not_writte
     assert export_policy(actor, env, tmp_path / "policy").is_dir()
 
 
-def test_no_simulator_flies_what_sees_or_what_flies_through_a_forest(export_once):
-    for task, why in (("forest", "images"), ("forest, blind", "no trees"), ("hovering, without memory", "no camera")):
+def test_no_simulator_flies_a_visual_policy_or_a_task_with_obstacles(export_once):
+    ways = (("forest", "images"), ("forest, blind", "obstacles"), ("hovering, without memory", "no camera"))
+    for task, why in ways:
         with pytest.raises(ValueError, match=f"cannot fly this bundle of the task .*: .*{why}"):
             transfer.fly(export_once(task)[2], "torchrl_quad")
-    forest = load_bundle(export_once("forest, blind")[2]).contract
-    for refused, why in ((environment, "no trees"), (lambda about: judge(about, {}), "'forest' has obstacles to hit")):
-        with pytest.raises(ValueError, match=why):
-            refused(forest)
+    bundle = load_bundle(export_once("forest, blind")[2])
+    with pytest.raises(ValueError, match="'forest' cannot be judged here: its drones crash into obstacles"):
+        Judge(bundle, bundle.starts())
 
 
-def test_a_policy_that_sees_otherwise_than_it_was_built_is_refused(tmp_path):
+def test_a_visual_policy_that_was_built_for_another_camera_or_changed_is_refused(tmp_path):
     forest = ForestEnv(num_envs=2, camera={"width": 6, "height": 5})
     seen, hooked, deeper = (make_visual_actor(forest) for _ in range(3))
 
@@ -146,5 +148,5 @@ def test_a_policy_that_sees_otherwise_than_it_was_built_is_refused(tmp_path):
     velocity = make_visual_actor(forest, in_keys=[("state", "velocity")])
     refuses(r"reads \['depth', \('state', 'velocity'\)\]. A drone can give it", velocity)
     flatter = make_visual_actor(forest)
-    flatter[0][0].module.eyes[1] = nn.ELU(0.5)
+    flatter[0][0].module.convolutions[1] = nn.ELU(0.5)
     refuses("cannot write ELU.alpha=0.5", flatter)

@@ -24,7 +24,7 @@ REFUSED = [  # of ABPT, unless a recipe is named
     ("actor.lr=0", "actor.lr=0: it must be greater than 0"),
     ("actor.betas=[0.9]", r"actor.betas=\[0.9\]: it must have at least 2 items, not 1. .* such as \[0.9, 0.999\]"),
     ("actor.betas=[0.9,1.0]", r"actor.betas\[1\]=1.0: it must be less than 1"),
-    ("actor.num_cells=64", r"actor.num_cells=64: it must be a list. .* or \[64\] for a single layer"),
+    ("actor.num_cells=64", r"actor.num_cells=64: it must be a list. .* or \[64\] for one layer"),
     ("actor.num_cells=[64,0]", r"actor.num_cells\[1\]=0: it must be at least 1"),
     ("actor.activation=functional", "actor.activation=functional: it must be 'CELU', 'ELU', .* or 'Tanh'"),
     ("actor.schedule=step", "actor.schedule=step: it must be 'constant', 'linear', 'exponential' or 'cosine'"),
@@ -90,7 +90,7 @@ REFUSED = [  # of ABPT, unless a recipe is named
     ("ppo +loss.gamma=0.9", "loss.gamma is unknown, or set by the recipe"),
     ("critic=null", "critic=null: it must be a section with settings of its own"),
     ("~critic.tau", "critic.tau is missing: do not delete it"),
-    ("num_envs=10000 horizon=20000", "it must have num_envs times horizon at most 100,000,000"),
+    ("num_envs=10000 horizon=20000", "num_envs times horizon must be at most 100,000,000"),
     ("env.control_dt=${nothing}", "env.control_dt: Interpolation key 'nothing' not found"),
     ("env.observe_last_action='False'", "env.observe_last_action=False: it must be true or false"),
     ("+actor.rate=0.9", "actor.rate is unknown"),
@@ -152,7 +152,7 @@ def test_every_setting_that_another_may_switch_off_is_one():
 
 def test_an_exponential_schedule_does_not_end_at_zero_while_a_linear_one_may():
     check(composed("abpt", "actor.final_lr=0"))
-    with pytest.raises(ValueError, match="actor: it must have a final_lr above 0 with schedule=exponential"):
+    with pytest.raises(ValueError, match="actor.final_lr=0: it must be above 0 with schedule=exponential"):
         check(composed("abpt", "actor.final_lr=0", "actor.schedule=exponential"))
 
 

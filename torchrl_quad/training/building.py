@@ -8,19 +8,21 @@ from typing import Any, TypeVar, cast
 
 import torch
 import torch.distributed as dist
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import ObservationNormalizer, QuadrotorEnv, TrustRegion, make_actor, make_env, make_visual_actor
+from torchrl_quad.data.unwrap import base_env, leaf, observed
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.options import argument_names
-from torchrl_quad.training.configuration import own_disturbances, own_loss
+from torchrl_quad.training.configuration import own_disturbances, own_loss, plain
 
 SEEDS_PER_RUN = 10_000  # the process of rank r draws from seed + r * this
 _Loss = TypeVar("_Loss", bound=PathwiseLoss)
@@ -73,7 +75,7 @@ def set_up(cfg: DictConfig) -> tuple[EnvBase, TensorDictModule]:
 
 def build_env(cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = False) -> EnvBase:
     """Build the environment of a configuration, with a normaliser if it asks for one."""
-    options = cast("dict[str, Any]", OmegaConf.to_container(cfg.env, resolve=True))
+    options = plain(cfg.env, resolve=True)
     if (disturbances := own_disturbances(options.pop("disturbances", None))) is not None:
         options["disturbances"] = disturbances
     env = make_env(cfg.task, num_envs=num_envs, device=cfg.device, seed=seed, compile=compile, **options)
@@ -82,7 +84,7 @@ def build_env(cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = Fals
 
 def task_of(env: EnvBase) -> QuadrotorEnv:
     """The task under a normaliser, or the environment itself."""
-    return cast("QuadrotorEnv", env.base_env if isinstance(env, TransformedEnv) else env)
+    return cast("QuadrotorEnv", base_env(env))
 
 
 def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModule:
@@ -91,17 +93,11 @@ def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModule:
     It reads the depth images of a camera, unless the environment has none or ``actor.vision`` is false.
     """
     log_prob = "entropy_bonus" in cfg.loss or cfg.loss.get("alpha", 0) != 0  # of PPO, or of an entropy bonus
-    options = network(cfg, "actor")
-    options |= {name: cfg.actor[name] for name in ("scale_init", "noise_correlation", "learn_scale")}
-    if not is_visual(cfg, env):
+    options = network(cfg, "actor") | {x: cfg.actor[x] for x in ("scale_init", "noise_correlation", "learn_scale")}
+    if not cfg.actor.vision or "depth" not in observed(env):
         return make_actor(env, **options, return_log_prob=log_prob)
     options |= {name: cfg.actor[name] for name in ("recurrent", "hidden_size")} | {"channels": list(cfg.actor.channels)}
     return make_visual_actor(env, **options, return_log_prob=log_prob)
-
-
-def is_visual(cfg: DictConfig, env: EnvBase) -> bool:
-    """Whether the policy of a configuration reads the images of a camera."""
-    return cfg.actor.vision and "depth" in env.observation_spec
 
 
 def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str, Any]:
@@ -113,7 +109,7 @@ def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str,
     scale = 1.0 if cfg.normalize else section.input_scale
     activation = getattr(nn, section.activation)
     options = {"num_cells": list(section.num_cells), "activation": activation, "input_scale": scale}
-    if env is not None and "obstacle" in env.observation_spec:
+    if env is not None and "obstacle" in observed(env):
         options |= {"in_keys": ["observation", "obstacle"], "input_scale": [scale, 1.0]}
     return options
 
@@ -138,7 +134,7 @@ def make_loss(
         make_critic: ``make_value`` or ``make_qvalue``, for a loss with a critic.
         **more: arguments of the loss that are no settings.
     """
-    options = cast("dict[str, Any]", OmegaConf.to_container(cfg.loss, resolve=True)) | more
+    options = plain(cfg.loss, resolve=True) | more
     if path := options.pop("_target_", None):
         kind = cast("type[_Loss]", own_loss(path, kind))
         known = argument_names(kind)
@@ -249,15 +245,15 @@ def average_policy(cfg: DictConfig, actor: TensorDictModuleBase) -> AveragedMode
     if share is None:
         return None
 
-    def update(average: list[Tensor], now: list[Tensor], updates: Tensor) -> None:
-        get_ema_multi_avg_fn((1 - 1 / (updates.item() + 1)) ** (1 / share))(average, now, updates)
+    def update(average: Any, now: Any, updates: Tensor | int) -> None:
+        get_ema_multi_avg_fn((1 - 1 / (int(updates) + 1)) ** (1 / share))(average, now, updates)
 
     return AveragedModel(actor, multi_avg_fn=update)
 
 
 def trust_region(cfg: DictConfig, actor: TensorDictModule) -> TrustRegion:
     """The bound of a configuration on what an update does to the policy; all processes shorten alike."""
-    return TrustRegion(actor, cfg.actor.max_kl, average=mean_of_all)
+    return TrustRegion(cast("ProbabilisticActor", actor), cfg.actor.max_kl, average=mean_of_all)
 
 
 # -- data --------------------------------------------------------------------------------------------------------------
@@ -266,21 +262,22 @@ def trust_region(cfg: DictConfig, actor: TensorDictModule) -> TrustRegion:
 def update_normalizer(env: EnvBase, rollout: TensorDictBase) -> None:
     """Update the normaliser, if there is one, with the observations of a horizon from all processes."""
     if isinstance(env, TransformedEnv):
-        seen = cat_all(rollout["next", "observation"].detach())
+        seen = cat_all(leaf(rollout, ("next", "observation")).detach())
         cast("ObservationNormalizer", env.transform).update(TensorDict({("next", "observation"): seen}))
 
 
 def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDictBase]:
     """``cfg.updates`` random batches of ``cfg.batch_size`` steps from a rollout."""
-    steps = rollout.reshape(-1)
+    steps = cast("TensorDict", rollout.reshape(-1))
     for _ in range(cfg.updates):
-        yield steps[torch.randint(len(steps), (cfg.batch_size,), device=steps.device)]
+        yield cast("TensorDict", steps[torch.randint(len(steps), (cfg.batch_size,), device=steps.device)])
 
 
 def shuffled(rollout: TensorDictBase, batch_size: int, epochs: int) -> Iterator[TensorDictBase]:
     """All steps of a rollout ``epochs`` times, in random batches; of a policy with a memory, whole horizons."""
     remembers, horizon = "is_init" in rollout, rollout.shape[-1]
-    steps = rollout if remembers else rollout.reshape(-1)
+    steps = cast("TensorDict", rollout if remembers else rollout.reshape(-1))
     size = max(batch_size // horizon, 1) if remembers else batch_size
     for _ in range(epochs):
-        yield from steps[torch.randperm(len(steps), device=steps.device)].split(size)
+        mixed = cast("TensorDict", steps[torch.randperm(len(steps), device=steps.device)])
+        yield from mixed.split(size)

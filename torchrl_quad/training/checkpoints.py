@@ -20,7 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl_quad.dynamics import presets
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import replacing
-from torchrl_quad.training.configuration import CONFIG, named_code
+from torchrl_quad.training.configuration import CONFIG, named_code, plain
 from torchrl_quad.training.schema import check
 
 FORMAT = 5  # of the content; raise it when older files can no longer be read
@@ -124,7 +124,7 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
     overrides = [override.lstrip("+~").partition("=") for override in HydraConfig.get().overrides.task]
     asked = {name: OmegaConf.select(cfg, name) for name, _, _ in overrides}
     path = Path(cfg.resume)
-    saved = saved_config(path, read_checkpoint(path), [*cfg.trust, *named_code(OmegaConf.to_container(cfg))])
+    saved = saved_config(path, read_checkpoint(path), [*cfg.trust, *named_code(plain(cfg))])
     for name, _, value in overrides:
         if name == "tuned" and value != "null":
             asked |= _leaves(OmegaConf.load(CONFIG / f"tuned/{value}.yaml"))

@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import NoneType
-from typing import Any
+from typing import Any, cast
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -59,6 +59,11 @@ def command_line(arguments: Iterable[str]) -> list[str]:
             node = {"task": name, "env": defaults(task_class(name))}
             ConfigStore.instance().store(group="task", name=name, node=node, package="_global_")
     return arguments
+
+
+def plain(cfg: Any, **options: Any) -> dict[str, Any]:
+    """A section of a configuration as a dict; the options are those of ``OmegaConf.to_container``."""
+    return cast("dict[str, Any]", OmegaConf.to_container(cfg, **options))
 
 
 def defaults(cls: type[QuadrotorEnv]) -> dict[str, Any]:

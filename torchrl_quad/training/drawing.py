@@ -13,12 +13,14 @@ import sys
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
+from torchrl_quad import QuadrotorEnv
+from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.deploy import Bundle
 from torchrl_quad.deploy.transfer import as_rollout, fly
 from torchrl_quad.errors import UserError
@@ -58,13 +60,13 @@ def draw_transfer(
     title = f"drones 1 to {drones}: {labels[0]}; {drones + 1} to {2 * drones}, from the same starts: {labels[1]}"
     page = path.with_suffix(".html")
     with _or_without(page):
-        write_replay(torch.cat((ours, theirs)), page, title=title, **about)
+        write_replay(cast("TensorDict", torch.cat((ours, theirs))), page, title=title, **about)
 
 
 def draw_learning_curve(metrics: Path, path: Path, env: EnvBase) -> None:
     """Draw the evaluations in a metrics.csv over training time and steps."""
     with _or_without(path):
-        plot_learning_curve(metrics, path, metrics=env.metric_info)
+        plot_learning_curve(metrics, path, metrics=cast("QuadrotorEnv", base_env(env)).metric_info)
 
 
 def _film(path: Path, flight: TensorDictBase, sharp: dict[str, Any] | None = None, **options: Any) -> None:

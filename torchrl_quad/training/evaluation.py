@@ -11,13 +11,14 @@ from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_quad import differentiable_rollout
+from torchrl_quad.data.unwrap import group
 from torchrl_quad.envs.metrics import EPISODE_METRICS, describe_metric, first_episode
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import replacing
@@ -36,19 +37,22 @@ def evaluate(
     """
     task, of_episodes = task_of(env), []
     with torch.no_grad():
-        for _ in range(rounds(episodes, env.batch_size[0])):
+        for _ in range(rounds(episodes, task.num_envs)):
             flight, _ = differentiable_rollout(
                 env, actor, None, task.max_episode_steps, exploration_type=ExplorationType.DETERMINISTIC
             )
             first = first_episode(flight)
-            rewards = {name: (term * first).sum(1) for name, term in flight["next", "reward_terms"].items()}
-            of_episodes.append(TensorDict({"eval": task.episode_metrics(flight), "reward": rewards}, env.batch_size))
-    measured = torch.cat(of_episodes)
-    metrics = {
-        f"eval/{name}": describe_metric(name, task.metric_info).summarise(values)
-        for name, values in measured["eval"].items()
-    }
-    return metrics | {f"reward/{name}": term.mean().item() for name, term in measured["reward"].items()}, flight
+            measured = {f"eval/{name}": x for name, x in task.episode_metrics(flight).items()}
+            for name, term in group(flight, ("next", "reward_terms")).items():
+                measured[f"reward/{name}"] = cast("Tensor", (term * first).sum(1))
+            of_episodes.append(measured)
+    metrics = {}
+    for name in of_episodes[0]:
+        section, _, key = name.partition("/")
+        values = torch.cat([each[name] for each in of_episodes])
+        is_term = section == "reward"
+        metrics[name] = values.mean().item() if is_term else describe_metric(key, task.metric_info).summarise(values)
+    return metrics, flight
 
 
 def rounds(episodes: int | None, drones: int) -> int:

@@ -35,7 +35,7 @@ from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import locked, make_folder
 from torchrl_quad.training.building import rank, world_size
 from torchrl_quad.training.checkpoints import take_over
-from torchrl_quad.training.configuration import CONFIG, OWN, command_line, named_code, own_recipe
+from torchrl_quad.training.configuration import CONFIG, OWN, command_line, named_code, own_recipe, plain
 from torchrl_quad.training.schema import check
 
 LOCK = "run.lock"  # names the process that writes into the folder of a run
@@ -286,7 +286,7 @@ def _resumable(folder: Path, cfg: DictConfig) -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, OSError) as error:
-        trust = ", ".join(named_code(OmegaConf.to_container(cfg)))
+        trust = ", ".join(named_code(plain(cfg)))
         how = f"Go on with: python {sys.argv[0]} resume={checkpoint}" + (f" 'trust=[{trust}]'" if trust else "")
         is_saved = checkpoint.exists()
         if isinstance(error, KeyboardInterrupt):

@@ -7,15 +7,16 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torchrl.record.loggers import get_logger
 
 from torchrl_quad.envs.metrics import Metric
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import write_rows
+from torchrl_quad.training.configuration import plain
 from torchrl_quad.training.evaluation import as_json
 
 ARTIFACT = ("checkpoint.pt", "config.yaml", "policy")  # of a run's folder, where they are there; and summary.json
@@ -46,12 +47,12 @@ class Logs:
         saved: dict[str, Any] | None,
     ) -> None:
         self.cfg, self.folder, self.rows = cfg, folder, rows
-        self.backend = None
+        self.backend: Any = None
         if rows:
             self._write()  # without those that came after the checkpoint
         if not cfg.logger.backend:
             return
-        config = {**OmegaConf.to_container(cfg, resolve=True), "revision": revision}
+        config = plain(cfg, resolve=True) | {"revision": revision}
         name = f"{cfg.task}_{cfg.algorithm}_seed{cfg.seed}"
         self.name = (saved or {}).get("name") or run_name(name, HydraConfig.get().overrides.task)
         wandb = {
@@ -94,7 +95,7 @@ class Logs:
 
             films = "flight.mp4", "flight.gif"
             drawn = self._drawn("eval/flight", "flight.png", make=wandb.Image)
-            drawn |= self._drawn("eval/film", *films, make=lambda x: wandb.Video(x, format=x[-3:]))
+            drawn |= self._drawn("eval/film", *films, make=lambda x: wandb.Video(x, format=cast("Any", x[-3:])))
             self.backend.experiment.log({"steps": steps, **drawn})
 
     def finish(self, summary: dict[str, Any]) -> None:
@@ -142,7 +143,7 @@ def _logger(backend: str, *arguments: Any, **options: Any) -> Any:
         UserValueError: wandb refuses, as where nobody has logged in.
     """
     try:
-        return get_logger(backend, *arguments, **options)
+        return get_logger(cast("Any", backend), *arguments, **options)
     except Exception as error:
         if not type(error).__module__.startswith("wandb"):
             raise

@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 import torch.distributed as dist
@@ -18,7 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.objectives import LossModule
 from tqdm import tqdm
 
 import torchrl_quad
@@ -31,7 +32,7 @@ from torchrl_quad import (
 )
 from torchrl_quad.errors import Diverged, UserValueError
 from torchrl_quad.files import replacing
-from torchrl_quad.objectives import PathwiseLoss
+from torchrl_quad.objectives import PathwiseCriticLoss, PathwiseLoss
 from torchrl_quad.training import drawing
 from torchrl_quad.training.building import (
     Optimizer,
@@ -102,16 +103,17 @@ class Run:
         cfg: DictConfig,
         env: EnvBase,
         actor: TensorDictModule,
-        loss: nn.Module,
+        loss: LossModule,
         stateful: Sequence[Any],
         buffer: VisitedStateBuffer | None = None,
     ) -> None:
         self.cfg, self.env, self.actor, self.loss, self.buffer = cfg, env, actor, loss, buffer
         self.task = task_of(env)
         self.average = average_policy(cfg, actor)
-        self.flown = actor if self.average is None else self.average.module  # what evaluations fly
-        averages = [] if self.average is None else [self.average]
-        self.stateful = [loss, *stateful, *averages, *([env.transform] if cfg.normalize else [])]
+        # What evaluations fly.
+        self.flown = actor if self.average is None else cast("TensorDictModule", self.average.module)
+        self.normalizer = env.transform if isinstance(env, TransformedEnv) else None
+        self.stateful = [x for x in (loss, *stateful, self.average, self.normalizer) if x is not None]
         self.horizon, self.steps, self.drones = cfg.horizon, 0, cfg.num_envs * world_size()
         self.total_steps = iterations(cfg) * cfg.horizon * self.drones
         self.recorded: dict[str, list[float]] = defaultdict(list)
@@ -133,7 +135,9 @@ class Run:
         if rank() == 0 and not self.is_over:
             for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
                 (self.folder / name).unlink(missing_ok=True)
-            self.logs = Logs(cfg, self.folder, self.revision, self.rows, self.steps, env.metric_info, logger_state)
+            self.logs = Logs(
+                cfg, self.folder, self.revision, self.rows, self.steps, self.task.metric_info, logger_state
+            )
             with replacing(self.folder / "config.yaml") as path:
                 OmegaConf.save(cfg, path, resolve=True)
 
@@ -223,14 +227,15 @@ class Run:
         Returns:
             the loss and the metrics of the last minibatch.
         """
-        loss = self.loss
+        loss, metrics = cast("PathwiseCriticLoss", self.loss), {}
         read = data.select(*getattr(loss, loss.critic_name).in_keys, loss.tensor_keys.value_target)
         for batch in minibatches(read, self.cfg.critic):
-            loss_critic, metrics = getattr(loss, loss.critic_loss_key)(batch)
+            loss_critic, measured = getattr(loss, loss.critic_loss_key)(batch)
             self.optimise(optimizer, loss_critic)
+            metrics = {loss.critic_loss_key: loss_critic, **measured}
             if target is not None:
                 target.step()
-        return {loss.critic_loss_key: loss_critic, **metrics}
+        return metrics
 
     def record(self, **metrics: Tensor | float) -> None:
         """Keep what this iteration measured; a row holds the mean since the row before."""
@@ -244,17 +249,17 @@ class Run:
 
     def _warm_up(self) -> None:
         """Compile all that the loop will call, before the clock starts; change nothing."""
-        pathwise = isinstance(self.loss, PathwiseLoss)
+        loss = self.loss if isinstance(self.loss, PathwiseLoss) else None
         before = copy.deepcopy(self.loss.state_dict())
         with (
             torch.random.fork_rng(),
             drawing_from(self.env, self.cfg.eval.seed),
-            torch.set_grad_enabled(pathwise),
+            torch.set_grad_enabled(loss is not None),
         ):
             rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, min(self.cfg.horizon, 2))
-            if pathwise:
-                self.loss.loss_actor(rollout)[0].backward()
-                self.loss.zero_grad()
+            if loss is not None:
+                loss.loss_actor(rollout)[0].backward()
+                loss.zero_grad()
         self.loss.load_state_dict(before)  # such as running means
 
     def _evaluate(self) -> dict[str, float]:
@@ -284,8 +289,8 @@ class Run:
         score = {name: metrics[f"eval/{name}"] for name in ("solved", "return")}
         record = self.best["solved"], self.best["return"]
         if math.isfinite(score["return"]) and tuple(score.values()) >= record:
-            policy = {"actor": self.flown, **({"normalizer": self.env.transform} if self.cfg.normalize else {})}
-            weights = {name: copy.deepcopy(module.state_dict()) for name, module in policy.items()}
+            policy = {"actor": self.flown, "normalizer": self.normalizer}
+            weights = {name: copy.deepcopy(x.state_dict()) for name, x in policy.items() if x is not None}
             self.best = {**score, "steps": self.steps, **weights}
         return metrics
 
@@ -374,8 +379,8 @@ class Run:
             if self.buffer is not None:
                 self.buffer.load_state_dict(own["buffer"])
             if own["clip"] is not None:
-                self.loss.clip.load_state_dict(own["clip"])
-            carry = TensorDict(own["carry"], self.env.batch_size).to(self.env.device)
+                cast("Any", self.loss).clip.load_state_dict(own["clip"])
+            carry = TensorDict(own["carry"], [self.cfg.num_envs]).to(self.env.device)
             self.carry = self.env.reset(carry.exclude("_reset"), set_state=True).update(carry)
             self.task.set_random_state(own["env"])
             torch.set_rng_state(own["torch"])

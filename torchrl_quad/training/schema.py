@@ -1,8 +1,8 @@
 """The schema of the configuration: the type and the range of every setting, checked before a run makes its folder.
 
 A setting is refused with its name, its value, what it must be, and the sentence that describes it. The signatures of
-task and loss declare the settings in ``env`` and ``loss``, this file all others. The YAML files of a recipe say which
-of them it has.
+task and loss declare the settings in ``env`` and ``loss``, ``SETTINGS`` all others. The YAML files of a recipe say
+which of them it has.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ from __future__ import annotations
 import difflib
 import inspect
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import Annotated, Any, Literal, cast
 
 import torch
 from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from torchrl_quad import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
 from torchrl_quad.envs import task_class
@@ -27,19 +27,20 @@ from torchrl_quad.options import (
     Below1,
     Count,
     Fraction,
+    Horizon,
     NonNegative,
     Positive,
     Real,
     Share,
     Size,
+    Width,
     argument_names,
     check_known,
     declared,
     must,
 )
-from torchrl_quad.training.configuration import CONFIG, OWN, SET_BY_RECIPES, own_disturbances, own_loss
+from torchrl_quad.training.configuration import CONFIG, OWN, SET_BY_RECIPES, own_disturbances, own_loss, plain
 
-TRUST = "The paths of your own classes that a checkpoint names, and that may be imported."
 MAX_ROLLOUT = 100_000_000  # control steps of a rollout: with a graph they take more than 50 GB
 
 
@@ -53,21 +54,10 @@ def available_device(name: str) -> str:
 
 
 def existing_checkpoint(path: str) -> str:
-    """The path of a checkpoint to go on from, or auto."""
+    """The path of a checkpoint to continue from, or auto."""
     if path != "auto" and not Path(path).is_file():
         raise UserValueError("be the path of a checkpoint.pt that exists, or auto")
     return path
-
-
-# -- types -------------------------------------------------------------------------------------------------------------
-
-Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
-Device = Annotated[str, AfterValidator(available_device)]
-Threads = Annotated[int, Field(ge=1, le=1024)]
-ACTIVATIONS = (
-    "CELU ELU GELU Hardswish LeakyReLU Mish PReLU ReLU SELU SiLU Sigmoid Softplus Softsign Tanh"  # of torch.nn
-)
-Activation = Literal[tuple(ACTIVATIONS.split())]  # type: ignore[valid-type]
 
 
 class Section(BaseModel):
@@ -76,208 +66,94 @@ class Section(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid")
 
 
-_Section = TypeVar("_Section", bound=Section)
+# -- what is declared here ---------------------------------------------------------------------------------------------
 
+ACTIVATIONS = "CELU ELU GELU Hardswish LeakyReLU Mish PReLU ReLU SELU SiLU Sigmoid Softplus Softsign Tanh"  # torch.nn
+_Channels = Annotated[list[Annotated[int, Field(ge=1, le=4096)]], Field(min_length=1, max_length=8)]
+_Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 
-class Optimised(Section):
-    """A network and its optimiser."""
-
-    num_cells: list[Annotated[int, Field(ge=1, le=65_536)]] = Field(
-        description="The width of every hidden layer, in a list: [64, 64], or [64] for a single layer."
-    )
-    activation: Activation
-    input_scale: Positive = Field(description="The observation is multiplied by this.")
-    lr: Positive = Field(description="The learning rate at the start; to keep a network as it is, write 1e-12.")
-    schedule: Literal["constant", "linear", "exponential", "cosine"]
-    final_lr: NonNegative = Field(description="The learning rate at the end of the run.")
-    betas: list[Below1] = Field(
-        min_length=2, max_length=2, description="The two decay rates of Adam's averages, such as [0.9, 0.999]."
-    )
-    max_grad_norm: Positive = Field(
-        description="Longer gradients are shortened to this norm; to clip nothing, write a large number such as 1e9."
-    )
-
-    @model_validator(mode="after")
-    def _exponential_never_reaches_zero(self) -> Optimised:
-        if self.schedule == "exponential" and self.final_lr == 0:
-            raise UserValueError("have a final_lr above 0 with schedule=exponential, which never reaches 0; try 1e-6")
-        return self
-
-
-class Actor(Optimised):
-    """The policy."""
-
-    scale_init: Annotated[Real, Field(ge=1e-4)] = Field(
-        description="The standard deviation of the policy's noise at the start."
-    )
-    learn_scale: bool = Field(description="Whether this noise changes with the state and in training.")
-    vision: bool = Field(description="Whether the policy reads the images of a camera, where there is one.")
-    recurrent: bool = Field(description="Whether a policy that sees has a memory.")
-    hidden_size: int = Field(ge=1, le=65_536, description="Numbers in that memory.")
-    channels: list[Annotated[int, Field(ge=1, le=4096)]] = Field(
-        min_length=1, max_length=8, description="Of the convolutions of a policy that sees: [8, 16]."
-    )
-    noise_correlation: Below1 = Field(
-        description="Of the policy's noise in two steps that follow each other; 0 is white noise."
-    )
-    max_kl: Positive | None = Field(
-        description="How far an update, or PPO's iteration, may move the policy; null for none."
-    )
-    average: Share | None = Field(
-        description="The share of the iterations so far over which the weights that are evaluated are averaged, such "
-        "as 0.1; null for none."
-    )
-
-
-class Critic(Optimised):
-    """The critic; some recipes add the settings of ``CRITIC``."""
-
-    lmbda: Fraction = Field(description="The lambda of the TD(lambda) targets; 0.95 is usual.")
-
-
-CRITIC: dict[str, Any] = {
-    "updates": Annotated[int, Field(ge=1, le=100_000, description="Gradient steps of the critic per iteration.")],
-    "batch_size": Annotated[Size, Field(description="Control steps in a minibatch of the critic.")],
-    "tau": Annotated[
-        Share, Field(description="The share of the critic that its target network takes over in each update.")
-    ],
+#: The type and the description of each setting outside env and loss; "network" stands for actor and critic.
+SETTINGS: dict[str, tuple[Any, str]] = {
+    "algorithm": (str, ""),
+    "task": (str, ""),
+    "seed": (_Seed, "All random numbers follow from it."),
+    "resume": (Annotated[str, AfterValidator(existing_checkpoint)] | None, ""),
+    "trust": (list[str], "The paths of your own classes that a checkpoint names, and that may be imported."),
+    "device": (Annotated[str, AfterValidator(available_device)], ""),
+    "threads": (Annotated[int, Field(ge=1, le=1024)], "Torch threads; 1 is the fastest for tensors as small as these."),
+    "num_envs": (Size, "Drones of each process; no memory holds more than these."),
+    "horizon": (Horizon, "Control steps in a rollout."),
+    "total_steps": (Annotated[int, Field(ge=1, le=10**15)], "Control steps of all drones together, in the whole run."),
+    "compile": (bool, ""),
+    "normalize": (bool, ""),
+    "gamma": (Fraction, "The discount of future rewards per control step; 0.99 is usual."),
+    "diagnostics": (Count, "Evaluations between audits of reward and gradient; 0 for none."),
+    "max_skipped": (Count, "Updates that may be left out for not being finite; 0 stops at the first."),
+    "restart_fraction": (Fraction, "The share of flights that each iteration gives up."),
+    "epochs": (Annotated[int, Field(ge=1, le=10_000)], "Passes over each rollout."),
+    "batch_size": (Size, "Control steps in a minibatch."),
+    "network.num_cells": (list[Width], "The width of every hidden layer, in a list: [64, 64], or [64] for one layer."),
+    "network.activation": (cast("Any", Literal)[tuple(ACTIVATIONS.split())], ""),
+    "network.input_scale": (Positive, "The observation is multiplied by this."),
+    "network.lr": (Positive, "The learning rate at the start; to keep a network as it is, write 1e-12."),
+    "network.schedule": (Literal["constant", "linear", "exponential", "cosine"], ""),
+    "network.final_lr": (NonNegative, "The learning rate at the end of the run."),
+    "network.betas": (
+        Annotated[list[Below1], Field(min_length=2, max_length=2)],
+        "The two decay rates of Adam's averages, such as [0.9, 0.999].",
+    ),
+    "network.max_grad_norm": (Positive, "Longer gradients are shortened to this norm; to clip nothing, write 1e9."),
+    "actor.scale_init": (Annotated[Real, Field(ge=1e-4)], "The standard deviation of the policy's noise at the start."),
+    "actor.learn_scale": (bool, "Whether this noise changes with the state and in training."),
+    "actor.noise_correlation": (Below1, "Of the policy's noise in two steps that follow each other; 0 is white noise."),
+    "actor.vision": (bool, "Whether the policy reads the images of a camera, where there is one."),
+    "actor.recurrent": (bool, "Whether a visual policy has a memory."),
+    "actor.hidden_size": (Width, "Numbers in that memory."),
+    "actor.channels": (_Channels, "Of the convolutions of a visual policy: [8, 16]."),
+    "actor.max_kl": (Positive | None, "How far an update, or PPO's iteration, may move the policy; null for none."),
+    "actor.average": (Share | None, "The share of the iterations whose weights are averaged, as 0.1; null for none."),
+    "critic.lmbda": (Fraction, "The lambda of the TD(lambda) targets; 0.95 is usual."),
+    "critic.updates": (Annotated[int, Field(ge=1, le=100_000)], "Gradient steps of the critic per iteration."),
+    "critic.batch_size": (Size, "Control steps in a minibatch of the critic."),
+    "critic.tau": (Share, "The share of the critic that its target network takes over in each update."),
+    "buffer.capacity": (Size, "Visited states kept; the oldest go first."),
+    "buffer.fraction": (Fraction | None, "The share of horizons that start in visited states; null for none."),
+    "eval.interval": (Size, "Iterations between evaluations; for only the last one, write 10000000."),
+    "eval.episodes": (Size | None, "Episodes of each evaluation, at least; null for one of each drone."),
+    "eval.seed": (_Seed, ""),
+    "logger.backend": (Literal["wandb", "tensorboard", "csv"] | None, ""),
+    "logger.project": (str, ""),
+    "logger.group": (str | None, ""),
+    "logger.mode": (Literal["offline", "online", "disabled"], ""),
+    "logger.flight_every": (Count, "Evaluations between pictures of the flight; 0 draws only the last one."),
+    "checkpoint": (str, ""),
+    "episodes": (Size, "Fresh episodes to fly, side by side."),
+    "folder": (str | None, "The folder to write."),
+    "logs": (Annotated[list[str], Field(min_length=1)], "The paths of flights of one drone, in a list."),
+    "drone": (str | dict[str, Any], "Where the fit starts: a preset, a YAML file, or a mapping."),
+    "mass": (Positive | None, "The mass in kg, from a scale; null if unknown."),
+    "known": (dict[str, Any] | None, "Fields of the drone that are known by measurement."),
+    "fields": (list[str] | None, "What to fit; null for everything."),
+    "past": (NonNegative, ""),
+    "iterations": (Size, ""),
+    "draws": (Count, "Of the bootstrap over windows; 0 for none."),
 }
-
-
-class Buffer(Section):
-    """The buffer of visited states."""
-
-    capacity: Size = Field(description="Visited states kept; the oldest go first.")
-    fraction: Fraction | None = Field(description="The share of horizons that start in visited states; null for none.")
-
-
-class Evaluation(Section):
-    """The evaluations during training."""
-
-    interval: Size = Field(description="Iterations between evaluations; for the last one alone, write 10000000.")
-    episodes: Size | None = Field(description="Episodes of each evaluation, at least; null for one of each drone.")
-    seed: Seed
-
-
-class Logger(Section):
-    """Loggers beside metrics.csv."""
-
-    backend: Literal["wandb", "tensorboard", "csv"] | None
-    project: str
-    group: str | None
-    mode: Literal["offline", "online", "disabled"]
-    flight_every: Count = Field(description="Evaluations between pictures of the flight; 0 draws the last one alone.")
-
-
-class Training(Section):
-    """The configuration of a training run; some recipes add the settings of ``TRAINING``."""
-
-    algorithm: str
-    task: str
-    seed: Seed = Field(description="Torch, the environment and the buffer draw from it.")
-    resume: Annotated[str, AfterValidator(existing_checkpoint)] | None
-    trust: list[str] = Field(description=TRUST)
-    device: Device
-    threads: Threads = Field(description="Torch threads; 1 is the fastest for tensors as small as these.")
-    num_envs: Size = Field(description="Drones of each process; no memory holds more than these.")
-    horizon: int = Field(ge=1, le=100_000, description="Control steps in a rollout.")
-    total_steps: int = Field(ge=1, le=10**15, description="Control steps of all drones together, in the whole run.")
-    compile: bool
-    normalize: bool
-    actor: Actor
-    gamma: Fraction = Field(description="The discount of future rewards per control step; 0.99 is usual.")
-    diagnostics: Count = Field(description="Evaluations between audits of reward and gradient; 0 for none.")
-    max_skipped: Count = Field(description="Updates that may be left out for not being finite; 0 stops at the first.")
-    eval: Evaluation
-    logger: Logger
-
-    @model_validator(mode="after")
-    def _fits_into_memory(self) -> Training:
-        if self.num_envs * self.horizon > MAX_ROLLOUT:
-            raise ValueError(f"have num_envs times horizon at most {MAX_ROLLOUT:,}, or no memory holds a rollout")
-        return self
-
-
-TRAINING: dict[str, Any] = {
-    "buffer": Buffer,
-    "restart_fraction": Annotated[Fraction, Field(description="The share of flights that each iteration gives up.")],
-    "epochs": Annotated[int, Field(ge=1, le=10_000, description="Passes over each rollout.")],
-    "batch_size": Annotated[Size, Field(description="Control steps in a minibatch.")],
-}
-
-
-class Exporting(Section):
-    """The configuration of export.py."""
-
-    checkpoint: str
-    trust: list[str] = Field(description=TRUST)
-    folder: str | None = Field(description="The folder to write; null: policy, beside the checkpoint.")
-    episodes: Size = Field(description="Fresh episodes to fly, side by side.")
-    threads: Threads
-
-
-class Flying(Section):
-    """The configuration of evaluate.py."""
-
-    checkpoint: str
-    trust: list[str] = Field(description=TRUST)
-    episodes: Size = Field(description="Fresh episodes to fly, side by side.")
-    seed: Seed
-    threads: Threads
-    device: Device
-
-
-class Identifying(Section):
-    """The configuration of identify.py."""
-
-    logs: list[str] = Field(min_length=1, description="The paths of flights of one drone, in a list.")
-    drone: str | dict[str, Any] = Field(description="Where the fit starts: a preset, a YAML file, or a mapping.")
-    mass: Positive | None = Field(description="The mass in kg, from a scale; null if unknown.")
-    known: dict[str, Any] | None = Field(description="Fields of the drone that are known by measurement.")
-    fields: list[str] | None = Field(description="What to fit; null for everything.")
-    folder: str = Field(description="The folder to write.")
-    past: NonNegative
-    horizon: Positive
-    iterations: Size
-    draws: Count = Field(description="Of the bootstrap over windows; 0 for none.")
-    seed: Seed
-    threads: Threads
-
-
+IDENTIFYING = {"horizon": (Positive, ""), "folder": (str, "The folder to write.")}  # of identify.py, under these names
 # -- what is declared elsewhere ----------------------------------------------------------------------------------------
 
-
-def ppo(
-    *,
-    clip_epsilon: Annotated[Real, Field(gt=0, lt=1)] = 0.2,
-    entropy_bonus: bool = True,
-    entropy_coeff: NonNegative = 0.01,
-    critic_coeff: Positive = 1.0,
-    loss_critic_type: Literal["l1", "l2", "smooth_l1"] = "smooth_l1",
-    normalize_advantage: bool = False,
-    max_importance_ratio: Positive | None = None,
-) -> None:
-    """The options of TorchRL's ClipPPOLoss that the recipe takes.
-
-    Args:
-        clip_epsilon: how far the ratio of probabilities may move from 1; 0.2 is usual.
-        entropy_bonus: whether there is one.
-        entropy_coeff: its weight.
-        critic_coeff: the weight of the critic's loss.
-        loss_critic_type: the distance of values from their targets.
-        normalize_advantage: to zero mean and unit variance in each minibatch.
-        max_importance_ratio: the largest ratio of probabilities; null for any.
-    """
-
-
-LOSSES: dict[str, Callable[..., Any]] = {
-    "abpt": ABPTLoss,
-    "ahac": AHACLoss,
-    "bptt": BPTTLoss,
-    "hybrid": HybridLoss,
-    "ppo": ppo,
-    "sapo": SAPOLoss,
-    "shac": SHACLoss,
+#: The options of TorchRL's ClipPPOLoss that the recipe takes.
+PPO: dict[str, tuple[Any, str]] = {
+    "clip_epsilon": (Annotated[Real, Field(gt=0, lt=1)], "How far the ratio of probabilities may move from 1."),
+    "entropy_bonus": (bool, ""),
+    "entropy_coeff": (NonNegative, "The weight of the entropy bonus."),
+    "critic_coeff": (Positive, "The weight of the critic's loss."),
+    "loss_critic_type": (Literal["l1", "l2", "smooth_l1"], "The distance of values from their targets."),
+    "normalize_advantage": (bool, "Whether advantages have zero mean and unit variance in each minibatch."),
+    "max_importance_ratio": (Positive | None, "The largest ratio of probabilities; null for any."),
+}
+LOSSES: dict[str, type | None] = {
+    **{"abpt": ABPTLoss, "ahac": AHACLoss, "bptt": BPTTLoss, "hybrid": HybridLoss, "sapo": SAPOLoss, "shac": SHACLoss},
+    "ppo": None,  # TorchRL's
 }
 # What a recipe builds its loss with itself.
 SET_BY_LOOPS = {"horizon", "average", "reduction", "delay_value", "delay_qvalue"}
@@ -299,19 +175,15 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
 ]
 
 
-def settings(algorithm: str) -> dict[str, Any] | None:
-    """What the YAML files of a recipe set, without those for a task; None for a recipe that is unknown here."""
-    config, own = OWN.get(algorithm, (algorithm, {}))
-    if config not in LOSSES:
-        return None
-    recipe = OmegaConf.create(OmegaConf.load(CONFIG / f"{config}.yaml"))
-    shared = [OmegaConf.load(CONFIG / f"{x}.yaml") for x in recipe["defaults"] if x in ("common", "critic")]
-    merged = _plain(OmegaConf.merge(*shared, recipe, own))
-    return {"task": None} | {name: value for name, value in merged.items() if name not in ("defaults", "hydra")}
-
-
-def _plain(cfg: Any, **options: bool) -> dict[str, Any]:
-    return cast("dict[str, Any]", OmegaConf.to_container(cfg, **options))
+def settings(name: str) -> dict[str, Any]:
+    """What the YAML files of a recipe set, without those for a task; of a recipe that is unknown here, of all."""
+    config, own = OWN.get(name, (name, {}))
+    if not (CONFIG / f"{config}.yaml").is_file():
+        return plain(OmegaConf.merge(*map(settings, LOSSES)))
+    recipe = OmegaConf.load(CONFIG / f"{config}.yaml")
+    shared = [OmegaConf.load(CONFIG / f"{x}.yaml") for x in recipe.defaults if x in ("common", "critic")]
+    merged = plain(OmegaConf.merge(*shared, recipe, own)) | ({"task": None} if shared else {})
+    return {name: value for name, value in merged.items() if name not in ("defaults", "hydra")}
 
 
 # -- the check ---------------------------------------------------------------------------------------------------------
@@ -326,52 +198,69 @@ def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
     """
     try:
         chosen = OmegaConf.masked_copy(cfg, [str(name) for name in cfg if name != "hydra"])
-        values = _plain(chosen, resolve=True, throw_on_missing=True)
+        values = plain(chosen, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
         name = error.full_key or "a setting"
         raise UserValueError(f"{name} is missing: write {name}=... on the command line.") from None
     except OmegaConfBaseException as error:
         raise UserValueError(f"{error.full_key or 'the configuration'}: {str(error).splitlines()[0]}") from None
     _check_none(values)
-    kinds: dict[str, type[Section]] = {"logs": Identifying, "folder": Exporting, "checkpoint": Flying}
     asked = {name.lstrip("+~"): value for name, _, value in (override.partition("=") for override in overrides)}
-    schema = next((kind for name, kind in kinds.items() if name in values), None) or schema_of(values, asked)
+    schema = schema_of(values, asked)
     try:
         schema.model_validate(values)
     except ValidationError as error:
         raise UserValueError(_sentence(schema, error.errors()[0])) from None
     if "algorithm" in values:
         own_disturbances(values["env"].get("disturbances"))
-        _check_effects(values, asked)
+        _check_together(values, asked)
 
 
-def schema_of(values: dict[str, Any], asked: Mapping[str, str] = MappingProxyType({})) -> type[Training]:
-    """The schema of a training run, of its recipe, its task and its loss."""
+def schema_of(values: dict[str, Any], asked: Mapping[str, str] = MappingProxyType({})) -> type[BaseModel]:
+    """The schema of a recipe, with its task and its loss, or of a program beside the recipes."""
+    for name, program in (("logs", "identify"), ("folder", "export"), ("checkpoint", "evaluate")):
+        if name in values:
+            return _section(settings(program), SETTINGS | (IDENTIFYING if program == "identify" else {}))
     for name in ("algorithm", "task"):
         if not isinstance(values.get(name), str):
             raise UserValueError(f"{name}={shown(values.get(name))}: it must be a name.")
+    config, own = OWN.get(values["algorithm"], (values["algorithm"], {}))
     known = settings(values["algorithm"])
-    if known is None:  # of a recipe that is somebody's own, in another program, which may have any of these
-        loss, critic = dict[str, Any], _extended(Critic, {name: (kind, None) for name, kind in CRITIC.items()})
-        more = {name: (kind, None) for name, kind in {**TRAINING, "critic": critic}.items()}
-    else:
-        loss, more = _loss(values["algorithm"], values["loss"], asked), {}
-        if "critic" in known:
-            fields = {name: kind for name, kind in CRITIC.items() if name in known["critic"]}
-            # What the tuned file of another recipe sets, which this one starts from, is left alone.
-            rest = {name: (kind, None) for name, kind in CRITIC.items() if f"critic.{name}" not in asked}
-            more = {"critic": _extended(Critic, rest | fields)}
-        more |= {name: kind for name, kind in TRAINING.items() if name in known}
-    return _extended(Training, {"env": _environment(values), "loss": loss, **more})
+    kinds: dict[str, tuple[Any, str]] = {"env": (_environment(values), ""), "loss": (dict[str, Any], "")}
+    if config not in LOSSES:  # of a recipe that is somebody's own, in another program
+        return _section(known, SETTINGS | kinds, default=None)
+    kinds["loss"] = _loss(LOSSES[config], own.get("loss") or {}, values.get("loss"), asked), ""
+    # What the tuned file of another recipe sets, which this one starts from, is left alone.
+    spare = {name for name in SETTINGS if name.startswith("critic.") and name not in asked}
+    return _section(known, SETTINGS | kinds, spare)
 
 
-def _extended(base: type[_Section], fields: Mapping[str, Any]) -> type[_Section]:
-    """A section with more settings: each a type, which makes it a must, or a type and a default."""
-    return cast("Any", create_model)(base.__name__, __base__=base, **fields)
+def _section(
+    known: Mapping[str, Any],
+    kinds: Mapping[str, tuple[Any, str]],
+    spare: Collection[str] = (),
+    section: str = "",
+    default: Any = ...,
+) -> type[BaseModel]:
+    """The schema of a section that has these settings, which ``default`` makes a must, and may have spare ones."""
+    fields: dict[str, Any] = {}
+    more = [name.removeprefix(section) for name in spare if section and name.startswith(section)]
+    for key, value in {**dict.fromkeys(more), **known}.items():
+        name = section + key
+        kind, text = kinds.get(name) or kinds.get(re.sub(r"^(actor|critic)\.", "network.", name)) or (None, "")
+        if kind is None and isinstance(value, Mapping):
+            kind = _section(value, kinds, spare, f"{name}.", default)
+        fields[key] = _field(key, kind or Any, text, default if key in known else None)
+    return create_model(section or "Configuration", __base__=Section, **fields)
 
 
-def _environment(values: dict[str, Any]) -> type[Section]:
-    """The schema of the section env, from the signature of the task."""
+def _field(name: str, kind: Any, described: str, default: Any = None) -> tuple[Any, Any]:
+    """A field of a schema; the alias is for _target_, since no field may start with an underscore."""
+    return kind, Field(default, alias=name, description=re.sub(r"\bNone\b", "null", described) or None)
+
+
+def _environment(values: dict[str, Any]) -> type[BaseModel]:
+    """The schema of the section env, from the signature of the task, which checks what has no declared type."""
     cls, env = task_class(values["task"]), values.get("env")
     for name in env if isinstance(env, dict) else ():
         if name in SET_BY_RECIPES:
@@ -379,47 +268,47 @@ def _environment(values: dict[str, Any]) -> type[Section]:
     if isinstance(env, dict):
         check_known(cls, sorted(map(str, env)))
     kinds = declared(cls) | {"disturbances": (list[str | dict[str, Any]] | None, "")}
-    return _section("Env", kinds, inspect.signature(cls).parameters)
+    fields: dict[str, Any] = {x: _field(x, *kinds.get(x, (Any, ""))) for x in inspect.signature(cls).parameters}
+    return create_model("Env", __base__=Section, **fields)
 
 
-def _loss(algorithm: str, values: Any, asked: Mapping[str, str]) -> type[Section]:
+def _loss(kind: type | None, added: Mapping[str, Any], values: Any, asked: Mapping[str, str]) -> type[BaseModel]:
     """The schema of the section loss, from the signature of the loss, and from what a recipe of your own adds."""
-    config, own = OWN.get(algorithm, (algorithm, {}))
-    kind, values = LOSSES[config], values if isinstance(values, dict) else {}
-    options = declared(kind)
-    names = {name: None for name in options if name not in SET_BY_LOOPS} | dict(own.get("loss") or {})
+    values = values if isinstance(values, dict) else {}
+    options = PPO if kind is None else declared(kind)
+    names = {*options, *added} - SET_BY_LOOPS
     if path := values.get("_target_"):
-        if not isinstance(kind, type):
+        if kind is None:
             raise UserValueError(f"loss._target_={path}: this recipe takes only TorchRL's loss. Write your own recipe.")
-        kind = own_loss(path, kind)
-        options |= declared(kind)
-        known = {*argument_names(kind), "_target_"} - SET_BY_LOOPS
+        own = own_loss(path, kind)
+        options |= declared(own)
         # A setting of the recipe's own loss that this one lacks is left out, but the command line must not name it.
-        names = {name: None for name in (*known, *values) if name in known or f"loss.{name}" not in asked}
-    options = {name: (type(x) if isinstance(x, bool | str) else Any, "") for name, x in names.items()} | options
+        unasked = {name for name in values if f"loss.{name}" not in asked}
+        names = {*argument_names(own), "_target_", *unasked} - SET_BY_LOOPS
     for name in values:
         if name not in names:
             raise UserValueError(
                 f"loss.{name} is unknown, or set by the recipe. Choose from: {', '.join(sorted(names))}."
             )
-    return _section("Loss", options, names)
+    plain = {name: (type(x), "") for name, x in added.items() if isinstance(x, bool | str)}
+    fields: dict[str, Any] = {x: _field(x, *(plain | options).get(x, (Any, ""))) for x in names}
+    return create_model("Loss", __base__=Section, **{x.strip("_"): field for x, field in fields.items()})
 
 
-def _section(name: str, kinds: Mapping[str, tuple[Any, str]], names: Iterable[str]) -> type[Section]:
-    """A section with these options, all of which may be left out; what has no declared type its owner checks."""
-    fields = {}
-    for option in names:
-        kind, described = kinds.get(option, (Any, ""))
-        # The alias allows _target_, since a field must not start with an underscore.
-        fields[option.strip("_")] = (
-            kind,
-            Field(None, alias=option, description=re.sub(r"\bNone\b", "null", described) or None),
-        )
-    return cast("Any", create_model)(name, __base__=Section, **fields)
+def _check_together(values: dict[str, Any], asked: Mapping[str, str]) -> None:
+    """Refuse settings that do not fit each other, or that the command line sets in vain.
 
-
-def _check_effects(values: dict[str, Any], asked: Mapping[str, str]) -> None:
-    """Refuse what the command line sets and another setting switches off, and a file in tuned/ that is not there."""
+    Raises:
+        UserValueError: there are such settings.
+    """
+    if values["num_envs"] * values["horizon"] > MAX_ROLLOUT:
+        raise UserValueError(f"num_envs times horizon must be at most {MAX_ROLLOUT:,}, or no memory holds a rollout.")
+    for name in ("actor", "critic"):
+        section = values.get(name) or {}
+        if section.get("schedule") == "exponential" and section["final_lr"] == 0:
+            raise UserValueError(
+                f"{name}.final_lr=0: it must be above 0 with schedule=exponential, which never reaches 0. Try 1e-6."
+            )
     tuned, files = asked.get("tuned", "null"), sorted(path.stem for path in (CONFIG / "tuned").glob("*.yaml"))
     if tuned not in ("null", *files):
         close = difflib.get_close_matches(tuned, files, 1) or files
@@ -439,25 +328,26 @@ def _check_none(values: Any, name: str = "") -> None:
         raise UserValueError(f"{name}={values}: it is the word {values!r} to YAML. For no value write {name}=null.")
 
 
-def _sentence(schema: type[BaseModel] | None, error: Any) -> str:
+def _sentence(schema: type[BaseModel], error: Any) -> str:
     """One refusal: the setting, its value, what it must be, and its description."""
-    name, field, value, known = "", None, error["input"], []
+    name, value, described = "", error["input"], ""
+    section: type[BaseModel] | None = schema
+    known: list[str] = []
     for key in error["loc"]:
         if isinstance(key, int):  # an entry of a list
             name += f"[{key}]"
-        elif schema is not None and (key in schema.model_fields or error["type"] == "extra_forbidden"):
-            name, known = f"{name}.{key}" if name else key, list(schema.model_fields)
-            field = schema.model_fields.get(key)
-            kinds = [] if field is None else [field.annotation, *getattr(field.annotation, "__args__", ())]
-            schema = next((x for x in kinds if isinstance(x, type) and issubclass(x, BaseModel)), None)
+        elif section is not None and (key in section.model_fields or error["type"] == "extra_forbidden"):
+            name, known = f"{name}.{key}" if name else key, list(section.model_fields)
+            field = section.model_fields.get(key)
+            described = (field and field.description) or ""
+            inner = None if field is None else field.annotation
+            section = inner if isinstance(inner, type) and issubclass(inner, BaseModel) else None
     if error["type"] == "extra_forbidden":
-        section, _, key = name.rpartition(".")
-        close = [f"{section}.{x}".lstrip(".") for x in difflib.get_close_matches(key, known, 1)]
-        hint = f"Did you mean {close[0]}?" if close else "Leave it out."
+        close = difflib.get_close_matches(name.rpartition(".")[2], known, 1)
+        hint = f"Did you mean {''.join([*name.rpartition('.')[:2], *close])}?" if close else "Leave it out."
         return f"{name} is unknown: this recipe has no such setting. {hint}"
     if error["type"] == "missing":
         return f"{name} is missing: do not delete it. Set it to another value instead."
     said = value[:100] if isinstance(value, str) else "null" if value is None else shown(value)
     text = "" if isinstance(value, dict) else f"={said}"
-    described = "" if field is None or not field.description else field.description
-    return " ".join(filter(None, (f"{name}{text}: it must {must(error)}.", described)))
+    return f"{name}{text}: it must {must(error)}. {described}".strip()

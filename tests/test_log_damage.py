@@ -16,7 +16,7 @@ from test_log_files import px4_messages, times, usd_events, write_bag
 from test_log_tables import OURS, own_table
 
 from torchrl_quad.identification import GapsTooLarge, LogError, UnreadableLog, bag_files, read_log, sources
-from torchrl_quad.identification.ulog import read_ulog
+from torchrl_quad.identification.autopilots import read_ulog
 
 BATTERY = {"battery_voltage": "/drone/battery.x"}
 TABLE = {"time": "t", **OURS}

@@ -5,7 +5,7 @@ import pytest
 from log_writers import END, flight, matrix, ned, write_ulog, write_usd
 
 from torchrl_quad.identification import MissingColumns, UnreadableLog, WrongUnit, read_log
-from torchrl_quad.identification.usd import decompress_quaternions
+from torchrl_quad.identification.autopilots import decompress_quaternions
 
 TOLERANCES = {
     "position": 2e-3,

@@ -267,7 +267,7 @@ def _sized(file: BinaryIO) -> bytes:
 
 def _zstd() -> Any:
     try:
-        from compression import zstd  # of Python 3.14
+        from compression import zstd  # pyrefly: ignore[missing-import]  # which Python 3.14 has
     except ModuleNotFoundError:
         from backports import zstd
     return zstd

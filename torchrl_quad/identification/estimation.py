@@ -21,21 +21,14 @@ from torchrl_quad.dynamics.presets import is_number
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.files import replacing
 from torchrl_quad.identification.errors import TooLittleFlight, UnknownField
-from torchrl_quad.identification.fitting import (
-    MAX_ITERATIONS,
-    Linear,
-    Problem,
-    State,
-    bootstrap,
-    covariance,
-    minimise,
-)
-from torchrl_quad.identification.log import FlightLog, as_logs
+from torchrl_quad.identification.fitting import MAX_ITERATIONS, Linear, Problem, State, bootstrap, covariance, minimise
+from torchrl_quad.identification.log import FlightLog
 from torchrl_quad.identification.parameters import FIELDS, UNKNOWNS, Model, report, unknowns_of
 from torchrl_quad.identification.prediction import (
     CONSTANT_VELOCITY,
     PAST,
     Windows,
+    as_logs,
     as_params,
     carrying_speed,
     cut,

@@ -47,23 +47,7 @@ class Linear:
     weight: Tensor  #: (W, m)
 
 
-def residuals(
-    model: Model, windows: Windows, x: Tensor, shift: Tensor, streams: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Errors of the predictions (W, POINTS, 4, 3), constant pushes before the windows (W, 2, 3), and gyro (W, p, 3).
-
-    ``shift`` () [s] moves the stream delays of all logs (L), so that one derivative serves each of them.
-    """
-    plant = model.plant(x, (streams + shift)[windows.log])
-    speed = windows.rotor_speed(plant)
-    push = windows.push(plant, speed)
-    seen = windows.measured(plant.stream_delay, torch.arange(0, windows.future + 1, windows.stride))
-    flown = windows.fly(plant, states_at(seen, 0), speed, push)
-    points = torch.arange(1, POINTS + 1) * (windows.future // windows.stride) // POINTS
-    errors = differences(states_at(flown, points), states_at(seen, points))
-    return errors, torch.stack(push, -2), windows.turning(plant.stream_delay, windows.future // POINTS)
-
-
+@dataclasses.dataclass
 class Problem:
     """The windows of some flights and a model whose predictions are to fit them.
 
@@ -72,19 +56,33 @@ class Problem:
     pushes before the windows are residuals, too: a model that needs none is the better one.
     """
 
-    def __init__(self, model: Model, windows: Windows, moves_streams: bool, counts_push: bool) -> None:
-        self.model, self.windows = model, windows
-        self.moves_streams, self.counts_push = moves_streams, counts_push
-        self.scale = torch.empty(0)  # until it is found
+    model: Model
+    windows: Windows
+    moves_streams: bool
+    counts_push: bool
+    scale: Tensor = dataclasses.field(default_factory=lambda: torch.empty(0))  #: (m), of the residuals, once found
 
     def raw(self, x: Tensor, shift: Tensor, streams: Tensor) -> Tensor:
-        """All residuals of each window, (W, m)."""
-        return torch.cat([part.flatten(1) for part in residuals(self.model, self.windows, x, shift, streams)], 1)
+        """All residuals (W, m): errors (POINTS, 4, 3), the push before a window (2, 3), and of the gyro (POINTS, 3).
+
+        ``shift`` () [s] moves the stream delays of all logs (L), so that one derivative serves each of them.
+        """
+        windows = self.windows
+        plant = self.model.plant(x, (streams + shift)[windows.log])
+        speed = windows.rotor_speed(plant)
+        push = windows.push(plant, speed)
+        seen = windows.measured(plant.stream_delay, torch.arange(0, windows.future + 1, windows.stride))
+        flown = windows.fly(plant, states_at(seen, 0), speed, push)
+        points = torch.arange(1, POINTS + 1) * (windows.future // windows.stride) // POINTS
+        errors = differences(states_at(flown, points), states_at(seen, points))
+        turned = windows.turning(plant.stream_delay, windows.future // POINTS)
+        return torch.cat([errors.flatten(1), torch.stack(push, -2).flatten(1), turned.flatten(1)], 1)
 
     def cost(self, state: State) -> float:
         """What is minimised, at a state."""
         raw = self.raw(state.x, state.x.new_zeros(()), state.streams)
-        return float(_pseudo_huber(raw / self.scale).sum()) / len(raw)
+        robust = ROBUST**2 * ((1.0 + (raw / self.scale / ROBUST).square()).sqrt() - 1.0)
+        return float(robust.sum()) / len(raw)
 
     def linearise(self, state: State, update_scale: bool) -> Linear:
         """Residuals and derivatives at a state."""
@@ -118,12 +116,7 @@ class Problem:
         return torch.cat((spread.flatten(), pushed.flatten(), turned.expand(POINTS * 3)))
 
 
-def minimise(
-    problem: Problem,
-    state: State,
-    report: Callable[[State], None] | None = None,
-    max_iterations: int = MAX_ITERATIONS,
-) -> State:
+def minimise(problem: Problem, state: State, report: Callable[[State], None], max_iterations: int) -> State:
     """Levenberg-Marquardt steps from a state until the coordinates stand still, each of which is reported.
 
     The scales of the residuals follow the first steps.
@@ -152,8 +145,7 @@ def minimise(
         else:  # no step makes it better
             state = dataclasses.replace(before, converged=True)
         state.iteration += 1
-        if report is not None:
-            report(state)
+        report(state)
     return state
 
 
@@ -222,10 +214,6 @@ def bootstrap(linear: Linear, log: Tensor, logs: int, block: int, draws: int, se
         hessian = (counts[:, None, None] * hessians).sum(0)
         changes.append(-_inverse(hessian) @ (counts[:, None] * scores).sum(0))
     return torch.stack(changes)
-
-
-def _pseudo_huber(residual: Tensor) -> Tensor:
-    return ROBUST**2 * ((1.0 + (residual / ROBUST).square()).sqrt() - 1.0)
 
 
 def _solve(hessian: Tensor, gradient: Tensor, damping: float) -> Tensor:

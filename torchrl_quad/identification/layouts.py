@@ -56,9 +56,9 @@ class Columns:
             value = getattr(self, field)
             try:
                 numbers = as_array(value)
-                fits = numbers.shape in ((), (len(names),)) and (np.abs(numbers) <= 1e30).all()
             except (ValueError, RecursionError):
-                fits = False
+                numbers = np.array(np.nan)
+            fits = numbers.shape in ((), (len(names),)) and (np.abs(numbers) <= 1e30).all()
             if not fits or (field == "scale" and not numbers.all()):
                 rule = "a number, or one for each column" + (", and none may be zero" if field == "scale" else "")
                 raise UserValueError(f"Columns: {field} of {', '.join(names)} must be {rule}; got {shown(value)}.")
@@ -239,7 +239,7 @@ def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Si
             )
         with np.errstate(over="ignore", invalid="ignore"):  # damage makes NaN and numbers of any size
             values = np.stack([np.asarray(stream.columns[column], float) for column in choice.names], -1)
-            values = (values - choice.offset) * choice.scale
+            values = (values - np.asarray(choice.offset, float)) * np.asarray(choice.scale, float)
         values[~(np.abs(values) < LARGEST)] = np.nan
         setpoint = quantity.removeprefix("setpoint.")
         _, alike = QUANTITIES.get(quantity, (0, setpoint if setpoint in _TRANSLATED else None))

@@ -14,39 +14,15 @@ from pydantic import Field
 from torchrl_quad.deploy.frames import Convention
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.identification import checks
-from torchrl_quad.identification.errors import (
-    GapsTooLarge,
-    LogError,
-    NoFlight,
-    TooLittleFlight,
-    TooShort,
-    UnreadableLog,
-    WrongUnit,
-)
+from torchrl_quad.identification.errors import GapsTooLarge, LogError, NoFlight, UnreadableLog, WrongUnit
 from torchrl_quad.identification.layouts import QUANTITIES, Columns, Layout, gather
-from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
-from torchrl_quad.identification.signals import (
-    LARGEST,
-    Array,
-    Mask,
-    Signal,
-    Stream,
-    body_rates,
-    clean,
-    covered,
-    frozen,
-    resample,
-    slope,
-)
+from torchrl_quad.identification.signals import LARGEST, Array, Signal, Stream, clean, cover, on_grid
 from torchrl_quad.identification.sources import read_streams
 from torchrl_quad.options import NonNegative, checked
-from torchrl_quad.rotations import continuous, from_euler, rotate
 
 _LONGEST = 3000  # letters of an error: it lists up to 60 columns of a file
 LEAST_STEP, MAX_STEPS = 1e-3, 1_000_000  # [s] of a log, and how many: 17 minutes at 1 kHz, half a gigabyte
-_SHAPES = {name: (size,) for name, (size, _) in QUANTITIES.items() if name not in ("euler", "velocity_body")}
-_SHAPES |= {"time": (), "battery_voltage": ()}  # of the fields that a fit reads, after (T,)
-_ONBOARD = sorted({*QUANTITIES, "setpoint"} - {"euler", "velocity_body"})
+_FIELDS = [name for name in QUANTITIES if name not in ("euler", "velocity_body")]
 
 
 @checked
@@ -74,8 +50,9 @@ class FlightLog:
 
     def __post_init__(self) -> None:
         length = np.shape(self.time)[:1]
-        for field, shape in _SHAPES.items():
+        for field in ("time", *_FIELDS):
             value = getattr(self, field)
+            shape = () if field in ("time", "battery_voltage") else (QUANTITIES[field][0],)
             if value is None and field in ("acceleration", "battery_voltage"):
                 continue
             fits = isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.shape == (*length, *shape)
@@ -146,7 +123,7 @@ def read_log(
         min_duration: the shortest piece in flight that is kept [s].
 
     Raises:
-        LogError: the log cannot be used. Its subclasses name the reason; ``docs/flight_logs.md`` lists them.
+        LogError: the log cannot be used. Its subclasses name the reason.
     """
     if not (convention is None or isinstance(convention, Convention)):
         raise UserTypeError(f"convention must be one of torchrl_quad.deploy.frames, or None; got {shown(convention)}.")
@@ -155,28 +132,29 @@ def read_log(
         streams, layout, notes = read_streams(path, columns)
         layout = layout if convention is None else replace(layout, convention=convention)
         fields = layout.onboard if onboard is None else tuple(onboard)
-        for field in fields:
-            if field not in _ONBOARD:
-                raise UserValueError(f"onboard: unknown field {shown(field)}. Choose from: {', '.join(_ONBOARD)}.")
+        unknown = [field for field in fields if field not in (*_FIELDS, "setpoint")]
+        if unknown:
+            known = ", ".join([*_FIELDS, "setpoint"])
+            raise UserValueError(f"onboard: unknown field {shown(unknown[0])}. Choose from: {known}.")
         signals = _signals(layout, streams, path.name, notes)
         main = [s for q, s in signals.items() if not _is_optional(q)]
         grid, step = _grid(signals, main, dt, path.name)
-        valid = _cover(main, grid, step, max_gap, notes)
-        at = _at(signals, grid, step)
-        on, _ = motors_on(at["motor_command"], step, path.name)
-        sound = on & valid & ~broken(at, on, step)[0]
+        valid = cover(main, grid, step, max_gap, notes)
+        at = on_grid(signals, grid, step)
+        on, _ = checks.motors_on(at["motor_command"], step, path.name)
+        sound = on & valid & ~checks.broken(at, on, step)[0]
         moving = sound if sound.sum() > 10 else on
         checks.check_velocity(at, signals, step, moving)
         checks.check_specific_force(at, signals, moving)
         notes.append(checks.check_rates(at, signals, step, moving))
-        segments, found = find_pieces(at, valid, step, path.name, clearance, min_duration)
+        segments, found = checks.find_pieces(at, valid, step, path.name, clearance, min_duration)
     setpoint = {q.removeprefix("setpoint."): x for q, x in at.items() if q.startswith("setpoint.")}
     present = {q.partition(".")[0] for q in at}
     if "battery_voltage" not in at:
         notes.append("no battery voltage: the thrust of a command cannot be told from the charge of the battery")
     return FlightLog(
         name=path.name.removesuffix(".gz").rsplit(".", 1)[0] if path.is_file() else path.name,
-        time=step * np.arange(len(grid)),
+        time=step * np.arange(len(grid), dtype=float),
         position=at["position"],
         quaternion=at["quaternion"],
         velocity=at["velocity"],
@@ -254,56 +232,3 @@ def _grid(signals: Mapping[str, Signal], main: Sequence[Signal], dt: float | Non
             "there and read the parts."
         )
     return start + step * np.arange(int(span / step + 1e-6) + 1), step
-
-
-def _cover(main: Sequence[Signal], grid: Array, step: float, max_gap: float, notes: list[str]) -> Mask:
-    """Which times lie in no gap of any stream; gaps, and streams that are slower than the log, are noted."""
-    valid = np.ones(len(grid), bool)
-    told: dict[tuple[int, float], list[str]] = {}
-    for signal in main:
-        free, gaps = covered(signal, grid, max_gap)
-        if signal.field in ("position", "quaternion"):
-            held, stuck = frozen(signal, grid, max_gap)
-            free, gaps = free & ~held, np.concatenate((gaps, stuck))
-        valid &= free
-        if len(gaps):
-            told.setdefault((len(gaps), round(float(gaps.max()), 3)), []).append(signal.field)
-        if signal.step > 1.5 * step:
-            notes.append(f"{signal.field} comes at {1.0 / signal.step:.0f} Hz only: interpolated")
-    for (count, longest), fields in told.items():
-        notes.append(f"{count} gap(s) of up to {longest:g} s in {', '.join(fields)}: cut out")
-    return valid
-
-
-def _at(signals: Mapping[str, Signal], grid: Array, step: float) -> dict[str, Array]:
-    """Every quantity of the schema at the times of the grid, derived from others where the file lacks it."""
-    signals = dict(signals)
-    if "quaternion" not in signals:
-        euler = signals.pop("euler")
-        signals["quaternion"] = replace(euler, values=from_euler(euler.values))
-    q = signals["quaternion"]
-    signals["quaternion"] = replace(q, values=continuous(q.values))
-    at = {name: resample(s, grid, step, hold=name.startswith("setpoint.")) for name, s in signals.items()}
-    at["quaternion"] /= np.linalg.norm(at["quaternion"], axis=-1, keepdims=True)
-    if "velocity_body" in at:
-        at["velocity"] = rotate(at["quaternion"], at.pop("velocity_body"))
-    if "velocity" not in at:
-        at["velocity"] = slope(at["position"], step)
-    if "angular_velocity" not in at:
-        at["angular_velocity"] = body_rates(at["quaternion"], step)
-    return at
-
-
-def as_logs(log: FlightLog | Sequence[FlightLog], whose: str) -> list[FlightLog]:
-    """One flight or several, as a list."""
-    logs = [log] if isinstance(log, FlightLog) else list(log) if isinstance(log, Sequence) else [log]
-    for one in logs:
-        if not isinstance(one, FlightLog):
-            raise UserTypeError(
-                f"{whose}: log must be a flight as read_log(path) gives it, or a list of them; got {shown(one)}."
-            )
-        if not one.segments:
-            raise TooShort(f"{whose}: {one.name} has no piece in flight.")
-    if not logs:
-        raise TooLittleFlight(f"{whose} needs at least one flight: read_log(path) gives it.")
-    return logs

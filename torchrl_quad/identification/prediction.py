@@ -16,9 +16,9 @@ from torch import Tensor
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams, load_drone, quaternion
 from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations, rk4
 from torchrl_quad.dynamics.rotors import Rotors
-from torchrl_quad.errors import UserValueError
-from torchrl_quad.identification.errors import NoFlight, TooShort
-from torchrl_quad.identification.log import FlightLog, as_logs
+from torchrl_quad.errors import UserTypeError, UserValueError, shown
+from torchrl_quad.identification.errors import NoFlight, TooLittleFlight, TooShort
+from torchrl_quad.identification.log import FlightLog
 from torchrl_quad.identification.signals import Array, convolved
 from torchrl_quad.options import checked
 
@@ -93,6 +93,21 @@ def predict(
     return windows, windows.fly(plant, states_at(seen, 0), speed, windows.push(plant, speed)), seen
 
 
+def as_logs(log: FlightLog | Sequence[FlightLog], whose: str) -> list[FlightLog]:
+    """One flight or several, as a list."""
+    logs = [log] if isinstance(log, FlightLog) else list(log) if isinstance(log, Sequence) else [log]
+    for one in logs:
+        if not isinstance(one, FlightLog):
+            raise UserTypeError(
+                f"{whose}: log must be a flight as read_log(path) gives it, or a list of them; got {shown(one)}."
+            )
+        if not one.segments:
+            raise TooShort(f"{whose}: {one.name} has no piece in flight.")
+    if not logs:
+        raise TooLittleFlight(f"{whose} needs at least one flight: read_log(path) gives it.")
+    return logs
+
+
 def rms_errors(
     windows: Windows, flown: RigidBodyState, seen: RigidBodyState, horizons: Sequence[float]
 ) -> dict[str, dict[float, float]]:
@@ -160,8 +175,8 @@ class Plant(NamedTuple):
 
 def plant_of(params: QuadrotorParams, motors: MotorCommand, stream_delay: Tensor) -> Plant:
     """A drone whose motors are known."""
-    numbers = (motors.speed_at_zero, motors.speed_per_volt, motors.delay)
-    return Plant(params, *(params.mass.new_tensor(x) for x in numbers), stream_delay)
+    zero, per_volt, delay = params.mass.new_tensor([motors.speed_at_zero, motors.speed_per_volt, motors.delay])
+    return Plant(params, zero, per_volt, delay, stream_delay)
 
 
 class Push(NamedTuple):

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import stat
-from collections.abc import Mapping
-from dataclasses import dataclass
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.identification.errors import ClockJumpsBack, NotFiniteLog, UnreadableLog
-from torchrl_quad.rotations import conjugate, multiply
+from torchrl_quad.rotations import conjugate, continuous, from_euler, multiply, rotate
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -22,15 +20,11 @@ MAX_COLUMNS = 100_000  # of a table, and of all messages of a ULog or a uSD log 
 MAX_RECORDS = 20 * 10**6  # messages of a ULog or a bag, events of a uSD log
 
 
-def open_plain(path: Path) -> BinaryIO:
+def open_plain(path: Path) -> io.BufferedReader:
     """A plain file, open for reading. A pipe, a socket or a device is not opened: to read one may never end."""
-    if stat.S_ISREG(path.stat().st_mode):
-        flags = getattr(os, "O_NONBLOCK", 0)  # if a pipe replaces it just now, opening does not wait
-        file = open(path, "rb", opener=lambda name, given: os.open(name, given | flags))  # noqa: SIM115
-        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            return file
-        file.close()
-    raise UnreadableLog(f"{path.name} is no plain file, but a pipe, a socket or a device. Give the path of a log.")
+    if not path.is_file():
+        raise UnreadableLog(f"{path.name} is no plain file, but a pipe, a socket or a device. Give the path of a log.")
+    return open(path, "rb")
 
 
 def too_many(name: str, most: int, what: str, remedy: str) -> UnreadableLog:
@@ -117,7 +111,45 @@ def resample(signal: Signal, grid: Array, dt: float, hold: bool = False) -> Arra
     return (integral(high) - integral(low)) / (high - low)[:, None]
 
 
-def covered(signal: Signal, grid: Array, max_gap: float) -> tuple[Mask, Array]:
+def cover(main: Sequence[Signal], grid: Array, step: float, max_gap: float, notes: list[str]) -> Mask:
+    """Which times lie in no gap of any stream; gaps, and streams that are slower than the log, are noted."""
+    valid = np.ones(len(grid), bool)
+    told: dict[tuple[int, float], list[str]] = {}
+    for signal in main:
+        free, gaps = _covered(signal, grid, max_gap)
+        if signal.field in ("position", "quaternion"):
+            held, stuck = _frozen(signal, grid, max_gap)
+            free, gaps = free & ~held, np.concatenate((gaps, stuck))
+        valid &= free
+        if len(gaps):
+            told.setdefault((len(gaps), round(float(gaps.max()), 3)), []).append(signal.field)
+        if signal.step > 1.5 * step:
+            notes.append(f"{signal.field} comes at {1.0 / signal.step:.0f} Hz only: interpolated")
+    for (count, longest), fields in told.items():
+        notes.append(f"{count} gap(s) of up to {longest:g} s in {', '.join(fields)}: cut out")
+    return valid
+
+
+def on_grid(signals: Mapping[str, Signal], grid: Array, step: float) -> dict[str, Array]:
+    """Every quantity of the schema at the times of the grid, derived from others where the file lacks it."""
+    signals = dict(signals)
+    if "quaternion" not in signals:
+        euler = signals.pop("euler")
+        signals["quaternion"] = replace(euler, values=from_euler(euler.values))
+    q = signals["quaternion"]
+    signals["quaternion"] = replace(q, values=continuous(q.values))
+    at = {name: resample(s, grid, step, hold=name.startswith("setpoint.")) for name, s in signals.items()}
+    at["quaternion"] /= np.linalg.norm(at["quaternion"], axis=-1, keepdims=True)
+    if "velocity_body" in at:
+        at["velocity"] = rotate(at["quaternion"], at.pop("velocity_body"))
+    if "velocity" not in at:
+        at["velocity"] = slope(at["position"], step)
+    if "angular_velocity" not in at:
+        at["angular_velocity"] = body_rates(at["quaternion"], step)
+    return at
+
+
+def _covered(signal: Signal, grid: Array, max_gap: float) -> tuple[Mask, Array]:
     """Which times of the grid lie in no gap of the signal, and the lengths of its gaps [s]."""
     spacing = np.diff(signal.time)
     gap = spacing > max(max_gap, 3.0 * signal.step)
@@ -127,7 +159,7 @@ def covered(signal: Signal, grid: Array, max_gap: float) -> tuple[Mask, Array]:
     return ~inside, spacing[gap]
 
 
-def frozen(signal: Signal, grid: Array, max_gap: float) -> tuple[Mask, Array]:
+def _frozen(signal: Signal, grid: Array, max_gap: float) -> tuple[Mask, Array]:
     """Which times of the grid lie where the signal repeats itself digit by digit for longer than ``max_gap``, and for
     how long [s]: a tracker that lost the drone. A signal that is held between slower samples is not frozen."""
     edges = runs((np.diff(signal.values, axis=0) == 0.0).all(-1))

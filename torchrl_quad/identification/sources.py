@@ -13,15 +13,15 @@ from array import array
 from collections.abc import Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from torchrl_quad.identification.autopilots import read_ulog, read_usd
 from torchrl_quad.identification.bags import MAGIC, read_bag
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
 from torchrl_quad.identification.layouts import LAYOUTS, Layout, choose, match
 from torchrl_quad.identification.signals import MAX_COLUMNS, Array, Stream, open_plain, too_many
-from torchrl_quad.identification.ulog import read_ulog
-from torchrl_quad.identification.usd import read_usd
 
 Asked = str | Layout | Mapping[str, object] | None
 Read = tuple[list[Stream], Layout, list[str]]
@@ -55,7 +55,7 @@ def read_streams(path: Path, columns: Asked) -> Read:
             raise UnreadableLog(f"{path.name} is a broken gz file: {error}. Copy it again.") from error
 
 
-def _read(file: io.BufferedReader, name: str, columns: Asked, most: int) -> Read:
+def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) -> Read:
     start = file.peek(8192)
     for magic, (reader, preset) in _READERS.items():
         if start.startswith(magic):

@@ -12,39 +12,26 @@ from torchrl_quad import files
 from torchrl_quad.files import add_rows, locked, make_folder, read_rows, replacing, replacing_folder, write_rows
 
 
-def fifo(path):
-    os.mkfifo(path)
-
-
 def socket_file(path):
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(path))
 
 
-def link_to_a_file(path):
-    (path.parent / "target").write_text("mine")
-    path.symlink_to(path.parent / "target")
+def link(make):
+    """Makes a link to what another function makes."""
 
+    def make_link(path):
+        make(path.parent / "target")
+        path.symlink_to(path.parent / "target")
 
-def link_to_a_folder(path):
-    (path.parent / "target").mkdir()
-    path.symlink_to(path.parent / "target")
-
-
-def dangling_link(path):
-    path.symlink_to(path.parent / "nothing")
-
-
-def looping_link(path):
-    path.symlink_to(path)
-
-
-def folder(path):
-    path.mkdir()
+    return make_link
 
 
 def plain_file(path):
     path.write_text("mine")
+
+
+fifo, folder, link_to_a_file = os.mkfifo, os.mkdir, link(plain_file)
 
 
 def write_a_file(path):
@@ -62,7 +49,8 @@ def lock(path):
         path.write_text("ours")
 
 
-NEITHER = [fifo, socket_file, link_to_a_file, link_to_a_folder, dangling_link, looping_link]
+dangling_link, looping_link = link(lambda path: None), lambda path: path.symlink_to(path)
+NEITHER = [fifo, socket_file, link_to_a_file, link(folder), dangling_link, looping_link]
 WRITERS = {  # what a path must not be for each
     write_a_file: [*NEITHER, folder],
     lock: [*NEITHER, folder],

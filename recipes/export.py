@@ -13,7 +13,7 @@ from torchrl_quad.deploy.contract import sha256
 from torchrl_quad.deploy.export import STARTS
 from torchrl_quad.training.building import build_env
 from torchrl_quad.training.checkpoints import read_checkpoint
-from torchrl_quad.training.evaluation import load_normalizer, load_policy
+from torchrl_quad.training.evaluation import load_policy
 from torchrl_quad.training.launch import recipe
 
 
@@ -22,8 +22,7 @@ def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     checkpoint = Path(cfg.checkpoint)
     trained, actor, normalizer = load_policy(checkpoint, trust=cfg.trust)
-    env = build_env(trained, cfg.episodes, STARTS)
-    load_normalizer(env, normalizer)
+    env = build_env(trained, cfg.episodes, STARTS, normalizer=normalizer)
     origin = {
         "revision": read_checkpoint(checkpoint)["revision"],
         "checkpoint_sha256": sha256(checkpoint.read_bytes()),

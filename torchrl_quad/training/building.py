@@ -73,13 +73,20 @@ def set_up(cfg: DictConfig) -> tuple[EnvBase, TensorDictModule]:
     return env, make_policy(cfg, env)
 
 
-def build_env(cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = False) -> EnvBase:
-    """Build the environment of a configuration, with a normaliser if it asks for one."""
+def build_env(
+    cfg: DictConfig, num_envs: int, seed: int, *, compile: bool = False, normalizer: dict[str, Tensor] | None = None
+) -> EnvBase:
+    """Build the environment of a configuration, with a normaliser, and its state, if it asks for one."""
     options = plain(cfg.env, resolve=True)
     if (disturbances := own_disturbances(options.pop("disturbances", None))) is not None:
         options["disturbances"] = disturbances
     env = make_env(cfg.task, num_envs=num_envs, device=cfg.device, seed=seed, compile=compile, **options)
-    return TransformedEnv(env, ObservationNormalizer(env)) if cfg.normalize else env
+    if not cfg.normalize:
+        return env
+    transform = ObservationNormalizer(env)
+    if normalizer is not None:
+        transform.load_state_dict(normalizer)
+    return TransformedEnv(env, transform)
 
 
 def task_of(env: EnvBase) -> QuadrotorEnv:

@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_quad import differentiable_rollout
@@ -79,17 +79,9 @@ def final_evaluation(
     seed: int = 2_000_000,
 ) -> tuple[dict[str, Any], TensorDictBase]:
     """Fly a policy over fresh episodes, side by side, from starts drawn with the seed: a summary, and the flight."""
-    env = build_env(cfg, episodes, seed)
-    load_normalizer(env, normalizer)
-    metrics, flight = evaluate(env, actor)
+    metrics, flight = evaluate(build_env(cfg, episodes, seed, normalizer=normalizer), actor)
     summary = {"task": cfg.task, "algorithm": cfg.algorithm, "seed": cfg.seed, "episodes": episodes}
     return summary | {name.removeprefix("eval/"): v for name, v in metrics.items() if name.startswith("eval/")}, flight
-
-
-def load_normalizer(env: EnvBase, normalizer: dict[str, Tensor] | None) -> None:
-    """Give an environment the state of a normaliser, if there is one."""
-    if normalizer is not None:
-        cast("TransformedEnv", env).transform.load_state_dict(normalizer)
 
 
 def best_policy(
@@ -105,12 +97,10 @@ def best_policy(
             f"{source} holds no policy: the run stopped before its first evaluation, or no return was finite. Train "
             "longer, or with a lower learning rate."
         )
-    env = build_env(cfg, 1, 0)
-    actor = make_policy(cfg, env)
     with fits(source, "the policy"):
         normalizer = best["normalizer"] if cfg.normalize else None
+        actor = make_policy(cfg, build_env(cfg, 1, 0, normalizer=normalizer))
         actor.load_state_dict(best["actor"])
-        load_normalizer(env, normalizer)
     return actor, normalizer
 
 

@@ -243,23 +243,11 @@ def own_folder(folder: Path, named: bool) -> Iterator[Path]:
     Raises:
         FileExistsError: another process runs in the folder that was named.
     """
-    with contextlib.ExitStack() as stack:
-        folder = _claim(folder, named, stack)
-        try:
-            yield folder
-        finally:
-            stack.close()
-            if not named:
-                with contextlib.suppress(OSError):  # not empty: it has results
-                    folder.rmdir()
-
-
-def _claim(folder: Path, named: bool, stack: contextlib.ExitStack) -> Path:
     for number in itertools.count(1):
         path = make_folder(folder if number == 1 else folder.with_name(f"{folder.name}_{number}"))
-        with contextlib.ExitStack() as claim:
+        with contextlib.ExitStack() as stack:
             try:
-                lock = claim.enter_context(locked(path / LOCK, wait=False))
+                lock = stack.enter_context(locked(path / LOCK, wait=False))
             except Timeout:
                 if not named:
                     continue
@@ -271,12 +259,16 @@ def _claim(folder: Path, named: bool, stack: contextlib.ExitStack) -> Path:
                 ) from None
             if not named and any(other.name != LOCK for other in path.iterdir()):  # a run that is over
                 continue
-            lock.write_text(
-                f"process {os.getpid()} on {socket.gethostname()} since {datetime.now():%Y-%m-%d %H:%M:%S}\n"
-            )
-            stack.push(claim.pop_all())
-            return path
-    raise AssertionError
+            now = datetime.now()
+            lock.write_text(f"process {os.getpid()} on {socket.gethostname()} since {now:%Y-%m-%d %H:%M:%S}\n")
+            try:
+                yield path
+            finally:
+                stack.close()
+                if not named:
+                    with contextlib.suppress(OSError):  # not empty: it has results
+                        path.rmdir()
+            return
 
 
 @contextlib.contextmanager

@@ -319,7 +319,7 @@ def test_what_is_not_a_disturbance_is_refused():
     for wrong, message in ((3.0, "must be a list of Disturbance, got float"), ([3.0], "each must .* got float")):
         with pytest.raises(TypeError, match=f"disturbances:? {message}"):
             HoveringEnv(num_envs=1, disturbances=wrong)
-    with pytest.raises(TypeError, match="disturbances: each must be a Disturbance, .* got type"):
+    with pytest.raises(TypeError, match="disturbances: each must be a Disturbance, .* got HoveringEnv"):
         HoveringEnv(num_envs=1, disturbances=HoveringEnv)
     with pytest.raises(ValueError, match="disturbance 'disturbed.Gyro': Python finds no module 'disturbed'"):
         HoveringEnv(num_envs=1, disturbances="disturbed.Gyro")

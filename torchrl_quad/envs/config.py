@@ -103,7 +103,7 @@ def as_disturbances(value: Any) -> list[Disturbance]:
         if isinstance(found, type) and issubclass(found, Disturbance):
             found = build(found, "disturbances", arguments)
         if not isinstance(found, Disturbance):
-            got = type(found).__name__
+            got = getattr(found, "__name__", type(found).__name__)
             raise UserTypeError(f"disturbances: each must be a Disturbance, its class, or its path; got {got}.")
         built.append(found)
     return built
@@ -208,26 +208,26 @@ def full_signature(cls: type, base: type) -> inspect.Signature:
 
 
 def check_compilation(options: Mapping[str, Any]) -> None:
-    """Check that torch.compile takes these keywords."""
+    """Check that torch.compile takes these keywords, which it would find out at the first step."""
     known = [*list(inspect.signature(torch.compile).parameters)[1:], "warmup"]
-    unknown = [name for name in options if name not in known]
-    if unknown:
-        raise UserTypeError(f"compile: torch.compile takes no {shown(unknown[0])}. Choose from: {_names(known)}.")
-    for name, kind in {"fullgraph": bool, "dynamic": bool | None, "disable": bool}.items():
-        check_value(f"compile: {name}", options.get(name, False), kind)
-    modes = ["default", *torch._inductor.list_mode_options()]
-    mode = options.get("mode") or "default"
-    if mode not in modes:
-        raise UserValueError(f"compile: mode must be one of {_names(modes)}; got {shown(mode)}.")
-    given = check_value("compile: options", options.get("options"), dict[str, Any] | None) or {}
-    unknown = [shown(name) for name in given if name.replace("-", "_") not in torch._inductor.list_options()]
-    if unknown:
-        raise UserValueError(f"compile: the compiler has no option {_names(unknown)}.")
-    backend, backends = options.get("backend", "inductor"), torch.compiler.list_backends(())
-    if not (callable(backend) or (isinstance(backend, str) and backend in backends)):
-        raise UserValueError(
-            f"compile: backend must be a function, or one of {_names(backends)}; got {shown(backend)}."
-        )
+    modes, backends = [None, *torch._inductor.list_mode_options()], torch.compiler.list_backends(())
+    settings = torch._inductor.list_options()
+
+    def are_settings(value: Any) -> bool:
+        return value is None or (isinstance(value, Mapping) and all(x.replace("-", "_") in settings for x in value))
+
+    kinds = {
+        "fullgraph": bool,
+        "dynamic": bool | None,
+        "disable": bool,
+        "mode": Annotated[Any, accepted(lambda x: x in modes, f"one of {_names(modes)}")],
+        "backend": Annotated[Any, accepted(lambda x: callable(x) or x in backends, f"one of {_names(backends)}")],
+        "options": Annotated[Any, accepted(are_settings, "a mapping of what torch._inductor.list_options() lists")],
+    }
+    for name, value in options.items():
+        if name not in known:
+            raise UserTypeError(f"compile: torch.compile takes no {shown(name)}. Choose from: {_names(known)}.")
+        check_value(f"compile: {name}", value, kinds.get(name, Any))
 
 
 def check_weights(weights: Mapping[str, Any], known: Mapping[str, Any]) -> Mapping[str, Any]:

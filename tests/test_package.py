@@ -11,6 +11,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.specifiers import SpecifierSet
 
 ROOT = Path(__file__).parent.parent
@@ -22,7 +23,8 @@ def built(tmp_path_factory):
     folder, source = tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("source")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    shutil.copytree(ROOT / "torchrl_quad", source / "torchrl_quad")
+    for name in ("torchrl_quad", "recipes/config"):  # to which a link in the package leads
+        shutil.copytree(ROOT / name, source / name, symlinks=True)
     command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(source)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -46,30 +48,41 @@ def test_the_wheel_holds_the_package_the_presets_and_its_types_and_nothing_else(
     for drone in ("visfly", "flightmare", "crazyflie", "small_racer"):
         assert f"torchrl_quad/dynamics/drones/{drone}.yaml" in names
     assert {"torchrl_quad/envs/tracks/visfly.yaml", "torchrl_quad/py.typed"} <= set(names)
+    configuration = {str(path.relative_to(ROOT / "recipes")) for path in (ROOT / "recipes/config").rglob("*.yaml")}
+    assert {f"torchrl_quad/training/{path}" for path in configuration} <= set(names)
     assert {name.split("/")[0].split("-")[0] for name in names} == {"torchrl_quad"}
 
 
-def test_the_wheel_works_away_from_the_repository(wheel, tmp_path):
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--target",
-        str(tmp_path / "site"),
-        str(wheel),
-    ]
-    subprocess.run(pip, check=True)
-    program = (
-        "import torchrl_quad, pathlib\n"
-        f"assert pathlib.Path(torchrl_quad.__file__).is_relative_to({str(tmp_path)!r}), torchrl_quad.__file__\n"
-        "for drone in torchrl_quad.available_drones():\n"
-        "    torchrl_quad.make_env('racing', num_envs=2, drone=drone).rollout(2)\n"
-    )
+PROGRAM = """
+import importlib.util, pathlib, torchrl_quad
+from torchrl_quad.training import configuration, launch, loop
+
+here = pathlib.Path.cwd()
+assert all(pathlib.Path(x).is_relative_to(here) for x in (torchrl_quad.__file__, configuration.CONFIG))
+assert not any(importlib.util.find_spec(name) for name in ("results", "tables", "training"))
+for drone in torchrl_quad.available_drones():
+    torchrl_quad.make_env("racing", num_envs=2, drone=drone).rollout(2)
+
+@launch.recipe("bptt", algorithm="smooth", loss={"smoothness": 0.1})
+def main(cfg):
+    pass
+
+main()
+"""
+
+
+def test_the_wheel_works_away_from_the_repository_and_so_does_a_recipe_of_your_own(wheel, tmp_path):
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(tmp_path / "site")]
+    subprocess.run([*pip, str(wheel)], check=True)
+    (tmp_path / "smooth.py").write_text(PROGRAM)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
-    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True)
+    command = [sys.executable, "smooth.py", "--cfg", "job", "task=racing"]  # which shows the configuration
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    shown = yaml.safe_load(done.stdout)
+    assert (shown["algorithm"], shown["loss"]["smoothness"]) == ("smooth", 0.1)
+    assert shown["env"]["max_episode_steps"] == 512
+    assert shown["eval"]["interval"] == 20  # of bptt_racing.yaml
 
 
 def test_every_python_that_the_package_names_can_have_the_tested_versions():

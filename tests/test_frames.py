@@ -187,9 +187,7 @@ def test_the_view_holds_the_markers_whatever_the_drones_do(task, monkeypatch):
     from torchrl_quad.render import video
 
     scenes = []
-    monkeypatch.setattr(
-        video, "View", lambda *a, scene=video.View, **k: scenes.append(scene(*a, **k)) or scenes[-1]
-    )
+    monkeypatch.setattr(video, "View", lambda *a, scene=video.View, **k: scenes.append(scene(*a, **k)) or scenes[-1])
     env = make_env(task, num_envs=1)
     env.reset()
     env.render()

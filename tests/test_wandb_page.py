@@ -5,7 +5,7 @@ import yaml
 from conftest import RECIPES
 from omegaconf import OmegaConf
 
-from torchrl_quad.training.arguments import hydra_argument
+from torchrl_quad.training.configuration import hydra_argument
 
 
 @pytest.mark.parametrize("style", ["args", "args_no_hyphens"])

@@ -1,4 +1,4 @@
-"""Rays per second of the depth camera on one core, beside MuJoCo's ray casting.
+"""Rays per second of the depth camera on one core, compared with MuJoCo's ray casting.
 
 python benchmarks/camera.py
 
@@ -86,12 +86,12 @@ def measure(name: str, count: int, n: int, width: int, height: int, rounds: int)
     length = rays.norm(dim=-1, keepdim=True)
     rays, length = (rays / length).flatten(1).numpy(), length.squeeze(-1).numpy()
     worlds = [in_mujoco(solids, i) for i in range(n)]
-    eye, hit, found = np.array([0.0, 0.0, 1.5]), np.zeros(camera.pixels, np.int32), np.zeros((n, camera.pixels))
+    origin, hit, found = np.array([0.0, 0.0, 1.5]), np.zeros(camera.pixels, np.int32), np.zeros((n, camera.pixels))
 
     def cast() -> None:
         for i, (model, data) in enumerate(worlds):
             mujoco.mj_multiRay(
-                model, data, eye, rays[i], None, 1, -1, hit, found[i], None, camera.pixels, FAR * length[i].max()
+                model, data, origin, rays[i], None, 1, -1, hit, found[i], None, camera.pixels, FAR * length[i].max()
             )
 
     theirs = fastest(cast, max(rounds // 4, 1))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import numbers
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import torch
@@ -204,58 +204,54 @@ def check_task(env: Task, state: State) -> None:
     def kind(x: Any) -> str:
         return f"{tuple(x.shape)}, {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
 
-    def check_tensor(method: str, x: Any, dtype: torch.dtype | None, columns: int | None = 1, hint: str = "") -> None:
+    def check_tensor(method: str, x: Any, dtype: torch.dtype | None, columns: int | None = 1) -> None:
         is_right = isinstance(x, Tensor) and x.shape == (n, columns or x.shape[-1:].numel())
         wanted = f"({n}, {columns or 'k'})" + ("" if dtype is None else f", {dtype}")
+        hint = " Sum a vector over its components: .sum(-1, keepdim=True)." if method.startswith("reward") else ""
         check(is_right and dtype in (None, x.dtype), f"{method} must be a tensor {wanted}; got {kind(x)}.{hint}")
 
-    def named(method: str, entries: Any) -> Mapping[Any, Any]:
+    def named(method: str, entries: Any) -> Iterator[tuple[str, Any]]:
         is_mapping = isinstance(entries, Mapping)
         check(is_mapping, f"{method} must be a mapping from names to tensors; got {type(entries).__name__}.")
-        return entries
+        return ((f"{method}[{name!r}]", x) for name, x in entries.items())
 
     taken = {"step", "action_queue", "collided", "drone", "scene"}
     taken |= {key for x in env.disturbances.values() for key in x.start(env.randomness, state) if isinstance(key, str)}
     for key in taken & set(env.task_entries):
         check(False, f"initial_state: entry {key!r} is the environment's own; give yours another name.")
+    fields, kinds = env.dynamics.plant_fields, (env.dtype, torch.int64, torch.bool)
     for key, x in state.items():
-        is_right = isinstance(x, Tensor) and x.dim() > 1 and len(x) == n
         check(
-            is_right and x.dtype in (env.dtype, torch.int64, torch.bool),
+            isinstance(x, Tensor) and x.dim() > 1 and len(x) == n and x.dtype in kinds,
             f"initial_state: entry {key!r} must be a tensor ({n}, ...) of at least two dimensions, {env.dtype}, int64 "
             f"or bool; got ({kind(x)}).",
         )
-        fields = env.dynamics.plant_fields
         if isinstance(key, tuple) and key[0] == "drone" and key[1] not in fields:
             choices = ", ".join(fields)
             raise UserValueError(f"Entry {key!r} changes no parameter of the drone. Choose from: {choices}.")
     check_tensor("observe(state)", env.observe(state), env.dtype, None)
-    terms = named("reward_terms(state)", env.reward_terms(state))
-    for name, term in terms.items():
-        hint = " Sum a vector over its components: .sum(-1, keepdim=True)."
-        check_tensor(f"reward_terms(state)[{name!r}]", term, env.dtype, hint=hint)
-    for name, event in named("events(previous, state)", env.events(state, state)).items():
-        method = f"events(previous, state)[{name!r}]"
+    terms, metrics, events = env.reward_terms(state), env.metrics(state), env.events(state, state)
+    for method, term in named("reward_terms(state)", terms):
+        check_tensor(method, term, env.dtype)
+    for (method, event), name in zip(named("events(previous, state)", events), events, strict=True):
         check(isinstance(event, Event), f"{method} must be an Event; got {type(event).__name__}.")
         check_tensor(f"{method}.happened", event.happened, torch.bool)
         check_tensor(f"{method}.time", event.time, env.dtype)
         if not isinstance(event.amount, numbers.Real) and getattr(event.amount, "numel", lambda: 0)() != 1:
             check_tensor(f"{method}.amount", event.amount, env.dtype)
-        check(
-            f"{name}_time" not in terms,
-            f"{method} gives the term '{name}_time', which the reward has already: rename one of them.",
-        )
+        known = f"{method} gives the term '{name}_time', which the reward has already: rename one of them."
+        check(f"{name}_time" not in terms, known)
         is_term = event.term is None or event.term in terms
         check(is_term, f"{method}.term must be one of {', '.join(terms)}, or None; got {event.term!r}.")
-    metrics = named("metrics(state)", env.metrics(state))
+    for method, metric in named("metrics(state)", metrics):
+        check_tensor(method, metric, None)
     missing = sorted(env.metric_info.keys() - EPISODE_METRICS.keys() - metrics.keys())
     adds_some = type(env).episode_metrics is not Task.episode_metrics  # which may give what metrics() lacks
     check(adds_some or not missing, f"metrics(state) lacks {', '.join(missing)}, which metric_info describes.")
-    for name, metric in metrics.items():
-        check_tensor(f"metrics(state)[{name!r}]", metric, None)
     for method in ("is_crash", "is_success"):
         check_tensor(f"{method}(state)", getattr(env, method)(state), torch.bool)
-    advanced = named("advance(previous, state)", env.advance(state, dict(state)))
+    advanced = env.advance(state, dict(state))
+    named("advance(previous, state)", advanced)
     for key in env.task_entries:
         got, wanted = kind(advanced.get(key)), kind(state[key])
         check(

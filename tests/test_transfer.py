@@ -156,8 +156,8 @@ def test_a_drone_that_no_simulator_can_fly_is_refused_with_the_name_of_its_bundl
     bundle = load_bundle(hovering)
     for changes, simulator, why in (
         ({"inertia": [1e-3, 1e-3, 3e-3]}, "mujoco", "MuJoCo flies no body with the inertia .*: each of the three"),
-        ({"drag_height": 0.1}, "mujoco", "Other simulators do not fly drones with drag_height"),
-        ({"motor_time_constant": [0.1, 0.2]}, "mujoco", "Other simulators do not fly drones with two motor"),
+        ({"drag_height": 0.1}, "mujoco", "Third-party simulators do not fly drones with drag_height"),
+        ({"motor_time_constant": [0.1, 0.2]}, "mujoco", "Third-party simulators do not fly drones with two motor"),
     ):
         monkeypatch.setitem(bundle.contract, "plant", changes)
         with pytest.raises(UserValueError, match=f"^{hovering}: {why}"):

@@ -139,7 +139,7 @@ class Bundle:
             after["action"] = self._hover.copy()
         action = after["action"]
         after["queue"] = np.concatenate((self.queue[1:], action[None])) if len(self.queue) else self.queue
-        command = self._half_thrust * (float(action[0]) + 1.0), self._max_rates * action[1:]
+        command = self._half_thrust * (float(action[0]) + 1.0), self._max_rates * action[1:].astype(float)
         vars(self).update(after)  # from here on nothing fails
         return command
 
@@ -220,6 +220,7 @@ class Bundle:
         about = self.contract["task"]["entries"][name]
         shape, dtype = tuple(about["shape"]), np.dtype(about["dtype"])
         kinds = {"b": "b", "i": "iu"}.get(dtype.kind, "iuf")
+        given = np.zeros(0)
         try:
             given = np.asarray(value)
             fits = given.dtype.kind in kinds and (given.shape == shape or (given.ndim == 0 and shape == (1,)))

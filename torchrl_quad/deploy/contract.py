@@ -68,7 +68,7 @@ class BrokenPolicy(Fault):
 
 def schema() -> dict[str, Any]:
     """The JSON schema of ``contract.json``."""
-    return json.loads((resources.files(__package__) / "contract.schema.json").read_text())
+    return json.loads((resources.files("torchrl_quad.deploy") / "contract.schema.json").read_text())
 
 
 def schema_table(deep: bool = True) -> str:
@@ -257,12 +257,13 @@ def _contradictions_of_the_graphs(contract: Mapping[str, Any]) -> Iterator[str]:
         yield "graphs must have judge and episode, or task.unjudged say why not"
         return
     entries: Signature = {name: ((*x["shape"],), x["dtype"]) for name, x in task["entries"].items()}
+    delay = contract["action_delay"]
     changing: Signature = {name: ((size,), floats) for name, size in MEASURED.items()}
-    if contract["action_delay"]:
-        changing["action_queue"] = ((contract["action_delay"], 4), floats)
+    changing |= {"action_queue": ((delay, 4), floats)} if delay else {}
     if taken := entries.keys() & {*changing, "step"}:
         yield f"task.entries has {shown(min(taken))}, which is not the task's"
-    now = changing | entries | {"step": ((1,), "int64")}
+    step: Signature = {"step": ((1,), "int64")}
+    now = changing | entries | step
     before = {f"previous.{name}": x for name, x in (changing | entries).items()}
     ends: Signature = dict.fromkeys(ENDS, ((1,), "bool"))
     found = {name: tuple(signature(graph[side]) for side in ("reads", "writes")) for name, graph in graphs.items()}
@@ -273,11 +274,12 @@ def _contradictions_of_the_graphs(contract: Mapping[str, Any]) -> Iterator[str]:
     policy: Signature = {"observation": ((contract["observation"]["size"],), "float32")}
     policy |= {"depth": ((1, camera["height"], camera["width"]), "float32")} if camera else {}
     policy |= {"memory": ((memory,), "float32")} if memory else {}
-    answer: Signature = {"action": ((4,), "float32")} | ({"next_memory": ((memory,), "float32")} if memory else {})
+    answer: Signature = {"action": ((4,), "float32")}
+    answer |= {"next_memory": ((memory,), "float32")} if memory else {}
     known = {
         "policy": (policy, answer),
         "observe": (now, {"observation": (policy["observation"][0], floats)}),
-        "advance": (before | changing | {"step": now["step"]}, entries),
+        "advance": (before | changing | step, entries),
         "judge": (now, ends | metrics),
         "episode": (flight | {"action": ((4,), floats)}, {name: ((), floats) for name in task["metrics"]}),
     }

@@ -11,8 +11,10 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.linalg import vector_norm
 
-from torchrl_quad.deploy.contract import GRAPHS
+from torchrl_quad.data.unwrap import leaf
+from torchrl_quad.deploy.contract import GRAPHS, MEASURED
 from torchrl_quad.deploy.simulators.vehicle import bandwidth, damping_ratio
 from torchrl_quad.deploy.tracing import Rules
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
@@ -60,10 +62,8 @@ def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, Any], memory:
     Raises:
         ValueError: it flies what a contract cannot say yet.
     """
-    if env.control != "rates":
-        raise UserValueError(f'export_policy exports only thrust and body rates, control="rates"; got {env.control!r}.')
     camera = env.camera if visual else None
-    nominal, sensors = _fields(env.nominal), env.disturbances.get("sensors", Sensors())
+    nominal, delay = _fields(env.nominal), getattr(env.disturbances.get("sensors"), "delay", 0)
     weight = nominal["mass"] * nominal["gravity"]
     most = float(np.float32(nominal["max_thrust_to_weight"] * weight))
     return {
@@ -89,7 +89,7 @@ def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, Any], memory:
         },
         "control_dt": env.control_dt,
         "action_delay": env.action_delay,
-        "observation_delay": sensors.delay,
+        "observation_delay": delay,
         "drone": nominal,
         "plant": {k: v for k, v in _fields(env.params).items() if v != nominal[k]},
         "randomized": _randomized(env),
@@ -98,10 +98,10 @@ def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, Any], memory:
         "simulator": {
             "dynamics": next(k for k, cls in DYNAMICS.items() if cls is type(env.dynamics)),
             "integrator": getattr(env.dynamics, "integrator", "semi_implicit_euler"),
-            "dt": env.dynamics.dt,
+            "dt": getattr(env.dynamics, "dt"),  # noqa: B009
         },
         "limits": {
-            "max_state_age": round((1 + sensors.delay) * env.control_dt, 9),
+            "max_state_age": round((1 + delay) * env.control_dt, 9),
             "max_depth_age": camera and round((camera.rate + camera.delay) * env.control_dt, 9),
             "quaternion_norm_error": 1e-3,
             "max_value": 1e6,
@@ -237,10 +237,13 @@ def results(env: QuadrotorEnv, flight: TensorDictBase) -> dict[str, Any]:
 
 def envelope(flight: TensorDictBase) -> dict[str, Any]:
     """Where a flight has been: the range of its positions, its greatest speed, body rate and tilt."""
-    state = flight["state"]
-    _, x, y, _ = state["quaternion"].unbind(-1)
-    tilt = torch.acos((1.0 - 2.0 * (x * x + y * y)).clamp(-1.0, 1.0))
-    norms = {"max_speed": state["velocity"].norm(dim=-1), "max_body_rate": state["angular_velocity"].norm(dim=-1)}
-    position = state["position"].flatten(0, 1)
-    ends = {"low": numbers(position.amin(0)), "high": numbers(position.amax(0))}
-    return ends | {name: numbers(x.max()) for name, x in {**norms, "max_tilt": tilt}.items()}
+    position, quaternion, *rates = (leaf(flight, ("state", name)).flatten(0, 1) for name in MEASURED)
+    velocity, angular_velocity = rates
+    _, x, y, _ = quaternion.unbind(-1)
+    return {
+        "low": numbers(position.amin(0)),
+        "high": numbers(position.amax(0)),
+        "max_speed": numbers(vector_norm(velocity, dim=-1).max()),
+        "max_body_rate": numbers(vector_norm(angular_velocity, dim=-1).max()),
+        "max_tilt": numbers(torch.acos((1.0 - 2.0 * (x * x + y * y)).clamp(-1.0, 1.0)).max()),
+    }

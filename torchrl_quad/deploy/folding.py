@@ -39,16 +39,16 @@ def fold(
             for name in ("plain", "parts")
         )
     if plain is not None:
-        _require_readable(plain.in_keys, ["observation"])
-        _require_unit_actions(plain.low, plain.high)
+        _check_keys(plain.in_keys, ["observation"])
+        _check_bounds(plain.low, plain.high)
         linear = zip(plain.weights[::2], plain.weights[1::2], [*plain.activations, nn.Tanh()], strict=True)
         layers = _layers(linear, plain.size, np.repeat(plain.scales, plain.widths), normalizer)
         network = Network(layers, max_loc=plain.head.max_loc)
     elif parts is not None:
-        network = _seeing(actor, parts, normalizer, image)
+        network = _visual(actor, parts, normalizer, image)
     else:
         raise UserValueError(
-            "export_policy exports what make_actor and make_visual_actor build, with its parts as they are and without "
+            "export_policy exports what make_actor and make_visual_actor build, with its parts unchanged and without "
             f"hooks: tanh-Gaussian policies. This {type(actor).__name__} is something else; build the policy with "
             "make_actor(env, ...) or make_visual_actor(env, ...), and load your weights into it."
         )
@@ -57,26 +57,27 @@ def fold(
     return network
 
 
-def _seeing(
-    actor: TensorDictModuleBase, parts: Any, normalizer: ObservationNormalizer | None, image: Sequence[int] | None
-) -> Network:
-    """The network of a policy with eyes, from what it says that it is made of."""
-    _require_readable(list(actor[0][0].in_keys), ["depth", "observation"])
+def _visual(actor: Any, parts: Any, normalizer: ObservationNormalizer | None, image: Sequence[int] | None) -> Network:
+    """The network of a visual policy, from the parts that it names."""
+    _check_keys(list(actor[0][0].in_keys), ["depth", "observation"])
     bounds = actor[1].distribution_kwargs
-    _require_unit_actions(bounds.get("low"), bounds.get("high"))
-    eyes, trunk = (
+    _check_bounds(bounds.get("low"), bounds.get("high"))
+    convolutions, trunk = (
         [(layer.weight, layer.bias, activation) for layer, activation in zip(x[::2], x[1::2], strict=True)]
         for x in (parts.convolutions, parts.trunk)
     )
     memory = parts.memory and Memory(*(_float32(_numbers(getattr(parts.memory, name))) for name in GRU))
-    sight = Network([], _layers(eyes), tuple(image or (0, 0)), parts.nearest, memory, parts.max_loc)
-    if image is None or sight.found != parts.widths[0] or sight.eyes[0].weight.shape[1] != 1:
+    height, width = image or (0, 0)
+    network = Network([], _layers(convolutions), (height, width), parts.nearest, memory, parts.max_loc)
+    if image is None or network.features != parts.widths[0] or network.convolutions[0].weight.shape[1] != 1:
         camera = "has no camera" if image is None else f"shows it {image[1]} x {image[0]} pixels"
         raise UserValueError(
             f"export_policy: the policy was built for images of another size; the environment {camera}."
         )
     last = parts.head.weight, parts.head.bias, nn.Tanh()
-    return sight._replace(layers=_layers([*trunk, last], parts.size, np.repeat(parts.scales, parts.widths), normalizer))
+    return network._replace(
+        layers=_layers([*trunk, last], parts.size, np.repeat(parts.scales, parts.widths), normalizer)
+    )
 
 
 def _layers(
@@ -116,15 +117,15 @@ def _layers(
     return [Layer(_float32(w), _float32(b), name) for w, b, name in zip(weights, biases, names, strict=True)]
 
 
-def _require_readable(found: Sequence[Any], known: list[str]) -> None:
+def _check_keys(found: Sequence[Any], known: list[str]) -> None:
     if found != known:
         raise UserValueError(
             f'export_policy: the policy reads {found}. A drone can give it the "observation" alone: train it with '
-            'in_keys=[\'observation\']. A policy that sees may also read "depth", with image_key="depth".'
+            'in_keys=[\'observation\']. A visual policy may also read "depth", with image_key="depth".'
         )
 
 
-def _require_unit_actions(low: Any, high: Any) -> None:
+def _check_bounds(low: Any, high: Any) -> None:
     if low is not None:
         raise UserValueError(f"export_policy: actions must lie from -1 to 1, got {low} to {high}.")
 

@@ -60,7 +60,7 @@ class Convention:
     world: Quaternion = SAME  #: from our world frame to theirs
     body: Quaternion = SAME  #: from our body frame to theirs
     xyzw: bool = False  #: whether their quaternions are (x, y, z, w)
-    motors: tuple[int, int, int, int] | None = None  #: for each of their motors the index of ours
+    motors: tuple[int, ...] = ()  #: for each of their motors the index of ours; none where they have no fixed order
     rates: tuple[float, float, float] = (1.0, 1.0, 1.0)  #: their commanded rates for ours of 1 rad/s
     thrust_range: tuple[float, float] | None = (
         None  #: their commands for no and for full thrust; newtons where there are none
@@ -124,7 +124,7 @@ class Convention:
     def _checked(self, name: str, value: ArrayLike) -> Array:
         if name not in _SIZES:
             raise UserValueError(f"Unknown quantity {name!r}. Choose from: {', '.join(_SIZES)}.")
-        if name == "motors" and self.motors is None:
+        if name == "motors" and not self.motors:
             raise UserValueError(f"{self.name} has no order of motors of its own: name them by their places.")
         x = np.asarray(value, float)
         if x.shape[-1:] != (_SIZES[name],):

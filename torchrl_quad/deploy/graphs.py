@@ -72,7 +72,7 @@ class Graph:
             BrokenPolicy: it fails, or answers in other shapes than the contract says.
         """
         try:
-            found = self.session.run([*self.writes], {name: given[name] for name in self.reads})
+            found: Any = self.session.run([*self.writes], {name: given[name] for name in self.reads})
         except Exception as error:  # see above
             raise BrokenPolicy(f"onnxruntime cannot run {self.name}.onnx: {one_line(error)}.") from error
         count = len(given[self.reads[0]])

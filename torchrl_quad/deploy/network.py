@@ -37,9 +37,9 @@ ACTIVATIONS: dict[str, tuple[str, str]] = {
 
 
 class Layer(NamedTuple):
-    """A layer: activation(weight x + bias). That of an eye is a convolution, which halves height and width."""
+    """A layer: activation(weight x + bias). A convolution halves height and width."""
 
-    weight: Array  #: (out, in), of an eye (out, in, 3, 3)
+    weight: Array  #: (out, in), of a convolution (out, in, 3, 3)
     bias: Array  #: (out)
     activation: str  #: one of ``ACTIVATIONS``; the last layer's is Tanh, and the action is clamped
 
@@ -54,12 +54,12 @@ class Memory(NamedTuple):
 
 
 class Network(NamedTuple):
-    """A policy: layers, and of a policy that sees the eyes before them and a memory beside the last one."""
+    """A policy: layers; of a visual one also convolutions before them, and a memory beside the last one."""
 
-    layers: list[Layer]  #: the first reads what the eyes found, then the observation; the last one answers
-    eyes: Sequence[Layer] = ()
+    layers: list[Layer]  #: the first reads the features of the image, then the observation; the last gives the action
+    convolutions: Sequence[Layer] = ()
     image: tuple[int, int] = (0, 0)  #: height and width
-    nearest: float = 0.0  #: the eyes read 1 / max(depth, nearest) [m]
+    nearest: float = 0.0  #: the convolutions read 1 / max(depth, nearest) [m]
     memory: Memory | None = None  #: reads what the last layer reads, which then reads the memory, too
     max_loc: float = math.inf  #: the largest sum of the last layer
 
@@ -70,28 +70,28 @@ class Network(NamedTuple):
 
     @property
     def images(self) -> list[tuple[int, int, int]]:
-        """Channels, height and width of the image, and of what each eye makes of it."""
+        """Channels, height and width of the image, and of what each convolution makes of it."""
         found = [(1, *self.image)]
-        for eye in self.eyes:
+        for layer in self.convolutions:
             _, height, width = found[-1]
-            found.append((len(eye.bias), (height + 1) // 2, (width + 1) // 2))
+            found.append((len(layer.bias), (height + 1) // 2, (width + 1) // 2))
         return found
 
     @property
-    def found(self) -> int:
-        """How many numbers the eyes give."""
-        return math.prod(self.images[-1]) if self.eyes else 0
+    def features(self) -> int:
+        """How many features the convolutions give."""
+        return math.prod(self.images[-1]) if self.convolutions else 0
 
     @property
     def reads(self) -> dict[str, tuple[int, ...]]:
         """The shapes of what it reads, by name, without the batch."""
-        shapes: dict[str, tuple[int, ...]] = {"observation": (self.layers[0].weight.shape[1] - self.found,)}
-        shapes |= {"depth": self.images[0]} if self.eyes else {}
+        shapes: dict[str, tuple[int, ...]] = {"observation": (self.layers[0].weight.shape[1] - self.features,)}
+        shapes |= {"depth": self.images[0]} if self.convolutions else {}
         return shapes | ({"memory": (self.memory.own_weight.shape[1],)} if self.memory else {})
 
     def weights(self) -> Iterator[Array]:
         """All weights and biases, in the order in which they are used."""
-        for layer in (*self.eyes, *self.layers[:-1]):
+        for layer in (*self.convolutions, *self.layers[:-1]):
             yield from layer[:2]
         yield from self.memory or ()
         yield from self.layers[-1][:2]
@@ -131,12 +131,12 @@ def write_onnx(network: Network) -> bytes:
         return add(ACTIVATIONS[layer.activation][0], [total], f"layer_{suffix}")
 
     x = "observation"
-    if network.eyes:
-        seen = add("Max", ["depth", constant("nearest", network.nearest)], "clamped")
-        seen = add("Reciprocal", [seen], "inverse")
-        for i, eye in enumerate(network.eyes):
-            seen = run(eye, seen, f"eye_{i}")
-        x = add("Concat", [add("Flatten", [seen], "found"), x], "seen", axis=1)
+    if network.convolutions:
+        image = add("Max", ["depth", constant("nearest", network.nearest)], "clamped")
+        image = add("Reciprocal", [image], "inverse")
+        for i, layer in enumerate(network.convolutions):
+            image = run(layer, image, f"convolution_{i}")
+        x = add("Concat", [add("Flatten", [image], "features"), x], "features_and_observation", axis=1)
     for i, layer in enumerate(network.layers[:-1]):
         x = run(layer, x, f"{i}")
     if network.memory:
@@ -153,11 +153,11 @@ def write_onnx(network: Network) -> bytes:
     shapes = network.reads
     written = {"action": (len(network.layers[-1].bias),)}
     written |= {"next_memory": shapes["memory"]} if network.memory else {}
-    ends = [
+    begin, end = (
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape]) for name, shape in side.items()]
         for side in (shapes, written)
-    ]
-    graph = helper.make_graph(nodes, "policy", *ends, constants)
+    )
+    graph = helper.make_graph(nodes, "policy", begin, end, constants)
     opset = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(graph, producer_name="torchrl_quad", ir_version=IR_VERSION, opset_imports=opset)
     onnx.checker.check_model(model, full_check=True)
@@ -182,7 +182,7 @@ def write_c(network: Network, contract: Mapping[str, Any], vectors: Mapping[str,
         vectors: for the self-test, (n, ...) by name: what the ONNX of the network reads and writes.
     """
     output, reads = contract["output"], network.reads
-    names = sorted({layer.activation for layer in (*network.eyes, *network.layers)})
+    names = sorted({layer.activation for layer in (*network.convolutions, *network.layers)})
     tests = {f"test_{name}": _rows(x.reshape(len(x), -1)) for name, x in vectors.items()}
     others = [name for name in reads if name != "observation"]
     parameters = {"depth": " const float depth[POLICY_DEPTH],", "memory": f"\n{18 * ' '}float memory[POLICY_MEMORY],"}
@@ -214,7 +214,7 @@ def write_c(network: Network, contract: Mapping[str, Any], vectors: Mapping[str,
 def fill_in(template: str, values: Mapping[str, Any], features: Collection[str]) -> str:
     """A file from its template. Lines that begin with ``@name`` stay, without it, where there is such a feature."""
     lines = []
-    for line in (resources.files(__package__) / "templates" / template).read_text().splitlines(keepends=True):
+    for line in (resources.files("torchrl_quad.deploy") / "templates" / template).read_text().splitlines(keepends=True):
         marked = re.match(r"@(\w+) ?", line)
         if marked is None or marked[1] in features:
             lines.append(line[marked.end() if marked else 0 :])
@@ -224,28 +224,28 @@ def fill_in(template: str, values: Mapping[str, Any], features: Collection[str])
 def _sizes(network: Network) -> dict[str, int]:
     """Of the image, and how many floats the C code needs between its steps."""
     between = [layer.weight.shape[0] for layer in network.layers]
-    between += [math.prod(image) for image in network.images] if network.eyes else []
+    between += [math.prod(image) for image in network.images] if network.convolutions else []
     (rows, columns), recalled = network.image, network.layers[-1].weight.shape[1]
-    return {"rows": rows, "columns": columns, "width": max(between), "found": network.found, "recalled": recalled}
+    return {"rows": rows, "columns": columns, "width": max(between), "features": network.features, "recalled": recalled}
 
 
 def _steps(network: Network) -> Iterator[str]:
     """The statements of the C code, one for each part of the network."""
     places = itertools.cycle(("one", "two"))
     x = "observation"
-    if network.eyes:
+    if network.convolutions:
         x = next(places)
         yield f"for (int i = 0; i < POLICY_DEPTH; ++i) {x}[i] = 1.0f / fmaxf(depth[i], {_float(network.nearest)});"
         images = network.images
-        for i, (eye, (channels, height, width), after) in enumerate(
-            zip(network.eyes, images, images[1:], strict=False)
+        for i, (layer, (channels, height, width), after) in enumerate(
+            zip(network.convolutions, images, images[1:], strict=False)
         ):
-            y = "seen" if i == len(network.eyes) - 1 else next(places)
-            own = f"eye_weight_{i}, eye_bias_{i}"
+            y = "features" if i == len(network.convolutions) - 1 else next(places)
+            own = f"kernel_{i}, kernel_bias_{i}"
             yield f"convolve({own}, {channels}, {height}, {width}, {x}, {after[0]}, {y});"
-            yield _activate(eye, y, math.prod(after))
+            yield _activate(layer, y, math.prod(after))
             x = y
-        yield f"for (int i = 0; i < POLICY_OBSERVATION; ++i) seen[{network.found} + i] = observation[i];"
+        yield f"for (int i = 0; i < POLICY_OBSERVATION; ++i) features[{network.features} + i] = observation[i];"
     for i, layer in enumerate(network.layers):
         is_last = i == len(network.layers) - 1
         if is_last and network.memory:
@@ -265,9 +265,9 @@ def _activate(layer: Layer, x: str, size: int) -> str:
 
 
 def _constants(network: Network) -> Iterator[str]:
-    for i, eye in enumerate(network.eyes):
-        yield _constant(f"eye_weight_{i}", eye.weight.reshape(-1, 9))  # a row for each kernel
-        yield _constant(f"eye_bias_{i}", eye.bias)
+    for i, layer in enumerate(network.convolutions):
+        yield _constant(f"kernel_{i}", layer.weight.reshape(-1, 9))  # a row for each kernel
+        yield _constant(f"kernel_bias_{i}", layer.bias)
     for i, layer in enumerate(network.layers):
         yield _constant(f"weight_{i}", layer.weight.T)  # one row for each input: the inner loop runs along memory
         yield _constant(f"bias_{i}", layer.bias)

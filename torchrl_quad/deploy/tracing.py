@@ -10,7 +10,7 @@ import contextlib
 import logging
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDict
@@ -20,6 +20,7 @@ from torchrl_quad.deploy.contract import ENDS, MEASURED
 from torchrl_quad.deploy.graphs import IR_VERSION, NOT_IN_TASKS, OPSET
 from torchrl_quad.envs import QuadrotorEnv
 from torchrl_quad.envs.guard import is_unit
+from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.errors import UserValueError, one_line
 
 Tensors = dict[str, Tensor]
@@ -51,7 +52,8 @@ def trace(env: QuadrotorEnv, state: Mapping[Any, Tensor]) -> Rules:
     with _quietly(), _without_randomness(env), torch.no_grad():
         program, outputs = _exported(rules)
         try:
-            model = torch.onnx.export(program, (), dynamo=True, opset_version=OPSET, verbose=False).model_proto
+            found: Any = torch.onnx.export(program, (), dynamo=True, opset_version=OPSET, verbose=False)
+            model = found.model_proto
         except Exception as error:  # torch.onnx has many kinds
             raise _refusal(env, "torch.onnx cannot convert its rules", error) from error
     return _Cut(model, [*rules.inputs], outputs, map(name_of, env.task_entries)).rules(rules)
@@ -80,7 +82,7 @@ class _Methods:
         self.hidden = {f"hidden.{name_of(key)}": key for key in state if key not in self.known.values()}
         self.inputs = {name: state[key] for name, key in (self.known | self.hidden).items()}
         self.inputs |= {f"previous.{name}": state[name].clone() for name in self.changing}
-        self.methods = [self.observe, self.advance]
+        self.methods: list[Method] = [self.observe, self.advance]
         self.flight: dict[str, tuple[str, ...]] = {}
         if self.unjudged is None:
             self.methods += [self.judge, self.measure, self.sum_up]
@@ -228,7 +230,7 @@ def _without_randomness(env: QuadrotorEnv) -> Iterator[None]:
 
     randomness = env.randomness
     try:
-        env.randomness = Refusing()
+        env.randomness = cast(Randomness, Refusing())
         yield
     finally:
         env.randomness = randomness
@@ -344,8 +346,8 @@ class _Cut:
                     f"export_policy: {task}: {name}.onnx would compute {node.domain}{node.op_type}, which bundles do "
                     "not. Write it with other operations of torch."
                 )
-            own = ([names.get(x, "") for x in side] for side in (node.input, node.output))
-            nodes.append(helper.make_node(node.op_type, *own))
+            read, written = ([names.get(x, "") for x in side] for side in (node.input, node.output))
+            nodes.append(helper.make_node(node.op_type, read, written))
             nodes[-1].attribute.extend(node.attribute)
         for output, end in zip(wanted, writes, strict=True):
             nodes.append(helper.make_node("Identity", [names[self.outputs[output]]], [end.name]))

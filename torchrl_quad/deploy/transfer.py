@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,6 +202,8 @@ def as_rollout(flight: Mapping[str, Any]) -> Any:
     states = {name: torch.from_numpy(flight[name]).float() for name in names}
     first = flight["done"].cumsum(1) - flight["done"] == 0  # what comes after the first episode has not flown
     ends = {name: torch.from_numpy(flight[name] & first).unsqueeze(-1) for name in (*ENDS, "done")}
-    later = {"state": {name: x[:, 1:] for name, x in states.items()}, **ends}
-    action = torch.from_numpy(flight["action"]).float()
-    return TensorDict({"state": {k: x[:, :-1] for k, x in states.items()}, "action": action, "next": later}, [n, time])
+    rollout: dict[Any, torch.Tensor] = {"action": torch.from_numpy(flight["action"]).float()}
+    rollout |= {("state", name): x[:, :-1] for name, x in states.items()}
+    rollout |= {("next", "state", name): x[:, 1:] for name, x in states.items()}
+    rollout |= {("next", name): x for name, x in ends.items()}
+    return TensorDict(cast(Any, rollout), [n, time])

@@ -25,12 +25,16 @@ SIMULATORS = {
 class Simulator(Protocol):
     """The protocol of all simulators: many drones at once, in the conventions of the package.
 
-    A class takes the contract, the name of a rate loop, and for each rotor the index of the motor whose command it
-    gets.
+    Args:
+        contract: of a bundle. Its ``plant`` flies; its ``drone`` is what the rate loop believes in.
+        loop: the rate loop, one of ``loops``.
+        motors: for each rotor the index of the motor whose command it gets.
     """
 
     version: str  #: name and version
     loops: tuple[str, ...]  #: the rate loops that it can fly with
+
+    def __init__(self, contract: Mapping[str, Any], loop: str, motors: Sequence[int]) -> None: ...
 
     def reset(self, starts: Mapping[str, Array]) -> None:
         """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
@@ -42,7 +46,7 @@ class Simulator(Protocol):
         """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Go on with these drones alone (n)."""
+        """Continue with only these drones (n)."""
 
 
 def simulator_class(name: str) -> type[Simulator]:

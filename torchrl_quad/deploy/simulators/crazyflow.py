@@ -25,22 +25,15 @@ NAMES = {"position": "pos", "quaternion": "quat", "velocity": "vel", "angular_ve
 
 
 class Crazyflow:
-    """Drones in worlds of their own, in Crazyflow; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
+    """Independent drones in Crazyflow; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
 
-    Its dynamics take all that a contract says of a drone but quadratic drag, which they do not know. They compute in
+    Its dynamics have everything that a contract says of a drone except quadratic drag. They compute in
     float32, and hold drones above the ground. Physics and rate loop run at 1 kHz, by symplectic Euler.
-
-    Args:
-        contract: of a bundle. Its ``plant`` flies, its ``drone`` is what the rate loop believes in.
-        loop: "contract", "pid" or "pd".
-        motors: for each rotor the index of the motor whose command it gets.
     """
 
     loops = tuple(LOOPS)
 
-    def __init__(
-        self, contract: Mapping[str, Any], loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
-    ) -> None:
+    def __init__(self, contract: Mapping[str, Any], loop: str, motors: Sequence[int]) -> None:
         self.version = f"Crazyflow {version('crazyflow')}"
         self.substeps = max(round(contract["control_dt"] * RATE), 1)
         self.rate = round(self.substeps / contract["control_dt"])
@@ -71,7 +64,7 @@ class Crazyflow:
             **{k: jnp.asarray(x, jnp.float32) for k, x in _parameters(drone, self.frame).items()}
         )
         self.sim.data = data.replace(states=states, params=params)
-        self.flying = np.arange(n)  # the others go on, too, but nobody looks at them
+        self.flying = np.arange(n)  # the others also fly on, unobserved
 
     def state(self) -> dict[str, Array]:
         """The present states (n, ...)."""
@@ -93,7 +86,7 @@ class Crazyflow:
             self.sim.step(1)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Go on with these drones alone (n)."""
+        """Continue with only these drones (n)."""
         self.flying = self.flying[chosen]
         self.loop.keep(chosen)
 

@@ -24,10 +24,10 @@ STATE |= {"angular_velocity": slice(11, 14), "rotor_speed": slice(14, 18)}
 def model(drone: Drone, timestep: float) -> str:
     """The drone as MJCF.
 
-    Everything that the motion depends on is said: mass and inertia, gravity, the integrator (semi-implicit Euler), no
+    It states everything that the motion depends on: mass and inertia, gravity, the integrator (semi-implicit Euler), no
     contact, no fluid. The first four actuators make no force: they are the lag of the rotors, of first order in the
-    speed and exact for any step. The other four push along z at the place of a rotor, by the thrust [N] that is written
-    into them, and turn by its drag torque.
+    speed and exact for any step. The other four push along z at the place of a rotor, by the thrust [N]
+    written into them, and turn by its drag torque.
     """
     places, spins = drone.rotor_positions.tolist(), drone.rotor_spin.tolist()
     sites = "".join(
@@ -58,22 +58,15 @@ def model(drone: Drone, timestep: float) -> str:
 
 
 class MuJoCo:
-    """Drones that do not know of each other, in MuJoCo; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
+    """Independent drones in MuJoCo; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
 
     Thrust follows from the speed of the rotors by the contract's thrust map, and drag by its coefficients; both are
     forces to MuJoCo, held over a step of 1 ms. The rate loop runs at 1 kHz, too.
-
-    Args:
-        contract: of a bundle. Its ``plant`` flies, its ``drone`` is what the rate loop believes in.
-        loop: "contract", "pid" or "pd".
-        motors: for each rotor the index of the motor whose command it gets.
     """
 
     loops = tuple(LOOPS)
 
-    def __init__(
-        self, contract: Mapping[str, Any], loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
-    ) -> None:
+    def __init__(self, contract: Mapping[str, Any], loop: str, motors: Sequence[int]) -> None:
         self.version = f"MuJoCo {mujoco.__version__}"
         self.substeps = max(round(contract["control_dt"] * RATE), 1)
         timestep = contract["control_dt"] / self.substeps
@@ -118,7 +111,7 @@ class MuJoCo:
             self.x, self.after = self.after[:, 0], x[:, None]
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Go on with these drones alone (n)."""
+        """Continue with only these drones (n)."""
         self.x = self.x[chosen]
         self.loop.keep(chosen)
         self._allocate()

@@ -9,41 +9,30 @@ import torch
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.simulators.vehicle import Array
-from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams, load_drone
+from torchrl_quad.dynamics import DYNAMICS, load_drone
 from torchrl_quad.errors import UserValueError, shown
 
 
 class Ours:
-    """The simulator of the contract; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
-
-    Args:
-        contract: of a bundle.
-        loop: "contract", which is a part of this simulator.
-        motors: for each rotor the index of the motor whose command it gets; here each gets its own.
-    """
+    """The simulator of the contract; see :class:`~torchrl_quad.deploy.simulators.Simulator`."""
 
     loops = ("contract",)
 
-    def __init__(
-        self, contract: Mapping[str, Any], loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
-    ) -> None:
+    def __init__(self, contract: Mapping[str, Any], loop: str, motors: Sequence[int]) -> None:
         if tuple(motors) != (0, 1, 2, 3):
             raise UserValueError("torchrl_quad flies motors as they are: swap them in another simulator.")
         about = contract["simulator"]
         self.version = contract["origin"]["package"]
         nominal, substeps = load_drone(contract["drone"]), round(contract["control_dt"] / about["dt"])
-        self.params: QuadrotorParams = (
-            load_drone(contract["drone"] | contract["plant"]) if contract["plant"] else nominal
-        )
         if about["dynamics"] not in DYNAMICS:
             raise UserValueError(
                 f"The simulator lacks the dynamics {shown(about['dynamics'])}. Known are {', '.join(DYNAMICS)}; "
                 "register those of your own first."
             )
-        kind = DYNAMICS[about["dynamics"]]
+        kind: Any = DYNAMICS[about["dynamics"]]
         self.dynamics = kind(nominal, about["dt"], substeps, about["integrator"], "rates")
-        if not contract["plant"]:
-            self.params = self.dynamics.nominal
+        flies = contract["drone"] | contract["plant"]
+        self.params = load_drone(flies) if contract["plant"] else self.dynamics.nominal
 
     def reset(self, starts: Mapping[str, Array]) -> None:
         """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
@@ -62,5 +51,5 @@ class Ours:
         self.now = self.dynamics.control_step(self.now, action, self.params, None)
 
     def keep(self, chosen: NDArray[Any]) -> None:
-        """Go on with these drones alone (n)."""
+        """Continue with only these drones (n)."""
         self.now = {name: x[torch.from_numpy(chosen)] for name, x in self.now.items()}

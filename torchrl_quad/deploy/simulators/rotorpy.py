@@ -17,7 +17,7 @@ NAMES = {"position": "x", "quaternion": "q", "velocity": "v", "angular_velocity"
 
 
 class RotorPy:
-    """Drones that do not know of each other, in RotorPy; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
+    """Independent drones in RotorPy; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
 
     RotorPy integrates over steps of the contract's simulator, in which commands are held: 5 ms by default. Its vehicle
     cannot be all that a contract says:
@@ -27,18 +27,12 @@ class RotorPy:
     - quadratic drag is -C |v| v with the norm of the velocity, not axis by axis;
     - gravity is 9.81 m/s2.
 
-    Args:
-        contract: of a bundle. Its ``plant`` flies.
-        loop: "contract", "pid", "pd", or "own": RotorPy's ``cmd_ctbr``, proportional, with the gain that gives the
-            damping of the contract's loop.
-        motors: for each rotor the index of the motor whose command it gets.
+    The loop "own" is its ``cmd_ctbr``, proportional, with the gain that gives the damping of the contract's loop.
     """
 
     loops = (*LOOPS, "own")
 
-    def __init__(
-        self, contract: Mapping[str, Any], loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
-    ) -> None:
+    def __init__(self, contract: Mapping[str, Any], loop: str, motors: Sequence[int]) -> None:
         self.version = f"RotorPy {version('rotorpy')}"
         self.dt = contract["simulator"]["dt"]
         self.substeps = round(contract["control_dt"] / self.dt)
@@ -81,7 +75,7 @@ class RotorPy:
             self.now = [self.vehicle.step(x, c, self.dt) for x, c in zip(self.now, commands, strict=True)]
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Go on with these drones alone (n)."""
+        """Continue with only these drones (n)."""
         self.now = [x for x, on in zip(self.now, chosen, strict=True) if on]
         if self.loop is not None:
             self.loop.keep(chosen)

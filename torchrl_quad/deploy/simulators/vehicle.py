@@ -6,7 +6,7 @@ Arrays are (n, ...), one row for each drone. Nothing here imports torch.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +31,28 @@ class Drone:
         ValueError: its drag acts above its centre of mass, or its rotors have two time constants.
     """
 
+    mass: float
+    gravity: float
+    yaw_torque_coefficient: float
+    rotor_speed_min: float
+    rotor_speed_max: float
+    motor_time_constant: float
+    inertia: Array
+    rotor_positions: Array
+    rotor_spin: Array
+    thrust_map: Array
+    linear_drag: Array
+    quadratic_drag: Array
+    rate_gain: Array
+    rate_damping: Array
+
     def __init__(self, fields: Mapping[str, Any]) -> None:
         self.fields = {name: np.array(value, float) for name, value in fields.items()}
-        unknown = {"drag_height": self.fields.get("drag_height", np.zeros(1)).any()}
-        unknown["two motor_time_constants"] = self.fields["motor_time_constant"].size > 1
-        if any(unknown.values()):
+        unknown = ["drag_height"] if self.fields.get("drag_height", np.zeros(1)).any() else []
+        unknown += ["two motor_time_constants"] if self.fields["motor_time_constant"].size > 1 else []
+        if unknown:
             raise UserValueError(
-                f"Other simulators do not fly drones with {' and '.join(x for x in unknown if unknown[x])}. Export the "
+                f"Third-party simulators do not fly drones with {' and '.join(unknown)}. Export the "
                 "policy of a drone without: env.drone with drag_height: 0 and one motor_time_constant."
             )
         for name, value in self.fields.items():
@@ -68,18 +83,8 @@ class Drone:
         return rotate(quaternion, -(self.linear_drag + self.quadratic_drag * np.abs(body)) * body)
 
 
-class RateLoop(Protocol):
-    """From a collective thrust (n) [N] and body rates (n, 3) [rad/s] to commanded rotor speeds (n, 4) [rad/s]."""
-
-    def __call__(self, thrust: Array, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
-        """The command, from the body rates (n, 3) [rad/s] and rotor speeds (n, 4) [rad/s] of this moment."""
-
-    def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Go on with these drones alone (n)."""
-
-
 class ContractLoop:
-    """The rate loop of the contract, as the drone was trained with; it knows how fast its rotors turn.
+    """The rate loop of the contract, as the drone was trained with; it reads rotor speeds.
 
     torque = J K (desired - rate) - D (angular acceleration) + w x J w, where the angular acceleration follows from the
     rotor speeds. Where rotors saturate it gives up yaw first, then thrust, then roll and pitch.
@@ -99,7 +104,8 @@ class ContractLoop:
         self.yaw_share, self.tiny = drone.mixer[:, 3] * self.per_share, 1e-6 * drone.weight
 
     def __call__(self, thrust: Array, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
-        """The command; see :class:`RateLoop`."""
+        """Rotor speeds (n, 4) [rad/s] to command, for a collective thrust (n) [N] and body rates (n, 3) [rad/s], from
+        the body rates (n, 3) [rad/s] and rotor speeds (n, 4) [rad/s] of this moment."""
         return self.mix(thrust, self.torque(rates, angular_velocity, rotor_speed))
 
     def torque(self, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
@@ -121,7 +127,7 @@ class ContractLoop:
         return drone.speed(limited)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Nothing to choose from: it has no memory."""
+        """Continue with only these drones (n); this loop has no memory."""
 
     def _within_limits(self, thrust: Array, collective: Array, yaw_torque: Array) -> Array:
         # In units of collective thrust, of which every rotor has its share.
@@ -140,7 +146,7 @@ class ContractLoop:
 
 
 class PIDLoop(ContractLoop):
-    """A PID rate loop as firmware has it: it reads a gyro, and knows no rotor speed, no inertial coupling and no model.
+    """A PID rate loop as in firmware: it only reads a gyro, and has no model of the drone.
 
     Its gains follow from the contract by a rule. P is the contract's gain times the inertia, and D the contract's
     damping, but of the measured body rate: with a perfect derivative the loop would have the bandwidth and the damping
@@ -156,10 +162,11 @@ class PIDLoop(ContractLoop):
         loop = drone.rate_gain, drone.inertia, drone.rate_damping, drone.motor_time_constant
         self.integral_gain = self.gain * self.integral_share * bandwidth(*loop)
         self.smoothing = 1.0 - np.exp(-2.0 * np.pi * self.cutoff * dt)
-        self.integral, self.derivative, self.before = np.zeros(3), np.zeros(3), None
+        self.integral, self.derivative = np.zeros(3), np.zeros(3)
+        self.before: Array | None = None
 
     def __call__(self, thrust: Array, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
-        """The command; see :class:`RateLoop`. The rotor speeds are not read."""
+        """The command; see :class:`ContractLoop`. The rotor speeds are not read."""
         if self.before is None:
             self.before = angular_velocity
         error = rates - angular_velocity
@@ -174,7 +181,7 @@ class PIDLoop(ContractLoop):
         return self.mix(thrust, torque)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Go on with these drones alone."""
+        """Continue with only these drones."""
         if self.before is not None:
             self.integral, self.derivative = self.integral[chosen], self.derivative[chosen]
             self.before = self.before[chosen]

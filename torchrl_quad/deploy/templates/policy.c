@@ -63,7 +63,7 @@ int policy_action(const float observation[POLICY_OBSERVATION],$parameters float 
 {
     const float limit = $limit;
     float one[WIDTH], two[WIDTH];
-@depth     float seen[$found + POLICY_OBSERVATION];
+@depth     float features[$features + POLICY_OBSERVATION];
 @memory     float recalled[$recalled], *next = recalled + $recalled - POLICY_MEMORY;
     int broken = 0;
 

@@ -132,8 +132,7 @@ class Flight:
     @property
     def has_own_obstacles(self) -> bool:
         """Whether each environment has other obstacles."""
-        scene = None if self.env is None else self.env.scene
-        return scene is not None and scene.is_random
+        return self.env is not None and bool(self.entries("next", "state", "scene"))
 
     def solids(self, i: int) -> Primitives | None:
         """The obstacles in the first episode of an environment, if there are any."""

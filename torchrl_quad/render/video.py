@@ -252,8 +252,8 @@ def draw_frame(env: QuadrotorEnv, drones: Sequence[int] | None, size: int) -> np
     """Draw an environment as it is; see :meth:`~torchrl_quad.envs.QuadrotorEnv.render`."""
     if not env.render_state:
         raise UserValueError("render() draws the state after the last reset or step. Call env.reset() first.")
-    count = 1 if env.scene is not None and env.scene.is_random else 6
-    chosen = list(range(min(env.num_envs, count)) if drones is None else drones)
+    alone = any(not isinstance(key, str) for key in env.render_state)  # each environment has other obstacles
+    chosen = list(range(min(env.num_envs, 1 if alone else 6)) if drones is None else drones)
     if not chosen or not all(isinstance(i, numbers.Integral) and 0 <= i < env.num_envs for i in chosen):
         raise UserValueError(
             f"render: drones are indices from 0 to {env.num_envs - 1}, at least one, such as drones=[0]; got {chosen}."

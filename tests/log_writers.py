@@ -4,10 +4,11 @@ import struct
 import zlib
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 END = 10.0  # [s]
 G = 9.80665
-STEP = {"<u4": "I", "<u8": "Q"}
+ULOG = b"ULog\x01\x12\x35\x01" + bytes(8)  # its header
 
 
 def product(p, q):
@@ -18,14 +19,7 @@ def product(p, q):
 
 def matrix(q):
     """Rotation matrices (T, 3, 3) of quaternions w x y z."""
-    w, x, y, z = q.T
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
+    return Rotation.from_quat(q, scalar_first=True).as_matrix()
 
 
 def _position(t):
@@ -70,28 +64,22 @@ def write_csv(path, columns):
     return path
 
 
-def quaternion_of(r):
-    """Quaternions of rotation matrices, by the eigenvector that all of them share with Davenport's matrix."""
-    k = np.zeros((len(r), 4, 4))
-    k[:, 0, 0] = np.trace(r, axis1=1, axis2=2)
-    off = np.stack((r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]), -1)
-    k[:, 0, 1:] = k[:, 1:, 0] = off
-    k[:, 1:, 1:] = r + r.transpose(0, 2, 1) - np.trace(r, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    return np.linalg.eigh(k)[1][:, :, -1]
-
-
 def ned(true):
     """What PX4 logs of a flight in our frames: x east becomes y east; body y left becomes y right."""
     world = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     body = np.diag([1.0, -1.0, -1.0])
-    rotation = np.einsum("ij,njk,kl->nil", world, matrix(true["quaternion"]), body)
+    rotation = Rotation.from_matrix(world @ matrix(true["quaternion"]) @ body)
     return {
         "position": true["position"] @ world.T,
         "velocity": true["velocity"] @ world.T,
-        "quaternion": quaternion_of(rotation),
+        "quaternion": rotation.as_quat(scalar_first=True),
         "angular_velocity": true["angular_velocity"] @ body,
         "acceleration": true["acceleration"] @ body,
     }
+
+
+def ulog_message(kind, body):
+    return struct.pack("<HB", len(body), ord(kind)) + body
 
 
 def write_ulog(path, messages, parameters):
@@ -99,29 +87,25 @@ def write_ulog(path, messages, parameters):
 
     ``messages`` maps a name to (times [s], {field: (type, array)}); arrays of shape (T, n) are fields of n.
     """
-
-    def message(kind, body):
-        return struct.pack("<HB", len(body), ord(kind)) + body
-
-    out = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), message("B", bytes(40))]
+    out = [ULOG, ulog_message("B", bytes(40))]
     letters = {"float": "f4", "uint64_t": "u8"}
     for name, (_, fields) in messages.items():
         parts = ["uint64_t timestamp"]
         for field, (kind, values) in fields.items():
             parts.append(f"{kind}[{values.shape[1]}] {field}" if values.ndim == 2 else f"{kind} {field}")
-        out.append(message("F", f"{name}:{';'.join(parts)};".encode()))
+        out.append(ulog_message("F", f"{name}:{';'.join(parts)};".encode()))
     for name, value in parameters.items():
         key = f"float {name}".encode()
-        out.append(message("P", bytes([len(key)]) + key + struct.pack("<f", value)))
+        out.append(ulog_message("P", bytes([len(key)]) + key + struct.pack("<f", value)))
     for k, name in enumerate(messages):
-        out.append(message("A", bytes([0]) + struct.pack("<H", k) + name.encode()))
+        out.append(ulog_message("A", bytes([0]) + struct.pack("<H", k) + name.encode()))
     rows = []
     for k, (times, fields) in enumerate(messages.values()):
         stamps = np.round(times * 1e6).astype("<u8")
         parts = [v.astype("<" + letters[kind]).reshape(len(times), -1) for kind, v in fields.values()]
         for i, stamp in enumerate(stamps):
             rows.append((stamp, struct.pack("<H", k) + stamp.tobytes() + b"".join(p[i].tobytes() for p in parts)))
-    out += [message("D", body) for _, body in sorted(rows, key=lambda row: row[0])]
+    out += [ulog_message("D", body) for _, body in sorted(rows, key=lambda row: row[0])]
     path.write_bytes(b"".join(out))
     return path
 

@@ -202,23 +202,29 @@ def test_predictions_of_a_drone_that_is_right_are_right_and_of_one_that_drifts_a
 
 
 def test_bad_input_of_a_fit_is_refused_by_name(real):
-    with pytest.raises(UnknownField, match="cannot fit 'mass'. Choose from: thrust_map"):
-        identify(real, fields=["mass"])
-    with pytest.raises(TooLittleFlight, match="at least one flight"):
-        identify([])
-    short = dataclasses.replace(real, segments=((300, 420),))
-    with pytest.raises(TooShort, match="no piece of the flight is 1.90 s long"):
-        prediction_error(short, "crazyflie")
-    with pytest.raises(TooLittleFlight, match="too few"):
-        identify(dataclasses.replace(real, segments=((300, 600),)))
-    with pytest.raises(ValueError, match="motor_command: missing key 'nominal_voltage'"):
-        load_drone({**_plain("visfly"), "motor_command": {"speed_per_volt": 500.0}})
-    with pytest.raises(ValueError, match="motor_command: unknown key 'gain'. Allowed: speed_per_volt, nominal_voltage"):
-        load_drone({**_plain("visfly"), "motor_command": {"gain": 1.0}})
-    with pytest.raises(ValueError, match="motor_command must be a mapping with any of speed_per_volt, .*; got 500.0"):
-        load_drone({**_plain("visfly"), "motor_command": 500.0})
-    with pytest.raises(ValueError, match="speed_per_volt must be"):
-        MotorCommand(-1.0, 3.7)
+    def flown(*segments):
+        return dataclasses.replace(real, segments=segments)
+
+    def drone(motor_command):
+        plain = {key: value.squeeze().tolist() for key, value in load_drone("visfly").fields().items()}
+        return load_drone({**plain, "motor_command": motor_command})
+
+    still = dataclasses.replace(real, motor_command=0.0 * real.motor_command)
+    no_motors = dataclasses.replace(load_drone("visfly"), motor_command=None)
+    for error, message, call, *arguments in (
+        (UnknownField, "cannot fit 'mass'. Choose from: thrust_map", identify, real, "crazyflie", None, ["mass"]),
+        (TooLittleFlight, "at least one flight", identify, []),
+        (TooLittleFlight, "too few", identify, flown((300, 600))),
+        (TooShort, "no piece of the flight is 1.90 s long", prediction_error, flown((300, 420)), "crazyflie"),
+        (TooShort, "figure8 has no piece in flight", prediction_error, flown(), "visfly"),
+        (NoFlight, "its motor commands are zero", prediction_error, still, no_motors),
+        (ValueError, "motor_command: missing key 'nominal_voltage'", drone, {"speed_per_volt": 500.0}),
+        (ValueError, "command: unknown key 'gain'. Allowed: speed_per_volt, nominal_voltage", drone, {"gain": 1.0}),
+        (ValueError, "command must be a mapping with any of speed_per_volt, .*; got 500.0", drone, 500.0),
+        (ValueError, "speed_per_volt must be", MotorCommand, -1.0, 3.7),
+    ):
+        with pytest.raises(error, match=message):
+            call(*arguments)
 
 
 NUMBERS = (float("nan"), float("inf"), -1, True, "a", 10**400, [0.5], torch.ones(2), None)
@@ -255,34 +261,18 @@ def test_hostile_arguments_of_fits_and_predictions_are_refused_in_one_line(real)
 
 
 def test_a_flight_of_ones_own_making_must_be_whole(real):
-    changes = {
-        name: (None, 5, "a", np.zeros(3), np.full_like(getattr(real, name), np.nan)) for name in ("position", "time")
-    }
-    changes |= {
-        "segments": (None, 5, ((5, 3),), ((0, 10**9),), ((-1, 5),), (("a", 5),)),
-        "setpoint": (5,),
-        "name": (5,),
-    }
-    changes |= {"quaternion": (real.position,), "onboard": ("gyro",), "time": (real.time[::-1], 100.0 * real.time)}
-    for name, values in changes.items():
-        for value in values:
-            with pytest.raises(UserError, match=name):
-                dataclasses.replace(real, **{name: value})
-    with pytest.raises(TooShort, match="figure8 has no piece in flight"):
-        prediction_error(dataclasses.replace(real, segments=()), "visfly")
-    still = dataclasses.replace(real, motor_command=0.0 * real.motor_command)
-    with pytest.raises(NoFlight, match="its motor commands are zero"):
-        prediction_error(still, dataclasses.replace(load_drone("visfly"), motor_command=None))
+    bad = [("position", x) for x in (None, 5, "a", np.zeros(3), np.nan * real.position)]
+    bad += [("time", x) for x in (None, 5, "a", np.nan * real.time, real.time[::-1], 100.0 * real.time)]
+    bad += [("segments", x) for x in (None, 5, ((5, 3),), ((0, 10**9),), ((-1, 5),), (("a", 5),))]
+    bad += [("setpoint", 5), ("name", 5), ("quaternion", real.position), ("onboard", "gyro")]
+    for name, value in bad:
+        with pytest.raises(UserError, match=name):
+            dataclasses.replace(real, **{name: value})
 
 
 BROKEN = ("{", "[]", "5", '{"stages": 5}', "[" * 100_000, "\xff", '{"fingerprint": "F", "stages": 5}')
-BROKEN_STAGES = (
-    5,
-    {},
-    {"free": 5},
-    {"free": ["drag_xy", "drag_z"]},
-    {"free": ["drag_xy", "drag_z"], "x": [0], "streams": [0]},
-)
+DRAG = {"free": ["drag_xy", "drag_z"]}
+BROKEN_STAGES = (5, {}, {"free": 5}, DRAG, DRAG | {"x": [0], "streams": [0]})
 
 
 def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
@@ -296,7 +286,7 @@ def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
         texts.append(json.dumps({**whole, "stages": {first: stage}}))
     for text in texts:
         file.write_text(text, encoding="latin-1")
-        with pytest.raises(UserError, match="checkpoint.json is no checkpoint of a fit: .*Delete it to start again"):
+        with pytest.raises(UserError, match="checkpoint.json is not a checkpoint of a fit: .*Delete it to start again"):
             identify(short, **options)
 
 
@@ -304,18 +294,7 @@ def test_the_recipe_fits_a_real_flight_and_draws_it(launch, refused, tmp_path):
     arguments = [f"logs=[{REAL}]", "mass=0.027", "fields=[linear_drag]", "iterations=1", "draws=5"]
     said = launch("identify", *arguments, f"folder={tmp_path}/fit")
     assert "linear_drag.xy" in said
-    names = {path.name for path in (tmp_path / "fit").iterdir()}
-    assert names == {
-        "checkpoint.json",
-        "drone.yaml",
-        "prediction.png",
-        "randomization.yaml",
-        "report.json",
-        "residuals.png",
-    }
+    names = "checkpoint.json drone.yaml prediction.png randomization.yaml report.json residuals.png"
+    assert sorted(path.name for path in (tmp_path / "fit").iterdir()) == names.split()
     assert refused("identify", "logs=[none.csv]").startswith("Error: none.csv")
     assert "mass=-1: it must be greater than 0" in refused("identify", f"logs=[{REAL}]", "mass=-1")
-
-
-def _plain(name):
-    return {key: value.squeeze().tolist() for key, value in load_drone(name).fields().items()}

@@ -1,5 +1,6 @@
 """Logs that are damaged, or made to never end: each reads, or is refused by a LogError in one line that names it."""
 
+import bz2
 import gzip
 import os
 import random
@@ -9,9 +10,10 @@ import sqlite3
 import struct
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
-from log_writers import flight, write_csv, write_ulog, write_usd
+from log_writers import ULOG, flight, ulog_message, write_csv, write_ulog, write_usd
 from test_log_files import px4_messages, times, usd_events, write_bag
 from test_log_tables import OURS, own_table
 
@@ -91,7 +93,7 @@ def test_a_damaged_log_reads_or_is_refused_in_one_line_that_names_it(kind, whole
 
 
 def test_a_ulog_is_read_on_behind_what_is_damaged(whole, tmp_path):
-    sync = struct.pack("<HB", 8, ord("S")) + bytes.fromhex("2f731320250cbb12")
+    sync = ulog_message("S", bytes.fromhex("2f731320250cbb12"))
     data, half = whole["a.ulg"], whole["a.ulg"].index(struct.pack("<H", 14) + b"D", 150_000)
     (tmp_path / "a.ulg").write_bytes(data[:half] + b"\xff" * 1000 + sync + data[half:])
     log, plain = read_log(tmp_path / "a.ulg"), read_ulog(data, "a")[0]
@@ -100,30 +102,23 @@ def test_a_ulog_is_read_on_behind_what_is_damaged(whole, tmp_path):
     assert [len(stream.time) for stream in again] == [len(stream.time) for stream in plain]
 
 
-def ulog_message(kind, body):
-    return struct.pack("<HB", len(body), ord(kind)) + body
-
-
 def ulog_of(*formats, count=100):
     body = b"".join(ulog_message("F", text.encode()) for text in formats)
     body += ulog_message("A", b"\0\0\0" + formats[0].split(":")[0].encode()) * count
-    return b"ULog\x01\x12\x35\x01" + bytes(8) + body + ulog_message("D", bytes(20))
+    return ULOG + body + ulog_message("D", bytes(20))
 
 
 def mcap_record(op, body):
     return struct.pack("<BQ", op, len(body)) + body
 
 
-def sized(text):
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
+def sized(*texts):
+    return b"".join(struct.pack("<I", len(text)) + text.encode() for text in texts)
 
 
 def mcap_of(definition, *messages):
-    body = mcap_record(
-        3, struct.pack("<H", 1) + sized("geometry_msgs/msg/PoseStamped") + sized("ros2msg") + sized(definition)
-    )
-    body += mcap_record(4, struct.pack("<HH", 1, 1) + sized("/pose") + sized("cdr") + sized(""))
+    body = mcap_record(3, struct.pack("<H", 1) + sized("geometry_msgs/msg/PoseStamped", "ros2msg", definition))
+    body += mcap_record(4, struct.pack("<HH", 1, 1) + sized("/pose", "cdr", ""))
     return body + b"".join(mcap_record(5, struct.pack("<HIQQ", 1, 0, 9, 9) + message) for message in messages)
 
 
@@ -132,18 +127,8 @@ def mcap_chunk(data, compression, size):
     return mcap_record(6, head + data)
 
 
-def lots(compression):
-    """A million zeros, packed, and how their unpacking is called."""
-    import bz2
-
-    import lz4.frame
-
-    return {"zstd": bag_files._zstd().compress, "lz4": lz4.frame.compress, "bz2": bz2.compress}[compression](
-        bytes(10**6)
-    )
-
-
 MCAP = b"\x89MCAP0\r\n"
+PACK = {"zstd": bag_files._zstd().compress, "lz4": lz4.frame.compress, "bz2": bz2.compress}
 MESSAGE = b"\0\1\0\0" + bytes(200)
 ENDLESS = {  # what no reader should follow to its end: a file, and what its refusal says
     "nested.ulg": (ulog_of(*(f"a{k}:a{k + 1}[65535] x;" for k in range(9)), "a9:uint8_t[65535] x;"), "no sample"),
@@ -155,10 +140,10 @@ ENDLESS = {  # what no reader should follow to its end: a file, and what its ref
     "texts.mcap": (MCAP + mcap_of("string[4000000000] x", MESSAGE), "too short"),
     "itself.mcap": (MCAP + mcap_of("geometry_msgs/PoseStamped x", MESSAGE), "no definition"),
     "definition.mcap": (MCAP + mcap_of("int32 x\n" * 20_000, MESSAGE), "more than 100,000 characters"),
-    "zeros.bag": (b"#ROSBAG V2.0\n" + bytes(1000), "no readable ROS bag"),
+    "zeros.bag": (b"#ROSBAG V2.0\n" + bytes(1000), "not a readable ROS bag"),
     "line.csv": (b"t" * 5_000_000, "line 1 has more than 4,000,000 bytes"),
     "columns.csv": (b"," * 100_000 + b"\n1\n", "has more than 100,000 columns, the maximum"),
-    "zeros.ulg": (b"ULog\x01\x12\x35\x01" + bytes(10**6), "no sample"),
+    "zeros.ulg": (ULOG + bytes(10**6), "no sample"),
 }
 
 
@@ -169,12 +154,12 @@ def test_what_would_take_for_ever_is_refused_at_once(name, tmp_path):
     assert message in refused(tmp_path / name)
 
 
-@pytest.mark.parametrize("compression", ["zstd", "lz4", "bz2"])
+@pytest.mark.parametrize(("name", "pack"), PACK.items())
 @pytest.mark.parametrize("lies", [False, True])
-def test_chunks_unpack_to_what_they_may_and_no_further(compression, lies, tmp_path, monkeypatch):
+def test_chunks_unpack_to_what_they_may_and_no_further(name, pack, lies, tmp_path, monkeypatch):
     monkeypatch.setattr(bag_files, "MAX_CHUNK", 10**5)
     size, path = 1000 if lies else 10**6, tmp_path / "a.mcap"
-    path.write_bytes(MCAP + mcap_chunk(lots(compression), compression, size))
+    path.write_bytes(MCAP + mcap_chunk(pack(bytes(10**6)), name, size))
     asked, unpack = [], bag_files.BagFile._unpack
     monkeypatch.setattr(bag_files.BagFile, "_unpack", lambda *a: asked.append(unpack(*a)) or asked[-1])
     assert ("a record of the kind 0" if lies else "unpacks to 1,000,000 bytes; the maximum is 100,000") in refused(path)
@@ -204,28 +189,25 @@ def test_a_pipe_a_socket_and_a_device_are_refused_unopened(tmp_path):
     (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {relative_file_paths: [a.mcap]}")
     os.mkfifo(folder / "a.mcap")
     for path in (tmp_path / "pipe.csv", tmp_path / "link.csv", tmp_path / "socket", folder, Path("/dev/zero")):
-        assert "is no plain file, but a pipe, a socket or a device" in refused(path)
+        assert "is not a regular file but a pipe, a socket or a device" in refused(path)
     monitor.close()
 
 
 TOPICS = "CREATE TABLE topics(id, name, type, serialization_format);"
 TOPICS += "INSERT INTO topics VALUES(1, '/pose', 'geometry_msgs/msg/PoseStamped', 'cdr'), (NULL, NULL, 5, 'cdr');"
 RECURSIVE = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT 1 topic_id, x timestamp, x'00' data"
-BASES = {
-    "a view without end": (f"CREATE VIEW messages AS {RECURSIVE} FROM c;", "no plain table of messages"),
-    "a column that is made": ("CREATE TABLE messages(topic_id, timestamp, data AS (zeroblob(9)));", "no plain table"),
-    "other columns": ("CREATE TABLE messages(a, b);", "no such column"),
-    "other types": (
-        "CREATE TABLE messages(topic_id, timestamp, data);INSERT INTO messages VALUES(1, 'a', 5);",
-        "no messages",
-    ),
-    "nothing": ("", "no plain table of messages"),
+ROWS = "CREATE TABLE messages(topic_id, timestamp, data);"
+BASES = {  # tables of messages: without end, made, of other columns or types, and none
+    f"CREATE VIEW messages AS {RECURSIVE} FROM c;": "no plain table of messages",
+    "CREATE TABLE messages(topic_id, timestamp, data AS (zeroblob(9)));": "no plain table",
+    "CREATE TABLE messages(a, b);": "no such column",
+    f"{ROWS}INSERT INTO messages VALUES(1, 'a', 5);": "no messages",
+    "": "no plain table of messages",
 }
 
 
-@pytest.mark.parametrize("base", BASES)
-def test_a_database_that_is_no_bag_is_refused(base, tmp_path):
-    sql, message = BASES[base]
+@pytest.mark.parametrize(("sql", "message"), BASES.items())
+def test_a_database_that_is_no_bag_is_refused(sql, message, tmp_path):
     with sqlite3.connect(tmp_path / "a.db3") as connection:
         connection.executescript(TOPICS + sql)
     connection.close()

@@ -7,15 +7,8 @@ from log_writers import END, flight, matrix, ned, write_ulog, write_usd
 from torchrl_quad.identification import MissingColumns, UnreadableLog, WrongUnit, read_log
 from torchrl_quad.identification.autopilots import decompress_quaternions
 
-TOLERANCES = {
-    "position": 2e-3,
-    "quaternion": 2e-3,
-    "velocity": 1e-2,
-    "angular_velocity": 2e-2,
-    "acceleration": 2e-2,
-    "motor_command": 2e-3,
-    "battery_voltage": 2e-3,
-}
+TOLERANCES = dict.fromkeys(("position", "quaternion", "motor_command", "battery_voltage"), 2e-3)
+TOLERANCES |= {"velocity": 1e-2, "angular_velocity": 2e-2, "acceleration": 2e-2}
 
 
 def times(rate, start=0.0):
@@ -42,22 +35,15 @@ def px4_messages():
     signal = true["motors"]["motor_command"][:, [3, 1, 0, 2]]  # front right, back left, front left, back right
     control = np.where(signal > 0.0, 0.3 * signal**2 + 0.7 * signal, np.nan)  # a motor that stands is NaN
     late = {"timestamp_sample": ("uint64_t", np.round((t["imu"] + 5.0) * 1e6))}
-    place = theirs["position"]["position"]
-    speed = theirs["position"]["velocity"]
+    place = np.concatenate((theirs["position"]["position"], theirs["position"]["velocity"]), 1)
     return {
         "vehicle_local_position": (
             t["position"] + 5.0,
-            {
-                **{axis: ("float", place[:, k]) for k, axis in enumerate("xyz")},
-                **{f"v{axis}": ("float", speed[:, k]) for k, axis in enumerate("xyz")},
-            },
+            {name: ("float", x) for name, x in zip(("x", "y", "z", "vx", "vy", "vz"), place.T, strict=True)},
         ),
         "vehicle_attitude": (t["quaternion"] + 5.0, {"q": ("float", theirs["quaternion"]["quaternion"])}),
         # Published 4 ms after they were sampled.
-        "vehicle_angular_velocity": (
-            t["imu"] + 5.004,
-            late | {"xyz": ("float", theirs["imu"]["angular_velocity"])},
-        ),
+        "vehicle_angular_velocity": (t["imu"] + 5.004, late | {"xyz": ("float", theirs["imu"]["angular_velocity"])}),
         "vehicle_acceleration": (t["imu"] + 5.004, late | {"xyz": ("float", theirs["imu"]["acceleration"])}),
         "actuator_motors": (t["motors"] + 5.0, {"control": ("float", np.pad(control, ((0, 0), (0, 8))))}),
         "battery_status": (t["battery"] + 5.0, {"voltage_v": ("float", true["battery"]["battery_voltage"])}),
@@ -94,13 +80,15 @@ def test_a_ulog_is_read_in_our_frames_with_what_leaves_for_the_motors(tmp_path):
 
 def usd_events(t, slow):
     true, battery = flight(t), flight(slow)
-    state = {"x": true["position"], "vx": true["velocity"]}
     columns = {}
-    for first, values in state.items():
-        columns |= {f"stateEstimate.{first[:-1]}{axis}": ("f", values[:, k]) for k, axis in enumerate("xyz")}
-    columns |= {f"stateEstimate.q{axis}": ("f", true["quaternion"][:, k]) for k, axis in zip((1, 2, 3, 0), "xyzw")}  # noqa: B905
-    columns |= {f"gyro.{axis}": ("f", np.degrees(true["angular_velocity"][:, k])) for k, axis in enumerate("xyz")}
-    columns |= {f"acc.{axis}": ("f", true["acceleration"][:, k] / 9.80665) for k, axis in enumerate("xyz")}
+    for stem, axes, values in (
+        ("stateEstimate.", "xyz", true["position"]),
+        ("stateEstimate.v", "xyz", true["velocity"]),
+        ("stateEstimate.q", "wxyz", true["quaternion"]),
+        ("gyro.", "xyz", np.degrees(true["angular_velocity"])),
+        ("acc.", "xyz", true["acceleration"] / 9.80665),
+    ):
+        columns |= {stem + axis: ("f", values[:, k]) for k, axis in enumerate(axes)}
     pulses = np.round(65535 * true["motor_command"]).astype(int)  # m1 is front right, and then clockwise
     columns |= {f"motor.m{k + 1}": ("H", pulses[:, place]) for k, place in enumerate((3, 2, 1, 0))}
     return {"fixedFrequency": (t, columns), "battery": (slow, {"pm.vbat": ("f", battery["battery_voltage"])})}
@@ -146,11 +134,8 @@ def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
     for k, axis in enumerate("xyz"):
         small[f"stateEstimateZ.{axis}"] = ("h", np.round(1e3 * true["position"][:, k]).astype(int))
         small[f"stateEstimateZ.v{axis}"] = ("h", np.round(1e3 * true["velocity"][:, k]).astype(int))
-    for k, (angle, sign) in enumerate((("Roll", 1), ("Pitch", -1), ("Yaw", 1))):
-        small[f"stateEstimateZ.rate{angle}"] = (
-            "h",
-            np.round(1e3 * sign * true["angular_velocity"][:, k]).astype(int),
-        )
+    for name, x in zip(("Roll", "Pitch", "Yaw"), (true["angular_velocity"] * (1, -1, 1)).T, strict=True):
+        small[f"stateEstimateZ.rate{name}"] = ("h", np.round(1e3 * x).astype(int))
     small["stateEstimateZ.quat"] = ("I", code.astype(int))
     log = read_log(write_usd(tmp_path / "log01", {"fixedFrequency": (t, small)}, 2))
     assert log.battery_voltage is None
@@ -167,53 +152,45 @@ ACTUATORS = "std_msgs/Header header\nfloat64[] angles\nfloat64[] angular_velocit
 
 def ros_messages(store, stamped=True):
     """Topics of a flight in motion capture: poses of the tracker, an IMU, the motors, odometry, and a battery."""
-    types = store.types
-    seconds = 1_700_000_000
+    seconds, zeros = 1_700_000_000, np.zeros(9)
 
-    def header(t):
-        stamp = types["builtin_interfaces/msg/Time"](sec=seconds + int(t) if stamped else 0, nanosec=round(t % 1 * 1e9))
-        extra = {"seq": 0} if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__ else {}
-        return types["std_msgs/msg/Header"](stamp=stamp, frame_id="world", **extra)
+    def make(kind, *values, **more):
+        return store.types[kind](*values, **more)
 
-    def vector(x, kind="Vector3"):
-        return types[f"geometry_msgs/msg/{kind}"](*map(float, x))
+    def geometry(kind, *values):
+        return make(f"geometry_msgs/msg/{kind}", *values)
 
-    def pose(true, i):
-        w, x, y, z = map(float, true["quaternion"][i])
-        return types["geometry_msgs/msg/Pose"](
-            vector(true["position"][i], "Point"), types["geometry_msgs/msg/Quaternion"](x, y, z, w)
-        )
-
-    zeros = np.zeros(9)
-    for rate, topic in ((100, "pose"), (50, "odom"), (125, "imu"), (100, "motors"), (5, "battery")):
+    for rate, topic, kind in (
+        (100, "pose", "geometry_msgs/msg/PoseStamped"),
+        (50, "odom", "nav_msgs/msg/Odometry"),
+        (125, "imu", "sensor_msgs/msg/Imu"),
+        (100, "motors", "mav_msgs/msg/Actuators"),
+        (5, "battery", "geometry_msgs/msg/Vector3"),  # any message may carry the battery: a mapping names it
+    ):
         t = times(rate)
         true = flight(t)
-        body = np.einsum("nji,nj->ni", matrix(true["quaternion"]), true["velocity"])
+        true["body"] = np.einsum("nji,nj->ni", matrix(true["quaternion"]), true["velocity"])
         for i, at in enumerate(t):
-            if topic == "pose":
-                kind = "geometry_msgs/msg/PoseStamped"
-                message = types[kind](header(at), pose(true, i))
-            elif topic == "odom":
-                kind = "nav_msgs/msg/Odometry"
-                twist = types["geometry_msgs/msg/Twist"](vector(body[i]), vector(true["angular_velocity"][i]))
-                message = types[kind](
-                    header(at),
+            now = {name: x[i].tolist() for name, x in true.items()}
+            stamp = make("builtin_interfaces/msg/Time", seconds + int(at) if stamped else 0, round(at % 1 * 1e9))
+            extra = {"seq": 0} if "seq" in store.types["std_msgs/msg/Header"].__dataclass_fields__ else {}
+            header = make("std_msgs/msg/Header", stamp=stamp, frame_id="world", **extra)
+            w, *xyz = now["quaternion"]
+            pose = geometry("Pose", geometry("Point", *now["position"]), geometry("Quaternion", *xyz, w))
+            rates, speed, force = (geometry("Vector3", *now[x]) for x in ("angular_velocity", "body", "acceleration"))
+            values = {
+                "pose": (header, pose),
+                "odom": (
+                    header,
                     "drone",
-                    types["geometry_msgs/msg/PoseWithCovariance"](pose(true, i), np.zeros(36)),
-                    types["geometry_msgs/msg/TwistWithCovariance"](twist, np.zeros(36)),
-                )
-            elif topic == "imu":
-                kind = "sensor_msgs/msg/Imu"
-                rates, force = vector(true["angular_velocity"][i]), vector(true["acceleration"][i])
-                turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-                message = types[kind](header(at), turn, zeros, rates, zeros, force, zeros)
-            elif topic == "motors":
-                kind = "mav_msgs/msg/Actuators"
-                message = types[kind](header(at), np.zeros(0), np.zeros(0), true["motor_command"][i])
-            else:
-                kind = "geometry_msgs/msg/Vector3"  # any message may carry the battery: a mapping names it
-                message = vector((true["battery_voltage"][i], 0, 0))
-            yield topic, kind, int((seconds + at) * 1e9), message
+                    geometry("PoseWithCovariance", pose, np.zeros(36)),
+                    geometry("TwistWithCovariance", geometry("Twist", speed, rates), np.zeros(36)),
+                ),
+                "imu": (header, geometry("Quaternion", 0.0, 0.0, 0.0, 1.0), zeros, rates, zeros, force, zeros),
+                "motors": (header, zeros[:0], zeros[:0], true["motor_command"][i]),
+                "battery": (now["battery_voltage"], 0.0, 0.0),
+            }
+            yield topic, kind, int((seconds + at) * 1e9), make(kind, *values[topic])
 
 
 def write_bag(path, ros2, storage=None, twin=None, pack=None, **options):

@@ -55,28 +55,26 @@ def test_a_mapping_reads_any_table_and_rates_are_matched(tmp_path):
     np.testing.assert_allclose(log.battery_voltage[inside], true["battery_voltage"][inside], atol=1e-3)
     assert log.onboard == ("angular_velocity", "acceleration", "motor_command", "battery_voltage")
 
-    with pytest.raises(WrongQuaternion, match="scalar last"):
-        read_log(path, {**mapping, "quaternion": ("qx", "qy", "qz", "qw")})
     xyzw = replace(LAYOUTS["nanobench"].convention, motors=(0, 1, 2, 3))
     listed = {**mapping, "quaternion": ("qx", "qy", "qz", "qw")}
     np.testing.assert_allclose(read_log(path, listed, convention=xyzw, dt=0.01).quaternion, log.quaternion)
-    for wrong, message in (
-        ({"motor_command": ("u0", "u1", "u2")}, "takes 4 column"),
-        ({"speed": ("vx", "vy", "vz")}, "Unknown quantity 'speed'"),
-        ({"velocity": ("vx", "vy", "nowhere")}, "no column nowhere, named for velocity.*There are: .*x, y"),
-    ):
-        with pytest.raises(MissingColumns, match=message):
-            read_log(path, {**mapping, **wrong})
-    with pytest.raises(MissingColumns, match="No preset knows"):
-        read_log(path, {"angular_velocity": OURS["angular_velocity"]})
-    with pytest.raises(MissingColumns, match="has no motor_command"):
-        read_log(path, {k: v for k, v in mapping.items() if k != "motor_command"})
     twice = tmp_path / "twice.csv"
     twice.write_text(path.read_text().replace("wz,", "wy,", 1))
-    with pytest.raises(UnreadableLog, match="twice.csv has several columns of one name: wy. Rename them"):
-        read_log(twice, {**mapping, "angular_velocity": ("wx", "wy", "wx")})
-    with pytest.raises(MissingColumns, match="No preset knows.*columns="):
-        read_log(path)
+    without = {k: v for k, v in mapping.items() if k != "motor_command"}
+    twin = mapping | {"angular_velocity": ("wx", "wy", "wx")}
+    nowhere = "no column nowhere, named for velocity.*There are: .*x, y"
+    for error, message, file, columns in (
+        (WrongQuaternion, "scalar last", path, listed),
+        (MissingColumns, "takes 4 column", path, mapping | {"motor_command": ("u0", "u1", "u2")}),
+        (MissingColumns, "Unknown quantity 'speed'", path, mapping | {"speed": ("vx", "vy", "vz")}),
+        (MissingColumns, nowhere, path, mapping | {"velocity": ("vx", "vy", "nowhere")}),
+        (MissingColumns, "No preset knows", path, {"angular_velocity": OURS["angular_velocity"]}),
+        (MissingColumns, "No preset knows.*columns=", path, None),
+        (MissingColumns, "has no motor_command", path, without),
+        (UnreadableLog, "twice.csv has several columns of one name: wy. Rename them", twice, twin),
+    ):
+        with pytest.raises(error, match=message):
+            read_log(file, columns)
 
 
 def test_what_is_faster_than_the_log_does_not_alias(tmp_path):
@@ -97,10 +95,7 @@ def test_touching_down_and_landing_on_a_table_are_cut_out(tmp_path):
     true["velocity"][:, 2] = np.gradient(true["position"][:, 2], t)
     true["motor_command"] = np.full((len(t), 4), 0.5) * ((t > 0.8) & (t < 10.0))[:, None]
     log = read_log(write_csv(tmp_path / "touch.csv", own_table(t, **true)), {"time": "t", **OURS})
-    expected = (
-        (1.1, 4 + 0.9 / 0.97),
-        (5.5 + 0.07 / 0.97, 8.75),
-    )  # from 0.1 m above the ground to 0.1 m above the table
+    expected = ((1.1, 4 + 0.9 / 0.97), (5.5 + 0.07 / 0.97, 8.75))  # 0.1 m above the ground, and above the table
     np.testing.assert_allclose(np.array(log.segments) * log.dt, expected, atol=0.02)
     assert "between take-off and landing are within 0.1 m of the ground" in str(log)
 
@@ -121,15 +116,17 @@ def test_euler_angles_and_velocities_of_the_body_become_ours(tmp_path):
     np.testing.assert_allclose(np.abs((log.quaternion * true["quaternion"]).sum(-1)), 1.0, atol=1e-7)
     with pytest.raises(WrongFrame, match='"velocity_body"'):
         read_log(path, mapping)
-    world = np.einsum("nij,nj->ni", r, true["angular_velocity"])
-    with pytest.raises(WrongFrame, match="in the world frame"):
-        read_log(write_csv(path, own_table(t, angular_velocity=world)), mapping)
-    for scale, message in ((1 / G, "in g.*scale=9.80665"), (1e3 / G, "scale=9.80665e-3")):
-        with pytest.raises(WrongUnit, match=message):
-            read_log(write_csv(path, own_table(t, acceleration=true["acceleration"] * scale)), mapping)
-    for motors, message in ((65535.0, "scale=1 / 65535"), (100.0, "scale=1 / 100"), (2000.0, "offset=1000")):
-        with pytest.raises(WrongUnit, match=message):
-            read_log(write_csv(path, own_table(t, motor_command=true["motor_command"] * motors)), mapping)
+    force, motors = true["acceleration"], true["motor_command"]
+    for error, message, changes in (
+        (WrongFrame, "in the world frame", {"angular_velocity": np.einsum("nij,nj->ni", r, true["angular_velocity"])}),
+        (WrongUnit, "in g.*scale=9.80665", {"acceleration": force / G}),
+        (WrongUnit, "scale=9.80665e-3", {"acceleration": 1e3 * force / G}),
+        (WrongUnit, "scale=1 / 65535", {"motor_command": 65535.0 * motors}),
+        (WrongUnit, "scale=1 / 100", {"motor_command": 100.0 * motors}),
+        (WrongUnit, "offset=1000", {"motor_command": 2000.0 * motors}),
+    ):
+        with pytest.raises(error, match=message):
+            read_log(write_csv(path, own_table(t, **changes)), mapping)
     log = read_log(path, {k: v for k, v in mapping.items() if k in ("time", "position", "quaternion")} | {
         "motor_command": Columns(OURS["motor_command"], scale=1 / 2000)}, convention=None)  # fmt: skip
     inside = slice(*log.segments[0])

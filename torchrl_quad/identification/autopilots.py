@@ -40,7 +40,7 @@ _VARIABLE = re.compile(r"(.+)\(([bBhHiIqQfd?])\)")
 
 
 class _Damaged(Exception):
-    """A message that makes no sense."""
+    """A message that cannot be read."""
 
 
 @dataclass
@@ -60,7 +60,7 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     Where a message says when its data were sampled, that is its time. A motor that is stopped has the command 0.
     ``actuator_motors.signal`` is what leaves for the motors: PX4 undoes the thrust curve of THR_MDL_FAC after it has
     logged ``actuator_motors.control`` (``FunctionMotors.hpp``). The file is read once, in time and memory proportional
-    to its size; what makes no sense is left out, and the notes say so.
+    to its size; the notes say what could not be read.
     """
     log = _Log(data)
     log.scan(name)
@@ -68,7 +68,7 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     if sum(s.columns for s in used) > MAX_COLUMNS:
         raise too_many(name, MAX_COLUMNS, "columns", "Log fewer messages.")
     if not used:
-        raise UnreadableLog(f"{name} is no readable ULog: it holds no sample of any message. Copy it again.")
+        raise UnreadableLog(f"{name} is not a readable ULog: it holds no sample of any message. Copy it again.")
     notes = []
     if log.damage or log.unread:
         notes.append(f"the ULog is damaged: {log.damage} messages and {log.unread} bytes were not read")
@@ -183,7 +183,7 @@ class _Log:
             self.dropouts += struct.unpack("<H", data[start:stop])
 
     def _measure(self, message: str, depth: int = 0) -> tuple[int, int]:
-        """The bytes and the columns of a message, with those of the messages in it, from its formats alone."""
+        """The bytes and the columns of a message, with those of the messages in it, from its formats."""
         if message not in self.sizes:
             self.sizes[message] = (0, 0)  # while it is measured, so that one in itself is damaged, too
             size = columns = 0
@@ -254,7 +254,7 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
         raise UnreadableLog(f"{name} begins like a uSD log, but its header is cut off. Copy it again.") from error
     starts, left = _events(body, at, {kind: record.itemsize for kind, record in records.items()}, name)
     if left:
-        notes.append(f"the last {left} bytes of the uSD log were not read: they are no whole events")
+        notes.append(f"the last {left} bytes of the uSD log were not read: they are not whole events")
     streams = []
     for kind, record in records.items():
         rows = pick(body, starts[kind], record)
@@ -268,7 +268,7 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
 
 
 def _events(body: bytes, at: int, sizes: dict[int, int], name: str) -> tuple[dict[int, array], int]:
-    """Where the events of each kind begin, and how many bytes at the end are no event."""
+    """Where the events of each kind begin, and how many bytes at the end belong to none."""
     starts = {kind: array("Q") for kind in sizes}
     for _ in range(MAX_RECORDS):
         if at + 2 > len(body):

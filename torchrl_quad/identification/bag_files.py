@@ -70,7 +70,7 @@ class BagFile:
         said = str(error)
         if isinstance(error, _BROKEN):
             said = f"{type(error).__name__}: {said}" if said else type(error).__name__
-        return UnreadableLog(f"{self.name} is no readable ROS bag: {said}. Record or copy it again.")
+        return UnreadableLog(f"{self.name} is not a readable ROS bag: {said}. Record or copy it again.")
 
     def _from_metadata(self, folder: Path) -> list[Path]:
         with open_plain(folder / "metadata.yaml") as file:
@@ -87,18 +87,17 @@ class BagFile:
             )
         mode = str(about.get("compression_mode") or "").lower()
         self.packed = mode if mode in ("file", "message") else ""
-        return [folder / PurePath(name).name for name in names]
-
-    def _open(self, path: Path) -> BinaryIO:
-        if not path.exists():
-            raise UnreadableLog(f"{self.name} lacks the file {path.name}, which its metadata.yaml names.")
-        return open_plain(path)
+        paths = [folder / PurePath(name).name for name in names]
+        for path in paths:
+            if not path.exists():
+                raise UnreadableLog(f"{self.name} lacks the file {path.name}, which its metadata.yaml names.")
+        return paths
 
     def _read_packed(self, path: Path) -> Iterator[Message]:
         with tempfile.TemporaryDirectory() as folder:
             whole, written, zstd = Path(folder) / path.stem, 0, _zstd()
             try:
-                with self._open(path) as packed, zstd.open(packed, "rb") as file, open(whole, "wb") as out:
+                with open_plain(path) as packed, zstd.open(packed, "rb") as file, open(whole, "wb") as out:
                     while written <= MAX_FILE and (part := file.read(1 << 20)):
                         written += out.write(part)
             except zstd.ZstdError as error:
@@ -108,7 +107,7 @@ class BagFile:
             yield from self._read(whole)
 
     def _read(self, path: Path) -> Iterator[Message]:
-        with self._open(path) as file:
+        with open_plain(path) as file:
             start = file.read(16)
             size = os.fstat(file.fileno()).st_size
             left = [MAX_RATIO * size + MAX_CHUNK]
@@ -121,7 +120,7 @@ class BagFile:
                 file.seek(len(_MCAP))
                 messages = self._mcap(file, size, {}, {}, left)
             else:
-                raise UnreadableLog(f"{path.name} is no ROS 1 bag of version 2.0, and no MCAP or SQLite file.")
+                raise UnreadableLog(f"{path.name} is neither a ROS 1 bag of version 2.0 nor an MCAP or SQLite file.")
             for connection, time, raw in messages:
                 packed = connection.is_cdr and self.packed == "message"
                 yield connection, time, self._unpack("zstd", raw, MAX_CHUNK, [MAX_CHUNK]) if packed else raw
@@ -233,7 +232,7 @@ class BagFile:
             for table in {"messages", "topics"} | ({"message_definitions"} & tables.keys()):
                 hidden = base.execute(f"SELECT hidden FROM pragma_table_xinfo('{table}')").fetchall()
                 if not str(tables.get(table)).upper().startswith("CREATE TABLE") or any(mark for (mark,) in hidden):
-                    raise UnreadableLog(f"{self.name} is no ROS bag: it has no plain table of {table}.")
+                    raise UnreadableLog(f"{self.name} is not a ROS bag: it has no plain table of {table}.")
             definitions: dict[Any, tuple[str, str]] = {}
             if "message_definitions" in tables:
                 rows = base.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")

@@ -19,7 +19,7 @@ from torchrl_quad.identification.signals import Stream
 __all__ = ["MAGIC", "read_bag"]
 
 MAX_DEFINITION = 100_000  # characters
-# What the messages of a type hold. Poses first: whoever flies in motion capture has them, too, as odometry.
+# What the messages of a type hold. Poses first: in motion capture they come along with odometry.
 _TYPES: dict[str, dict[str, tuple[str, str]]] = {
     "geometry_msgs/msg/PoseStamped": {
         "position": ("pose.position", ".x .y .z"),
@@ -107,7 +107,7 @@ def _layout(topics: Mapping[str, str], columns: str | Layout | Mapping[str, obje
         for topic in sorted(topic for topic, kind in topics.items() if kind == message):
             for quantity in quantities:
                 candidates.setdefault(quantity, []).append(topic)
-    if "position" in given or "quaternion" in given:  # whoever names one of the pose means that topic alone
+    if "position" in given or "quaternion" in given:  # the caller means the pose of that topic only
         for quantity in ("position", "quaternion", "velocity_body"):
             candidates.pop(quantity, None)
     if "velocity" in given:
@@ -156,7 +156,7 @@ def _streams(
         lacking = [part for part in parts[topic] if part not in found]
         if lacking:
             raise MissingColumns(
-                f"{topic} lacks a field of {', '.join(asked[topic])}: {', '.join(lacking)} is no number in it. Its "
+                f"{topic} lacks a field of {', '.join(asked[topic])}: {', '.join(lacking)} is not a number there. Its "
                 f"messages have: {', '.join(decoders[topic].fields)}."
             )
         seconds, rest = (int(found.get(part, 0)) for part in _STAMP)
@@ -172,7 +172,7 @@ def _streams(
 
 
 class _Damaged(Exception):
-    """A message, or the definition of one, that makes no sense."""
+    """A message, or the definition of one, that cannot be read."""
 
 
 class _Decoder:

@@ -225,7 +225,7 @@ def motors_on(motors: Array, dt: float, name: str) -> tuple[Mask, Mask]:
     full = float(np.percentile(level, 95))
     if full < OFF:
         raise NoFlight(
-            f"{name} is no flight: the mean motor command is below {OFF:g} for 95 % of the time. Give the log of a "
+            f"{name} is not a flight: the mean motor command is below {OFF:g} for 95 % of the time. Give the log of a "
             "flight, or name the right motor columns."
         )
     idle = _long(level < max(OFF, 0.3 * full), REST, dt)
@@ -247,8 +247,8 @@ def find_pieces(
     if not flying.any():
         rise = (z - np.median(z[resting])).max()
         raise NoFlight(
-            f"{name} is no flight: it rises {rise:.3f} m at most above where it stood, and never {clearance:g} m. Give "
-            "the log of a flight, or a smaller clearance."
+            f"{name} is not a flight: it rises {rise:.3f} m at most above where it stood, and never {clearance:g} m. "
+            "Give the log of a flight, or a smaller clearance."
         )
     cut, notes = broken(at, flying, dt)
     airborne = flying & ~cut
@@ -260,8 +260,8 @@ def find_pieces(
                 "a log with fewer gaps, a larger max_gap, or a smaller min_duration."
             )
         raise NoFlight(
-            f"{name} is no flight: in the air for {airborne.sum() * dt:.2f} s in all, and never for {min_duration:g} s "
-            "at a time. Give the log of a longer flight, or a smaller min_duration."
+            f"{name} is not a flight: in the air for {airborne.sum() * dt:.2f} s in all, and never for "
+            f"{min_duration:g} s at a time. Give the log of a longer flight, or a smaller min_duration."
         )
     first, last = pieces[0][0], pieces[-1][1]
     if resting[:first].any():

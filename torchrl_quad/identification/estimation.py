@@ -257,7 +257,7 @@ class Fit:
         return minimise(self._problem(start), self.file.resume(stage, start), after, self.iterations)
 
     def _least_certain(self, state: State) -> dict[str, str]:
-        """The unknown of which flights tell least, if too little, and why; or all of which they tell nothing."""
+        """The unknown that is least certain, if it is too uncertain, and why; or all that nothing depends on."""
         if not state.free:
             return {}
         _, _, cover, _ = self.uncertainty(state)
@@ -329,7 +329,7 @@ class Checkpoint:
             raise self._broken(error) from error
 
     def _broken(self, error: object) -> UserValueError:
-        return UserValueError(f"{self.path} is no checkpoint of a fit: {shown(error)}. Delete it to start again.")
+        return UserValueError(f"{self.path} is not a checkpoint of a fit: {shown(error)}. Delete it to start again.")
 
 
 def held_out(windows: Windows) -> Tensor:
@@ -357,7 +357,7 @@ def _errors(
 
 
 def _not_identifiable(dropped: Mapping[str, str], has_mass: bool, fields: str | Sequence[str] | None) -> dict[str, str]:
-    """Fields that got no number, with the reason."""
+    """Fields without a number, with the reason."""
     found = {UNKNOWNS[name].number: reason for name, reason in dropped.items()}
     if not has_mass:
         found["mass"] = "motion does not tell it: weigh the drone, and give known={'mass': ...}"

@@ -234,7 +234,7 @@ def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Si
         stream = owner[choice.names[0]]
         if any(owner[column] is not stream for column in choice.names):
             raise UnreadableLog(
-                f"{name}: the columns of {quantity}, {', '.join(choice.names)}, stand in different streams, whose "
+                f"{name}: the columns of {quantity}, {', '.join(choice.names)}, are in different streams, whose "
                 "samples have different times. Name columns of one."
             )
         with np.errstate(over="ignore", invalid="ignore"):  # damage makes NaN and numbers of any size

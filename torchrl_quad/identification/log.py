@@ -20,7 +20,7 @@ from torchrl_quad.identification.signals import LARGEST, Array, Signal, Stream, 
 from torchrl_quad.identification.sources import read_streams
 from torchrl_quad.options import NonNegative, checked
 
-_LONGEST = 3000  # letters of an error: it lists up to 60 columns of a file
+_LONGEST = 3000  # letters of an error: it lists up to 60 columns
 LEAST_STEP, MAX_STEPS = 1e-3, 1_000_000  # [s] of a log, and how many: 17 minutes at 1 kHz, half a gigabyte
 _FIELDS = [name for name in QUANTITIES if name not in ("euler", "velocity_body")]
 
@@ -210,14 +210,14 @@ def _grid(signals: Mapping[str, Signal], main: Sequence[Signal], dt: float | Non
     step = dt or max(round(attitude.step, 5), LEAST_STEP)
     if not 0.0 < attitude.step < 0.5:
         raise WrongUnit(
-            f"{name}: the clock steps by {attitude.step:.4g} s, which is no flight. Is it in milliseconds? Then "
+            f"{name}: the clock steps by {attitude.step:.4g} s, which is not a flight. Is it in milliseconds? Then "
             'write columns={"time": Columns(("t",), scale=1e-3), ...}.'
         )
     start, stop = max(s.time[0] for s in main), min(s.time[-1] for s in main)
     span = stop - start
     if span < 20.0 * step:
         raise NoFlight(
-            f"{name} is no flight: its streams share {max(span, 0.0):.2f} s. Give a longer log, or name "
+            f"{name} is not a flight: its streams share {max(span, 0.0):.2f} s. Give a longer log, or name "
             "columns that were recorded at the same time."
         )
     if span > MAX_STEPS * step:  # a clock that jumps ahead, or a long log: seen before anything is put on a grid

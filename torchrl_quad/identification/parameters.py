@@ -1,4 +1,4 @@
-"""What a fit can find: its unknowns, what they make of a drone, and in which words they are reported."""
+"""What a fit can find: its unknowns, what they make of a drone, and how they are reported."""
 
 from __future__ import annotations
 
@@ -195,14 +195,10 @@ _NUMBERS = {
 def report(
     model: Model, x: Tensor, covariance: Tensor, quantile: float, has_mass: bool
 ) -> tuple[dict[str, Estimate], dict[str, Estimate]]:
-    """The parameters and the ratios by name.
+    """The parameters and the ratios by name, at coordinates (n) with a covariance (n, n).
 
-    Args:
-        model: the drone.
-        x: its coordinates (n).
-        covariance: of them (n, n).
-        quantile: standard deviations in half of an interval.
-        has_mass: whether the mass is known; without it, fields that scale with the mass are left out.
+    ``quantile`` is how many standard deviations half of an interval has. Without a known mass, fields that scale with
+    it are left out.
     """
     place = {name: i for i, name in enumerate(model.free)}
     fitted, prior = model.plant(x, x.new_zeros(())), model.only(()).plant(x[:0], x.new_zeros(()))

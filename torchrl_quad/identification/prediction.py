@@ -216,7 +216,7 @@ class Windows:
         return RigidBodyState(position, attitude, velocity, self._between(self.rate, index + late[:, None]))
 
     def rotor_speed(self, plant: Plant) -> Tensor:
-        """Rotor speeds (W, past + future + 1, 4) [rad/s], from the commands alone."""
+        """Rotor speeds (W, past + future + 1, 4) [rad/s], from the commands."""
         warm = round(WARM_UP / self.dt)
         steps = torch.arange(-warm - self.past, self.future)
         late = (plant.stream_delay - plant.delay) / self.dt
@@ -306,15 +306,10 @@ def states_at(states: RigidBodyState, steps: int | Tensor) -> RigidBodyState:
 def cut(
     logs: Sequence[FlightLog], future: float, past: float, every: float, stride: int = 1, nominal_voltage: float = 1.0
 ) -> Windows:
-    """Windows of all logs; each lies in one piece of flight, with its past and room for its delays.
+    """Windows of length ``future``, one ``every`` so often [s]; each lies in one piece of flight, with its ``past`` [s]
+    and room for delays.
 
-    Args:
-        logs: the flights.
-        future: length of a window [s].
-        past: time before a window from which its disturbance follows [s].
-        every: time between the starts of windows [s].
-        stride: samples in a step of the body.
-        nominal_voltage: of a battery whose voltage is not in the log [V].
+    A step of the body is ``stride`` samples long. ``nominal_voltage`` [V] is of a battery that is not in the log.
     """
     dt = min(log.dt * max(1, round(SAMPLE / log.dt)) for log in logs)
     columns, starts, owners = [], [], []

@@ -23,7 +23,9 @@ MAX_RECORDS = 20 * 10**6  # messages of a ULog or a bag, events of a uSD log
 def open_plain(path: Path) -> io.BufferedReader:
     """A plain file, open for reading. A pipe, a socket or a device is not opened: to read one may never end."""
     if not path.is_file():
-        raise UnreadableLog(f"{path.name} is no plain file, but a pipe, a socket or a device. Give the path of a log.")
+        raise UnreadableLog(
+            f"{path.name} is not a regular file but a pipe, a socket or a device. Give the path of a log."
+        )
     return open(path, "rb")
 
 

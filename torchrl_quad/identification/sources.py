@@ -38,7 +38,9 @@ def read_streams(path: Path, columns: Asked) -> Read:
         raise UnreadableLog(f"{path} does not exist. Give the path of a log.")
     if path.is_dir():
         if not (path / "metadata.yaml").is_file():
-            raise UnreadableLog(f"{path} is a folder without metadata.yaml, so no ROS 2 bag. Give the path of a log.")
+            raise UnreadableLog(
+                f"{path} is a folder without metadata.yaml, so not a ROS 2 bag. Give the path of a log."
+            )
         return read_bag(path, columns)
     with open_plain(path) as file:
         start = file.peek(16)[:16]
@@ -67,7 +69,7 @@ def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) ->
         codecs.getincrementaldecoder("utf-8")().decode(start)
     except UnicodeDecodeError as error:
         raise UnreadableLog(
-            f"{name} is no log of a known kind: its bytes are no text, and begin like no ULog, ROS bag or uSD log "
+            f"{name} is not a log of a known kind: it is not text, and does not begin like a ULog, ROS bag or uSD log "
             "(versions 1 and 2). Export it as CSV."
         ) from error
     return _read_csv(_counted(iter(lambda: file.readline(MAX_LINE + 1), b""), name, most), name, columns)
@@ -83,7 +85,7 @@ def _counted(parts: Iterator[bytes], name: str, most: int) -> Iterator[bytes]:
 
 
 def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
-    """Only the columns that are asked for become numbers; cells that are none become NaN."""
+    """Only the columns that are asked for become numbers; cells without a number become NaN."""
     rows = _rows(lines, name)
     first = next(rows, "").removeprefix("\ufeff")
     if not first:
@@ -130,7 +132,7 @@ def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
         try:
             text = line.decode()
         except UnicodeDecodeError as error:
-            raise UnreadableLog(f"{name}: line {k + 1} is no text in UTF-8. Export it as CSV again.") from error
+            raise UnreadableLog(f"{name}: line {k + 1} is not text in UTF-8. Export it as CSV again.") from error
         if k and "#" in text:
             text = text.partition("#")[0]
         text = text.strip(" \r\n")
@@ -140,7 +142,7 @@ def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
 
 def _numbers(rows: Iterator[str], mark: str, width: int, places: list[int], name: str) -> Array:
     """Some columns of a table (N, len(places))."""
-    flat, pick = array("d"), itemgetter(*places, places[0])  # of one place alone it would give no tuple
+    flat, pick = array("d"), itemgetter(*places, places[0])  # of a single place it would not give a tuple
     for k, row in enumerate(rows):
         picked = pick(_cells(row, mark, width, name, k))[:-1]
         try:
@@ -154,7 +156,7 @@ def _cells(row: str, mark: str, width: int, name: str, k: int) -> list[str]:
     cells = row.split(mark)
     if len(cells) != width:
         raise UnreadableLog(
-            f"{name} is no table of numbers: row {k + 1} has {len(cells)} cells, and the first row names {width}. "
+            f"{name} is not a table of numbers: row {k + 1} has {len(cells)} cells, and the first row names {width}. "
             "Give a CSV file whose first row names the columns."
         )
     return cells

@@ -15,9 +15,9 @@ def test_the_gradients_of_every_method_are_compared_with_the_simulator(launch, n
     for folder, algorithm in zip([*folders, other], ("abpt", "shac", "bptt", "bptt"), strict=True):
         launch(algorithm, *running.QUICK, f"seed={7 if folder == other else 42}", f"hydra.run.dir={folder}")
     checkpoints = [folder / "checkpoint.pt" for folder in (*folders, other)]
-    sizes = ("--data", tmp_path, "--states", 4, "--repeats", 2, "--steps", 8)
+    ascent = "ascent --states 4 --repeats 2 --steps 8 --data", tmp_path
     for some in (checkpoints[:1], checkpoints):
-        run_main(monkeypatch, reproduce, "ascent", *some, *sizes)
+        run_main(monkeypatch, reproduce, *ascent, *some)
     rows = read_rows(tmp_path / "ascent.csv")
     trained = [*((algorithm, "42") for algorithm in ("abpt", "shac", "bptt")), ("bptt", "7")]
     assert [(row["variant"], row["seed"]) for row in rows] == trained
@@ -25,10 +25,10 @@ def test_the_gradients_of_every_method_are_compared_with_the_simulator(launch, n
     assert [bool(row["zero_step_return"]) for row in rows] == [True, False, False, False]
 
     with pytest.raises(SystemExit, match="is a second hovering bptt 7: give each a --data folder of its own"):
-        run_main(monkeypatch, reproduce, "ascent", *(2 * [other / "checkpoint.pt"]), *sizes)
+        run_main(monkeypatch, reproduce, *ascent, *(2 * [other / "checkpoint.pt"]))
     launch("ppo", *running.QUICK, "batch_size=8", f"hydra.run.dir={tmp_path}/ppo")
     with pytest.raises(SystemExit, match="was trained with ppo; choose runs of bptt, abpt, shac"):
-        run_main(monkeypatch, reproduce, "ascent", tmp_path / "ppo/checkpoint.pt", *sizes)
+        run_main(monkeypatch, reproduce, *ascent, tmp_path / "ppo/checkpoint.pt")
 
 
 def test_backpropagation_through_all_steps_knows_the_true_slopes():
@@ -45,10 +45,10 @@ def test_backpropagation_through_all_steps_knows_the_true_slopes():
 
 
 def test_the_phases_of_the_hybrid_are_flown_and_measured_once(run_here, monkeypatch, tmp_path):
-    sizes = ("--states", 4, "--repeats", 2, "--steps", 8, "--tasks", "racing", "--quick")
+    phases = "phases --states 4 --repeats 2 --steps 8 --tasks racing --quick --data", tmp_path
     monkeypatch.setattr(gradients, "run", run_here)
     for _ in range(2):
-        run_main(monkeypatch, reproduce, "phases", *sizes, "--data", tmp_path, "--output", tmp_path / "runs")
+        run_main(monkeypatch, reproduce, *phases, "--output", tmp_path / "runs")
         for name in ("run", "examine_phase"):
             monkeypatch.setattr(gradients, name, lambda *_: pytest.fail("It has been measured."))
     rows = read_rows(tmp_path / "phases.csv")

@@ -10,20 +10,7 @@ from test_reproduce import curve, run_main
 
 from benchmarks.paper import claims, evidence, matrix, results, running, tables
 from benchmarks.paper.claims import Claim, try_claim
-from benchmarks.paper.evidence import (
-    Part,
-    Results,
-    Starts,
-    bootstrap,
-    column,
-    gap,
-    grouped,
-    judged,
-    mean,
-    probability,
-    roughness,
-    shares,
-)
+from benchmarks.paper.evidence import Part, Results, Starts, bootstrap, gap, judged, mean, probability, roughness
 from benchmarks.paper.tables import interval, is_level
 from torchrl_quad.files import read_rows, write_rows
 
@@ -33,9 +20,16 @@ RENEW = "it differs from the data: python -m benchmarks.paper.results"
 
 
 def data(folder, task="hovering", seeds=matrix.SEEDS, **ends):
+    """Results with curves of these ends, for all seeds or by seed."""
+    ends = {name: end if callable(end) else lambda _, end=end: end for name, end in ends.items()}
     rows = [row for name, end in ends.items() for seed in seeds for row in curve(name, seed, 0.0, *end(seed))]
     write_rows(folder / f"curves/{task}.csv", rows)
     return Results(folder)
+
+
+def ends_higher(r, best, *others, task="hovering"):
+    """The verdict on a claim that one method ends higher than the others."""
+    return try_claim(Claim("A", "", lambda r: claims.higher_end(r, [task], best, others)), r)
 
 
 # -- claims ------------------------------------------------------------------------------------------------------------
@@ -65,14 +59,13 @@ def test_an_interval_draws_starts_too_and_what_they_shift_alike_is_no_difference
     assert interval(seeds) == (10.0, 10.0)
     assert interval(from_starts(seeds, "abpt")) == pytest.approx(tuple(10.0 + wide))
     assert interval(from_starts(seeds, "abpt", starts=64)) == pytest.approx(tuple(10.0 + 2.0 * wide))
-    assert interval(from_starts(seeds, "ppo")) == pytest.approx(
-        tuple(10.0 + wide)
-    )  # not flown: as any of those that were
+    not_flown = interval(from_starts(seeds, "ppo"))  # as any of those that were
+    assert not_flown == pytest.approx(tuple(10.0 + wide))
     best = from_starts(seeds + 0.5, "shac")
     assert not is_level(from_starts(seeds, "abpt"), best) and is_level(from_starts(seeds, "bptt"), best)
     assert Starts(tmp_path).shift("racing", "abpt", "return") is None
     assert Starts(tmp_path).shift("landing", "abpt", "gates_passed") is None
-    low, high = bootstrap("", mean, judged(np.full(5, 0.5), shares(np.full(5, 0.5), 64))).interval()
+    low, high = bootstrap("", mean, judged(np.full(5, 0.5), evidence.shares(np.full(5, 0.5), 64))).interval()
     assert high - 0.5 == pytest.approx(1.96 * 0.5 / 8, rel=0.1) and 0.5 - low == pytest.approx(high - 0.5, rel=0.1)
 
 
@@ -97,35 +90,29 @@ def test_one_of_many_parts_is_refuted_by_a_wider_interval_only():
 
 
 def test_a_method_that_ends_higher_with_every_seed_is_supported_and_one_that_does_not_is_refuted(tmp_path):
-    r = data(
-        tmp_path, abpt=lambda s: [9 + 0.01 * s], shac=lambda s: [8 + 0.01 * s], bptt=lambda s: [8], ppo=lambda s: [s]
-    )
-    up = Claim("A", "", lambda r: claims.higher_end(r, ["hovering"], "abpt", ["shac", "bptt"]))
-    down = Claim("B", "", lambda r: claims.higher_end(r, ["hovering"], "shac", ["abpt", "bptt"]))
-    open_ = Claim("C", "", lambda r: claims.higher_end(r, ["hovering"], "ppo", ["abpt"]))
-    assert [try_claim(c, r).verdict for c in (up, down)] == ["supported", "refuted"]
-    assert try_claim(open_, r).verdict == "undecided"
-    assert (
-        try_claim(Claim("D", "", lambda r: claims.higher_end(r, ["racing"], "shac", ["abpt"])), r).verdict == "not run"
-    )
+    r = data(tmp_path, abpt=lambda s: [9 + 0.01 * s], shac=lambda s: [8 + 0.01 * s], bptt=[8], ppo=lambda s: [s])
+    assert ends_higher(r, "abpt", "shac", "bptt").verdict == "supported"
+    assert ends_higher(r, "shac", "abpt", "bptt").verdict == "refuted"
+    assert ends_higher(r, "ppo", "abpt").verdict == "undecided"
+    assert ends_higher(r, "shac", "abpt", task="racing").verdict == "not run"
 
 
 @pytest.mark.parametrize(("seeds", "verdict"), [((42, 0, 1), "supported (preliminary)"), ((42, 0), "too few seeds")])
 def test_fewer_than_five_seeds_of_any_run_are_preliminary_and_fewer_than_three_no_verdict(tmp_path, seeds, verdict):
-    r = data(tmp_path, seeds=seeds, abpt=lambda s: [9], shac=lambda s: [8])
-    claim = Claim("A", "", lambda r: claims.higher_end(r, ["hovering"], "abpt", ["shac"]))
-    assert try_claim(claim, r).verdict == verdict and try_claim(claim, r).seeds == len(seeds)
+    found = ends_higher(data(tmp_path, seeds=seeds, abpt=[9], shac=[8]), "abpt", "shac")
+    assert found.verdict == verdict and found.seeds == len(seeds)
+
+
+def test_a_verdict_says_when_it_compares_runs_of_two_dynamics(tmp_path):
+    data(tmp_path, abpt=[9], shac=[8], ppo=[8])
+    flown = {"abpt": "old", "shac": "new", "ppo": "old"}
+    rows = [{"task": "hovering", "variant": name, "lr": "", "seed": 42, "dynamics": x} for name, x in flown.items()]
+    write_rows(tmp_path / "final.csv", rows)
+    assert [ends_higher(Results(tmp_path), "abpt", x).dynamics for x in ("shac", "ppo")] == ["both", "old"]
 
 
 def test_methods_have_converged_when_they_reach_nearly_what_both_reach(tmp_path):
-    r = data(
-        tmp_path,
-        task="landing",
-        abpt=lambda s: [9.5, 10],
-        shac=lambda s: [8.9, 9.1],
-        bptt=lambda s: [math.nan, math.nan],
-        ppo=lambda s: [1, 2],
-    )
+    r = data(tmp_path, "landing", abpt=[9.5, 10], shac=[8.9, 9.1], bptt=[math.nan, math.nan], ppo=[1, 2])
     level = r.level("landing", r.end("landing", "abpt"), r.end("landing", "shac"))
     assert level == pytest.approx(0.9 * 9.1)
     assert r.level("landing", np.array([-10.0])) == pytest.approx(-11.0)
@@ -166,39 +153,21 @@ def synthetic(tmp_path, strong):
 
 @pytest.mark.parametrize("strong", [True, False])
 def test_every_claim_can_be_tried_and_can_come_out_either_way(quick, tmp_path, strong):
-    verdicts = {
-        v.claim.id: v.verdict for v in (try_claim(claim, synthetic(tmp_path, strong)) for claim in claims.CLAIMS)
-    }
+    r = synthetic(tmp_path, strong)
+    verdicts = {claim.id: try_claim(claim, r).verdict for claim in claims.CLAIMS}
     assert set(verdicts.values()) <= {"supported", "refuted", "undecided"}
     for name in ("C1", "C14", "C15", "C17", "C18"):
         assert verdicts[name] == ("supported" if strong else "refuted"), name
 
 
-def test_claims_about_visited_states_compare_runs_of_the_same_dynamics(quick, tmp_path):
-    r = synthetic(tmp_path, strong=True)
-    for claim in (claim for claim in claims.CLAIMS if claim.id in ("C15", "C17")):
-        try_claim(claim, r)
-        assert {variant for _, variant in r.used} == {"abpt-now", "abpt-no-visited"}
-
-
-def test_a_verdict_says_when_it_compares_runs_of_two_dynamics(tmp_path):
-    data(tmp_path, abpt=lambda s: [9], shac=lambda s: [8], ppo=lambda s: [8])
-    flown = {"abpt": "old", "shac": "new", "ppo": "old"}
-    rows = [{"task": "hovering", "variant": name, "lr": "", "seed": 42, "dynamics": x} for name, x in flown.items()]
-    write_rows(tmp_path / "final.csv", rows)
-    r = Results(tmp_path)
-    for other, dynamics in (("shac", "both"), ("ppo", "old")):
-        claim = Claim("A", "", lambda r, other=other: claims.higher_end(r, ["hovering"], "abpt", [other]))
-        assert try_claim(claim, r).dynamics == dynamics
-
-
-def test_shac_as_published_is_that_of_xu_where_it_was_run_and_the_cut_one_elsewhere(quick, tmp_path):
+def test_claims_compare_visited_states_under_the_same_dynamics_and_shac_as_xu_where_that_was_run(quick, tmp_path):
     synthetic(tmp_path, strong=True)
-    r = Results(tmp_path, claims.PUBLISHED)
-    used = {}
+    r, used = Results(tmp_path, claims.PUBLISHED), {}
     for claim in claims.CLAIMS:
         try_claim(claim, r)
-        used[claim.id] = {run for run in r.used if run[1].startswith("shac")}
+        used[claim.id] = {run for run in r.used if run[1].startswith(("shac", "abpt-no"))}
+        if claim.id in ("C15", "C17"):
+            assert {variant for _, variant in r.used} == {"abpt-now", "abpt-no-visited"}
     assert used["C8"] == {("hovering", "shac-cut"), ("tracking", "shac-cut")}
     assert used["C11"] == used["C12"] == {("landing", "shac-xu")} and used["C13"] == {("racing", "shac-xu")}
 
@@ -263,9 +232,9 @@ def test_the_sentences_of_the_page_say_what_its_data_hold():
     more, fewer = (mean("racing", x, "gates_passed") for x in ("abpt-no-0-step", "abpt"))
 
     ascent = {}  # mean cosines, by task, variant and gradient
-    for (task, variant), rows in grouped(read_rows(running.DATA / "ascent.csv"), "task", "variant").items():
+    for (task, variant), rows in evidence.grouped(read_rows(running.DATA / "ascent.csv"), "task", "variant").items():
         for name in ("n_step_return", "zero_step_return", "objective", "explained_variance"):
-            if values := column(rows, name):
+            if values := evidence.column(rows, name):
                 ascent.setdefault((task, variant), {})[name] = round(float(np.mean(values)), 2)
     least = min(of["n_step_return"] for of in ascent.values() if "n_step_return" in of)
     ascent = {run: of for run, of in ascent.items() if "zero_step_return" in of}

@@ -19,7 +19,7 @@ def test_a_loss_trains_on_another_environment_once_and_has_a_row_in_the_table(
 ):
     for name, value in {"ENVS": 2, "HORIZON": 4, "EPISODE": 4, "EPISODES": 2, "STEPS": 1}.items():
         monkeypatch.setattr(elsewhere, name, value)
-    arguments = ["elsewhere", "--environments", environment, "--losses", *losses, "--seeds", 0, "--data", tmp_path]
+    arguments = [f"elsewhere --environments {environment} --losses {' '.join(losses)} --seeds 0 --data", tmp_path]
     run_main(monkeypatch, reproduce, *arguments)
     rows = read_rows(tmp_path / "elsewhere.csv")
     assert [(row["environment"], row["loss"], row["seed"]) for row in rows] == [(environment, x, "0") for x in losses]

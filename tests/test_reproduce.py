@@ -3,6 +3,7 @@
 import math
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -23,8 +24,9 @@ def curve(variant, seed, *returns, **more):
         yield {"variant": variant, "lr": "", "seed": seed, "steps": 100 * i, "seconds": 2 * i, "return": value, **more}
 
 
-def run_main(monkeypatch, module, *arguments):
-    monkeypatch.setattr(sys, "argv", [module.__name__, *map(str, arguments)])
+def run_main(monkeypatch, module, words, *arguments):
+    """Run a program with a command line, and more arguments that may hold spaces."""
+    monkeypatch.setattr(sys, "argv", [module.__name__, *shlex.split(words), *map(str, arguments)])
     module.main()
 
 
@@ -36,20 +38,9 @@ def test_a_shrunken_matrix_runs_and_goes_on_where_it_was_stopped(run_here, monke
         (in_own_process if folder.parent.name == "abpt-now" else run_here)(recipe, overrides, folder)
 
     monkeypatch.setattr(reproduce, "run", run)
-    arguments = [
-        "trial",
-        "--quick",
-        "--tasks",
-        "hovering",
-        "--experiments",
-        "dynamics",
-        "--seeds",
-        "42",
-        "--cores",
-        "2",
-    ]
-    folders = ["--data", tmp_path / "data", "--output", tmp_path / "runs"]
-    run_main(monkeypatch, reproduce, *arguments, *folders)
+    arguments = ["trial --quick --tasks hovering --experiments dynamics --seeds 42 --cores 2"]
+    arguments += ["--data", tmp_path / "data", "--output", tmp_path / "runs"]
+    run_main(monkeypatch, reproduce, *arguments)
     finals = read_rows(tmp_path / "data/final.csv")
     assert sorted((row["variant"], row["seed"], row["lr"]) for row in finals) == [
         *(("abpt", "100", "0.003"), ("abpt-no-visited", "42", ""), ("abpt-now", "42", ""))
@@ -65,7 +56,7 @@ def test_a_shrunken_matrix_runs_and_goes_on_where_it_was_stopped(run_here, monke
     started = []
     monkeypatch.setattr(reproduce, "run", lambda *of: started.append(of[-1]))  # it had finished
     monkeypatch.setattr(reproduce.gradients, "audit_tasks", lambda _: audit)
-    run_main(monkeypatch, reproduce, *arguments, *folders)
+    run_main(monkeypatch, reproduce, *arguments)
     assert started == [tmp_path / "runs/hovering/abpt-now/seed42"]
     assert len(read_rows(tmp_path / "data/final.csv")) == 3
     assert sorted(map(str, read_rows(tmp_path / "data/curves/hovering.csv"))) == sorted(map(str, curves))
@@ -79,15 +70,11 @@ def finish(folder):
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        *(["trial", "--quick"], ["ablations", "--quick"], ["rates", "--quick"], ["shipped", "--quick"]),
-        *(["forest", "--forests", "2"], ["shipped", "--tasks", "own_task.CornerEnv"]),
-    ],
+    "what", ["trial --quick", "ablations --quick", "forest --forests 2", "shipped --tasks six_gates"]
 )
-def test_results_that_do_not_ship_never_get_among_those_that_do(monkeypatch, capsys, arguments):
+def test_results_that_do_not_ship_never_get_among_those_that_do(monkeypatch, capsys, what):
     with pytest.raises(SystemExit):
-        run_main(monkeypatch, reproduce, *arguments)
+        run_main(monkeypatch, reproduce, what)
     assert "name another folder with --data" in capsys.readouterr().err
 
 
@@ -99,9 +86,9 @@ def test_a_run_that_fails_is_reported_and_the_others_go_on(monkeypatch, capsys, 
 
     monkeypatch.setattr(reproduce, "run", run)
     monkeypatch.setattr(reproduce.gradients, "audit_tasks", list)
-    arguments = ["trial", "--quick", "--tasks", "hovering", "--experiments", "main", "--seeds", "0"]
+    arguments = "trial --quick --tasks hovering --experiments main --seeds 0 --data"
     with pytest.raises(SystemExit, match="2 of 8 runs failed"):
-        run_main(monkeypatch, reproduce, *arguments, "--data", tmp_path / "data", "--output", tmp_path / "runs")
+        run_main(monkeypatch, reproduce, arguments, tmp_path / "data", "--output", tmp_path / "runs")
     said = capsys.readouterr().err
     assert "hovering/shac/lr0.003/seed100 ended with 1" in said
     assert "hovering/shac/seed0: the search for its learning rate is not complete" in said
@@ -145,21 +132,17 @@ def test_a_run_that_fails_is_told_and_stops_no_other(tmp_path, capsys):
 
 
 def test_a_run_that_diverged_is_kept_as_one(tmp_path):
-    folder = tmp_path / "run"
-    finish(folder)
-    (folder / "failure.pt").write_text("")
+    finish(tmp_path / "run")
+    (tmp_path / "run/failure.pt").write_text("")
     job = Job("hovering", "abpt", 100, 0.03)
-    reproduce.keep(job, folder, tmp_path)
+    reproduce.keep(job, tmp_path / "run", tmp_path)
     assert running.kept(tmp_path / "final.csv", *reproduce.KEY) == {job.key} != {Job("hovering", "abpt", 100, 0.01).key}
     assert [row["return"] for row in read_rows(tmp_path / "search/hovering.csv")] == ["2.5", "nan"]
 
 
 def test_the_best_learning_rate_is_that_whose_curve_ends_highest(tmp_path):
-    rows = [
-        {**row, "lr": lr}
-        for lr, end in (("0.001", 3.0), ("0.01", 5.0), ("0.1", math.nan))
-        for row in curve("abpt", 100, 9.0, end)
-    ]
+    ends = {"0.001": 3.0, "0.01": 5.0, "0.1": math.nan}
+    rows = [row | {"lr": lr} for lr, end in ends.items() for row in curve("abpt", 100, 9.0, end)]
     write_rows(tmp_path / "search/hovering.csv", rows)
     assert best_learning_rate("hovering", "abpt", tmp_path, (1e-3, 1e-2, 1e-1)) == 1e-2
     assert best_learning_rate("hovering", "abpt", tmp_path, (1e-3, 1e-2, 1.0)) is None
@@ -200,20 +183,17 @@ def test_without_visited_states_every_horizon_goes_on_where_the_last_one_ended()
 def flown(run_here, monkeypatch, tmp_path):
     """Fly quick runs, and again what is missing of them, which is nothing; the rows of their file."""
 
-    def fly(what, *arguments):
-        monkeypatch.setattr(flights, "run", run_here)
-        wanted = [what, *arguments, "--data", tmp_path, "--output", tmp_path / "runs", "--quick", "--cores", "2"]
-        run_main(monkeypatch, reproduce, *wanted)
-        monkeypatch.setattr(flights, "run", lambda *_: pytest.fail("It has been flown."))
-        run_main(monkeypatch, reproduce, *wanted)
-        return read_rows(tmp_path / f"{what}.csv")
+    def fly(what):
+        for run in (run_here, lambda *_: pytest.fail("It has been flown.")):
+            monkeypatch.setattr(flights, "run", run)
+            run_main(monkeypatch, reproduce, f"{what} --quick --data", tmp_path, "--output", tmp_path / "runs")
+        return read_rows(tmp_path / f"{what.split()[0]}.csv")
 
     return fly
 
 
 def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(flown, monkeypatch, tmp_path):
-    wanted = ["--tasks", "six_gates_back", "own_task.CornerEnv", "--methods", "ppo", "--seeds", "0"]
-    rows = flown("shipped", *wanted)
+    rows = flown("shipped --tasks six_gates_back own_task.CornerEnv --methods ppo --seeds 0 --cores 2")
     assert len(rows) == 2 and {row["task"] for row in rows} == {"own_task.CornerEnv", "six_gates_back"}
     assert all(row["steps"] == "64" and row["machine"] and float(row["seconds"]) > 0 for row in rows)
     run_main(monkeypatch, results, "--data", tmp_path)
@@ -229,12 +209,11 @@ def test_recipes_are_flown_as_they_ship_and_what_is_there_is_not_flown_again(flo
     group = [about | dict(zip(("solved", "position_error", "seconds"), x, strict=True)) for x in values]
     assert tables.summary_table(group) == [{"": "PPO", "hovering": "83.3% (50.0%), 1.5 cm, 7 s, 3 seeds"}]
     with pytest.raises(SystemExit):
-        run_main(monkeypatch, reproduce, "shipped", "--tasks", "window", "--data", tmp_path)
+        run_main(monkeypatch, reproduce, "shipped --tasks window --data", tmp_path)
 
 
 def test_options_are_changed_one_at_a_time_and_shown_beside_what_ships(flown, tmp_path):
-    wanted = ["--tasks", "landing", "--methods", "bptt", "--changes", "event times", "clip", "--seeds", "0"]
-    (row,) = flown("ablations", *wanted)
+    (row,) = flown("ablations --tasks landing --methods bptt --changes 'event times' clip --seeds 0")
     assert (row["change"], row["algorithm"], row["steps"]) == ("clip", "bptt", "64")
     assert tables.ablations_table(tmp_path) == []
     clip = row | {"return": "8.0", "solved": "0.5"}
@@ -248,7 +227,7 @@ def test_options_are_changed_one_at_a_time_and_shown_beside_what_ships(flown, tm
 
 
 def test_half_and_twice_a_rate_fly_once_and_are_judged_by_their_worst_seed(flown, tmp_path):
-    (row,) = flown("rates", "--tasks", "hovering", "--methods", "bptt", "--factors", "0.5", "--seeds", "101")
+    (row,) = flown("rates --tasks hovering --methods bptt --factors 0.5 --seeds 101")
     assert (row["factor"], row["algorithm"], row["steps"]) == ("0.5", "bptt", "64")
     ends = {("0.5", "101"): "0.75", ("0.5", "102"): "0.5", ("2", "101"): "1", ("2", "103"): "0.9"}
     rows = [row | {"factor": factor, "seed": seed, "solved": x} for (factor, seed), x in ends.items()]
@@ -259,8 +238,7 @@ def test_half_and_twice_a_rate_fly_once_and_are_judged_by_their_worst_seed(flown
 
 
 def test_policies_of_the_forest_are_flown_at_the_speeds_and_densities_and_not_twice(flown, monkeypatch, tmp_path):
-    wanted = ["--policies", "blind", "--seeds", "0", "--speeds", "6", "--difficulties", "middle", "--forests", "2"]
-    (row,) = flown("forest", *wanted)
+    (row,) = flown("forest --policies blind --seeds 0 --speeds 6 --difficulties middle --forests 2")
     assert (row["difficulty"], row["speed"], row["steps"]) == ("middle", "6.0", "64")
     assert float(row["solved"]) + float(row["crash"]) <= 1.0
     two = [{**row, "policy": "bptt", "seed": str(seed), "solved": x} for seed, x in enumerate(("0.5", "0.75"))]
@@ -273,7 +251,7 @@ def test_policies_of_the_forest_are_flown_at_the_speeds_and_densities_and_not_tw
 def test_a_policy_is_flown_from_every_set_of_starts_once(flown, monkeypatch):
     monkeypatch.setattr(flights, "STARTS", 2)
     monkeypatch.setattr(flights, "SETS", 3)
-    rows = flown("starts", "--tasks", "racing", "--methods", "bptt", "--seeds", "0")
+    rows = flown("starts --tasks racing --methods bptt --seeds 0")
     assert [row["starts_seed"] for row in rows] == ["2000000", "2000001", "2000002"]
     assert len({row["return"] for row in rows}) == 3 and all(row["gates_passed"] == "0" for row in rows)
 

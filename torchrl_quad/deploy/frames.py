@@ -13,7 +13,7 @@ Ours: a world with z up, in which x and y may point anywhere; body x forward, y 
 where our x and y point: ``world="enu"``, x east and y north, or ``world="nwu"``, x north and y west.
 
 Everything broadcasts over leading dimensions. ``docs/deploy_autopilots.md`` says which facts were read in the source of
-a target, and which in its documentation. Check them against the version that you fly.
+a target, and which in its documentation; check them against your version.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.rotations import conjugate, multiply
+from torchrl_quad.rotations import conjugate, multiply, rotate
 
 Array = NDArray[np.float64]
 Quaternion = tuple[float, float, float, float]
@@ -62,9 +62,7 @@ class Convention:
     xyzw: bool = False  #: whether their quaternions are (x, y, z, w)
     motors: tuple[int, ...] = ()  #: for each of their motors the index of ours; none where they have no fixed order
     rates: tuple[float, float, float] = (1.0, 1.0, 1.0)  #: their commanded rates for ours of 1 rad/s
-    thrust_range: tuple[float, float] | None = (
-        None  #: their commands for no and for full thrust; newtons where there are none
-    )
+    thrust_range: tuple[float, float] | None = None  #: their commands for no and full thrust; None where in newtons
     thrust_limit: float = 1.0  #: the share of this range that may be commanded
     whole_thrust: bool = False  #: whether their command is a whole number
 
@@ -87,8 +85,8 @@ class Convention:
 
         Args:
             newtons: our collective thrust.
-            full_thrust: the thrust [N] of their full command; every target needs it that does not take newtons. From
-                the command that hovers: weight / hover command. For a Crazyflie 4 THRUST_MAX.
+            full_thrust: the thrust [N] of their full command, unless the target takes newtons: weight / hover command,
+                and for a Crazyflie 4 THRUST_MAX.
             model_factor: f of the thrust curve f s^2 + (1 - f) s of the signal s, where the target does not undo it
                 itself. PX4 does, by THR_MDL_FAC, and ArduPilot, by MOT_THST_EXPO: leave it 0 there.
 
@@ -133,8 +131,8 @@ class Convention:
 
     def _translate(self, name: str, x: Array, back: bool) -> Array:
         if name in ("position", "velocity", "angular_velocity"):
-            matrix = _matrix(self.body if name == "angular_velocity" else self.world)
-            return x @ (matrix if back else matrix.T)
+            turn = np.round(rotate(self.body if name == "angular_velocity" else self.world, np.eye(3)))  # 0, 1 and -1
+            return x @ (turn.T if back else turn)
         if name == "body_rate":
             return x / self.rates if back else x * self.rates
         if name == "motors":
@@ -177,15 +175,7 @@ def crazyflie(manual: bool = False) -> Convention:
     Send one ``send_setpoint`` of zero thrust first: until then the firmware holds the motors. Measured body rates are
     ``stateEstimateZ.rateRoll``, ``ratePitch`` and ``rateYaw`` in mrad/s; ratePitch has the other sign than ours."""
     rates = (DEGREES, DEGREES, DEGREES if manual else -DEGREES)
-    return Convention(
-        "Crazyflie",
-        xyzw=True,
-        motors=(3, 2, 1, 0),
-        rates=rates,
-        thrust_range=(0.0, 65535.0),
-        thrust_limit=60000 / 65535,
-        whole_thrust=True,
-    )
+    return Convention("Crazyflie", SAME, SAME, True, (3, 2, 1, 0), rates, (0.0, 65535.0), 60000 / 65535, True)
 
 
 def mavros(world: str = "enu", thrust_scaling: float = 1.0) -> Convention:
@@ -254,10 +244,3 @@ def _choose(turns: Mapping[str, Quaternion], world: str) -> Quaternion:
             f'Unknown world {world!r}. Choose from: "enu", x east and y north; "nwu", x north and y west.'
         )
     return turns[world]
-
-
-def _matrix(q: Quaternion) -> Array:
-    """The matrix of a turn between frames: its entries are 0, 1 and -1."""
-    w, x, y, z = q
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.round(np.eye(3) + 2.0 * w * skew + 2.0 * skew @ skew)

@@ -1,5 +1,6 @@
 """Physics against physics, in float64."""
 
+import itertools
 import math
 
 import pytest
@@ -8,11 +9,11 @@ import torch
 from torchrl_quad.dynamics import (
     INTEGRATORS,
     FlightController,
+    Quadrotor,
     QuadrotorState,
     RigidBodyState,
     accelerations,
     available_drones,
-    control_step,
     load_drone,
     quaternion,
 )
@@ -28,8 +29,8 @@ def drone(name="visfly", **changes):
     return load_drone(name, dtype=F64).replace(**changes)
 
 
-def without_drag(name="visfly"):
-    return drone(name, linear_drag=[0.0] * 3, quadratic_drag=[0.0] * 3)
+def without_drag():
+    return drone(linear_drag=[0.0] * 3, quadratic_drag=[0.0] * 3)
 
 
 def vector(*values):
@@ -53,9 +54,9 @@ def hovering(controller, n=1):
 
 
 def fly(state, action, params, controller, seconds, dt=0.005, integrator="semi_implicit_euler"):
-    history = []
+    model, history = Quadrotor(controller.nominal, dt, 1, integrator), []
     for _ in range(round(seconds / dt)):
-        state = control_step(state, action, params, controller, dt, 1, integrator)
+        state = QuadrotorState(**model.control_step(state._asdict(), action, params, None))
         history.append(state)
     return history
 
@@ -71,9 +72,8 @@ def test_free_fall_follows_the_parabola():
 def test_hover_action_keeps_every_drone_where_it_is(name, integrator):
     params = drone(name)
     controller = FlightController(params)
-    end = fly(
-        hovering(controller), controller.hover_action.expand(1, 4), params, controller, 2.0, integrator=integrator
-    )[-1]
+    action = controller.hover_action.expand(1, 4)
+    end = fly(hovering(controller), action, params, controller, 2.0, integrator=integrator)[-1]
     torch.testing.assert_close(end.position, ZERO, atol=1e-9, rtol=0)
     torch.testing.assert_close(end.quaternion, LEVEL, atol=1e-9, rtol=0)
     torch.testing.assert_close(end.rotor_speed, controller.hover_speed.expand(1, 4))
@@ -89,12 +89,10 @@ def test_terminal_velocity_is_where_drag_balances_weight():
 
 def test_drag_opposes_motion_along_every_axis_in_both_directions():
     params = drone(gravity=0.01)
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            velocity = torch.zeros(1, 3, dtype=F64)
-            velocity[0, axis] = 5.0 * sign
-            linear, _ = accelerations(body(velocity=velocity), NO_WRENCH, params)
-            assert (linear * velocity).sum() < -0.05
+    velocity = 5.0 * torch.cat((torch.eye(3, dtype=F64), -torch.eye(3, dtype=F64)))
+    still = torch.zeros_like(velocity)
+    linear, _ = accelerations(body(still, LEVEL.repeat(6, 1), velocity, still), NO_WRENCH, params)
+    assert ((linear * velocity).sum(-1) < -0.05).all()
 
 
 def test_energy_is_conserved_without_drag_and_lost_with_it():
@@ -106,9 +104,8 @@ def test_energy_is_conserved_without_drag_and_lost_with_it():
         return kinetic + rotational + params.mass * params.gravity * state.position[0, 2]
 
     free, dragged = without_drag(), drone()
-    torch.testing.assert_close(
-        energy(fly_body(start, free, NO_WRENCH, 1.0, 1e-3), free), energy(start, free), rtol=1e-9, atol=0
-    )
+    end = fly_body(start, free, NO_WRENCH, 1.0, 1e-3)
+    torch.testing.assert_close(energy(end, free), energy(start, free), rtol=1e-9, atol=0)
     assert energy(fly_body(start, dragged, NO_WRENCH, 1.0, 1e-3), dragged) < energy(start, dragged) - 0.1
 
 
@@ -133,11 +130,8 @@ def test_constant_rotation_about_a_principal_axis_turns_by_rate_times_time():
 def test_each_integrator_converges_with_its_order_under_a_prescribed_wrench(integrator, order):
     params = drone()
     wrench = vector(6.0, 2e-3, -3e-3, 1e-3)
-    start = body(
-        attitude=quaternion.from_axis_angle(vector(0.2, 0.4, -0.3)),
-        velocity=vector(2.0, -1.0, 0.5),
-        angular_velocity=vector(1.0, -2.0, 1.5),
-    )
+    attitude = quaternion.from_axis_angle(vector(0.2, 0.4, -0.3))
+    start = body(ZERO, attitude, vector(2.0, -1.0, 0.5), vector(1.0, -2.0, 1.5))
 
     def end(dt, method):
         return torch.cat(list(fly_body(start, params, wrench, 0.4, dt, method)), -1)
@@ -152,7 +146,7 @@ def test_each_integrator_converges_with_its_order_under_a_prescribed_wrench(inte
 def test_every_integrator_is_of_first_order_with_controller_and_rotors_in_the_loop(integrator):
     params = drone()
     controller = FlightController(params)
-    action = torch.tensor([[0.0, 0.5, -0.4, 0.3]], dtype=F64)
+    action = vector(0.0, 0.5, -0.4, 0.3)
 
     def end(dt):
         return torch.cat(list(fly(hovering(controller), action, params, controller, 0.05, dt, integrator)[-1][:4]), -1)
@@ -166,7 +160,7 @@ def test_every_integrator_is_of_first_order_with_controller_and_rotors_in_the_lo
 def test_quaternions_stay_of_unit_norm(integrator):
     params = drone("small_racer")
     controller = FlightController(params)
-    action = torch.tensor([[0.3, 1.0, -1.0, 1.0]], dtype=F64)
+    action = vector(0.3, 1.0, -1.0, 1.0)
     for state in fly(hovering(controller), action, params, controller, 3.0, integrator=integrator):
         torch.testing.assert_close(state.quaternion.norm(dim=-1), torch.ones(1, dtype=F64))
 
@@ -176,12 +170,9 @@ def test_flight_is_symmetric_under_yaw():
     controller = FlightController(params)
     yaw = quaternion.from_axis_angle(vector(0.0, 0.0, 1.1))
     start = hovering(controller)._replace(velocity=vector(1.0, -2.0, 0.3))
-    turned = start._replace(
-        quaternion=quaternion.multiply(yaw, start.quaternion), velocity=quaternion.rotate(yaw, start.velocity)
-    )
-    action = torch.tensor([[0.1, 0.4, -0.6, 0.2]], dtype=F64)
-    end = fly(start, action, params, controller, 1.0)[-1]
-    end_turned = fly(turned, action, params, controller, 1.0)[-1]
+    attitude, velocity = quaternion.multiply(yaw, start.quaternion), quaternion.rotate(yaw, start.velocity)
+    turned, action = start._replace(quaternion=attitude, velocity=velocity), vector(0.1, 0.4, -0.6, 0.2)
+    end, end_turned = (fly(state, action, params, controller, 1.0)[-1] for state in (start, turned))
     torch.testing.assert_close(end_turned.position, quaternion.rotate(yaw, end.position))
     torch.testing.assert_close(end_turned.quaternion, quaternion.multiply(yaw, end.quaternion))
     torch.testing.assert_close(end_turned.angular_velocity, end.angular_velocity)
@@ -191,9 +182,8 @@ def test_allocation_is_r_cross_f_for_any_layout():
     positions = [[0.2, 0.1], [-0.15, 0.12], [-0.1, -0.3], [0.05, -0.2]]
     params = drone(rotor_positions=positions, rotor_spin=[1.0, 1.0, -1.0, -1.0])
     thrust = torch.tensor([1.0, 2.0, 0.5, 1.5], dtype=F64)
-    arms = torch.cat((params.rotor_positions, torch.zeros(4, 1, dtype=F64)), -1)
-    forces = torch.zeros(4, 3, dtype=F64)
-    forces[:, 2] = thrust
+    arms = torch.nn.functional.pad(params.rotor_positions, (0, 1))
+    forces = torch.nn.functional.pad(thrust.unsqueeze(-1), (2, 0))
     torque = torch.linalg.cross(arms, forces).sum(0)
     torque[2] += (params.yaw_torque_coefficient * params.rotor_spin * thrust).sum()
     torch.testing.assert_close(allocation_matrix(params) @ thrust, torch.cat((thrust.sum()[None], torque)))
@@ -204,11 +194,10 @@ def test_a_body_rate_command_turns_the_drone_that_way(name):
     params = drone(name, drag_height=0.0)  # a drag moment that changes with the speed disturbs the loop
     controller = FlightController(params)
     for axis in range(3):
-        action = controller.hover_action.clone().expand(1, 4).clone()
-        action[0, 1 + axis] = 0.5
+        stick = 0.5 * torch.eye(3, dtype=F64)[axis : axis + 1]
+        action = controller.hover_action + torch.nn.functional.pad(stick, (1, 0))
         end = fly(hovering(controller), action, params, controller, 1.0)[-1]
-        wanted = torch.zeros(1, 3, dtype=F64)
-        wanted[0, axis] = 0.5 * params.max_body_rate[axis]
+        wanted = stick * params.max_body_rate
         torch.testing.assert_close(end.angular_velocity, wanted, atol=0.02 * params.max_body_rate[0].item(), rtol=0.02)
 
 
@@ -256,12 +245,12 @@ def test_commanded_rotor_thrust_is_never_negative_and_never_above_the_top_speed(
     params = drone(name)
     controller = FlightController(params)
     rotors = Rotors(params)
-    for thrust in (-1.0, 1.0):
-        for rate in (-1.0, 1.0):
-            setpoint = controller.setpoint(torch.tensor([[thrust, rate, rate, rate]], dtype=F64))
-            speed = controller.rotor_speed(setpoint, ZERO - 10.0 * rate, NO_WRENCH)
-            assert (rotors.thrust(speed) >= -1e-12).all()
-            assert (speed <= params.rotor_speed_max * (1 + 1e-9)).all()
+    for thrust, rate in itertools.product((-1.0, 1.0), repeat=2):
+        speed = controller.rotor_speed(
+            controller.setpoint(vector(thrust, rate, rate, rate)), ZERO - 10.0 * rate, NO_WRENCH
+        )
+        assert (rotors.thrust(speed) >= -1e-12).all()
+        assert (speed <= params.rotor_speed_max * (1 + 1e-9)).all()
 
 
 def test_the_motor_step_response_is_the_exact_exponential_for_any_dt():
@@ -278,7 +267,7 @@ def test_the_motor_step_response_is_the_exact_exponential_for_any_dt():
 def test_the_rotors_lag_by_one_minus_1_over_e_after_one_time_constant_in_flight():
     params = drone(motor_time_constant=0.05)
     controller = FlightController(params)
-    action = controller.hover_action.expand(1, 4) + torch.tensor([0.2, 0.0, 0.0, 0.0], dtype=F64)
+    action = controller.hover_action + vector(0.2, 0.0, 0.0, 0.0)
     start, end = controller.hover_speed, fly(hovering(controller), action, params, controller, 2.0)[-1].rotor_speed
     after = fly(hovering(controller), action, params, controller, 0.05)[-1].rotor_speed
     torch.testing.assert_close((after - start) / (end - start), torch.full((1, 4), 1 - math.exp(-1), dtype=F64))
@@ -297,9 +286,9 @@ def test_parameters_broadcast_over_environments():
     controller = FlightController(params)
     masses = torch.tensor([[0.4], [0.46], [0.6]], dtype=F64)
     action = torch.tensor([[0.1, 0.2, -0.3, 0.4]], dtype=F64).expand(3, 4)
-    together = control_step(hovering(controller, 3), action, params.replace(mass=masses), controller, 0.005, 20)
+    together = fly(hovering(controller, 3), action, params.replace(mass=masses), controller, 0.1)[-1]
     for i in range(3):
-        alone = control_step(hovering(controller), action[:1], params.replace(mass=masses[i]), controller, 0.005, 20)
+        alone = fly(hovering(controller), action[:1], params.replace(mass=masses[i]), controller, 0.1)[-1]
         for a, b in zip(together, alone, strict=True):
             torch.testing.assert_close(a[i : i + 1], b)
 
@@ -308,20 +297,17 @@ def test_rotations_agree_with_the_rotation_matrix_and_invert_each_other():
     q = quaternion.normalize(torch.randn(5, 4, dtype=F64))
     v = torch.randn(5, 3, dtype=F64)
     w, x, y, z = q.unbind(-1)
-    matrix = torch.stack(
-        (
-            torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),
-            torch.stack((2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)), -1),
-            torch.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), -1),
-        ),
-        -2,
-    )
+    rows = [
+        torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),
+        torch.stack((2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)), -1),
+        torch.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), -1),
+    ]
+    matrix = torch.stack(rows, -2)
     torch.testing.assert_close(quaternion.rotate(q, v), (matrix @ v.unsqueeze(-1)).squeeze(-1))
     torch.testing.assert_close(quaternion.rotate_inverse(q, quaternion.rotate(q, v)), v)
     p = quaternion.normalize(torch.randn(5, 4, dtype=F64))
-    torch.testing.assert_close(
-        quaternion.rotate(quaternion.multiply(p, q), v), quaternion.rotate(p, quaternion.rotate(q, v))
-    )
+    one_by_one = quaternion.rotate(p, quaternion.rotate(q, v))
+    torch.testing.assert_close(quaternion.rotate(quaternion.multiply(p, q), v), one_by_one)
 
 
 def test_attitude_distance_does_not_depend_on_the_sign_of_the_quaternion():
@@ -334,3 +320,35 @@ def test_quaternion_orders_convert_both_ways():
     q = torch.tensor([1.0, 2.0, 3.0, 4.0])
     assert quaternion.to_xyzw(q).tolist() == [2.0, 3.0, 4.0, 1.0]
     assert quaternion.from_xyzw(quaternion.to_xyzw(q)).tolist() == q.tolist()
+
+
+def test_rotors_with_two_time_constants_speed_up_at_one_pace_and_slow_down_at_the_other():
+    rotors = Rotors(drone(motor_time_constant=[0.05, 0.2]))
+    speed, target = torch.full((1, 4), 1000.0, dtype=F64), vector(2000.0, 2000.0, 500.0, 500.0)
+    up, down = 2000.0 - 1000.0 * math.exp(-0.1 / 0.05), 500.0 + 500.0 * math.exp(-0.1 / 0.2)
+    torch.testing.assert_close(rotors.follow(speed, target, 0.1), vector(up, up, down, down))
+
+
+def test_drag_above_the_centre_of_mass_pitches_a_drone_that_flies_forward_up():
+    params = drone(drag_height=0.03, linear_drag=[0.2] * 3, quadratic_drag=[0.0] * 3)
+    still = torch.zeros(2, 3, dtype=F64)
+    velocity = torch.tensor([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0]], dtype=F64)
+    state = RigidBodyState(still, quaternion.identity(still), velocity, still)
+    _, angular = accelerations(state, torch.zeros(2, 4, dtype=F64), params)
+    moment = 0.03 * 0.2 * 2.0  # about y where it flies along x (nose up), about x where it flies along y
+    about = torch.tensor([[0.0, -moment, 0.0], [moment, 0.0, 0.0]], dtype=F64)
+    torch.testing.assert_close(angular, about / params.inertia)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_components_fly_as_tensors_do_with_two_time_constants_and_drag_above_the_centre_of_mass(own):
+    params = drone(motor_time_constant=[0.03, 0.06], drag_height=0.02)
+    model = Quadrotor(params, 0.005, 1, "semi_implicit_euler")
+    state = model.rest(torch.zeros(3, 3, dtype=F64))
+    state["velocity"] = vector(1.0, -2.0, 0.5).repeat(3, 1)
+    action = model.hover_action + torch.tensor([[0.3, 0.2, -0.1, 0.4], [-0.3, 0.0, 0.3, 0.0], [0.0] * 4], dtype=F64)
+    flies = params.replace(mass=0.5, drag_height=0.04) if own else model.nominal
+    plant = tuple(getattr(flies, name).reshape(-1, 1).expand(-1, 3) for name in model.plant_fields) if own else ()
+    rows = model.rows_step()(torch.cat([x.t() for x in state.values()]), model.setpoint_rows(action), plant, ())
+    after = model.control_step(state, action, flies, None)
+    torch.testing.assert_close(rows, torch.cat([after[name].t() for name in model.sizes]))

@@ -122,7 +122,7 @@ def identify(
     fit = Fit(Model(prior, motors, ()), kept, logs, moves_streams, progress, iterations, Checkpoint(checkpoint, mark))
     state, dropped, two = fit.run(wanted)
     model = fit.model.only(state.free)
-    _, linear, cover, _ = fit.uncertainty(state)
+    linear, cover = fit.uncertainty(state)
     n = len(state.x)
     # Student's distribution, nearly, and the bias of a sum over so many of the lags that there are.
     quantile = 1.96 * (1.0 + 2.5 / max(len(kept) - n, 1) + 1.5 * fit.lags / len(kept))
@@ -133,9 +133,8 @@ def identify(
         changes = bootstrap(linear, kept.log, len(logs), fit.lags, draws, seed)
         tables = report(model, state.x, torch.cov(changes[:, :n].T).reshape(n, n), 1.96, has_mass)
         resampled = {name: (entry["low"], entry["high"]) for table in tables for name, entry in table.items()}
-    if "command_delay" in parameters:
-        motors = dataclasses.replace(motors, delay=parameters["command_delay"]["value"])
-    motors = dataclasses.replace(motors, delay=float(np.clip(motors.delay, -0.1, 0.5)))
+    found = parameters["command_delay"]["value"] if "command_delay" in parameters else motors.delay
+    motors = dataclasses.replace(motors, delay=float(np.clip(found, -0.1, 0.5)))  # what a drone's file may say
     fitted = QuadrotorParams(**model.params(state.x)._asdict(), motor_command=motors)
     half = quantile * cover.diag()[n:].clamp_min(0.0).sqrt() * UNKNOWNS["stream"].scale
     return IdentificationResult(
@@ -220,7 +219,7 @@ class Fit:
             return state, dropped, "not asked for"
         start = State((*free, "asymmetry"), torch.cat((state.x, state.x.new_zeros(1))), state.streams, iteration=near)
         more = self._minimise(start, "two time constants")
-        _, _, cover, _ = self.uncertainty(more)
+        _, cover = self.uncertainty(more)
         ratio, error = float(more.x[-1]), float(cover[len(free), len(free)].sqrt())
         said = (
             f"rising / falling = {math.exp(ratio):.2f}, 95 % between {math.exp(ratio - 1.96 * error):.2f} and "
@@ -230,10 +229,9 @@ class Fit:
             return more, dropped, f"two time constants: {said}"
         return state, dropped, f"one time constant: {said}"
 
-    def uncertainty(self, state: State) -> tuple[Problem, Linear, Tensor, Tensor]:
-        """The covariance (n + L, n + L) of the unknowns at the optimum, and the inverse Hessian."""
-        problem = self._problem(state)
-        linear = problem.linearise(state, update_scale=True)
+    def uncertainty(self, state: State) -> tuple[Linear, Tensor]:
+        """Residuals and derivatives at the optimum, and the covariance (n + L, n + L) of the unknowns."""
+        linear = self._problem(state).linearise(state, update_scale=True)
         cover, bread, scores = covariance(linear, self.windows.log, len(self.logs), self.lags)
         if len(self.logs) > 2 and "thrust" in state.free:
             # The level of thrust differs from flight to flight, with rotors and battery, more than within one.
@@ -243,7 +241,7 @@ class Fit:
             i = state.free.index("thrust")
             wider[i] = (between[i] / cover[i, i].clamp_min(1e-300)).clamp_min(1.0).sqrt()
             cover = cover * wider[:, None] * wider
-        return problem, linear, cover, bread
+        return linear, cover
 
     def _problem(self, state: State) -> Problem:
         return Problem(self.model.only(state.free), self.windows, self.moves_streams, "thrust" in state.free)
@@ -260,7 +258,7 @@ class Fit:
         """The unknown that is least certain, if it is too uncertain, and why; or all that nothing depends on."""
         if not state.free:
             return {}
-        _, _, cover, _ = self.uncertainty(state)
+        _, cover = self.uncertainty(state)
         variance = cover.diag()[: len(state.x)]
         untold = [name for name, x in zip(state.free, variance, strict=True) if x <= 0]
         if untold:

@@ -32,8 +32,8 @@ METHODS = {"observe": "observe", "judge": "is_crash and is_success", "measure": 
 class Rules(NamedTuple):
     """What a task computes outside the network."""
 
-    graphs: dict[str, Any]  #: ONNX models by name: "observe", and those that there are of "advance", "judge", "episode"
-    entries: dict[str, Any]  #: the task's own entries that these read: their keys in the state, by name
+    graphs: dict[str, Any]  #: ONNX models by name, "observe" and those that there are of "advance", "judge", "episode"
+    entries: dict[str, Any]  #: the keys in the state of the task's own entries that these read, by name
     unjudged: str | None  #: why there are no graphs "judge" and "episode", or None
 
 

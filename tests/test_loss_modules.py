@@ -1,5 +1,9 @@
 """Losses as LossModules: their keys, what they refuse, their checkpoints, and environments that are no quadrotors."""
 
+import inspect
+import re
+import textwrap
+
 import pytest
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -13,6 +17,7 @@ from torchrl_quad import (
     AHACLoss,
     BPTTLoss,
     HoveringEnv,
+    HybridLoss,
     SAPOLoss,
     SHACLoss,
     VisitedStateBuffer,
@@ -119,6 +124,16 @@ def test_the_running_median_of_the_clip_has_the_precision_of_the_actor():
     other = BPTTLoss(make_actor(env), clip_action_gradient=2.0)
     other.load_state_dict(loss.state_dict())
     assert other.clip.median == loss.clip.median and other.clip.median.dtype == torch.float64
+
+
+@pytest.mark.parametrize("loss", [ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss])
+def test_the_example_of_a_loss_is_short_and_runs(loss):
+    (block,) = re.findall(r"code-block:: python\n\n((?: {4}.*\n|\n)+)", inspect.getdoc(loss) + "\n")
+    program = textwrap.dedent(block).strip()
+    assert len(program.splitlines()) < 12
+    names = {}
+    exec(program, names)
+    assert all(p.grad.isfinite().all() and p.grad.any() for p in names["loss"].actor_network_params.parameters())
 
 
 # -- what they refuse -------------------------------------------------------------------------------------------------

@@ -177,8 +177,8 @@ class TanhGaussianActor(ProbabilisticActor):
         tensordict.set("noise_before", before)
         if is_random is None:
             return super().forward(tensordict, **kwargs).set("noise", before)
-        read = self[0](tensordict)
-        loc, scale = leaf(read, "loc"), leaf(read, "scale")
+        # Evaluated for each of the two, which fixes the order in which gradients add up.
+        loc, scale = (leaf(self[0](tensordict), key) for key in ("loc", "scale"))
         xi = _first_noise(torch.zeros_like(loc.detach()), is_random)
         written = tanh_gaussian(loc, scale, xi, self.bounds, self.log_prob_entry)
         return tensordict.update(written).set("noise", head.next(before, xi))

@@ -104,7 +104,7 @@ class Bundle:
 
     @property
     def progress(self) -> Arrays:
-        """The entries of the task by name, which tell where the flight is in it, such as ``bundle.progress["gate"]``."""
+        """The entries of the task by name, where the flight is in it, such as ``bundle.progress["gate"]``."""
         return {name: x[0].copy() for name, x in self._progress.items()}
 
     def __call__(self, state: Mapping[str, Any]) -> tuple[float, NDArray[np.float64]]:

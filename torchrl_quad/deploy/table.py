@@ -32,10 +32,10 @@ def measure(
     late: int = 0,
     episodes: int | None = None,
 ) -> None:
-    """Fly once, and add the result to a table, unless it is there; the arguments are those of :func:`~torchrl_quad.deploy.transfer.fly`.
+    """Fly once, and add the result to a table, unless it is there; the arguments are those of ``fly``.
 
     Raises:
-        ValueError: the file is no table of flights, or an argument is one that :func:`~torchrl_quad.deploy.transfer.fly` refuses.
+        ValueError: the file is no table of flights, or an argument is one that ``fly`` refuses.
         OSError: the result cannot be written; then it is printed.
     """
     task = bundle.contract["task"]

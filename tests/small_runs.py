@@ -34,7 +34,7 @@ def assert_equal(a, b, path=""):
     if isinstance(a, dict):
         assert a.keys() == b.keys(), path
         for key in a:
-            if not str(key).startswith(("time/", "seconds", "config", "revision")):
+            if not str(key).startswith(("time/", "seconds", "processor_seconds", "config", "revision")):
                 assert_equal(a[key], b[key], f"{path}/{key}")
     elif isinstance(a, (list, tuple)):
         assert len(a) == len(b), path

@@ -119,7 +119,7 @@ def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
     printed = said.read_text()
     assert run.returncode == 130
     assert "Traceback" not in printed
-    assert printed.splitlines()[-1] == f"Stopped. Go on with: python {script} resume={folder}/checkpoint.pt"
+    assert printed.splitlines()[-1] == f"Stopped. Continue with: python {script} resume={folder}/checkpoint.pt"
 
 
 def test_ctrl_c_before_the_first_checkpoint_says_so(refused, no_pictures, tmp_path, monkeypatch):

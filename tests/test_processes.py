@@ -57,14 +57,8 @@ def train_together(rank, port, arguments):
 
 
 def test_two_processes_train_one_policy_and_resume(in_two_processes, tmp_path):
-    options = [
-        *SMALL,
-        *EVERYTHING,
-        "loss.clip_action_gradient=2",
-        "buffer.capacity=24",
-        "actor.schedule=constant",
-        "critic.schedule=constant",
-    ]
+    options = [*SMALL, *EVERYTHING, "loss.clip_action_gradient=2", "buffer.capacity=24"]
+    options += [f"{network}.schedule=constant" for network in ("actor", "critic")]
     launches = [
         [*options, "total_steps=384", f"hydra.run.dir={tmp_path}/straight"],
         [*options, "total_steps=192", f"hydra.run.dir={tmp_path}/resumed"],
@@ -131,15 +125,8 @@ def descend_on_own_data(rank, port):
 def test_the_runs_of_a_sweep_go_side_by_side_and_a_second_time_are_skipped(launch, tmp_path):
     from joblib.externals.loky import get_reusable_executor
 
-    sweep = [
-        "--multirun",
-        *SMALL,
-        "total_steps=48",
-        "task=hovering,tracking",
-        "resume=auto",
-        f"hydra.sweep.dir={tmp_path}",
-    ]
-    sweep += ["hydra.sweep.subdir=${task}"]
+    sweep = ["--multirun", *SMALL, "total_steps=48", "task=hovering,tracking", "resume=auto"]
+    sweep += [f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=${task}"]
     launch("bptt", *sweep, "hydra.launcher.n_jobs=2")  # the runs have processes of their own, the sweep has this one
     get_reusable_executor().shutdown()
     folders = [tmp_path / task for task in ("hovering", "tracking")]

@@ -43,7 +43,7 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(recipe, options, train,
     with monkeypatch.context() as patch:
         stop_at_save(patch, 2)
         said = refused(recipe, *SMALL, short, f"hydra.run.dir={folder}", *options, status=130)
-    assert said.startswith("Stopped. Go on with: python ")
+    assert said.startswith("Stopped. Continue with: python ")
     assert said.endswith(f"recipes/{recipe}.py resume={folder}/checkpoint.pt")
     assert [row["iteration"] for row in rows(folder)] == ["2", "4"]  # and a checkpoint at 2
     torch.manual_seed(77)
@@ -124,7 +124,7 @@ def test_what_the_command_line_says_must_agree_with_the_checkpoint(train, refuse
     train("bptt", tmp_path)
     small = [*SMALL, f"hydra.run.dir={tmp_path}"]
     said = refused("bptt", *small)
-    assert f"{tmp_path} holds another run. Go on with it, resume={tmp_path}/checkpoint.pt, or choose another" in said
+    assert f"{tmp_path} holds another run. Continue with it, resume={tmp_path}/checkpoint.pt, or choose another" in said
     said = refused("bptt", *small, "resume=auto", "env.drone=small_racer")
     assert "env.drone=small_racer contradicts the checkpoint" in said and "trained with env.drone=visfly" in said
     said = refused("bptt", *small, "resume=auto", "tuned=bptt_racing")
@@ -139,7 +139,7 @@ def test_a_run_that_is_resumed_by_path_goes_on_in_the_folder_of_its_checkpoint(t
     train("bptt", tmp_path / "first")
     path = tmp_path / "first/checkpoint.pt"
     said = refused("bptt", f"resume={path}", "total_steps=240", f"hydra.run.dir={tmp_path}/elsewhere")
-    assert f"hydra.run.dir={tmp_path}/elsewhere has no effect: resume={path} goes on in the folder of that" in said
+    assert f"hydra.run.dir={tmp_path}/elsewhere has no effect: resume={path} continues in the folder of that" in said
     launch("bptt", f"resume={path}", "total_steps=240")
     assert read_checkpoint(path)["iteration"] == 10
     assert not (tmp_path / "elsewhere").exists()

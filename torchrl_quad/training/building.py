@@ -24,7 +24,7 @@ from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.options import argument_names
 from torchrl_quad.training.configuration import own_disturbances, own_loss, plain
 
-SEEDS_PER_RUN = 10_000  # the process of rank r draws from seed + r * this
+SEEDS_PER_PROCESS = 10_000
 _Loss = TypeVar("_Loss", bound=PathwiseLoss)
 
 # -- several processes that train one policy, as torchrun starts them; all this also works for a single one ------------
@@ -56,7 +56,7 @@ def mean_of_all(x: Tensor) -> Tensor:
 
 def own_seed(cfg: DictConfig) -> int:
     """The seed of this process."""
-    return cfg.seed + SEEDS_PER_RUN * rank()
+    return cfg.seed + SEEDS_PER_PROCESS * rank()
 
 
 # -- environment, networks and loss ------------------------------------------------------------------------------------
@@ -131,15 +131,8 @@ def make_loss(
 ) -> _Loss:
     """Build the loss of a recipe, or the one that ``loss._target_`` names, with critic and discounts as configured.
 
-    A loss of your own gets those settings of the recipe's loss that it knows, too.
-
-    Args:
-        kind: the class of the recipe's loss.
-        cfg: the configuration.
-        env: the environment.
-        actor: the policy.
-        make_critic: ``make_value`` or ``make_qvalue``, for a loss with a critic.
-        **more: arguments of the loss that are no settings.
+    A loss of your own also gets those settings of the recipe's loss that it knows. ``make_critic`` is ``make_value`` or
+    ``make_qvalue``; ``more`` are arguments of the loss that are no settings.
     """
     options = plain(cfg.loss, resolve=True) | more
     if path := options.pop("_target_", None):
@@ -176,10 +169,7 @@ def parameter_groups(name: str, module: nn.Module) -> list[dict[str, Any]]:
 class Optimizer(torch.optim.Adam):
     """Adam, a schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run, and a bound on gradients.
 
-    Args:
-        cfg: the configuration.
-        name: of its section for the network, "actor" or "critic".
-        module: the loss that holds the network, or the network itself.
+    ``name`` is the section of the network, "actor" or "critic"; the module is the loss that holds it, or the network itself.
     """
 
     def __init__(self, cfg: DictConfig, name: str, module: nn.Module) -> None:
@@ -206,11 +196,8 @@ class Optimizer(torch.optim.Adam):
 class AdaptiveOptimizer(Optimizer):
     """Adam for a policy that a horizon moves by about ``max_kl`` (KL divergence), which falls to 2 % over the run.
 
-    A horizon that moves it beyond 1.5 of the bound divides the rate by 1.5, and one that stays below 2/3 of it
-    multiplies it. The rate keeps between 1e-6 and 20 times the first one.
-
-    Attributes:
-        limit: how far the horizon of this iteration may move the policy.
+    A horizon that moves it beyond 1.5 of the bound, the ``limit`` of this iteration, divides the rate by 1.5, and one
+    that stays below 2/3 of it multiplies it. The rate keeps between 1e-6 and 20 times the first one.
     """
 
     def __init__(self, cfg: DictConfig, name: str, module: nn.Module) -> None:

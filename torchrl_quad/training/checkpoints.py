@@ -26,8 +26,9 @@ from torchrl_quad.training.schema import check
 FORMAT = 5  # of the content; raise it when older files can no longer be read
 MARK = b"\ntorchrl_quad checkpoint, sha256 "  # then 64 digits: the checksum of all bytes before the mark
 CONTENT = {  # and its types
-    **{"version": str, "revision": str, "config": str, "best": dict, "logger": (dict, type(None)), "seconds": tuple},
-    **{"iteration": int, "steps": int, "skipped": int, "rows": list, "stateful": list, "processes": list},
+    **{"version": str, "revision": str, "config": str, "logger": (dict, type(None)), "stateful": list},
+    **{"iteration": int, "steps": int, "skipped": int, "seconds": float, "processor_seconds": float},
+    **{"rows": list, "best": dict, "processes": list},
 }
 FREE_ON_RESUME = (
     *("resume", "trust", "total_steps", "threads", "compile"),
@@ -98,7 +99,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 def _way_out(path: Path) -> str:
     if previous(path).exists():
-        return f"Go on from the checkpoint before it: resume={previous(path)}"
+        return f"Continue from the checkpoint before it: resume={previous(path)}"
     return "There is none before it to continue from: train again."
 
 
@@ -117,7 +118,7 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
         cfg.resume = str(own) if own.exists() else None
     elif cfg.resume is None and own.exists():
         raise FileExistsError(
-            f"{folder} holds another run. Go on with it, resume={own}, or choose another hydra.run.dir."
+            f"{folder} holds another run. Continue with it, resume={own}, or choose another hydra.run.dir."
         )
     if cfg.resume is None:
         return
@@ -133,7 +134,7 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
         if value != was and key.split(".")[0] not in FREE_ON_RESUME:
             raise UserValueError(
                 f"{key}={value} contradicts the checkpoint {cfg.resume}, which was trained with {key}={was}. Leave it "
-                f"out to go on, or start a new run without resume. These may change: {', '.join(FREE_ON_RESUME)}."
+                f"out to continue, or start a new run without resume. These may change: {', '.join(FREE_ON_RESUME)}."
             )
         if value != was:
             OmegaConf.update(saved, key, value)
@@ -146,10 +147,7 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
 def saved_config(path: Path, content: Mapping[str, Any], trust: Collection[str] = ()) -> DictConfig:
     """The configuration in a checkpoint, which has passed the schema like a command line.
 
-    Args:
-        path: of the checkpoint.
-        content: of the checkpoint.
-        trust: the paths of the classes that it may name; nothing else that a file names is imported.
+    ``trust`` lists the paths of the classes that it may name; nothing else that a file names is imported.
 
     Raises:
         UserValueError: it would not pass as a command line, or names a class that is not trusted.
@@ -178,11 +176,7 @@ def saved_config(path: Path, content: Mapping[str, Any], trust: Collection[str] 
 
 @contextlib.contextmanager
 def fits(path: Path, what: str) -> Iterator[None]:
-    """Say of which file the content does not fit what is built from its configuration.
-
-    Raises:
-        UserValueError: it does not.
-    """
+    """Raise a UserValueError that names the file whose content does not fit what its configuration builds."""
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:

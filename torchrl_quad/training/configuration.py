@@ -82,12 +82,7 @@ def defaults(cls: type[QuadrotorEnv]) -> dict[str, Any]:
 
 
 def own_class(path: Any, base: type, setting: str) -> type:
-    """Import a class of your own by its path, such as "mypackage.Gust".
-
-    Raises:
-        UserValueError: the path leads to nothing.
-        UserTypeError: it leads to what is no subclass of ``base``.
-    """
+    """Import a subclass of ``base`` by its path, such as "mypackage.Gust"; a UserError says what is wrong with it."""
     if not (isinstance(path, str) and re.fullmatch(r"\w+(\.\w+)+", path)):
         raise UserValueError(f"{setting}={shown(path)}: it must be the path of a class, such as mypackage.Mine.")
     cls = imported(path, setting)
@@ -102,12 +97,7 @@ def own_loss(path: Any, kind: type) -> type:
 
 
 def own_disturbances(specs: Sequence[str | Mapping[str, Any]] | None) -> list[Disturbance] | None:
-    """The disturbances that ``env.disturbances`` names: paths of classes, or mappings with ``_target_`` and arguments.
-
-    Raises:
-        UserValueError: a path leads to nothing, or an argument is unknown or out of its range.
-        UserTypeError: a path leads to what is no disturbance.
-    """
+    """The disturbances that ``env.disturbances`` names: paths, or mappings with ``_target_`` and arguments."""
     if specs is None:
         return None
     found, setting = [], "env.disturbances"
@@ -127,11 +117,7 @@ def named_code(values: Any) -> list[str]:
 
 
 def own_recipe(config: str, settings: Mapping[str, Any]) -> str:
-    """Store the configuration of a recipe of your own: ``config``, and then these settings. Returns its name.
-
-    Raises:
-        UserValueError: the settings lack a name, or a recipe that ships has it.
-    """
+    """Store the configuration of a recipe of your own: ``config``, and then these settings. Returns its name."""
     name = settings.get("algorithm")
     if not isinstance(name, str) or (CONFIG / f"{name}.yaml").exists():
         raise UserValueError(

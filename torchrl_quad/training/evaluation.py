@@ -87,11 +87,7 @@ def final_evaluation(
 def best_policy(
     cfg: DictConfig, best: Mapping[str, Any], source: Path
 ) -> tuple[TensorDictModule, dict[str, Tensor] | None]:
-    """Build the best policy of a run from its weights, with the state of its normaliser if it has one.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """Build the best policy of a run from its weights, with the state of its normaliser if it has one."""
     if not isinstance(best.get("actor"), Mapping):
         raise UserValueError(
             f"{source} holds no policy: the run stopped before its first evaluation, or no return was finite. Train "
@@ -109,14 +105,11 @@ def load_policy(
 ) -> tuple[DictConfig, TensorDictModule, dict[str, Tensor] | None]:
     """Read the configuration, the best policy, and the state of its normaliser if it has one, from a checkpoint.
 
-    Args:
-        checkpoint: the path of the file.
-        device: where the policy goes.
-        trust: the paths of the classes that the configuration may name, such as "mypackage.WindowEnv".
+    ``trust`` lists the paths of your own classes that the configuration may name, such as "mypackage.WindowEnv".
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is not a checkpoint that these recipes can read, or holds no policy.
+        UserValueError: the file is not a checkpoint that these recipes can read, or holds no policy.
     """
     saved = read_checkpoint(checkpoint)
     cfg = saved_config(checkpoint, saved, trust)

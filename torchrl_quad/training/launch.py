@@ -160,7 +160,7 @@ def _check(cfg: DictConfig, hydra_config: Any) -> None:
         asked = Path(hydra_config.run.dir)
         if asked.resolve() != Path(cfg.resume).resolve().parent:
             raise UserValueError(
-                f"hydra.run.dir={asked} has no effect: resume={cfg.resume} goes on in the folder of that checkpoint. "
+                f"hydra.run.dir={asked} has no effect: resume={cfg.resume} continues in the folder of that checkpoint. "
                 "Leave it out."
             )
 
@@ -188,11 +188,7 @@ def _explained() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _joined(cfg: DictConfig) -> Iterator[None]:
-    """Join the processes that torchrun has started, if it has, and leave them at the end.
-
-    Raises:
-        UserValueError: the configuration names one GPU for all of them.
-    """
+    """Join the processes that torchrun has started, if it has, and leave them at the end."""
     if "RANK" in os.environ:
         if ":" in cfg.device:
             raise UserValueError(
@@ -279,7 +275,7 @@ def _resumable(folder: Path, cfg: DictConfig) -> Iterator[None]:
         yield
     except (KeyboardInterrupt, OSError) as error:
         trust = ", ".join(named_code(plain(cfg)))
-        how = f"Go on with: python {sys.argv[0]} resume={checkpoint}" + (f" 'trust=[{trust}]'" if trust else "")
+        how = f"Continue with: python {sys.argv[0]} resume={checkpoint}" + (f" 'trust=[{trust}]'" if trust else "")
         is_saved = checkpoint.exists()
         if isinstance(error, KeyboardInterrupt):
             why = how if is_saved else "Nothing was saved yet: the first evaluation writes a checkpoint."

@@ -30,10 +30,9 @@ class Logs:
         cfg: the configuration.
         folder: where the files go.
         revision: of the code, for wandb.
-        rows: of metrics.csv so far.
-        steps: of training so far; tensorboard forgets what it was given later.
+        rows: of metrics.csv so far; tensorboard forgets what it was given later.
         metrics: of the task, for wandb.
-        saved: the logger's state in the checkpoint from which the run goes on; it then goes on in the same wandb run.
+        saved: the logger's state in the checkpoint from which the run continues, in the same wandb run.
     """
 
     def __init__(
@@ -42,7 +41,6 @@ class Logs:
         folder: Path,
         revision: str,
         rows: list[dict[str, float]],
-        steps: int,
         metrics: Mapping[str, Metric],
         saved: dict[str, Any] | None,
     ) -> None:
@@ -73,13 +71,13 @@ class Logs:
             for metric, described in metrics.items():
                 if described.goal:  # the table of runs then shows the best value, not the last
                     self.backend.experiment.define_metric(f"eval/{metric}", step_metric="steps", summary=described.goal)
-        if steps and cfg.logger.backend == "tensorboard":
+        if rows and cfg.logger.backend == "tensorboard":
             self.backend.experiment.close()
             writer = type(self.backend.experiment)
-            self.backend.experiment = writer(self.backend.experiment.log_dir, purge_step=steps + 1)
+            self.backend.experiment = writer(self.backend.experiment.log_dir, purge_step=int(rows[-1]["steps"]) + 1)
 
     def add(self, row: dict[str, float]) -> None:
-        """Log a row, and write metrics.csv anew: after a resume it ends where the checkpoint does."""
+        """Log a row, and rewrite metrics.csv: after a resume it ends where the checkpoint does."""
         self.rows.append(row)
         self._write()
         metrics = {key: x for key, x in row.items() if "/" in key}
@@ -124,7 +122,7 @@ class Logs:
             self.backend.shutdown()
 
     def state_dict(self) -> dict[str, Any] | None:
-        """What a run that goes on needs to log into the same wandb run."""
+        """What a resumed run needs to log into the same wandb run."""
         return {**self.backend.state_dict(), "name": self.name} if self.cfg.logger.backend == "wandb" else None
 
     def _drawn(self, name: str, *files: str, make: Callable[[str], Any]) -> dict[str, Any]:
@@ -137,11 +135,7 @@ class Logs:
 
 
 def _logger(backend: str, *arguments: Any, **options: Any) -> Any:
-    """TorchRL's logger.
-
-    Raises:
-        UserValueError: wandb refuses, as where nobody has logged in.
-    """
+    """TorchRL's logger; what wandb refuses, such as a run without a login, is a UserValueError."""
     try:
         return get_logger(cast("Any", backend), *arguments, **options)
     except Exception as error:
@@ -152,7 +146,7 @@ def _logger(backend: str, *arguments: Any, **options: Any) -> Any:
 
 
 def run_name(name: str, overrides: Iterable[str]) -> str:
-    """The name of a run in wandb, at most 128 characters: with what was asked for beside task and seed."""
+    """The name of a run in wandb, at most 128 characters: with what was asked for, but for task and seed."""
     given = [x.lstrip("+") for x in overrides if not x.lstrip("+~").startswith(NOT_IN_A_NAME)]
     name = " ".join([name, *given])
     return name if len(name) <= 128 else f"{name[:127]}…"

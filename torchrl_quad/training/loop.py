@@ -1,4 +1,4 @@
-"""The training loop: it counts, evaluates, saves, and goes on after a stop."""
+"""The training loop: it counts, evaluates, saves, and continues after a stop."""
 
 from __future__ import annotations
 
@@ -58,27 +58,21 @@ from torchrl_quad.training.evaluation import (
 )
 from torchrl_quad.training.logs import Logs
 
+PROGRESS = ("iteration", "steps", "skipped", "seconds", "processor_seconds", "rows", "best")  # of a checkpoint
 CELL = 0.5  # [m]: train/start_cells counts the cubes of this size in which horizons have started
 
 
 class Run:
     """A training run: ``for _ in run: ...``, with ``run.carry``, ``run.optimise(...)`` and ``run.record(...)`` in it.
 
-    Evaluates every ``eval.interval`` iterations, and each time writes a row of metrics and a checkpoint. The checkpoint
-    holds all that the run needs to go on exactly as if it had not stopped (``resume=PATH``), and the best policy so
-    far, which is flown at the end from other starts: the one that solved most episodes in these evaluations, and of
-    those the one with the greatest return. With ``actor.average`` evaluations fly the average of the policy's weights,
-    and the best policy is one of these averages.
+    Before each iteration every :class:`Optimizer` gets its learning rate, by the steps of the run so far. Every
+    ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs to
+    continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of those
+    the one with the greatest return. At the end that policy flies from other starts. With ``actor.average``
+    evaluations fly the average of the policy's weights.
 
-    Before each iteration every :class:`Optimizer` gets its learning rate, by the steps of the run so far.
-
-    Leaves in the run's folder: ``config.yaml``, ``metrics.csv``, ``checkpoint.pt`` and the one before it,
-    ``summary.json``, ``learning_curve.png``, and the flight as ``flight.png``, ``flight.mp4`` or .gif,
-    ``flight.html`` and ``episode.pdf``.
-
-    The seconds are those of the loop alone, without set-up, compilation, evaluations and checkpoints. Processor seconds
-    count the time in which the threads of this process computed. Of several processes the first evaluates, logs and
-    saves.
+    The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints. Processor seconds count
+    the time in which the threads of this process computed. Of several processes the first evaluates, logs and saves.
 
     Args:
         cfg: the configuration.
@@ -94,8 +88,6 @@ class Run:
     Attributes:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
         horizon: control steps of this iteration's rollout, ``cfg.horizon`` unless the algorithm sets it.
-        steps: control steps of all drones before this iteration.
-        drones: of all processes.
     """
 
     def __init__(
@@ -107,19 +99,20 @@ class Run:
         stateful: Sequence[Any],
         buffer: VisitedStateBuffer | None = None,
     ) -> None:
-        self.cfg, self.env, self.actor, self.loss, self.buffer = cfg, env, actor, loss, buffer
-        self.task = task_of(env)
+        self.cfg, self.env, self.actor, self.loss, self.task = cfg, env, actor, loss, task_of(env)
         self.average = average_policy(cfg, actor)
         # What evaluations fly.
         self.flown = actor if self.average is None else cast("TensorDictModule", self.average.module)
         self.normalizer = env.transform if isinstance(env, TransformedEnv) else None
         self.stateful = [x for x in (loss, *stateful, self.average, self.normalizer) if x is not None]
+        own = {"buffer": buffer, "clip": getattr(loss, "clip", None)}  # each clips by the median of its own drones
+        self.of_process = {name: x for name, x in own.items() if x is not None}
         self.horizon, self.steps, self.drones = cfg.horizon, 0, cfg.num_envs * world_size()
         self.total_steps = iterations(cfg) * cfg.horizon * self.drones
         self.recorded: dict[str, list[float]] = defaultdict(list)
         self.starts: list[Tensor] = []  # positions in which the horizons since the last row have started
         self.rows: list[dict[str, float]] = []  # of metrics.csv
-        self.done, self.seconds, self.processor_seconds, self.skipped = 0, 0.0, 0.0, 0
+        self.iteration, self.seconds, self.processor_seconds, self.skipped = 0, 0.0, 0.0, 0
         self.best: dict[str, Any] = {"solved": -math.inf, "return": -math.inf}
         self.folder = Path(HydraConfig.get().runtime.output_dir)
         self.saved: Path | None = None  # the last checkpoint known to be intact
@@ -135,9 +128,7 @@ class Run:
         if rank() == 0 and not self.is_over:
             for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
                 (self.folder / name).unlink(missing_ok=True)
-            self.logs = Logs(
-                cfg, self.folder, self.revision, self.rows, self.steps, self.task.metric_info, logger_state
-            )
+            self.logs = Logs(cfg, self.folder, self.revision, self.rows, self.task.metric_info, logger_state)
             with replacing(self.folder / "config.yaml") as path:
                 OmegaConf.save(cfg, path, resolve=True)
 
@@ -150,30 +141,24 @@ class Run:
             return
         if self.cfg.compile and self.steps < self.total_steps:
             self._warm_up()
-        inside = self.task.flies_inside(self.actor)
-        way = "policy inside the step" if inside else "policy before the step"
-        with tqdm(
-            total=self.total_steps,
-            initial=self.steps,
-            unit="step",
-            unit_scale=True,
-            desc=f"{self.cfg.algorithm} {self.cfg.task} {self.cfg.seed}, {way}",
-            disable=rank() > 0,
-        ) as bar:
+        way = "inside" if self.task.flies_inside(self.actor) else "before"
+        name = f"{self.cfg.algorithm} {self.cfg.task} {self.cfg.seed}, policy {way} the step"
+        bounds = {"total": self.total_steps, "initial": self.steps}
+        with tqdm(**bounds, unit="step", unit_scale=True, desc=name, disable=rank() > 0) as bar:
             while self.steps < self.total_steps:
                 self.starts.append(self.carry["state", "position"].clone())
                 for optimizer in (x for x in self.stateful if isinstance(x, Optimizer)):
                     optimizer.anneal(self.steps / self.drones / self.cfg.horizon)
                 start, processor_start = time.perf_counter(), time.process_time()
-                yield self.done
+                yield self.iteration
                 if self.average is not None:
                     self.average.update_parameters(self.actor)
                 self.seconds += time.perf_counter() - start
                 self.processor_seconds += time.process_time() - processor_start
-                self.done += 1
+                self.iteration += 1
                 self.steps += self.horizon * self.drones
                 bar.update(self.horizon * self.drones)
-                if self.done % self.cfg.eval.interval == 0 or self.steps >= self.total_steps:
+                if self.iteration % self.cfg.eval.interval == 0 or self.steps >= self.total_steps:
                     if rank() == 0:
                         metrics = self._evaluate()
                         solved = metrics["eval/solved"]
@@ -208,10 +193,10 @@ class Run:
         self._save(path)
         raise Diverged(
             f"{self.skipped} updates were skipped because their loss or gradient was not finite; the limit is "
-            f"max_skipped={self.cfg.max_skipped}. The last: {optimizer.name}, iteration {self.done}, loss {value:g}, "
-            f"gradient norm {norm:g}, not finite in {', '.join(broken[:3]) or 'no parameter'}. Networks and the state "
-            f'in which the horizon started are saved: {path}, ["processes"][{rank()}]["carry"]. Look for an infinite '
-            "derivative there, or lower the learning rate; raise max_skipped if the run recovers without help."
+            f"max_skipped={self.cfg.max_skipped}. The last: {optimizer.name}, iteration {self.iteration}, loss "
+            f"{value:g}, gradient norm {norm:g}, not finite in {', '.join(broken[:3]) or 'no parameter'}. Networks and "
+            f'the state in which the horizon started are saved: {path}, ["processes"][{rank()}]["carry"]. Look for an '
+            "infinite derivative there, or lower the learning rate; raise max_skipped if the run recovers without help."
         )
 
     def fit_critic(
@@ -240,10 +225,8 @@ class Run:
     def record(self, **metrics: Tensor | float) -> None:
         """Keep what this iteration measured; a row holds the mean since the row before."""
         for name, value in metrics.items():
-            group = "grad" if name.startswith("grad_") else "train"
-            self.recorded[f"{group}/{name.removeprefix('grad_')}"].append(
-                float(value.detach()) if isinstance(value, Tensor) else value
-            )
+            name = f"grad/{name.removeprefix('grad_')}" if name.startswith("grad_") else f"train/{name}"
+            self.recorded[name].append(float(value.detach()) if isinstance(value, Tensor) else value)
 
     # -- evaluating ----------------------------------------------------------------------------------------------------
 
@@ -251,11 +234,8 @@ class Run:
         """Compile all that the loop will call, before the clock starts; change nothing."""
         loss = self.loss if isinstance(self.loss, PathwiseLoss) else None
         before = copy.deepcopy(self.loss.state_dict())
-        with (
-            torch.random.fork_rng(),
-            drawing_from(self.env, self.cfg.eval.seed),
-            torch.set_grad_enabled(loss is not None),
-        ):
+        seed, has_gradient = self.cfg.eval.seed, torch.set_grad_enabled(loss is not None)
+        with torch.random.fork_rng(), drawing_from(self.env, seed), has_gradient:
             rollout, _ = differentiable_rollout(self.env, self.actor, self.carry, min(self.cfg.horizon, 2))
             if loss is not None:
                 loss.loss_actor(rollout)[0].backward()
@@ -267,7 +247,7 @@ class Run:
         with drawing_from(self.env, self.cfg.eval.seed):
             metrics, flight = evaluate(self.env, self.flown, self.cfg.eval.episodes)
         row = {
-            "iteration": self.done,
+            "iteration": self.iteration,
             "steps": self.steps,
             "time/seconds": self.seconds,
             "time/processor_seconds": self.processor_seconds,
@@ -313,8 +293,8 @@ class Run:
         summary |= {"revision": self.revision}
         write_summary(self.folder / "summary.json", summary)
         print_summary(summary, self.task.metric_info, self.folder)
-        picture, figure, page = (self.folder / name for name in ("flight.png", "episode.pdf", "flight.html"))
-        drawing.draw_flight(flight, picture, self.env, title(summary))
+        figure, page = self.folder / "episode.pdf", self.folder / "flight.html"
+        drawing.draw_flight(flight, self.folder / "flight.png", self.env, title(summary))
         drawing.publish_flight(flight, figure, page, self.env, title(summary))
         drawing.draw_learning_curve(self.folder / "metrics.csv", self.folder / "learning_curve.png", self.env)
         self.logs.show_flight(self.steps)
@@ -323,15 +303,13 @@ class Run:
     # -- stopping and going on -----------------------------------------------------------------------------------------
 
     def _save(self, path: Path) -> None:
-        """Write all that the run needs to go on, of all processes."""
-        clip = getattr(self.loss, "clip", None)
+        """Write all that the run needs to continue, of all processes."""
         own = {
             "torch": torch.get_rng_state(),
             "cuda": torch.cuda.get_rng_state(self.env.device) if self.env.device.type == "cuda" else None,
             "env": self.task.random_state(),
             "carry": self.carry.cpu().to_dict(),
-            "buffer": None if self.buffer is None else self.buffer.state_dict(),
-            "clip": None if clip is None else clip.state_dict(),  # each clips by the median of its own drones
+            **{name: x.state_dict() for name, x in self.of_process.items()},
             "parameters": sum(p.detach().double().sum().item() for p in self.loss.parameters()),
         }
         processes = [own] * world_size()
@@ -344,12 +322,7 @@ class Run:
                 "version": torchrl_quad.__version__,
                 "revision": self.revision,
                 "config": OmegaConf.to_yaml(self.cfg, resolve=True),
-                "iteration": self.done,
-                "steps": self.steps,
-                "seconds": (self.seconds, self.processor_seconds),
-                "skipped": self.skipped,
-                "rows": self.rows,
-                "best": self.best,
+                **{name: getattr(self, name) for name in PROGRESS},
                 "logger": self.logs.state_dict(),
                 "stateful": [x.state_dict() for x in self.stateful],
                 "processes": processes,
@@ -361,36 +334,30 @@ class Run:
             dist.barrier()  # none continues, or gives up, before the file is there
 
     def _load(self, path: Path) -> dict[str, Any] | None:
-        """Take everything from a checkpoint, and return the state of the logger.
-
-        Raises:
-            UserValueError: it was written by another number of processes, or does not fit its configuration.
-        """
+        """Take everything from a checkpoint, and return the state of the logger."""
         saved = read_checkpoint(path)
         if len(saved["processes"]) != world_size():
             raise UserValueError(
-                f"{path} was written by {len(saved['processes'])} processes, and {world_size()} want to go on. Start "
+                f"{path} was written by {len(saved['processes'])} processes, and {world_size()} want to continue. Start "
                 "as many as before: torchrun --nproc-per-node=N."
             )
         with fits(path, "the state of the run"):
             own = saved["processes"][rank()]
             for x, state in zip(self.stateful, saved["stateful"], strict=True):
                 x.load_state_dict(state)
-            if self.buffer is not None:
-                self.buffer.load_state_dict(own["buffer"])
-            if own["clip"] is not None:
-                cast("Any", self.loss).clip.load_state_dict(own["clip"])
+            for name, x in self.of_process.items():
+                x.load_state_dict(own[name])
             carry = TensorDict(own["carry"], [self.cfg.num_envs]).to(self.env.device)
             self.carry = self.env.reset(carry.exclude("_reset"), set_state=True).update(carry)
             self.task.set_random_state(own["env"])
             torch.set_rng_state(own["torch"])
             if own["cuda"] is not None:
                 torch.cuda.set_rng_state(own["cuda"], self.env.device)
-            self.seconds, self.processor_seconds = map(float, saved["seconds"])
-            self.best = {**saved["best"], **{name: float(saved["best"][name]) for name in ("solved", "return")}}
-            self.rows = [{str(name): value + 0 for name, value in row.items()} for row in saved["rows"]]
-        self.done, self.skipped, self.steps, self.saved = saved["iteration"], saved["skipped"], saved["steps"], path
-        before = saved["revision"]
+            for name in PROGRESS:
+                setattr(self, name, saved[name])
+            self.best |= {name: float(self.best[name]) for name in ("solved", "return")}
+            self.rows = [{str(name): value + 0 for name, value in row.items()} for row in self.rows]
+        self.saved, before = path, saved["revision"]
         self.revision = before if self.revision in before else f"{before}, then {self.revision}"
         return saved["logger"]
 

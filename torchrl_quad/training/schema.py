@@ -217,7 +217,7 @@ def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
 
 
 def schema_of(values: dict[str, Any], asked: Mapping[str, str] = MappingProxyType({})) -> type[BaseModel]:
-    """The schema of a recipe, with its task and its loss, or of a program beside the recipes."""
+    """The schema of a recipe, with its task and its loss, or of another program in recipes."""
     for name, program in (("logs", "identify"), ("folder", "export"), ("checkpoint", "evaluate")):
         if name in values:
             return _section(settings(program), SETTINGS | (IDENTIFYING if program == "identify" else {}))
@@ -296,11 +296,7 @@ def _loss(kind: type | None, added: Mapping[str, Any], values: Any, asked: Mappi
 
 
 def _check_together(values: dict[str, Any], asked: Mapping[str, str]) -> None:
-    """Refuse settings that do not fit each other, or that the command line sets in vain.
-
-    Raises:
-        UserValueError: there are such settings.
-    """
+    """Refuse settings that do not fit each other, or that the command line sets in vain."""
     if values["num_envs"] * values["horizon"] > MAX_ROLLOUT:
         raise UserValueError(f"num_envs times horizon must be at most {MAX_ROLLOUT:,}, or no memory holds a rollout.")
     for name in ("actor", "critic"):

@@ -169,7 +169,7 @@ def parameter_groups(name: str, module: nn.Module) -> list[dict[str, Any]]:
 class Optimizer(torch.optim.Adam):
     """Adam, a schedule that takes its learning rate from ``lr`` to ``final_lr`` over the run, and a bound on gradients.
 
-    ``name`` is the section of the network, "actor" or "critic"; the module is the loss that holds it, or the network itself.
+    ``name`` is the section of the network, "actor" or "critic"; ``module`` is that network, or the loss that holds it.
     """
 
     def __init__(self, cfg: DictConfig, name: str, module: nn.Module) -> None:

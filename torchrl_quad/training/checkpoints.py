@@ -30,10 +30,17 @@ CONTENT = {  # and its types
     **{"iteration": int, "steps": int, "skipped": int, "seconds": float, "processor_seconds": float},
     **{"rows": list, "best": dict, "processes": list},
 }
-FREE_ON_RESUME = (
-    *("resume", "trust", "total_steps", "threads", "compile"),
-    *("max_skipped", "diagnostics", "eval", "logger"),
-)
+FREE_ON_RESUME = ("resume", "trust", "total_steps", "threads", "compile", "max_skipped", "diagnostics", "eval", "logger")
+    "resume",
+    "trust",
+    "total_steps",
+    "threads",
+    "compile",
+    "max_skipped",
+    "diagnostics",
+    "eval",
+    "logger",
+]
 
 
 def previous(path: Path) -> Path:

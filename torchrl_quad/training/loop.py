@@ -338,8 +338,8 @@ class Run:
         saved = read_checkpoint(path)
         if len(saved["processes"]) != world_size():
             raise UserValueError(
-                f"{path} was written by {len(saved['processes'])} processes, and {world_size()} want to continue. Start "
-                "as many as before: torchrun --nproc-per-node=N."
+                f"{path} was written by {len(saved['processes'])} processes, and {world_size()} want to continue. "
+                "Start as many as before: torchrun --nproc-per-node=N."
             )
         with fits(path, "the state of the run"):
             own = saved["processes"][rank()]

@@ -30,17 +30,9 @@ CONTENT = {  # and its types
     **{"iteration": int, "steps": int, "skipped": int, "seconds": float, "processor_seconds": float},
     **{"rows": list, "best": dict, "processes": list},
 }
-FREE_ON_RESUME = ("resume", "trust", "total_steps", "threads", "compile", "max_skipped", "diagnostics", "eval", "logger")
-    "resume",
-    "trust",
-    "total_steps",
-    "threads",
-    "compile",
-    "max_skipped",
-    "diagnostics",
-    "eval",
-    "logger",
-]
+# Settings that a resumed run may change.
+FREE_ON_RESUME = ("resume", "trust", "total_steps", "threads", "compile", "max_skipped", "diagnostics")
+FREE_ON_RESUME += ("eval", "logger")
 
 
 def previous(path: Path) -> Path:

@@ -31,8 +31,7 @@ CONTENT = {  # and its types
     **{"rows": list, "best": dict, "processes": list},
 }
 # Settings that a resumed run may change.
-FREE_ON_RESUME = ("resume", "trust", "total_steps", "threads", "compile", "max_skipped", "diagnostics")
-FREE_ON_RESUME += ("eval", "logger")
+MAY_CHANGE = ("resume", "trust", "total_steps", "threads", "compile", "max_skipped", "diagnostics", "eval", "logger")
 
 
 def previous(path: Path) -> Path:
@@ -106,7 +105,7 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
     """Replace the configuration by that of the checkpoint that ``cfg.resume`` names.
 
     ``resume=auto`` means the checkpoint in the run's own folder, if there is one; name the folder with hydra.run.dir or
-    hydra.sweep.dir. The command line must agree with the checkpoint, except for ``FREE_ON_RESUME``.
+    hydra.sweep.dir. The command line must agree with the checkpoint, except for ``MAY_CHANGE``.
 
     Raises:
         FileExistsError: the folder holds another run, and ``resume`` does not name it.
@@ -130,10 +129,10 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
             asked |= _leaves(OmegaConf.load(CONFIG / f"tuned/{value}.yaml"))
     for key, value in ({"algorithm": cfg.algorithm} | asked).items():
         was = OmegaConf.select(saved, key)
-        if value != was and key.split(".")[0] not in FREE_ON_RESUME:
+        if value != was and key.split(".")[0] not in MAY_CHANGE:
             raise UserValueError(
                 f"{key}={value} contradicts the checkpoint {cfg.resume}, which was trained with {key}={was}. Leave it "
-                f"out to continue, or start a new run without resume. These may change: {', '.join(FREE_ON_RESUME)}."
+                f"out to continue, or start a new run without resume. These may change: {', '.join(MAY_CHANGE)}."
             )
         if value != was:
             OmegaConf.update(saved, key, value)

@@ -157,7 +157,7 @@ class ForestEnv(QuadrotorEnv):
     @property
     def scene(self) -> Scene:
         """The obstacles, which a forest always has."""
-        return cast(Scene, super().scene)
+        return cast(Scene, self.disturbances["scene"])  # a compiler cannot trace super().scene
 
     def command(self, state: State) -> Tensor:
         """The commanded velocity (n, 3) [m/s], world frame."""

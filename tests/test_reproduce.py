@@ -290,7 +290,7 @@ def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom(tmp_p
     speeds = {"BPTT": "333", "SHAC": "200", "ABPT": "1000", "SAPO": "", "AHAC": "", "Hybrid": "", "PPO": "25"}
     assert tables.speed_table(rows) == [{"task": "hovering", "machine": "a box", **speeds}]
     reached = tables.reached_tables(rows, none)
-    assert "| hovering | ABPT | 2 | 99 | 75.0% (50.0%) |  | 1.0 | 1 |" in tables.markdown(reached["reached_in_full"])
+    assert "| hovering | ABPT | 2 | 99 | 75.0% (50.0%) |  | 1e+06 | 1 |" in tables.markdown(reached["reached_in_full"])
     assert reached["reached"][0] == {"": "BPTT", "hovering": "9.1 [9, 9.2], 98.0%"}
     beaten = tables.markdown(tables.improvement_table(rows))
     assert "| PPO | 1.00, 1 | 1.00, 1 |  |" in beaten and "| BPTT |  | 0.50, 1 | 0.00, 1 |" in beaten

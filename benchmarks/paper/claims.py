@@ -1,9 +1,5 @@
 """The paper's claims as statistics over the results, each with its threshold and its rule, fixed before the first run.
 
-A claim has one part or several, and every part is a number with a bootstrap over seeds and starts (evidence.py). A part
-is supported when its 95 % interval lies on the right side of the threshold. It is refuted when a wider interval lies on
-the wrong side: its quantiles are 0.025 / m and 1 - 0.025 / m for a claim of m parts, since of many parts one looks
-refuted by chance.
 A claim is supported when all its parts are, refuted when one of them is, and undecided otherwise. With fewer than five
 seeds of any run that it needs it is preliminary, with fewer than three it has no verdict.
 

@@ -107,7 +107,10 @@ class Part:
         return float(self.draws[cut]), float(self.draws[len(self.draws) - 1 - cut])
 
     def verdict(self, parts: int = 1) -> str:
-        """Decide: supported, refuted or undecided, as one of several parts."""
+        """Decide: supported, refuted or undecided, as one of several parts.
+
+        Of many parts one looks refuted by chance: so that takes an interval which is wider the more there are.
+        """
         least, most = self.interval()
         if self.low < least and most < self.high:
             return "supported"

@@ -9,7 +9,7 @@ alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -66,12 +66,10 @@ def markdown(table: Table) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def spread(values: ArrayLike, factor: float = 1.0, digits: int = 2) -> str:
+def spread(values: Iterable[float]) -> str:
     """Write the mean over seeds, and the least and the greatest."""
-    values = factor * np.array([x for x in np.asarray(values, float) if np.isfinite(x)])
-    if len(values) == 0:
-        return ""
-    return f"{values.mean():.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
+    values = [x for x in values if np.isfinite(x)]
+    return f"{np.mean(values):.4g} ({min(values):.4g} to {max(values):.4g})" if values else ""
 
 
 def seeds(count: int) -> str:
@@ -84,23 +82,13 @@ def seeds(count: int) -> str:
 
 def claims_table(own: list[Verdict], published: list[Verdict]) -> Table:
     """Show the verdict on each claim, for the methods of the recipes and as published, and the part that decides it."""
-    again = {v.claim.id: v.verdict for v in published}
-    return [
-        {
-            "": v.claim.id,
-            "the paper's claim": v.claim.text,
-            "verdict": v.verdict,
-            "as published": again.get(v.claim.id, ""),
-            "decided by (bound)": "{what}: {value} ({must be})".format(**part) if (part := deciding(v)) else "",
-        }
-        for v in own
-    ]
-
-
-def deciding(verdict: Verdict) -> dict[str, str] | None:
-    """The first part of a claim that has the claim's own verdict, as :func:`parts_table` shows it."""
-    own = [x for x in parts_table("", [verdict]) if verdict.verdict.startswith(x["verdict"])]
-    return own[0] if own else None
+    again, rows = {v.claim.id: v.verdict for v in published}, []
+    for v in own:
+        row = {"": v.claim.id, "the paper's claim": v.claim.text, "verdict": v.verdict}
+        deciding = [part for part in parts_table("", [v]) if v.verdict.startswith(part["verdict"])]
+        decided = "{what}: {value} ({must be})".format(**deciding[0]) if deciding else ""
+        rows.append(row | {"as published": again.get(v.claim.id, ""), "decided by (bound)": decided})
+    return rows
 
 
 def parts_table(methods: str, verdicts: list[Verdict]) -> Table:
@@ -142,38 +130,31 @@ def best_level(results: Results, task: str) -> float:
 
 def ends_table(results: Results, experiment: str) -> Table:
     """Show where the curves of an experiment end, means over seeds, and when they converge, medians."""
-    shown = {"return": ("return", 1, 2), "solved [%]": ("solved", 100, 0), "gates": ("gates_passed", 1, 1)}
-    shown["error [cm]"] = ("position_error", 100, 1)
     rows = []
-    for task, variant in ((task, variant) for task in TASKS for variant in EXPERIMENTS[experiment]):
+    for task, variant in product(TASKS, EXPERIMENTS[experiment]):
+        row = {"experiment": experiment, "task": task, "method": VARIANTS[variant].label}
         try:
-            columns = {head: results.end(task, variant, name) for head, (name, _, _) in shown.items()}
-            level = best_level(results, task)
-            steps, seconds = (np.median(results.until(task, variant, x, level)) for x in ("steps", "seconds"))
+            for name in ("return", "solved", "gates_passed", "position_error"):
+                row |= {"seeds": str(len(results.end(task, variant)))} | {
+                    name: spread(results.end(task, variant, name))
+                }
+            if experiment not in ("reward", "relaxation"):  # whose returns are of another kind
+                for axis in ("steps", "seconds"):
+                    until = np.median(results.until(task, variant, axis, best_level(results, task)))
+                    row[f"{axis} to converge"] = f"{until:.4g}" if np.isfinite(until) else "never"
         except NotRunError:
             continue
-        row = {"experiment": experiment, "task": task, "method": VARIANTS[variant].label}
-        row |= {"seeds": str(len(columns["return"]))} | {x: spread(y, *shown[x][1:]) for x, y in columns.items()}
-        if experiment not in ("reward", "relaxation"):  # whose returns are of another kind
-            row["converged at [M steps]"] = f"{steps / 1e6:.2f}" if np.isfinite(steps) else "never"
-            row["[s]"] = f"{seconds:.0f}" if np.isfinite(seconds) else "never"
         rows.append(row)
     return rows
 
 
 def ascent_table(data: Path) -> Table:
     """Compare the gradients at the last policies with the measured ones: mean cosines over seeds."""
-    columns = {
-        "N-step return": "n_step_return",
-        "0-step return": "zero_step_return",
-        "whole objective": "objective",
-        "measurement": "halves",
-        "explained variance of the critic": "explained_variance",
-    }
+    names = ("n_step_return", "zero_step_return", "objective", "halves", "explained_variance")
     runs = grouped(read_rows(data / "ascent.csv"), "task", "variant")
     return [
         {"task": task, "method": VARIANTS[variant].label, "seeds": str(len(runs[task, variant]))}
-        | {head: spread(column(runs[task, variant], name)) for head, name in columns.items()}
+        | {name: spread(column(runs[task, variant], name)) for name in names}
         for task, variant in sorted(runs, key=lambda run: (TASKS.index(run[0]), list(VARIANTS).index(run[1])))
     ]
 
@@ -218,7 +199,7 @@ def metric_of(task: str) -> tuple[str, float, int, str]:
     name = flights.VARIANTS.get(task, [f"task={task}"])[0].removeprefix("task=")
     own = [x for x in task_class(name).metric_info.items() if x[0] not in EPISODE_METRICS]
     name, metric = own[0] if own else ("return", EPISODE_METRICS["return"])
-    return name, metric.scale, 1 if metric.unit is None else 2, metric.unit or metric.label
+    return name, metric.scale, 2, metric.unit or metric.label
 
 
 def shipped_tables(data: Path) -> dict[str, Table]:
@@ -258,11 +239,9 @@ def reached_tables(rows: Sequence[Row], starts: Starts) -> dict[str, Table]:
             if len(returns) >= ENOUGH:
                 mean += " [{:.4g}, {:.4g}]".format(*interval(returns))
             row = {"task": LABELS.get(task, task), "method": flights.METHODS[method], "seeds": str(len(own))}
-            row |= {"return (95 % interval)": mean}
-            row |= {"solved (worst seed)": f"{np.mean(solved):.1%} ({min(solved):.1%})"}
-            row |= {"metric": f"{factor * np.median(metric):.{digits}f} {unit}" if metric else ""}
-            row |= {"million steps": f"{np.median(column(own, 'steps')) / 1e6:.1f}"}
-            row |= {"seconds": f"{np.median(column(own, 'seconds')):.0f}"}
+            row |= {"return": mean, "solved (worst seed)": f"{np.mean(solved):.1%} ({min(solved):.1%})"}
+            row["metric"] = f"{factor * np.median(metric):.{digits}f} {unit}" if metric else ""
+            row |= {name: f"{np.median(column(own, name)):.4g}" for name in ("steps", "seconds")}
             full.append(row)
             short[method][row["task"]] = f"{mean}, {min(solved):.1%}"
     return {"reached": [row for row in short.values() if len(row) > 1], "reached_in_full": full}
@@ -308,9 +287,8 @@ def speed_table(rows: Sequence[Row]) -> Table:
 
 def improvement_table(rows: Sequence[Row]) -> Table:
     """Show how probable it is that the method of a row has a higher return than that of a column, over the tasks."""
-    flown = [
-        {x: column(own, "return") for x, own in of.items() if len(own) >= ENOUGH} for of in in_order(rows).values()
-    ]
+    tasks = in_order(rows).values()
+    flown = [{x: column(own, "return") for x, own in of.items() if len(own) >= ENOUGH} for of in tasks]
     enough = [x for x in flights.METHODS if any(x in of for of in flown)]
 
     def cell(ours: str, theirs: str) -> str:
@@ -337,11 +315,10 @@ def ablations_table(data: Path) -> Table:
             own = changed.get((task, method, no + option), [])
             ships = [x for x in shipped.get((task, method), []) if x["seed"] in {y["seed"] for y in own}]
             if ships:
-                both = (ships, own) if no else (own, ships)  # with the option, and without it
-                (gain, solved), (less, without) = (
-                    (np.mean(column(x, "return")), min(column(x, "solved"))) for x in both
-                )
-                row[flights.METHODS[method]] = f"{gain - less:+.1f}, {solved:.0%} ({without:.0%}), {len(own)}"
+                have, lack = (ships, own) if no else (own, ships)  # the option
+                gain = np.mean(column(have, "return")) - np.mean(column(lack, "return"))
+                solved, without = (min(column(x, "solved")) for x in (have, lack))
+                row[flights.METHODS[method]] = f"{gain:+.1f}, {solved:.0%} ({without:.0%}), {len(own)}"
         rows += [row] if len(row) > 2 else []
     return rows
 

@@ -23,10 +23,7 @@ def main(cfg: DictConfig) -> None:
     checkpoint = Path(cfg.checkpoint)
     trained, actor, normalizer = load_policy(checkpoint, trust=cfg.trust)
     env = build_env(trained, cfg.episodes, STARTS, normalizer=normalizer)
-    origin = {
-        "revision": read_checkpoint(checkpoint)["revision"],
-        "checkpoint_sha256": sha256(checkpoint.read_bytes()),
-    }
+    origin = {"revision": read_checkpoint(checkpoint)["revision"], "checkpoint_sha256": sha256(checkpoint.read_bytes())}
     folder = export_policy(actor, env, cfg.folder or checkpoint.parent / "policy", origin=origin)
     bundle = load_bundle(folder)
     print(f"{folder}: flies {bundle.contract['task']['name']}; its actions differ by at most {bundle.check():.1e}")

@@ -58,7 +58,8 @@ LIBRARIES = {
     "training": TORCHRL
     | {"hydra", "joblib", "omegaconf", "pydantic", "tensorboard", "tqdm", "wandb", "yaml", "filelock", "numpy"},
     "adapters": TORCHRL | {"gymnasium", "numpy", "rsl_rl", "skrl", "stable_baselines3"},
-    "identification": {"torch", "numpy", "yaml", "pydantic", "rosbags", "lz4", "backports", "compression"},
+    "identification": {"torch", "numpy", "yaml", "pydantic", "pydantic_core"}
+    | {"rosbags", "lz4", "backports", "compression"},
 }
 
 

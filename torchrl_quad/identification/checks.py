@@ -30,17 +30,10 @@ OFF = 0.02  # mean command of motors that stand
 _CHUNK = 20_000  # samples whose medians are taken together
 REST = 0.2  # [s] and [m/s]: how long and how slowly a drone stands
 FRD = np.array([1.0, -1.0, -1.0])
-_NAME = "Name its columns in the order w x y z"
-_TURN = "conjugate it: Columns(names, scale=(1, -1, -1, -1)), whose second to fourth are x y z"
-_FIRST = (
-    "The convention in use expects x y z w, and the file has w x y z: say another convention, or name the columns so"
-)
-_FIXES = {  # by hypothesis
-    "from world to body": f"To {_TURN}.",
-    "scalar last": f"{_NAME}.",
-    "scalar last, from world to body": f"{_NAME}, and {_TURN}.",
-    "scalar first": f"{_FIRST}.",
-    "scalar first, from world to body": f"{_FIRST}, and {_TURN}.",
+_FIXES = {  # by what may be wrong
+    "from world to body": "conjugate it: Columns(names, scale=(1, -1, -1, -1)), whose second to fourth are x y z",
+    "scalar last": "name its columns in the order w x y z",
+    "scalar first": "name its columns in the order x y z w, as the convention in use expects them",
 }
 _FULL = {101.0: "scale=1 / 100", 2600.0: "scale=1e-3, offset=1000", 65535.5: "scale=1 / 65535"}  # by the largest
 
@@ -156,7 +149,7 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
         told = f"{signal} correlates with the derivative of {given} by {fit:.2f} as given, and by {fits[best][0]:.2f}"
         if best in hypotheses:
             raise WrongQuaternion(
-                f"{told} if the quaternion is {best}. We need w x y z, from body to world. {_FIXES[best]}"
+                f"{told} if the quaternion is {best}. We need w x y z, from body to world: {_fix(best)}."
             )
         if best == "in the world frame":
             raise WrongFrame(f"{told} if the gyro is in the world frame. Name the body rates, or leave them out.")
@@ -197,8 +190,12 @@ def _check_by_thrust(
     if lean[best] + fits[best] > lean["as given"] + fits["as given"] + 6.0 * SURE and lean[best] > 0.5:
         raise WrongQuaternion(
             f"{given} leans where the drone accelerates if it is {best} (correlation {lean[best]:.2f}), and not as "
-            f"given ({lean['as given']:.2f}). We need w x y z, from body to world. {_FIXES[best]}"
+            f"given ({lean['as given']:.2f}). We need w x y z, from body to world: {_fix(best)}."
         )
+
+
+def _fix(hypothesis: str) -> str:
+    return ", and ".join(_FIXES[part] for part in hypothesis.split(", "))
 
 
 def _compare(late: Array, early: Array, dt: float, moving: Mask) -> tuple[float, float, float]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from pydantic_core import to_jsonable_python
 
 from torchrl_quad.dynamics import QuadrotorParams
 from torchrl_quad.dynamics.parameters import LIMITS
@@ -121,7 +121,7 @@ class IdentificationResult:
     def report(self) -> dict[str, Any]:
         """Everything but the flights, as plain numbers and strings."""
         names = [f.name for f in dataclasses.fields(self) if f.name not in ("drone", "prior", "flights")]
-        return {name: _plain(getattr(self, name)) for name in names}
+        return {name: to_jsonable_python(getattr(self, name), inf_nan_mode="null") for name in names}
 
     @checked
     def save(self, folder: str | Path, pictures: bool = True) -> Path:
@@ -166,21 +166,19 @@ def draw_prediction(
         windows, flown, seen = predict([log], one, horizon, past, every=horizon)
         count = min(len(windows), round(_SECONDS / horizon))
         time = windows.dt * (windows.start[:count, None].numpy() + np.arange(windows.future + 1))
-        for row, pair in zip(_ROWS, axes, strict=True):
+        for (row, quantity), pair in zip(_ROWS.items(), axes, strict=True):
             for k, ax in enumerate(pair):
+                name = ("roll", "pitch")[k] if row in ("tilt", "body_rate") else "xy"[k]
                 real, guess = (_component(x, row, k)[:count] for x in (seen, flown))
-                if color == BLUE:
+                if color == BLUE:  # the last
+                    ax.set_ylabel(quantity.format(name), fontsize=8)
+                    ax.tick_params(labelsize=7)
+                    ax.grid(alpha=0.3, linewidth=0.5)
                     ax.plot(time.T, real.T, color=INK, linewidth=1.6, alpha=0.55)
                     margin = 0.25 * (real.max() - real.min()) + 1e-3
                     ax.set_ylim(real.min() - margin, real.max() + margin)
                 ax.plot(time.T, guess.T, color=color, linewidth=0.9)
                 ax.plot([], [], color=color, label=label)
-    for (row, label), pair in zip(_ROWS.items(), axes, strict=True):
-        names = ("roll", "pitch") if row in ("tilt", "body_rate") else ("x", "y")
-        for ax, name in zip(pair, names, strict=True):
-            ax.set_ylabel(label.format(name), fontsize=8)
-            ax.tick_params(labelsize=7)
-            ax.grid(alpha=0.3, linewidth=0.5)
     axes[0, 0].plot([], [], color=INK, linewidth=1.6, alpha=0.55, label="flight")
     axes[0, 0].legend(fontsize=7, frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0))
     for ax in axes[-1]:
@@ -223,11 +221,3 @@ def _component(states: RigidBodyState, row: str, k: int) -> Array:
 
 def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

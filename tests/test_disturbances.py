@@ -133,10 +133,7 @@ def test_a_yaml_file_of_distributions_is_read(tmp_path):
         ({"mass": 0.5}, "mass needs one distribution of"),
         ({"mass": {"uniform": [1.0]}}, "mass needs two numbers"),
         ({"mass": {"uniform": [2.0, 1.0]}}, "mass needs two numbers"),
-        (
-            {"mass": {"uniform": [-0.1, 1.0]}},
-            "drones that may be drawn are not all possible: .* 'mass' must be between",
-        ),
+        ({"mass": {"uniform": [-0.1, 1.0]}}, "drones that may be drawn are not all possible: .*'mass' must be between"),
         ({"mass": {"normal": [0.5, 0.2]}}, "not all possible"),
         ({"mass": {"normal": [0.5, -0.1]}}, "mass needs two numbers, mean and standard deviation"),
         ({"rotor_spin": {"scale": [-1, 1]}}, "unknown field 'rotor_spin'"),

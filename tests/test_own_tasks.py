@@ -64,18 +64,8 @@ class UnfinishedEnv(QuadrotorEnv):
     ("name", "cls", "error", "message"),
     [
         ("Window", CornerEnv, ValueError, "small letters, digits and underscores, such as 'window'; got 'Window'"),
-        (
-            "hovering",
-            CornerEnv,
-            ValueError,
-            "is torchrl_quad.envs.hovering.HoveringEnv already. Choose another name for",
-        ),
-        (
-            "x",
-            CornerEnv(num_envs=1),
-            TypeError,
-            "a subclass of QuadrotorEnv, itself and not an instance; got CornerEnv",
-        ),
+        ("hovering", CornerEnv, ValueError, "is torchrl_quad.envs.hovering.HoveringEnv already. Choose another name"),
+        ("x", CornerEnv(num_envs=1), TypeError, "subclass of QuadrotorEnv, itself and not an instance; got CornerEnv"),
         ("x", dict, TypeError, "a subclass of QuadrotorEnv, itself and not an instance; got the class dict"),
         ("x", UnfinishedEnv, TypeError, "UnfinishedEnv lacks initial_state, is_crash, is_success, reward_terms. docs/"),
     ],

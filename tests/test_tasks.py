@@ -74,18 +74,12 @@ def test_a_large_curve_gets_a_box_that_holds_it():
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        (
-            {"curve": "square"},
-            "curve must be one of slow_circle, fast_circle, lemniscate, or a function .*, got 'square'",
-        ),
+        ({"curve": "square"}, "curve must be one of slow_circle, fast_circle, lemniscate, or a .* got 'square'"),
         ({"curve": lambda p: p}, "needs a period in seconds"),
         ({"curve": "slow_circle", "period": -1.0}, "period must be at least 0.1, got -1.0"),
         ({"curve": lambda p: p, "period": 5.0}, r"from shape \(2, 257\) it made \(2, 257\), torch.float32"),
         ({"curve": lambda p: torch.stack((p, p, p), 1), "period": 5.0}, r"it made \(2, 3, 257\)"),
-        (
-            {"curve": lambda p: torch.stack((p, p, p), -1).double(), "period": 5.0},
-            "both torch.float32; .* torch.float64",
-        ),
+        ({"curve": lambda p: torch.stack((p, p, p), -1).double(), "period": 5.0}, "both torch.float32.* torch.float64"),
         ({"curve": lambda p: [math.cos(p), 0, 1], "period": 5.0}, "it failed: "),
         ({"curve": lambda p: [p, p, p], "period": 5.0}, "it made a list"),
         ({"curve": lambda p: torch.stack((p, p, p + 1), -1), "period": 5.0}, "not periodic: .* moves by 10.9 m"),
@@ -312,14 +306,8 @@ def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):
         ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1]]}, "one start before each gate, got 1 for 2"),
         ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1], [9, 9, 1]]}, r"within 0.2 m of \[9.0, 9.0, 1.0\]"),
         ({"gates": [[0, 0, 0.1], [1, 1, 0.1]]}, "not all inside the box"),
-        (
-            {"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": 0},
-            "track: gate_radius must be at least 0.01, got 0. Of all gates",
-        ),
-        (
-            {"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": float("inf")},
-            "track: gate_radius must be a finite number, got inf",
-        ),
+        ({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": 0}, "gate_radius must be at least 0.01, got 0. Of all gates"),
+        ({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": math.inf}, "gate_radius must be a finite number, got inf"),
     ],
 )
 def test_a_track_that_nobody_can_fly_is_refused(track, message):

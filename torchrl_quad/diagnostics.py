@@ -99,14 +99,13 @@ def audit_reward(
 ) -> RewardAudit:
     """Find out which terms of a reward have a gradient, and how much each adds to the return and to its gradient.
 
-    It works for rollouts of any differentiable TorchRL environment. A verdict holds for this rollout alone. Start it
-    where all terms are paid, and make it longer than the delay between an action and its effect.
+    A verdict holds for this rollout alone, of any differentiable environment. Start it where all terms are paid, and
+    make it longer than the delay between an action and its effect.
 
     Args:
         rollout: (*, horizon) with its graph, as ``differentiable_rollout`` returns it.
-        inputs: to differentiate with respect to. The actor or a loss of it mean the actor's parameters; tensors that
-            the reward depends on are taken as they are. ``rollout["action"]`` means the actions before TorchRL stacked
-            them.
+        inputs: to differentiate with respect to: the actor or a loss, for the actor's parameters, or tensors.
+            ``rollout["action"]`` means the actions before TorchRL stacked them.
         gamma: discount of the returns, from 1 at the start of each episode in the rollout.
         terms_key: the weighted terms by name, each (*, horizon, 1); or a reward that is a single term.
         reward_key: their sum, (*, horizon, 1).
@@ -115,7 +114,6 @@ def audit_reward(
 
     Raises:
         ValueError: an entry is missing, the terms do not add up to the reward, or it does not depend on the inputs.
-        TypeError: the rollout is no tensordict, or the inputs are no tensors.
         RuntimeError: the rollout has lost its graph.
     """
     check_tensordict("audit_reward", rollout)
@@ -182,12 +180,7 @@ def compare_gradients(loss: PathwiseLoss, rollout: TensorDictBase) -> GradientCo
     both are means over environments. Without one of them, as with BPTT, its norm and the cosine are NaN. ABPT samples
     actions for this, as its loss does. ``clip_action_gradient`` is not applied. No ``.grad`` changes.
 
-    Args:
-        loss: a loss of the actor that flew the rollout.
-        rollout: (*, horizon) with its graph.
-
     Raises:
-        TypeError: ``loss`` is no pathwise loss, or the rollout no tensordict.
         RuntimeError: the rollout has lost its graph.
     """
     _check_loss(loss)
@@ -250,7 +243,7 @@ def gradient_by_horizon(
     Args:
         env: any differentiable TorchRL environment.
         actor: the policy of the loss.
-        loss: BPTTLoss, SHACLoss, ABPTLoss or another pathwise loss.
+        loss: any pathwise loss.
         horizons: numbers of control steps.
         start: a reset tensordict of at least two environments; ``env.reset()`` by default.
         max_envs: as for :func:`gradient_statistics`, whose errors it raises.

@@ -71,7 +71,6 @@ def differentiable_rollout(
     Raises:
         ValueError: the rollout is larger than the memory; the actor reads an entry that is missing, or a transform
             overwrites or leaves out a part of the state.
-        TypeError: an argument is no environment, no TensorDictModule or no tensordict.
     """
     check_env(env)
     check_actor(actor, "actor")
@@ -196,14 +195,12 @@ class DifferentiableCollector(BaseCollector):
         env: any differentiable environment, also under transforms; or a function that builds it.
         policy: a TensorDictModule that writes the action.
         frames_per_batch: control steps of all environments together in a batch, a multiple of their number.
-        total_frames: control steps of all environments together with which the iteration ends; -1 for never. The batch
-            that reaches them is the last.
+        total_frames: control steps of all environments together after which no batch begins; -1 for no end.
         restart_fraction: the share of flights that each batch gives up for a fresh start; see :func:`restart`.
         exploration_type: RANDOM samples the policy, DETERMINISTIC takes its mode.
 
     Attributes:
-        carry: the tensordict from which the next batch starts; None resets the environment. It may be set, such as to
-            ``buffer.initial_state(env, 0.9)`` of a :class:`VisitedStateBuffer`.
+        carry: the tensordict from which the next batch starts, which may be set; None resets the environment.
     """
 
     init_random_frames = 0

@@ -112,7 +112,6 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
             fraction: the share of horizons that start in visited states, a probability for each member of the batch.
 
         Raises:
-            ValueError: the environment's states differ in kind from the buffer's.
             RuntimeError: the buffer is empty.
         """
         check_env(env)

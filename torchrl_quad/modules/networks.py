@@ -85,9 +85,8 @@ def make_actor(
 
     Raises:
         ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one; the
-            number of scales is not that of the entries; the first action is not strictly inside the bounds; the network
-            has more than 100 million weights; or an option has the wrong type or is out of its range.
-        TypeError: ``env`` is no environment.
+            number of scales is not that of the entries; the first action is not strictly inside the bounds; or the
+            network has more than 100 million weights.
     """
     spec, first = first_action(env, action_init, "make_actor")
     size = spec.shape[-1]
@@ -116,11 +115,9 @@ def make_value(
     the body frame.
 
     Args:
-        env: as for :func:`make_actor`, and so are its errors.
+        env, activation, input_scale: as for :func:`make_actor`, and so are the errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
         in_keys: the entries that it reads, each (*, k), in a list: ["observation"].
-        activation: of the hidden layers.
-        input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``.
     """
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
     return Critic(net, in_keys=list(in_keys))
@@ -142,11 +139,9 @@ def make_qvalue(
     wrong; an ``action_scale`` below one makes it rely on the state first.
 
     Args:
-        env: as for :func:`make_actor`, and so are its errors.
+        env, activation, input_scale: as for :func:`make_actor`, and so are the errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
         in_keys: the entries that it reads, each (*, k), in a list: ["observation"].
-        activation: of the hidden layers.
-        input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``.
         action_scale: the action is multiplied by this.
     """
     in_keys = [*in_keys, "action"]

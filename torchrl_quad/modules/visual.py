@@ -67,7 +67,7 @@ def make_visual_actor(
 
     TorchRL's ConvNet reads the inverse of the depth, 1 / max(depth, 0.3 m), which weights near depths most. A
     multi-layer perceptron reads its features and the vectors; its output goes to TorchRL's GRUModule, and both outputs
-    to the head. What is not described here is as for :func:`~torchrl_quad.make_actor`.
+    to the head, as in :func:`~torchrl_quad.make_actor`.
 
     The policy of a recurrent network also reads ``recurrent_state`` (*, 1, hidden_size) and ``is_init`` (*, 1), and
     writes ``("next", "recurrent_state")``. Environments of this package that fly without transforms hand the memory on,
@@ -87,11 +87,7 @@ def make_visual_actor(
         hidden_size: numbers in that memory.
         activation: of convolutions and hidden layers.
         input_scale: the vectors are multiplied by this; a number, or one for each of ``in_keys``.
-        action_init: as for :func:`~torchrl_quad.make_actor`.
-        scale_init: the standard deviation of the policy's noise at the start, before the tanh.
-        learn_scale: whether this noise changes with the state and in training.
-        noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise.
-        return_log_prob: whether it also writes the log-probability of the action.
+        action_init, scale_init, learn_scale, noise_correlation, return_log_prob: as for ``make_actor``.
 
     Raises:
         ValueError: the environment has no such image; or as for :func:`~torchrl_quad.make_actor`.

@@ -136,11 +136,9 @@ class ABPTLoss(PathwiseCriticLoss):
         return is_first, is_first & (end | (index == self.simulated_steps - 1))
 
     def _check_rollout(self, tensordict: TensorDictBase) -> None:
-        actor, key = self.actor_network, self.tensor_keys.action
-        if key not in actor.out_keys:
-            raise UserValueError(
-                f"ABPTLoss samples {key!r} of its actor_network, which writes {', '.join(map(str, actor.out_keys))}."
-            )
+        key, written = self.tensor_keys.action, self.actor_network.out_keys
+        if key not in written:
+            raise UserValueError(f"ABPTLoss samples {key!r} of its actor_network, which writes {written}.")
         super()._check_rollout(tensordict)
 
     def _beside_actions(self, tensordict: TensorDictBase) -> Tensor | float:

@@ -61,12 +61,8 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
 
     The values are those of the rollout as long as the policy has not changed. The gradients reach the policy's
     parameters alone, neither earlier states nor the noise. A memory is built up again from that at the start.
-    Actions within 1e-6 of a bound count as if they were that far from it.
-
-    Args:
-        actor: the policy that flew the rollout.
-        params: its parameters.
-        tensordict: the rollout (*), with all that the policy wrote.
+    Actions within 1e-6 of a bound count as if they were that far from it. ``tensordict`` is the rollout (*), with all
+    that the policy wrote.
 
     Raises:
         NotImplementedError: the policy is another one than these build, whose noise is not known.
@@ -107,8 +103,7 @@ def median_length(length: Tensor) -> Tensor:
 class MedianClip(nn.Module):
     """Shortens gradients (*, k) that are longer than ``factor`` times the running median of their lengths.
 
-    The gradient of one tumbling drone can outweigh all others. One that is not finite becomes zero, and counts as
-    shortened. ``decay`` is that of the running median in each call; a factor of 1 to 5 is usual.
+    One that is not finite becomes zero, and counts as shortened. ``decay`` is that of the running median in each call.
     """
 
     def __init__(self, factor: float, decay: float = 0.9) -> None:

@@ -18,10 +18,7 @@ from torchrl_quad.objectives.pathwise import PathwiseLoss
 
 
 class PathwiseCriticLoss(PathwiseLoss):
-    """A pathwise loss with a critic, whose value ends each segment and which learns TD(lambda) targets.
-
-    A subclass names its critic network and says what it predicts.
-    """
+    """A pathwise loss with a critic, whose value ends each segment and which learns TD(lambda) targets."""
 
     @dataclass
     class _AcceptedKeys(PathwiseLoss._AcceptedKeys):
@@ -58,9 +55,7 @@ class PathwiseCriticLoss(PathwiseLoss):
         and the horizon's last step bootstraps unless it terminated. The critic's loss reads the targets if they are
         there, so that several critic steps share them, and computes them otherwise.
 
-        Args:
-            tensordict: a rollout (*, horizon); its graph is not needed. The targets (*, horizon, 1) are written under
-                the tensor key ``value_target``.
+        The rollout is (*, horizon); its graph is not needed. The targets are (*, horizon, 1).
         """
         self._check_rollout(tensordict)
         data = tensordict.detach()
@@ -72,10 +67,7 @@ class PathwiseCriticLoss(PathwiseLoss):
         return tensordict.set(self.tensor_keys.value_target, target)
 
     def _critics(self, tensordict: TensorDictBase, *, target: bool = False, learning: bool = False) -> Tensor:
-        """The prediction of each critic or of its target: (critics, *, 1).
-
-        It has a gradient in what the critics read, and none in their parameters; where they learn, the other way round.
-        """
+        """The prediction of each critic or of its target, (critics, *, 1); for ``learning`` see ``predict``."""
         network = getattr(self, self.critic_name)
         params = getattr(self, f"{'target_' if target else ''}{self.critic_name}_params")
         key = getattr(self.tensor_keys, self.prediction_key)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Self, cast
 
 import torch
@@ -28,10 +28,9 @@ MOST_WEIGHTS = 100_000_000  # of all copies of a critic; more fit into no memory
 class PathwiseLoss(LossModule):
     """Base of the losses that differentiate the return of a rollout through the environment's own dynamics.
 
-    A rollout is a tensordict of batch size (*, horizon) that still carries its graph. An episode that ends inside the
-    horizon splits it into segments, whose discounts start at 1. The objective J of a rollout sums over its segments,
-    and the loss is -J, averaged over environments. ``make_value_estimator(gamma=...)`` sets the discount, 0.99 by
-    default.
+    An episode that ends inside the horizon splits a rollout (*, horizon) into segments, whose discounts start at 1. The
+    objective J sums over the segments, and the loss is -J, averaged over environments.
+    ``make_value_estimator(gamma=...)`` sets the discount, 0.99 by default.
 
     Args:
         actor_network: the policy that flew the rollout.
@@ -47,9 +46,8 @@ class PathwiseLoss(LossModule):
         reduction: mean or sum over environments (over samples for a critic), or none.
 
     Raises:
-        TypeError: a network is not a TensorDictModule, or an argument is unknown.
-        ValueError: an option has the wrong type or is out of its range; (in use) the rollout has no time dimension,
-            lacks an entry, or is on another device.
+        TypeError: a network is not a TensorDictModule.
+        ValueError: (in use) the rollout has no time dimension, lacks an entry, or is on another device.
         RuntimeError: (in use) the rollout has lost its graph, or lacks the log-probability that the bonus needs.
     """
 
@@ -61,12 +59,9 @@ class PathwiseLoss(LossModule):
         reward: NestedKey = "reward"
         done: NestedKey = "done"
         terminated: NestedKey = "terminated"
-        sample_log_prob: NestedKey | None = None
-
-        def __post_init__(self) -> None:
-            if self.sample_log_prob is None:
-                aggregated = composite_lp_aggregate(nowarn=True)
-                self.sample_log_prob = "sample_log_prob" if aggregated else "action_log_prob"
+        sample_log_prob: NestedKey = field(
+            default_factory=lambda: "sample_log_prob" if composite_lp_aggregate(nowarn=True) else "action_log_prob"
+        )
 
     tensor_keys: Any  # each loss has its own
     default_keys = _AcceptedKeys
@@ -76,7 +71,7 @@ class PathwiseLoss(LossModule):
 
     out_keys = ["loss_actor", "n_step_return"]  # pyrefly: ignore[bad-override-mutable-attribute]  # as in TorchRL
     value_part: str | None = None  # the part of the objective that comes from a critic
-    # What is measured of the gradients in single actions. Where anything is, the policy learns from these gradients.
+    # What is measured of the gradients in single actions; if anything is, the policy learns from these.
     measured_of_actions: list[str] = []
 
     actor_network: TensorDictModule

@@ -33,8 +33,7 @@ class TrustRegion:
             optimizer.step()
 
     Args:
-        actor: the policy, which writes ``loc`` and ``scale`` as those of :func:`~torchrl_quad.make_actor` do. The bound
-            is on these normal distributions, before the tanh.
+        actor: a policy of :func:`~torchrl_quad.make_actor`; the bound is on its normal distributions before the tanh.
         max_kl: the largest divergence of an update, 0.01 to 0.1 are usual; null for no bound, which measures nothing.
         min_scale: the least standard deviation that the divergence is computed with. A policy whose noise the gradient
             has taken away could otherwise not move at all within a bound.
@@ -44,8 +43,8 @@ class TrustRegion:
         metrics: ``kl``, the divergence of the last update before it was shortened; empty without a bound.
 
     Raises:
-        ValueError: (in use) the rollout has no ``loc`` and ``scale``.
         TypeError: the actor is no such policy.
+        ValueError: (in use) the rollout has no ``loc`` and ``scale``.
     """
 
     def __init__(

@@ -9,10 +9,11 @@ READY := $(VENV)/.ready
 train: $(READY)
 	$(BIN)/python recipes/abpt.py $(ARGS)
 
-# Lint, and run all fast tests.
+# Lint, check types, and run all fast tests.
 test: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/pyrefly check
 	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal -m "not slow"
 
 # Build the documentation site; open docs/_build/html/index.html.

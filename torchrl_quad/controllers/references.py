@@ -172,10 +172,9 @@ def plan_lap(gates: Tensor, drone: QuadrotorParams, gate_radius: float) -> Lap:
     """Plan the quickest lap through gates (g, 3) [m] that leaves some thrust and body rate to the feedback.
 
     A quadrotor is differentially flat (Mellinger and Kumar 2011): a path with the acceleration a and the jerk j asks
-    for the thrust m |a + g| and, where the heading is free, for the body rate |(a + g) x j| / |a + g|^2. The
-    coefficients of the path, the times of the gates and the period minimise the period, and a penalty on what breaks
-    the limits of the drone or passes a gate too far from its centre. L-BFGS does it in double precision, from the
-    smoothest path through all centres; half a second for four gates. The path lies near to the best, not at it.
+    for the thrust m |a + g| and, where the heading is free, for the body rate |(a + g) x j| / |a + g|^2. L-BFGS finds
+    the path, the times of the gates and the period that minimise the period, and a penalty on what breaks the limits
+    of the drone or misses the centre of a gate, from the smoothest path through all centres: near the best.
     """
     low = {name: value.detach().double().amin().item() for name, value in drone.fields().items()}
     centres = gates.detach().double().cpu()

@@ -23,12 +23,7 @@ class PointMass(ControlledModel):
     physics step turns the attitude with the commanded rate, then moves velocity and position (semi-implicit Euler). It
     flies commands that the rotors of the drone may not reach.
 
-    Args:
-        nominal: the drone whose weight and limits scale the action.
-        dt: physics step, 1e-6 to 0.1 s.
-        substeps: physics steps in a control step, 1 to 200.
-        integrator: must be "semi_implicit_euler".
-        control: what an action commands, as :func:`~torchrl_quad.dynamics.make_controller` takes it; not rotors.
+    The arguments are those of :class:`~torchrl_quad.dynamics.Quadrotor`.
 
     Raises:
         ValueError: another integrator is asked for, or actions command rotors.

@@ -74,16 +74,12 @@ def parse(content: bytes, source: str) -> Any:
         return _Loader(text).get_single_data()
     except yaml.YAMLError as error:
         raise UserValueError(f"{source}: not a YAML file: {' '.join(str(error).split())}") from error
-    except _Refused as error:
+    except UserValueError as error:
         raise UserValueError(f"{source}: {error}") from None
 
 
-class _Refused(Exception):
-    """What a file says is YAML, but no setting needs it."""
-
-
 class _Loader(yaml.SafeLoader):
-    """Plain values, each written once."""
+    """Plain values, each written once; what is YAML, but no setting needs, is a UserValueError."""
 
     yaml_implicit_resolvers = {}  # those of YAML 1.1 read 1:30 as 90 and 010 as 8, in time that grows with the square
     depth = 0
@@ -92,12 +88,12 @@ class _Loader(yaml.SafeLoader):
         event = self.peek_event()
         line = event.start_mark.line + 1
         if isinstance(event, yaml.AliasEvent):
-            raise _Refused(f"line {line} uses the alias *{event.anchor}. Write the values out instead.")
+            raise UserValueError(f"line {line} uses the alias *{event.anchor}. Write the values out instead.")
         if event.tag is not None:
-            raise _Refused(f"line {line} uses the tag {shown(event.tag)}. Write the value without it.")
+            raise UserValueError(f"line {line} uses the tag {shown(event.tag)}. Write the value without it.")
         self.depth += 1
         if self.depth > MAX_DEPTH + 1:  # the innermost is no list or mapping
-            raise _Refused(f"nests more than {MAX_DEPTH} lists or mappings. Write it flatter.")
+            raise UserValueError(f"nests more than {MAX_DEPTH} lists or mappings. Write it flatter.")
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
@@ -108,15 +104,15 @@ class _Loader(yaml.SafeLoader):
             name = self.construct_object(key, deep=True) if isinstance(key, yaml.ScalarNode) else None
             line = key.start_mark.line + 1
             if not isinstance(name, str):
-                raise _Refused(f"line {line} names a value by {shown(name)}, and a name must be a word.")
+                raise UserValueError(f"line {line} names a value by {shown(name)}, and a name must be a word.")
             if name in found:
-                raise _Refused(f"line {line} names {shown(name)} for the second time. Leave one of them out.")
+                raise UserValueError(f"line {line} names {shown(name)} for the second time. Leave one of them out.")
             found[name] = self.construct_object(value, deep=True)
         return found
 
     def construct_number(self, node: yaml.ScalarNode) -> int | float:
         if len(node.value) > MAX_DIGITS:
-            raise _Refused(f"line {node.start_mark.line + 1} has a number of {len(node.value)} digits.")
+            raise UserValueError(f"line {node.start_mark.line + 1} has a number of {len(node.value)} digits.")
         text = node.value.lower().replace(".inf", "inf").replace(".nan", "nan")
         if text.startswith(("0x", "0o")):
             return int(text, 0)

@@ -31,10 +31,8 @@ class Quadrotor(ControlledModel):
     """The quadrotor as environments fly it: an implementation of :class:`~torchrl_quad.dynamics.Dynamics`.
 
     Args:
-        nominal: the drone that the flight controller is built for.
         dt: physics step, 1e-6 to 0.1 s.
         substeps: physics steps in a control step, 1 to 200.
-        integrator: how the rigid body moves on in a physics step.
         control: what an action commands, as :func:`~torchrl_quad.dynamics.make_controller` takes it.
     """
 

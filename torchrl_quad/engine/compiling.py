@@ -7,14 +7,14 @@ import os
 import shutil
 import types
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 Function = Callable[..., tuple[Tensor, ...]]
+Call = tuple[Function, Sequence[Any], Sequence[Any]]  # with its inputs and outputs
 
 
 def has_compiler() -> bool:
@@ -52,23 +52,26 @@ class Compiled:
         given = {name: x for name, x in options.items() if name not in ("mode", "options", "backend")}
         keywords: dict[str, Any] = {"fullgraph": True, "dynamic": False, **given, "backend": self._compile}
         self.checked = torch.compile(_own(method), **keywords, options={"guard_filter_fn": _watched})
-        self.last: tuple[Function, Sequence[Any], Sequence[Any]] | None = None  # call of what was compiled
-        self.direct: _Direct | None = None
+        self.last: Call | None = None  # of what was compiled
+        self.direct: Function | None = None
 
     def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Check everything, and call."""
         self.direct = None
+        collects = gc.isenabled()
+        gc.disable()  # an eighth of a compilation went by finding that its graphs are in use
         try:
-            with _no_collection():
-                outputs = self.checked(*inputs)
-            self.direct = None if self.last is None else _Direct.of(self.last, inputs, outputs)
+            outputs = self.checked(*inputs)
+            self.direct = None if self.last is None else _direct(self.last, inputs, outputs)
         finally:
             self.last = None  # it holds tensors
+            if collects:
+                gc.enable()
         return outputs
 
     def again(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Call on the assumptions of the last call, with tensors of the same shapes, strides and types."""
-        return self(*inputs) if self.direct is None else self.direct(inputs)
+        return self(*inputs) if self.direct is None else self.direct(*inputs)
 
     def _compile(self, graph: torch.fx.GraphModule, examples: list[Tensor], **_: Any) -> Function:
         if self.backend is None:
@@ -84,51 +87,29 @@ class Compiled:
         return call
 
 
-class _Direct:
-    """What a call has compiled, with the places of the function's own inputs and outputs among those of the graph."""
+def _direct(last: Call, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> Function | None:
+    """What a call has compiled, on the function's own inputs and outputs, wherever they are among those of the graph.
 
-    def __init__(self, function: Function, template: list[Any], places: list[int | None], results: list[int]) -> None:
-        self.function, self.template, self.places, self.results = function, template, places, results
+    None where their places are not unique, as when one tensor is given twice.
+    """
+    function, taken, given = last
+    place = {id(x): i for i, x in enumerate(taken)}
+    source = {id(x): i for i, x in enumerate(given)}
+    if not all(id(x) in source for x in outputs) or len({id(x) for x in inputs}) < len(inputs):
+        return None
+    places, results = [place.get(id(x)) for x in inputs], [source[id(x)] for x in outputs]
+    own = set(places)
+    template = [None if i in own else x for i, x in enumerate(taken)]
 
-    @classmethod
-    def of(
-        cls, last: tuple[Function, Sequence[Any], Sequence[Any]], inputs: Sequence[Tensor], outputs: Sequence[Tensor]
-    ) -> _Direct | None:
-        """None where the places are not unique, as when one tensor is given twice."""
-        function, taken, given = last
-        place = {id(x): i for i, x in enumerate(taken)}
-        source = {id(x): i for i, x in enumerate(given)}
-        known = all(id(x) in source for x in outputs) and len({id(x) for x in inputs}) == len(inputs)
-        if not known:
-            return None
-        places = [place.get(id(x)) for x in inputs]
-        own = set(places)
-        return cls(
-            function,
-            [None if i in own else x for i, x in enumerate(taken)],
-            places,
-            [source[id(x)] for x in outputs],
-        )
-
-    def __call__(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        values = self.template.copy()
-        for i, x in zip(self.places, inputs, strict=True):
+    def call(*inputs: Tensor) -> tuple[Tensor, ...]:
+        values = template.copy()
+        for i, x in zip(places, inputs, strict=True):
             if i is not None:
                 values[i] = x
-        outputs = self.function(*values)
-        return tuple([outputs[i] for i in self.results])
+        outputs = function(*values)
+        return tuple([outputs[i] for i in results])
 
-
-@contextmanager
-def _no_collection() -> Iterator[None]:
-    """Without the garbage collector: an eighth of a compilation went by finding that its graphs are in use."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
+    return call
 
 
 def _own(method: types.MethodType) -> types.MethodType:

@@ -59,13 +59,8 @@ def fly(
 ) -> TensorDict:
     """A rollout (n, steps) with its graph, through the ends of episodes.
 
-    Args:
-        stepper: steps the simulation.
-        source: of noise and starts.
-        policy: reads the observation, or the state, and writes the action.
-        state: where it begins.
-        tensordict: what a reset or a step wrote about that state.
-        steps: at least one.
+    It begins at ``state``, about which a reset or a step wrote ``tensordict``. The policy reads the observation, or the
+    state, and writes the action.
     """
     state, valid = stepper.simulation.guard(state)
     loop, acts = _Loop(stepper, source, policy, tensordict), _plain(stepper, policy)

@@ -26,12 +26,7 @@ class Flight(NamedTuple):
 
 
 class Stepper:
-    """Steps a simulation, on entries or on rows.
-
-    Args:
-        simulation: what happens in a step.
-        options: keywords of ``torch.compile``; None for an eager step.
-    """
+    """Steps a simulation, on entries or on rows; ``options`` are those of ``torch.compile``, None for eager."""
 
     def __init__(self, simulation: Simulation, options: dict[str, Any] | None = None) -> None:
         self.simulation, self.options = simulation, options
@@ -91,10 +86,7 @@ class Stepper:
         ``learns``, to be switched off for a backward pass that wants no gradient of the policy's weights.
 
         Args:
-            policy: acts inside the step.
-            start: where it begins.
-            valid: where that state is meaningful, bool (n); elsewhere the episode ends with the first step.
-            steps: at least one.
+            valid: where the start is meaningful, bool (n); elsewhere the episode ends with the first step.
             noise: gives what each disturbance has drawn for the next step, by name.
             restarted: from the end of a step where to continue, and who restarts, bool (n); None if nobody does.
             before: what the policy has written in the step before.
@@ -223,7 +215,7 @@ class _Horizon(torch.autograd.Function):
 
 
 class _Policy:
-    """The policy of one pass over a horizon, on lists of tensors; backwards it gathers the gradient of its weights."""
+    """The policy of one pass over a horizon; backwards it gathers the gradient of its weights."""
 
     def __init__(self, horizon: Horizon, learns: bool = True) -> None:
         self.learns = learns

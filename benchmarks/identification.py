@@ -1,4 +1,4 @@
-"""Fit simulated flights whose truth is known, and see how near the fit comes, and whether its intervals hold the truth.
+"""Fit simulated flights whose truth is known: how close does the fit come, and do its intervals hold the truth?
 
 python benchmarks/identification.py            # ten flights: minutes; writes results/identification.csv
 python benchmarks/identification.py --seeds 1
@@ -30,7 +30,7 @@ from torchrl_quad.identification import FlightLog, identify
 STEP = 0.001  # [s], of the simulated truth
 CONTROL = 2  # steps of the on-board controller's loop: 500 Hz
 SAMPLE = 10  # steps between samples of the log: 100 Hz
-WANTED = {  # how near the fit shall come
+WANTED = {  # how close the fit should come
     "k2/m": 0.01,
     "motor_time_constant": 0.05,
     "arm k2/Jx": 0.03,
@@ -82,13 +82,8 @@ def simulate_flight(
     controller = make_controller({"mode": "velocity", "max_speed": 4.0}, believed)
     rotors = Rotors(drone)
     hover = (drone.mass * drone.gravity / (4.0 * drone.thrust_map[:1])).sqrt().expand(1, 4)
-    state = QuadrotorState(
-        *(
-            torch.tensor([x], dtype=torch.float64)
-            for x in ([0.0, 0.0, 2.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
-        ),
-        hover.clone(),
-    )
+    still = ([0.0, 0.0, 2.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    state = QuadrotorState(*(torch.tensor([x], dtype=torch.float64) for x in still), hover.clone())
     lag = round(motors.delay / STEP)
     queue, rows, load = [], [], 1.0
     push = dither = torch.zeros(1, 4, dtype=torch.float64)
@@ -182,33 +177,19 @@ def fit(seed: int, seconds: float = 20.0) -> list[dict[str, object]]:
     result = identify(log, start(seed, truth), {"mass": float(truth.mass)})
     took, wall = time.process_time() - begun, time.perf_counter() - clock
     found = {**result.parameters, **result.ratios, "stream_delay": result.stream_delay[log.name]}
+    if "motor_time_constant.rising" in found:
+        found["motor_time_constant"] = found["motor_time_constant.rising"]
     rows = []
     for name, value in truths(truth).items():
+        row: dict[str, object] = {"seed": seed, "parameter": name, "truth": value}
+        rows.append(row)
         if name not in found:
-            name_of = name if name != "motor_time_constant" else "motor_time_constant.rising"
-            if name_of not in found:
-                rows.append({"seed": seed, "parameter": name, "truth": value, "reason": "not identifiable"})
-                continue
-            found[name] = found[name_of]
+            row["reason"] = "not identifiable"
+            continue
         x = found[name]
-        low, high = result.bootstrap.get(name, (math.nan, math.nan))
-        rows.append(
-            {
-                "seed": seed,
-                "parameter": name,
-                "truth": value,
-                "value": x["value"],
-                "low": x["low"],
-                "high": x["high"],
-                "holds": int(x["low"] <= value <= x["high"]),
-                "bootstrap_low": low,
-                "bootstrap_high": high,
-                "error": x["value"] - value,
-                "relative": x["value"] / value - 1.0,
-                "cpu_s": took,
-                "wall_s": wall,
-            }
-        )
+        row |= {key: x[key] for key in ("value", "low", "high")} | {"holds": int(x["low"] <= value <= x["high"])}
+        row["bootstrap_low"], row["bootstrap_high"] = result.bootstrap.get(name, (math.nan, math.nan))
+        row |= {"error": x["value"] - value, "relative": x["value"] / value - 1.0, "cpu_s": took, "wall_s": wall}
     return rows
 
 

@@ -53,9 +53,10 @@ def command_line(arguments: Iterable[str]) -> list[str]:
         _check_depth(argument)
     if any(argument.startswith("loss._target_=") for argument in arguments):
         arguments = [re.sub(r"^loss\.", "++loss.", argument) for argument in arguments]  # the files lack its options
-    asked = [argument.removeprefix("task=") for argument in arguments if argument.startswith("task=")]
-    for name in {*TASKS, *re.findall(r"[\w.]+", " ".join(asked))}:
-        if name in asked or name in available_tasks() or "." in name:  # others are words of a sweep, such as choice
+    asked = ",".join(argument.removeprefix("task=") for argument in arguments if argument.startswith("task="))
+    for name in {*TASKS, *re.findall(r"[\w.]+", asked)}:
+        # Other names are words of a sweep, such as choice(hovering, racing).
+        if name in asked.split(",") or name in available_tasks() or "." in name:
             node = {"task": name, "env": defaults(task_class(name))}
             ConfigStore.instance().store(group="task", name=name, node=node, package="_global_")
     return arguments

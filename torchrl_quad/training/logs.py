@@ -24,15 +24,10 @@ NOT_IN_A_NAME = ("task=", "seed=", "resume=", "device=", "threads=", "logger.")
 
 
 class Logs:
-    """The log of a run: ``add`` a row, ``show`` pictures, ``finish`` with the summary.
+    """The log of a run: ``add`` a row, ``show_flight``, ``finish`` with the summary.
 
-    Args:
-        cfg: the configuration.
-        folder: where the files go.
-        revision: of the code, for wandb.
-        rows: of metrics.csv so far; tensorboard forgets what it was given later.
-        metrics: of the task, for wandb.
-        saved: the logger's state in the checkpoint from which the run continues, in the same wandb run.
+    ``rows`` are those of metrics.csv so far, ``metrics`` the task's. ``saved`` is the logger's state in the checkpoint
+    from which the run continues, in the same wandb run; tensorboard forgets what it was given later.
     """
 
     def __init__(

@@ -2,10 +2,10 @@
 
 python benchmarks/deployment.py --checkpoints outputs/.../checkpoint.pt ...
 
-Each policy is exported as it is, and once more as the same policy behind an ObservationNormalizer. Fresh flights, other
-than those of the export, give the observations. A time is the median over single calls from Python. That of C holds
-what ctypes takes, and the bundle's everything from the named quantities to newtons and radians per second. Without
-checkpoints, the policies are untrained. Writes ``benchmarks/results/deployment.csv``.
+Each policy is exported as it is, and once more behind an ObservationNormalizer. Fresh flights give the observations. A
+time is the median over single calls from Python: of C with what ctypes takes, of the bundle from the named quantities to
+newtons and radians per second. Without checkpoints, the policies are untrained.
+Writes ``benchmarks/results/deployment.csv``.
 """
 
 import argparse
@@ -52,14 +52,14 @@ def normalized(env: EnvBase, actor: TensorDictModuleBase) -> EnvBase:
     """The environment behind a normaliser; the first layer of the policy changes so that it does the same as before."""
     env = TransformedEnv(env, ObservationNormalizer(env))
     env.transform.update(fly(env.base_env, actor))
-    network, normalizer = actor[0][0].module.trunk if sees(actor) else actor[0].module, env.transform
+    network, normalizer = actor[0][0].module.trunk if is_visual(actor) else actor[0].module, env.transform
     first, size = network.mlp[0], len(normalizer.loc)  # the observation is the last that it reads
     first.bias.add_(first.weight[:, -size:] @ (network.scales[-1] * normalizer.loc))
     first.weight[:, -size:].mul_(normalizer.scale)
     return env
 
 
-def sees(actor: TensorDictModuleBase) -> bool:
+def is_visual(actor: TensorDictModuleBase) -> bool:
     """Whether a policy reads images."""
     return "depth" in actor.in_keys
 
@@ -101,13 +101,13 @@ def measure(source: str, with_normalizer: bool, count: int, calls: int) -> dict[
         library = Path(name) / "policy.so"
         subprocess.run([*GCC, str(folder / "policy.c"), "-o", str(library), "-lm"], check=True)
         policy = ctypes.CDLL(str(library)).policy_action
-    by_onnx = bundle._session.run(None, raw)[0]
+    by_onnx = bundle.graphs["policy"](raw)["action"]
     by_c, pointer = np.empty((count, 4), np.float32), ctypes.POINTER(ctypes.c_float)
     for *x, y in zip(*raw.values(), by_c, strict=True):
         ends = [z.ctypes.data_as(pointer) for z in (*x, y)]
         policy(*ends)
     still = {"position": [1.0, 0.0, 1.4], "quaternion": [1.0, 0, 0, 0], "velocity": np.zeros(3)}
-    image = {"depth": raw["depth"][0], "depth_age": 0.0} if sees(actor) else {}
+    image = {"depth": raw["depth"][0], "depth_age": 0.0} if is_visual(actor) else {}
     state = {**still, "angular_velocity": np.zeros(3), "age": 0.0, **image}
     return {
         "task": bundle.contract["task"]["name"],

@@ -3,8 +3,8 @@
 python benchmarks/deployment.py --checkpoints outputs/.../checkpoint.pt ...
 
 Each policy is exported as it is, and once more behind an ObservationNormalizer. Fresh flights give the observations. A
-time is the median over single calls from Python: of C with what ctypes takes, of the bundle from the named quantities to
-newtons and radians per second. Without checkpoints, the policies are untrained.
+time is the median over single calls from Python: of C with what ctypes takes, of the bundle from the named quantities
+to newtons and radians per second. Without checkpoints, the policies are untrained.
 Writes ``benchmarks/results/deployment.csv``.
 """
 

@@ -71,14 +71,9 @@ def schema() -> dict[str, Any]:
     return json.loads((resources.files("torchrl_quad.deploy") / "contract.schema.json").read_text())
 
 
-def schema_table(deep: bool = True) -> str:
-    """The fields of the contract with their meaning, and what numbers they may hold, as a table in Markdown.
-
-    Args:
-        deep: whether it also shows the fields of fields.
-    """
-    fields = [(name, entry) for name, entry in _fields(schema()) if deep or "." not in name]
-    rows = [f"| `{name}` | {entry['description']} | {_range(entry)} |" for name, entry in fields]
+def schema_table() -> str:
+    """The fields of the contract with their meaning, and what numbers they may hold, as a table in Markdown."""
+    rows = [f"| `{name}` | {entry['description']} | {_range(entry)} |" for name, entry in _fields(schema())]
     return "\n".join(("| field | meaning | numbers |", "|---|---|---|", *rows))
 
 

@@ -32,7 +32,7 @@ Weight = Annotated[float, between(-1e6, 1e6)]
 # -- types of options --------------------------------------------------------------------------------------------------
 
 
-def _names(keys: Iterable[Any]) -> str:
+def _names(keys: Iterable[object]) -> str:
     return ", ".join(map(str, keys))
 
 
@@ -42,14 +42,14 @@ def _dynamics(value: object) -> object:
     return value
 
 
-def _scene(value: Any) -> Any:
+def _scene(value: Any) -> object:
     try:
         return value if value is None else Scene.of(value)
     except UserValueError as error:
         raise Explained(str(error).removeprefix("scene: ")) from None
 
 
-def _weights(weights: Any) -> Any:
+def _weights(weights: object) -> object:
     if weights is None:
         return None
     if not isinstance(weights, Mapping):
@@ -121,20 +121,20 @@ class EnvConfig:
     """
 
     dynamics: str
-    control: str | Mapping[str, Any]
+    control: str | Mapping[str, object]
     dt: float
     control_dt: float
     action_delay: int
     integrator: str
     observe_last_action: bool
-    random_start: RandomStart | Mapping[str, Any] | None
-    randomize: str | Path | Mapping[str, Any] | None
-    wind: Wind | Mapping[str, Any] | None
-    observation_noise: Sensors | Mapping[str, Any] | None
+    random_start: RandomStart | Mapping[str, object] | None
+    randomize: str | Path | Mapping[str, object] | None
+    wind: Wind | Mapping[str, object] | None
+    observation_noise: Sensors | Mapping[str, object] | None
     observation_delay: int
     disturbances: Sequence[Disturbance]
-    scene: Scene | str | Path | Mapping[str, Any] | None
-    camera: DepthCamera | Mapping[str, Any] | None
+    scene: Scene | str | Path | Mapping[str, object] | None
+    camera: DepthCamera | Mapping[str, object] | None
 
     def __post_init__(self) -> None:
         if not self.takes_control and self.control != "rates":
@@ -213,7 +213,7 @@ def check_compilation(options: Mapping[str, Any]) -> None:
     modes, backends = [None, *torch._inductor.list_mode_options()], torch.compiler.list_backends(())
     settings = torch._inductor.list_options()
 
-    def are_settings(value: Any) -> bool:
+    def are_settings(value: object) -> bool:
         return value is None or (isinstance(value, Mapping) and all(x.replace("-", "_") in settings for x in value))
 
     kinds = {

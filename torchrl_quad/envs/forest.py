@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from torchrl_quad.dynamics import quaternion
+from torchrl_quad.engine.packing import Key
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.config import CameraOption, SceneOption
@@ -213,7 +214,7 @@ class ForestEnv(QuadrotorEnv):
         distance = state["position"][..., :1].clamp(0.0, self.length)
         return {"distance": distance, "flown_speed": along, "clearance": self.scene.nearest(state)[0]}
 
-    def state_bounds(self) -> dict[Any, tuple[float, float]]:
+    def state_bounds(self) -> dict[Key, tuple[float, float]]:
         return {"speed": (0.1, 30.0)}
 
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:

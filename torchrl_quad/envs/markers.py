@@ -62,20 +62,20 @@ class Shape:
         object.__setattr__(self, "faces", faces.long())
 
     @classmethod
-    def line(cls, points: Any, **style: Any) -> Shape:
+    def line(cls, points: object, **style: Any) -> Shape:
         """A line through points (n, 3) [m]."""
         return cls(points, **style)
 
     @classmethod
     @checked
-    def ring(cls, centre: Any, radius: Length, axis: Any = (1.0, 0.0, 0.0), **style: Any) -> Shape:
+    def ring(cls, centre: object, radius: Length, axis: object = (1.0, 0.0, 0.0), **style: Any) -> Shape:
         """A circle around an axis (3), such as a gate."""
         centre, axis = as_points("Shape.ring: centre and axis", [centre, axis]).split(1)
         return cls(rings(centre, axis, radius)[0], **style)
 
     @classmethod
     @checked
-    def box(cls, low: Any, high: Any, **style: Any) -> Shape:
+    def box(cls, low: object, high: object, **style: Any) -> Shape:
         """A box along the axes, from its lowest corner (3) to its highest (3) [m]."""
         low, high = as_points("Shape.box: low and high", [low, high])
         bits = torch.arange(8)[:, None] >> torch.tensor([2, 1, 0]) & 1
@@ -84,19 +84,19 @@ class Shape:
 
     @classmethod
     @checked
-    def sphere(cls, centre: Any, radius: Length, **style: Any) -> Shape:
+    def sphere(cls, centre: object, radius: Length, **style: Any) -> Shape:
         """A ball."""
         angle = torch.linspace(-0.5 * math.pi, 0.5 * math.pi, 13)
         return cls._turned(centre, radius * angle.cos(), radius * angle.sin(), style)
 
     @classmethod
     @checked
-    def cylinder(cls, base: Any, radius: Length, height: Length, **style: Any) -> Shape:
+    def cylinder(cls, base: object, radius: Length, height: Length, **style: Any) -> Shape:
         """An upright cylinder on the centre (3) of its base, such as a tree or a pillar."""
         return cls._turned(base, radius * torch.tensor([0.0, 1, 1, 0]), height * torch.tensor([0.0, 0, 1, 1]), style)
 
     @classmethod
-    def _turned(cls, centre: Any, radii: Tensor, heights: Tensor, style: dict[str, Any], around: int = 24) -> Shape:
+    def _turned(cls, centre: object, radii: Tensor, heights: Tensor, style: dict[str, Any], around: int = 24) -> Shape:
         """The surface that a line (k) of radii and heights sweeps around an upright axis."""
         angle = torch.arange(around) * (2 * math.pi / around)
         x, y = (radii[:, None] * turn for turn in (angle.cos(), angle.sin()))
@@ -107,7 +107,7 @@ class Shape:
         return cls(as_points("Shape: the centre", [centre]) + points, faces, **style)
 
 
-def as_points(what: str, points: Any) -> Tensor:
+def as_points(what: str, points: object) -> Tensor:
     """Points (n, 3) as pictures take them: on the CPU, in single precision, without gradient."""
     found = as_numbers(points)
     if found is None:

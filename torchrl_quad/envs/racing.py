@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.dynamics import presets
+from torchrl_quad.engine.packing import Key
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import terms
 from torchrl_quad.envs.base import QuadrotorEnv
@@ -204,7 +205,7 @@ class RacingEnv(QuadrotorEnv):
     def metrics(self, state: State) -> State:
         return {"gates_passed": state["gates_passed"].to(self.dtype), "lap_time": state["lap_time"]}
 
-    def state_bounds(self) -> dict[Any, tuple[float, float]]:
+    def state_bounds(self) -> dict[Key, tuple[float, float]]:
         counts = {"gates_passed": (0, MAX_STEPS), "pass_step": (-1, MAX_STEPS)}
         return {"gate": (0, len(self.gates) - 1), "lap_time": (0, math.inf), **counts}
 

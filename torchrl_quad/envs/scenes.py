@@ -265,7 +265,7 @@ def drone_radius(params: QuadrotorParams) -> float:
     return (rotors.norm(dim=-1).max() + 0.5 * torch.pdist(rotors).min()).item()
 
 
-def _range(name: str, value: Any, size: int, may_vary: bool) -> tuple[list[float], list[float]]:
+def _range(name: str, value: object, size: int, may_vary: bool) -> tuple[list[float], list[float]]:
     """The least and the greatest value of a field, each a list of so many numbers."""
     one = [(size,), ()] if size == 1 else [(size,)]
     pair = [(2, size), (2,)] if size == 1 else [(2, size)]

@@ -32,6 +32,8 @@ from torchrl_quad.envs.task import Task
 from torchrl_quad.envs.terms import time_terms
 from torchrl_quad.errors import UserValueError
 
+Outputs = dict[str, Any]  # of a step by name; mappings of names hold further ones
+
 
 class ControlStep:
     """Queue the action, fly, disturb, guard, advance the task, judge: a pure function from entries to entries.
@@ -125,7 +127,7 @@ class ControlStep:
         old_terms, discount = env.reward_terms(old), env.event_discount or 1.0
         return time_terms(env.events(before, state), discount, terms, old_terms, terminated)
 
-    def measure(self, state: State) -> dict[str, Any]:
+    def measure(self, state: State) -> Outputs:
         """The outputs that any state has, also the first of an episode."""
         env = self.env
         with torch.no_grad():
@@ -150,7 +152,7 @@ class ControlStep:
 
     # -- where it starts -----------------------------------------------------------------------------------------------
 
-    def at_start(self, state: State) -> dict[str, Any]:
+    def at_start(self, state: State) -> Outputs:
         """All outputs of the first state of an episode, nested; there is no reward yet."""
         no = torch.zeros_like(state["step"], dtype=torch.bool)
         flags = {name: no.clone() for name in ("crash", "terminated", "truncated", "done")}
@@ -158,11 +160,11 @@ class ControlStep:
         terms |= {f"{name}_time": torch.zeros_like(state["position"][:, :1]) for name in self.event_names}
         return {**self.measure(state), "reward_terms": terms, "success": self.env.is_success(state), **flags}
 
-    def reset(self, state: State) -> dict[str, Any]:
+    def reset(self, state: State) -> Outputs:
         """All entries that a reset to a state writes, nested."""
         return {"state": nested(state), **self.at_start(state)}
 
-    def draw_start(self) -> dict[str, Any]:
+    def draw_start(self) -> Outputs:
         """All entries that a reset of all environments writes, nested."""
         env, source = self.env, self.env.initial_state_source
         if source is None:
@@ -210,7 +212,7 @@ class ControlStep:
         own = params is not self.env.nominal
         return tuple(getattr(params, name) for name in self.dynamics.plant_fields) if own else ()
 
-    def example(self) -> tuple[State, dict[str, Any]]:
+    def example(self) -> tuple[State, Outputs]:
         """The safe state and outputs of it."""
         outputs = self.at_start(self.safe_state)
         return self.safe_state, {**outputs, "reward": outputs["observation"][:, :1]}

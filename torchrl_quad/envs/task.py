@@ -110,7 +110,7 @@ class Task(abc.ABC):
         """Measurements in addition to the reward, by name, each (num_envs, 1), without gradient."""
         return {}
 
-    def state_bounds(self) -> dict[Any, tuple[float, float]]:
+    def state_bounds(self) -> dict[Key, tuple[float, float]]:
         """The least and the greatest value of the task's own entries; states beyond them cannot be restored."""
         return {}
 
@@ -201,7 +201,7 @@ def check_task(env: Task, state: State) -> None:
         if not condition:
             raise UserValueError(f"{task}.{message}")
 
-    def kind(x: Any) -> str:
+    def kind(x: object) -> str:
         return f"{tuple(x.shape)}, {x.dtype}" if isinstance(x, Tensor) else type(x).__name__
 
     def check_tensor(method: str, x: Any, dtype: torch.dtype | None, columns: int | None = 1) -> None:

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_quad.engine.packing import Key
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import terms
 from torchrl_quad.envs.base import QuadrotorEnv
@@ -162,7 +163,7 @@ class TrackingEnv(QuadrotorEnv):
         counted = torch.where(settled, state["step"] - self.settling_steps, state["step"]).clamp_min(1)
         return {"position_error": terms.distance(state), "tracking_rmse": (state["squared_error"] / counted).sqrt()}
 
-    def state_bounds(self) -> dict[Any, tuple[float, float]]:
+    def state_bounds(self) -> dict[Key, tuple[float, float]]:
         return {"phase": (0, 2 * math.pi), "squared_error": (0, math.inf)}
 
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:

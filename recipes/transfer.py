@@ -41,7 +41,7 @@ def main() -> None:
         try:
             from torchrl_quad.training.drawing import draw_transfer
         except ImportError as error:
-            what = 'pictures=true needs torch and the extra render: pip install ".[render]"'
+            what = 'pictures=true needs torch and the extra recipes: pip install ".[recipes]"'
             raise MissingPackage(f"{what} ({error})") from error
     bundle = load_bundle(cfg["bundle"], on_fault="hover")
     bundle.check()

@@ -31,6 +31,7 @@ from torchrl_quad.deploy import (
 )
 from torchrl_quad.envs import TASKS
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.training.drawing import environment_beside
 
 ROOT = Path(__file__).parent.parent
 
@@ -336,7 +337,7 @@ def test_the_package_imports_its_parts_when_they_are_asked_for():
 # -- recipe and page ---------------------------------------------------------------------------------------------------
 
 
-def test_the_recipe_exports_the_best_policy_of_a_run_with_its_results(train, launch, refused, tmp_path):
+def test_the_recipe_exports_the_best_policy_of_a_run_with_its_results(train, launch, refused, tmp_path, export_once):
     train("bptt", tmp_path, "normalize=true", "task=forest", "env.camera={width: 6, height: 5}", "env.density=0.02")
     printed = launch("export", f"checkpoint={tmp_path}/checkpoint.pt")
     assert re.search(r"policy: flies forest; its actions differ by at most \d\.\de-0[6-9]", printed)
@@ -345,6 +346,8 @@ def test_the_recipe_exports_the_best_policy_of_a_run_with_its_results(train, lau
     assert about["results"] == {key: summary[key] for key in about["results"]}
     assert about["origin"]["checkpoint_sha256"] == contract.sha256((tmp_path / "checkpoint.pt").read_bytes())
     assert about["memory"] > 0 and about["camera"]["range"] == 10.0
+    assert environment_beside(load_bundle(tmp_path / "policy")).camera.width == 6
+    assert environment_beside(load_bundle(export_once("hovering")[2])) is None
     assert "cannot fly this bundle of the task 'forest': its policy reads images, and they have no camera" in refused(
         "transfer", f"bundle={tmp_path}/policy", "simulator=torchrl_quad"
     )

@@ -204,7 +204,7 @@ def test_a_transfer_without_a_film_still_gets_its_page(broken_ffmpeg, monkeypatc
     monkeypatch.setattr(drawing, "as_rollout", lambda flight: env.rollout(3))
     broken_ffmpeg("killed later")
     (tmp_path / "transfer.mp4").touch()
-    bundle = SimpleNamespace(contract={"control_dt": 0.02})
+    bundle = SimpleNamespace(contract={"control_dt": 0.02}, folder=tmp_path)
     drawing.draw_transfer(bundle, "mujoco", "contract", tmp_path / "transfer")
     assert {"transfer.gif", "transfer.html"} == {path.name for path in tmp_path.glob("transfer.*")}
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)

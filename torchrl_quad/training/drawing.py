@@ -22,11 +22,14 @@ from torchrl.envs import EnvBase
 from torchrl_quad import QuadrotorEnv
 from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.deploy import Bundle
+from torchrl_quad.deploy.contract import sha256
 from torchrl_quad.deploy.transfer import as_rollout, fly
 from torchrl_quad.errors import UserError
 from torchrl_quad.files import check_place
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, write_replay
 from torchrl_quad.render.video import NoFfmpeg
+from torchrl_quad.training.building import build_env
+from torchrl_quad.training.evaluation import load_policy
 
 EXPLAINED = (UserError, OSError, ImportError, MemoryError)
 
@@ -47,20 +50,30 @@ def publish_flight(flight: TensorDictBase, figure: Path, page: Path, env: EnvBas
         write_replay(flight, page, env=env, title=title)
 
 
-def draw_transfer(
-    bundle: Bundle, simulator: str, loop: str, path: Path, env: EnvBase | None = None, drones: int = 4
-) -> None:
-    """Film a bundle in our simulator and in another one, side by side, and write a page that plays both together."""
+def draw_transfer(bundle: Bundle, simulator: str, loop: str, path: Path, drones: int = 4) -> None:
+    """Film a bundle in our simulator and in another one, side by side, and write a page that plays both together.
+
+    The task's markers are in the pictures if the checkpoint that was exported lies beside the bundle.
+    """
     ways = (("torchrl_quad", "contract"), (simulator, loop))
     flights = [fly(bundle, name, how, episodes=drones) for name, how in ways]
     ours, theirs = map(as_rollout, flights)
     labels = tuple(flight["simulator"] for flight in flights)
-    about = {"env": env, "control_dt": bundle.contract["control_dt"]}
+    about = {"env": environment_beside(bundle), "control_dt": bundle.contract["control_dt"]}
     _film(path, ours, beside=theirs, labels=labels, **about)
     title = f"drones 1 to {drones}: {labels[0]}; {drones + 1} to {2 * drones}, from the same starts: {labels[1]}"
     page = path.with_suffix(".html")
     with _or_without(page):
         write_replay(cast("TensorDict", torch.cat((ours, theirs))), page, title=title, **about)
+
+
+def environment_beside(bundle: Bundle) -> EnvBase | None:
+    """The environment of the checkpoint beside a bundle, if it was exported from there and its task has a name."""
+    checkpoint = bundle.folder.resolve().parent / "checkpoint.pt"
+    with contextlib.suppress(UserError, OSError):
+        if sha256(checkpoint.read_bytes()) == bundle.contract["origin"].get("checkpoint_sha256"):
+            return build_env(load_policy(checkpoint)[0], 1, 0)
+    return None
 
 
 def draw_learning_curve(metrics: Path, path: Path, env: EnvBase) -> None:

@@ -12,7 +12,29 @@ import pytest
 from torchrl_quad.files import machine
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+PUBLISHED = "camera throughput memory time_to_solve profile deployment controllers identification identified_training"
 SMALL = "num_envs=4 horizon=4 env.max_episode_steps=20 compile=false"
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Runs a benchmark in this process, where it starts quicker; gives its rows. ``change`` sees the module before."""
+
+    def run(name, arguments, change=lambda module: None):
+        output = tmp_path / "results.csv"
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("OMP_NUM_THREADS", "1")
+        monkeypatch.syspath_prepend(BENCHMARKS)
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments.split(), "--output", str(output)])
+        module = importlib.import_module(name)
+        change(module)
+        module.main()
+        with open(output, newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert all(row["machine"] and row["torch"] for row in rows)
+        return rows
+
+    return run
 
 
 @pytest.mark.parametrize(
@@ -36,69 +58,38 @@ SMALL = "num_envs=4 horizon=4 env.max_episode_steps=20 compile=false"
     ],
 )
 @pytest.mark.usefixtures("quick_fits")
-def test_a_benchmark_writes_a_table(name, arguments, rows, tmp_path, monkeypatch):
-    output = tmp_path / "results.csv"
-    monkeypatch.chdir(tmp_path)
+def test_a_benchmark_writes_a_table(name, arguments, rows, run, tmp_path, monkeypatch):
     (tmp_path / "flights").mkdir()
     for flight in ("circle", "figure8"):  # one to fit, and one that judges
         (tmp_path / f"flights/{flight}.csv.gz").symlink_to(BENCHMARKS.parent / "examples/data/figure8.csv.gz")
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments.split(), "--output", str(output)])
-    module = importlib.import_module(name)  # in this process, though some start others
-    if hasattr(module, "identify"):
-        monkeypatch.setattr(
-            module, "identify", functools.partial(module.identify, fields=["linear_drag"], iterations=1, draws=2)
-        )
-    module.main()
-    with open(output, newline="") as file:
-        results = list(csv.DictReader(file))
-    assert len(results) == rows
-    assert all(row["machine"] and row["torch"] for row in results)
+
+    def quicker(module):
+        if hasattr(module, "identify"):
+            quick = functools.partial(module.identify, fields=["linear_drag"], iterations=1, draws=2)
+            monkeypatch.setattr(module, "identify", quick)
+
+    assert len(run(name, arguments, quicker)) == rows
 
 
-def test_the_benchmark_of_exported_policies_writes_a_table(tmp_path, monkeypatch):
-    """In this process, where it starts quicker."""
-    output = tmp_path / "results.csv"
-    arguments = ["--checkpoints", "racing", "--observations", "20", "--calls", "2", "--output", str(output)]
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    monkeypatch.setattr(sys, "argv", ["deployment.py", *arguments])
-    module = importlib.import_module("deployment")
-    monkeypatch.setattr(module, "make_env", functools.partial(module.make_env, max_episode_steps=40))
-    module.main()
-    with open(output, newline="") as file:
-        rows = list(csv.DictReader(file))
+def test_the_benchmark_of_exported_policies_writes_a_table(run, monkeypatch):
+    def shorter(module):
+        monkeypatch.setattr(module, "make_env", functools.partial(module.make_env, max_episode_steps=40))
+
+    rows = run("deployment", "--checkpoints racing --observations 20 --calls 2", shorter)
     assert [row["normalizer"] for row in rows] == ["False", "True"]
     assert all(float(row[pair]) <= 1e-5 for row in rows for pair in ("torch - ONNX", "torch - C", "ONNX - C"))
 
 
-def test_the_benchmark_of_controllers_writes_a_table(tmp_path, monkeypatch):
-    output = tmp_path / "results.csv"
-    arguments = ["--tasks", "hovering", "--starts", "2", "--mpc-starts", "1", "--steps", "2", "--calls", "1"]
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    monkeypatch.setattr(sys, "argv", ["controllers.py", *arguments, "--output", str(output)])
-    module = importlib.import_module("controllers")
-    module.main()
-    with open(output, newline="") as file:
-        rows = list(csv.DictReader(file))
+def test_the_benchmark_of_controllers_writes_a_table(run):
+    rows = run("controllers", "--tasks hovering --starts 2 --mpc-starts 1 --steps 2 --calls 1")
     assert [row["policy"] for row in rows] == ["geometric", "mpc"]
+    module = importlib.import_module("controllers")
     assert module.table(rows).count("\n") == 3
 
 
 def test_the_results_that_are_published_name_their_machine():
     published = list((BENCHMARKS / "results").glob("*.csv"))
-    assert {path.stem for path in published} >= {
-        "camera",
-        "throughput",
-        "memory",
-        "time_to_solve",
-        "profile",
-        "deployment",
-        "controllers",
-        "identification",
-        "identified_training",
-        "real_flights",
-    }
+    assert {path.stem for path in published} >= {*PUBLISHED.split(), "real_flights"}
     for path in published:
         with open(path, newline="") as file:
             assert all(row["machine"] for row in csv.DictReader(file))

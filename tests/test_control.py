@@ -91,8 +91,8 @@ def test_no_command_asks_more_of_a_rotor_than_it_can_give(drone):
 @each_drone
 def test_the_saturated_mixer_has_exact_derivatives(drone):
     controller = controller_of(drone)
-    setpoint = setpoints(controller, 20, 3.0)
-    weight, rate = controller.nominal.mass * controller.nominal.gravity, controller.nominal.max_body_rate
+    setpoint, rate = setpoints(controller, 20, 3.0), controller.nominal.max_body_rate
+    weight = controller.nominal.mass * controller.nominal.gravity
 
     def commanded(thrust, rates):
         return speeds(controller, Setpoint(thrust * weight, rates * rate)) / controller.hover_speed

@@ -14,10 +14,6 @@ from torchrl_quad.errors import UserValueError, shown
 VISFLY = {name: value.squeeze().tolist() for name, value in load_drone("visfly").fields().items()}
 
 
-def test_the_four_presets_are_there():
-    assert available_drones() == ["crazyflie", "flightmare", "small_racer", "visfly"]
-
-
 @pytest.mark.parametrize("name", available_drones())
 def test_every_preset_can_hover_and_reach_its_commanded_thrust(name):
     params = load_drone(name)
@@ -61,34 +57,21 @@ def test_a_bad_file_is_refused_with_its_field_and_what_is_allowed(tmp_path, chan
         load_drone(path)
 
 
-def test_an_unknown_preset_lists_the_known_ones():
-    with pytest.raises(
-        ValueError, match="Unknown drone 'visflu'. Choose from: crazyflie, flightmare, small_racer, visfly"
+def test_what_is_no_drone_is_refused_by_name(tmp_path):
+    assert available_drones() == ["crazyflie", "flightmare", "small_racer", "visfly"]
+    (tmp_path / "list.yaml").write_text("- 1\n- 2\n")
+    (tmp_path / "bad.yaml").write_text("mass: [1")
+    for drone, message in (
+        ("visflu", "Unknown drone 'visflu'. Choose from: crazyflie, flightmare, small_racer, visfly"),
+        (tmp_path / "list.yaml", "expected a mapping of names to values, got list"),
+        (tmp_path / "bad.yaml", "bad.yaml: not a YAML file"),
     ):
-        load_drone("visflu")
-
-
-def test_a_file_that_is_no_mapping_is_refused(tmp_path):
-    path = tmp_path / "list.yaml"
-    path.write_text("- 1\n- 2\n")
-    with pytest.raises(ValueError, match="expected a mapping of names to values, got list"):
-        load_drone(path)
-
-
-def test_a_file_that_is_missing_or_no_yaml_is_named(tmp_path):
+        with pytest.raises(ValueError, match=message):
+            load_drone(drone)
     with pytest.raises(FileNotFoundError, match="No drone file at .*none.yaml. Choose from: crazyflie"):
         load_drone(tmp_path / "none.yaml")
-    (tmp_path / "bad.yaml").write_text("mass: [1")
-    with pytest.raises(ValueError, match="bad.yaml: not a YAML file"):
-        load_drone(tmp_path / "bad.yaml")
-
-
-def test_rotors_that_cannot_turn_the_drone_are_refused():
     with pytest.raises(ValueError, match="cannot make thrust and torque about each axis"):
         HoveringEnv(num_envs=1, drone=load_drone().replace(rotor_spin=[1.0, 1.0, 1.0, 1.0]))
-
-
-def test_replacing_an_unknown_field_lists_the_known_ones():
     with pytest.raises(ValueError, match="QuadrotorParams has no field 'weight'. Choose from: mass,"):
         load_drone().replace(weight=1.0)
 
@@ -108,17 +91,20 @@ def test_gradients_flow_through_replace_to_and_construction():
     assert not params.detach().mass.requires_grad
 
 
+def test_a_drone_shows_itself_as_a_table_with_units():
+    drone = load_drone("crazyflie")
+    lines = str(drone.replace(mass=torch.tensor([[0.02], [0.03]], requires_grad=True))).splitlines()
+    assert lines[0] == "QuadrotorParams" and len(lines) == 1 + len(drone.fields()) + 1
+    shown = {label.strip(): value for label, value in (line.strip().split("  ", 1) for line in lines[1:])}
+    assert shown["mass [kg]"].strip() == "0.02 to 0.03 over 2 drones"
+    assert shown["inertia [kg m2]"].strip() == "3.7e-05, 3.2e-05, 5.3e-05"
+    assert shown["rotor_positions [m]"].strip().startswith("(0.028072, 0.028072), (-0.028072, ")
+    assert "speed_per_volt=519.0" in shown["motor_command"]
+
+
 NO_NUMBERS = [True, np.True_, [True, 1.0, 1.0], "1", b"1", "", [], [[1.0], [1.0, 2.0]], 10**400, 10**6000, float("nan")]
-NO_NUMBERS += [
-    functools.reduce(lambda inner, _: [inner], range(5000), 1.0),
-    {},
-    object(),
-    1j,
-    np.array(["1"]),
-    torch.tensor(True),
-    torch.tensor(1j),
-    torch.zeros(0),
-]
+NO_NUMBERS += [functools.reduce(lambda inner, _: [inner], range(5000), 1.0), {}, object(), 1j, np.array(["1"])]
+NO_NUMBERS += [torch.tensor(True), torch.tensor(1j), torch.zeros(0)]
 
 
 @pytest.mark.parametrize("value", NO_NUMBERS, ids=lambda value: shown(value)[:20])

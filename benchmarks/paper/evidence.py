@@ -9,7 +9,7 @@ Three statistics carry most claims:
 Each is a ``Part`` with a bootstrap over seeds and over sets of starts. All runs are judged from the same starts, so
 seeds alone cannot tell what other starts would give. ``reproduce starts`` flies policies from many sets. A draw of the
 bootstrap takes one set for all methods, and shifts each by as much as its policy returned more from that set than from
-all of them. What two methods have in common of this leaves their difference alone.
+all of them. A shift that two methods share does not change their difference.
 """
 
 from __future__ import annotations
@@ -67,8 +67,7 @@ class Starts:
     def shift(self, task: str, algorithm: str, name: str, starts: int = 256) -> Shift | None:
         """How far each set of so many starts shifts a column: that of a policy of the method, drawn from those flown.
 
-        Where none of the method was flown it is that of any other; None where nobody has flown the task from several
-        sets, or the column was not measured.
+        If none of the method was flown it is that of any other method; None if the column of the task is unknown.
         """
         rows = [row for row in self.rows if row["task"] == task and row.get(name)]
         rows = [row for row in rows if row["algorithm"] == algorithm] or rows
@@ -214,7 +213,7 @@ class Results:
 def bootstrap(
     what: str, statistic: Callable[..., np.ndarray], *samples: np.ndarray, low=-math.inf, high=math.inf
 ) -> Part:
-    """Compute a statistic of samples over seeds, and its bootstrap, which draws each sample by itself.
+    """Compute a statistic of samples over seeds, and its bootstrap, which draws each sample separately.
 
     The statistic takes samples (*, seeds) and gives numbers (*). A draw takes one set of starts for all
     samples that are ``judged``.

@@ -29,7 +29,7 @@ from torchrl_quad.training.configuration import CONFIG
 from torchrl_quad.training.evaluation import drawing_from, evaluate, load_policy
 
 METHODS = {name: name.upper() for name in ("bptt", "shac", "abpt", "sapo", "ahac")} | {"hybrid": "Hybrid", "ppo": "PPO"}
-TASKS = {  # what is shown of each beside the solved episodes: column, factor, digits, unit
+TASKS = {  # what is shown of each with the solved episodes: column, factor, digits, unit
     "hovering": ("position_error", 100, 1, "cm"),
     "tracking": ("tracking_rmse", 100, 1, "cm"),
     "landing": ("landing_speed", 1, 2, "m/s"),
@@ -214,7 +214,7 @@ POLICIES = {  # recipe, and what differs from what it ships with
     "ppo, four times as long": ("ppo", ["total_steps=11_520_000"]),
 }
 SPEEDS, DIFFICULTIES = (2.0, 4.0, 6.0, 8.0), ("easy", "middle", "hard")
-FORESTS, FIRST_FOREST = 256, 3_000_000  # seed of their random numbers: nobody trains or chooses in them
+FORESTS, FIRST_FOREST = 256, 3_000_000  # seed of their random numbers: in no training or choice
 CHUNK = 50  # control steps between looks at who still flies
 PATIENCE = 2.0  # times the way at the commanded speed, in which a flight must be over
 

@@ -69,7 +69,7 @@ def flown_on(
 def return_of(env: EnvBase, loss: objectives.PathwiseLoss, start: TensorDictBase, steps: int) -> Tensor:
     """Fly the action in ``start`` (envs), and then the policy, with the same noise in each call: the discounted return.
 
-    Noise that is correlated in time goes on from ``start["noise"]``, if it is there.
+    Noise that is correlated in time continues from ``start["noise"]``, if there is one.
 
     Returns:
         (envs), up to the end of the episode, or of the steps.

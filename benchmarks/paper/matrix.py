@@ -62,7 +62,7 @@ VARIANTS = {
     "shac-xu": Variant(
         "shac", "SHAC as in Xu et al. 2022", ("loss.target_bootstrap=true", "loss.average_over_horizon=true")
     ),
-    # Ablation. Without visited states each horizon goes on where the last one ended, or starts afresh in part.
+    # Ablation. Without visited states each horizon continues the last one; with restarts some are reset.
     "abpt-no-0-step": Variant("abpt", "ABPT without 0-step return", ("loss.zero_step_return=false",)),
     "abpt-no-n-step": Variant("abpt", "ABPT without N-step return", ("loss.n_step_return=false",)),
     "abpt-restarts": Variant("abpt", "ABPT, restarts instead of visited states", ("buffer.fraction=null",)),

@@ -2,8 +2,8 @@
 
 The conventions are those of Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical
 precipice": interquartile means, percentile intervals of the bootstrap, and the probability that one method improves on
-another. The bootstrap draws seeds and a set of starts (evidence.py); of tasks that were not flown from many sets, seeds
-alone.
+another. The bootstrap draws seeds and a set of starts (evidence.py); of tasks that were not flown from many sets, only
+seeds.
 """
 
 from __future__ import annotations
@@ -193,7 +193,7 @@ def in_order(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
 
 
 def metric_of(task: str) -> tuple[str, float, int, str]:
-    """What is shown of a task beside the solved episodes: of one of your own the metric that its class names first."""
+    """What is shown of a task with its solved episodes: of a task of your own the first metric that its class names."""
     if task in flights.TASKS:
         return flights.TASKS[task]
     name = flights.VARIANTS.get(task, [f"task={task}"])[0].removeprefix("task=")

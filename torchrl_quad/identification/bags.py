@@ -19,7 +19,7 @@ from torchrl_quad.identification.signals import Stream
 __all__ = ["MAGIC", "read_bag"]
 
 MAX_DEFINITION = 100_000  # characters
-# What the messages of a type hold. Poses first: in motion capture they come along with odometry.
+# What the messages of a type hold; the first type counts. Motion capture often sends odometry as well as poses.
 _TYPES: dict[str, dict[str, tuple[str, str]]] = {
     "geometry_msgs/msg/PoseStamped": {
         "position": ("pose.position", ".x .y .z"),
@@ -29,21 +29,20 @@ _TYPES: dict[str, dict[str, tuple[str, str]]] = {
         "position": ("transform.translation", ".x .y .z"),
         "quaternion": ("transform.rotation", ".x .y .z .w"),
     },
+    "sensor_msgs/msg/Imu": {
+        "angular_velocity": ("angular_velocity", ".x .y .z"),
+        "acceleration": ("linear_acceleration", ".x .y .z"),
+    },
     "nav_msgs/msg/Odometry": {
         "position": ("pose.pose.position", ".x .y .z"),
         "quaternion": ("pose.pose.orientation", ".x .y .z .w"),
         "velocity_body": ("twist.twist.linear", ".x .y .z"),  # its twist is in the frame of the child: the body
         "angular_velocity": ("twist.twist.angular", ".x .y .z"),
     },
-    "sensor_msgs/msg/Imu": {
-        "angular_velocity": ("angular_velocity", ".x .y .z"),
-        "acceleration": ("linear_acceleration", ".x .y .z"),
-    },
     "sensor_msgs/msg/BatteryState": {"battery_voltage": ("voltage", "")},
     "mav_msgs/msg/Actuators": {"motor_command": ("normalized", "[0] [1] [2] [3]")},
     "actuator_msgs/msg/Actuators": {"motor_command": ("normalized", "[0] [1] [2] [3]")},
 }
-_PREFERRED = {"angular_velocity": "sensor_msgs/msg/Imu"}
 _NUMBERS = {
     "bool": "?", "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
     "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
@@ -102,34 +101,27 @@ def _layout(topics: Mapping[str, str], columns: str | Layout | Mapping[str, obje
     if columns is not None and not isinstance(columns, Mapping):
         return choose(columns, None)
     given = columns or {}
-    candidates: dict[str, list[str]] = {}
-    for message, quantities in _TYPES.items():
-        for topic in sorted(topic for topic, kind in topics.items() if kind == message):
-            for quantity in quantities:
-                candidates.setdefault(quantity, []).append(topic)
-    if "position" in given or "quaternion" in given:  # the caller means the pose of that topic only
-        for quantity in ("position", "quaternion", "velocity_body"):
-            candidates.pop(quantity, None)
-    if "velocity" in given:
-        candidates.pop("velocity_body", None)
+    named = set(given)
+    if named & {"position", "quaternion"}:  # the caller means the pose of that topic only
+        named |= {"position", "quaternion", "velocity_body"}
+    if "velocity" in named:
+        named.add("velocity_body")
     found: dict[str, tuple[Columns, ...]] = {}
     onboard = BY_IMU
-    for quantity, choices in candidates.items():
-        if quantity in given:
-            continue
-        best = [t for t in choices if topics[t] == _PREFERRED.get(quantity)] or choices
-        kind = topics[best[0]]
-        best = [t for t in best if topics[t] == kind]
-        stem, parts = _TYPES[kind][quantity]
-        names = [f"{best[0]}.{stem}{part}" for part in parts.split(" ")]
-        if len(best) > 1:
-            raise MissingColumns(
-                f"{name} has several topics for {quantity}: {', '.join(best)}. Say which: "
-                f'columns={{"{quantity}": [{", ".join(names[:2])}, ...]}}.'
-            )
-        if quantity == "angular_velocity" and kind == "nav_msgs/msg/Odometry":  # whose clock is that of its pose
-            onboard = tuple(field for field in BY_IMU if field != quantity)
-        found[quantity] = (Columns(tuple(names)),)
+    for message, quantities in _TYPES.items():
+        own = sorted(topic for topic, kind in topics.items() if kind == message)
+        for quantity, (stem, parts) in quantities.items():
+            if not own or quantity in named or quantity in found:
+                continue
+            names = tuple(f"{own[0]}.{stem}{part}" for part in parts.split(" "))
+            if len(own) > 1:
+                raise MissingColumns(
+                    f"{name} has several topics for {quantity}: {', '.join(own)}. Say which: "
+                    f'columns={{"{quantity}": [{", ".join(names[:2])}, ...]}}.'
+                )
+            if quantity == "angular_velocity" and message == "nav_msgs/msg/Odometry":  # whose clock is that of its pose
+                onboard = tuple(field for field in BY_IMU if field != quantity)
+            found[quantity] = (Columns(names),)
     if not found and not given:
         raise MissingColumns(f"{name} has no topic of a known type. {_there(topics)}")
     return choose(given, Layout(found, ROS, onboard))

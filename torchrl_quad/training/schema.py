@@ -138,6 +138,7 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "iterations": (Size, ""),
     "draws": (Count, "Of the bootstrap over windows; 0 for none."),
 }
+PROGRAMS = {"logs": "identify", "folder": "export", "checkpoint": "evaluate"}  # by a setting that only they have
 IDENTIFYING = {"horizon": (Positive, ""), "folder": (str, "The folder to write.")}  # of identify.py, under these names
 # -- what is declared elsewhere ----------------------------------------------------------------------------------------
 
@@ -178,7 +179,7 @@ IDLE: list[tuple[str, Callable[[Any], bool], str]] = [
 def settings(name: str) -> dict[str, Any]:
     """What the YAML files of a recipe set, without those for a task; of a recipe that is unknown here, of all."""
     config, own = OWN.get(name, (name, {}))
-    if not (CONFIG / f"{config}.yaml").is_file():
+    if config not in {*LOSSES, *PROGRAMS.values()}:
         return plain(OmegaConf.merge(*map(settings, LOSSES)))
     recipe = OmegaConf.load(CONFIG / f"{config}.yaml")
     shared = [OmegaConf.load(CONFIG / f"{x}.yaml") for x in recipe.defaults if x in ("common", "critic")]
@@ -218,7 +219,7 @@ def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
 
 def schema_of(values: dict[str, Any], asked: Mapping[str, str] = MappingProxyType({})) -> type[BaseModel]:
     """The schema of a recipe, with its task and its loss, or of another program in recipes."""
-    for name, program in (("logs", "identify"), ("folder", "export"), ("checkpoint", "evaluate")):
+    for name, program in PROGRAMS.items():
         if name in values:
             return _section(settings(program), SETTINGS | (IDENTIFYING if program == "identify" else {}))
     for name in ("algorithm", "task"):
@@ -227,8 +228,9 @@ def schema_of(values: dict[str, Any], asked: Mapping[str, str] = MappingProxyTyp
     config, own = OWN.get(values["algorithm"], (values["algorithm"], {}))
     known = settings(values["algorithm"])
     kinds: dict[str, tuple[Any, str]] = {"env": (_environment(values), ""), "loss": (dict[str, Any], "")}
-    if config not in LOSSES:  # of a recipe that is somebody's own, in another program
-        return _section(known, SETTINGS | kinds, default=None)
+    if config not in LOSSES:  # of a recipe that is somebody's own, in another program, and may lack what BPTT does
+        must = {name: value for name, value in settings("bptt").items() if name != "restart_fraction"}
+        return _section(known, SETTINGS | kinds, must=must)
     kinds["loss"] = _loss(LOSSES[config], own.get("loss") or {}, values.get("loss"), asked), ""
     # What the tuned file of another recipe sets, which this one starts from, is left alone.
     spare = {name for name in SETTINGS if name.startswith("critic.") and name not in asked}
@@ -240,17 +242,18 @@ def _section(
     kinds: Mapping[str, tuple[Any, str]],
     spare: Collection[str] = (),
     section: str = "",
-    default: Any = ...,
+    must: Mapping[str, Any] | None = None,
 ) -> type[BaseModel]:
-    """The schema of a section that has these settings, which ``default`` makes a must, and may have spare ones."""
+    """The schema of a section that has these settings, all or some of which it must have, and may have spare ones."""
+    must = known if must is None else must
     fields: dict[str, Any] = {}
     more = [name.removeprefix(section) for name in spare if section and name.startswith(section)]
     for key, value in {**dict.fromkeys(more), **known}.items():
         name = section + key
         kind, text = kinds.get(name) or kinds.get(re.sub(r"^(actor|critic)\.", "network.", name)) or (None, "")
         if kind is None and isinstance(value, Mapping):
-            kind = _section(value, kinds, spare, f"{name}.", default)
-        fields[key] = _field(key, kind or Any, text, default if key in known else None)
+            kind = _section(value, kinds, spare, f"{name}.", must.get(key) or {})
+        fields[key] = _field(key, kind or Any, text, ... if key in must else None)
     return create_model(section or "Configuration", __base__=Section, **fields)
 
 

@@ -200,7 +200,7 @@ def test_content_that_does_not_fit_its_configuration_is_refused_in_one_line(trai
         said = refused("abpt", f"resume={path}", "total_steps=240")
         assert f"{path}" in said and "Traceback" not in said, change
     for name in checkpoints.CONTENT:
-        write_own(path, saved, **{name: 0.5})
+        write_own(path, saved, **{name: (1,)})
         with pytest.raises(ValueError, match=f"{path} lacks {name}, or has it in another type"):
             read_checkpoint(path)
 

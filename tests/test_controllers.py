@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.linalg import solve_discrete_are
+from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 from torch import nn
 
@@ -72,12 +73,7 @@ def test_the_geometric_law_is_that_of_the_formulas():
     td = at(env, position=[0.1, -0.2, 0.05], velocity=[0.3, 0.1, -0.2])
     attitude = quaternion.from_axis_angle(torch.tensor([[0.2, -0.1, 0.4]], dtype=env.dtype))
     td["state", "quaternion"] = attitude
-    w, x, y, z = attitude[0].tolist()
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    rotation = Rotation.from_quat(attitude[0].numpy(), scalar_first=True).as_matrix()
     force = -10 * np.array([0.1, -0.2, 0.05]) - 5 * np.array([0.3, 0.1, -0.2]) + np.array([0, 0, 9.81])
     third = force / np.linalg.norm(force)
     second = np.cross(third, [1, 0, 0])
@@ -122,9 +118,8 @@ def test_what_the_planner_predicts_is_what_the_environment_flies(delay):
     td, mpc = env.reset(), MPC(env, horizon=6)
     plan = mpc(td.copy())["plan"].transpose(0, 1)
     now = ActionSequence(torch.cat((plan, plan[-1:].expand(delay, -1, -1)))) if delay else ActionSequence(plan)
-    flown = env.rollout(6 + delay, now, tensordict=td.copy(), auto_reset=False, break_when_any_done=False)[
-        "next", "state"
-    ]
+    flight = env.rollout(6 + delay, now, tensordict=td.copy(), auto_reset=False, break_when_any_done=False)
+    flown = flight["next", "state"]
     start = td["state"] if delay == 0 else flown[:, delay - 1]
     predicted = mpc.predict(mpc.pack(dict(start.items())), plan)
     for t in range(1, 7):
@@ -134,7 +129,7 @@ def test_what_the_planner_predicts_is_what_the_environment_flies(delay):
 def test_a_step_of_gauss_newton_never_raises_the_cost_and_its_derivatives_are_finite_differences():
     env = HoveringEnv(num_envs=3, random_start={"tilt": 1.5, "velocity": 3.0}, seed=1, **DOUBLE)
     mpc, td = MPC(env, horizon=8), env.reset()
-    state = {**dict(td["state"].items())}
+    state = dict(td["state"].items())
     goal, neutral = mpc.goal(state)
     actions = neutral
     states, costs = mpc.predict(mpc.pack(state), actions), []

@@ -31,6 +31,10 @@ def fly(rollout, env, actor, start, steps):
     return flight, torch.autograd.grad(loss, list(actor.parameters()))
 
 
+def torchrls_loop(env):
+    return lambda *args, **kwargs: EnvBase.rollout(env, *args, **kwargs)
+
+
 def entries(flight):
     return dict(flight.items(include_nested=True, leaves_only=True))
 
@@ -42,7 +46,7 @@ def test_the_quick_rollout_is_that_of_torchrl_in_every_entry_and_gradient(task, 
     actor = make_actor(env)
     quick, quick_grad = fly(env.rollout, env, actor, env.reset(), 40)
     env.set_seed(0)
-    slow, slow_grad = fly(lambda *a, **k: EnvBase.rollout(env, *a, **k), env, actor, env.reset(), 40)
+    slow, slow_grad = fly(torchrls_loop(env), env, actor, env.reset(), 40)
     assert quick.names == slow.names and quick.shape == slow.shape
     assert quick["next", "done"].sum() >= 6
     torch.testing.assert_close(entries(quick), entries(slow))
@@ -59,16 +63,11 @@ def test_episodes_that_end_on_the_way_start_anew_from_different_states():
     assert (distances > 0).sum() > 0.9 * distances.numel()
 
 
-def test_a_policy_may_read_the_state():
-    env = HoveringEnv(num_envs=4)
-    actor = make_actor(env, in_keys=["observation", ("state", "rotor_speed")], input_scale=1e-4)
-    start = env.reset()
+def test_a_policy_may_read_the_state_and_any_other_flies_in_torchrls_loop(env):
+    actor, start = make_actor(env, in_keys=["observation", ("state", "rotor_speed")], input_scale=1e-4), env.reset()
     quick, _ = fly(env.rollout, env, actor, start, 5)
-    slow, _ = fly(lambda *a, **k: EnvBase.rollout(env, *a, **k), env, actor, start, 5)
+    slow, _ = fly(torchrls_loop(env), env, actor, start, 5)
     torch.testing.assert_close(entries(quick), entries(slow))
-
-
-def test_any_other_policy_flies_in_torchrls_loop(env):
     hover = env.hover_action.expand(4, 4)
     reads_more = TensorDictModule(lambda x, y: hover, in_keys=["observation", "mine"], out_keys=["action"])
     start = env.reset().set("mine", torch.ones(4, 1))
@@ -153,7 +152,7 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
 
     def train_in_torchrls_loop():
         env.set_seed(0)
-        return fly(lambda *a, **k: EnvBase.rollout(env, *a, **k), env, actor, env.reset(), 22)
+        return fly(torchrls_loop(env), env, actor, env.reset(), 22)
 
     def optimise_actions():
         env.set_seed(0)
@@ -342,5 +341,5 @@ def test_policies_that_somebody_has_changed_are_called():
 def test_a_sequence_of_actions_is_played_once(env):
     sequence = ActionSequence(torch.zeros(5, 4, 4))
     env.rollout(3, sequence, break_when_any_done=False)
-    with pytest.raises(ValueError, match="5 actions, 0 of them unplayed, and the flight wants 1 more"):
+    with pytest.raises(ValueError, match="5 actions, 0 of them unplayed, and the flight needs 1 more"):
         env.rollout(3, sequence, break_when_any_done=False)

@@ -85,17 +85,7 @@ def replace(owner, name, part):
         lambda critic: replace(critic, "module", Doubled(critic.module)),
         lambda critic: replace(critic, "__class__", type("Mine", (ValueOperator,), {})),
     ],
-    ids=[
-        "hook",
-        "backward hook",
-        "dropout",
-        "parameters",
-        "parametrization",
-        "shared layer",
-        "head",
-        "module",
-        "class",
-    ],
+    ids=["hook", "backward", "dropout", "parameters", "parametrization", "shared", "head", "module", "class"],
 )
 def test_a_critic_that_somebody_has_changed_is_called_as_it_is(env, change):
     critic = make_value(env)

@@ -118,9 +118,7 @@ def test_weights_are_copied_from_whatever_form_torchrl_hands_over(form):
 
 def test_wrong_numbers_are_refused_with_what_to_write_instead():
     env = HoveringEnv(num_envs=NUM_ENVS)
-    with pytest.raises(
-        ValueError, match="frames_per_batch=10 must be a multiple of .* 4. Try 8, a horizon of 2 control"
-    ):
+    with pytest.raises(ValueError, match="frames_per_batch=10 must be a multiple of .* 4. Try 8, a horizon of 2"):
         DifferentiableCollector(env, make_actor(env), frames_per_batch=10)
     with pytest.raises(ValueError, match="restart_fraction must be at most 1, got 2"):
         DifferentiableCollector(env, make_actor(env), frames_per_batch=8, restart_fraction=2)

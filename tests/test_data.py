@@ -413,9 +413,7 @@ def test_a_restart_begins_a_fraction_of_the_flights_afresh_and_lets_the_others_g
         assert fresh.float().mean().item() == pytest.approx(fraction, abs=0.06)
         assert (after["state"][~fresh] == carry["state"][~fresh]).all()
         torch.testing.assert_close(after["observation"][~fresh], carry["observation"][~fresh])
-    with pytest.raises(
-        ValueError, match="restart needs the whole state, .'state',., and the carry lacks .'state', 'action_queue'."
-    ):
+    with pytest.raises(ValueError, match="restart needs the whole state, .*, and the carry lacks .*'action_queue'."):
         restart(env, carry.exclude("state"), 0.5)
     with pytest.raises(ValueError, match=r"The carry has batch size \(10,\), and the environment \(1000,\)"):
         restart(env, carry[:10], 0.5)

@@ -178,17 +178,13 @@ def test_a_copy_of_a_loss_computes_the_same(env, way):
 
 def test_networks_and_horizons_that_fit_into_no_memory_are_refused_before_they_are_made(env, monkeypatch):
     actor, value = make_actor(env), make_value(env, [1300, 1300])
-    with pytest.raises(
-        UserValueError, match="64 copies of this value_network have 109,824,064 weights, more than 100,000,000"
-    ):
+    with pytest.raises(UserValueError, match="64 copies of this value_network have 109,824,064 weights, more than 1"):
         SHACLoss(actor, value, num_value_nets=64)
     with pytest.raises(UserValueError, match="horizon must be at most 100000, got 1000000000"):
         differentiable_rollout(env, actor, None, 10**9)
     many = HoveringEnv(num_envs=100_000)
     monkeypatch.setattr("os.sysconf", lambda name: 10**5 if name == "SC_PHYS_PAGES" else 10**4)
-    with pytest.raises(
-        UserValueError, match="of 50 steps of 100,000 environments takes more than 2 GB, and there are 1"
-    ):
+    with pytest.raises(UserValueError, match="of 50 steps of 100,000 environments .* more than 2 GB, and there are 1"):
         differentiable_rollout(many, actor, None, 50)
 
 
@@ -197,18 +193,19 @@ def test_networks_and_horizons_that_fit_into_no_memory_are_refused_before_they_a
 
 def test_an_actor_or_a_carry_of_another_environment_is_refused(env, env64):
     actor = make_actor(env)
-    with pytest.raises(
-        UserValueError, match="was built for entries of 13 numbers, and reads some of 9: those of another"
+    for other, carry, message in (
+        (
+            ForestEnv(num_envs=2, density=0.02),
+            None,
+            "was built for entries of 13 numbers, and reads some of 9: those",
+        ),
+        (env, HoveringEnv(num_envs=2).reset(), r"carry has batch size \(2,\), and the environment \(4,\)"),
+        (env, env64.reset(), "'observation' of the carry is torch.float64 on cpu, and that of the env"),
     ):
-        differentiable_rollout(ForestEnv(num_envs=2, density=0.02), actor, None, 1)
-    with pytest.raises(UserValueError, match=r"carry has batch size \(2,\), and the environment \(4,\)"):
-        differentiable_rollout(env, actor, HoveringEnv(num_envs=2).reset(), 1)
-    with pytest.raises(UserValueError, match="'observation' of the carry is torch.float64 on cpu, and that of the env"):
-        differentiable_rollout(env, actor, env64.reset(), 1)
+        with pytest.raises(UserValueError, match=message):
+            differentiable_rollout(other, actor, carry, 1)
     rollout, _ = differentiable_rollout(env64, make_actor(env64), None, 2)
-    with pytest.raises(
-        UserValueError, match="Critic computes in torch.float32 on cpu, and 'observation' is torch.float64"
-    ):
+    with pytest.raises(UserValueError, match="Critic computes in torch.float32 on cpu, and 'observation' is .*64"):
         SHACLoss(actor, make_value(env)).loss_value(rollout.detach())
 
 

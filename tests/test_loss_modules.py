@@ -26,7 +26,7 @@ from torchrl_quad import (
     make_qvalue,
     make_value,
 )
-from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.errors import UserError
 
 
 @pytest.fixture
@@ -84,8 +84,6 @@ def test_keys_can_be_renamed():
     assert result["loss_actor"] == expected["loss_actor"]
     assert result["loss_value"] == expected["loss_value"]
     assert "goal" in loss.write_value_target(rollout)
-    with pytest.raises(ValueError, match="rewards"):
-        loss.set_keys(rewards="gain")
 
 
 def test_soft_update_moves_the_target_network():
@@ -112,6 +110,7 @@ def test_a_loss_goes_on_from_a_checkpoint_with_its_discounts():
     assert [loss.value_estimator.gamma.item() for loss in loaded.values()] == [0.5] * 3
     actor, value, _ = make_networks()
     one_step = SHACLoss(actor, value).make_value_estimator(ValueEstimators.TD0, gamma=0.5)
+    assert SHACLoss(actor, value).make_value_estimator("TD0", gamma=0.5).value_type is ValueEstimators.TD0
     other = SHACLoss(actor, value)
     other.load_state_dict(one_step.state_dict())
     assert other.value_type is ValueEstimators.TD0 and other.value_estimator.gamma == 0.5
@@ -140,53 +139,78 @@ def test_the_example_of_a_loss_is_short_and_runs(loss):
 
 
 @pytest.mark.parametrize(
-    ("kwargs", "message"),
+    ("name", "options", "message"),
     [
-        ({"alpha": -1.0}, "alpha must be at least 0 or be 'auto', got -1.0. The coefficient of the entropy bonus"),
-        ({"alpha": float("inf")}, "alpha must be a finite number or be 'auto', got inf"),
-        ({"alpha": "automatic"}, "alpha must be a number or be 'auto', got 'automatic'"),
-        ({"alpha": "auto", "alpha_init": 0.0}, "alpha_init must be greater than 0, got 0.0. What alpha=auto starts"),
-        ({"alpha": "auto", "alpha_init": float("nan")}, "alpha_init must be a finite number, got nan"),
-        ({"alpha": "auto", "target_entropy": "low"}, "target_entropy must be a number or be 'auto', got 'low'"),
-        ({"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
-        ({"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
-        ({"n_step_return": "abc"}, "n_step_return must be true or false, got 'abc'. Whether J includes J_N"),
-        ({"zero_step_return": float("nan")}, "zero_step_return must be true or false, got nan"),
-        ({"num_qvalue_nets": 0}, "num_qvalue_nets must be at least 1, got 0. The critics made from it"),
-        ({"num_qvalue_nets": 2.5}, "num_qvalue_nets must be a whole number, got 2.5"),
-        ({"simulated_steps": -1}, "simulated_steps must be at least 0, got -1. Control steps"),
+        (
+            "abpt",
+            {"alpha": -1.0},
+            "alpha must be at least 0 or be 'auto', got -1.0. The coefficient of the entropy",
+        ),
+        ("abpt", {"alpha": float("inf")}, "alpha must be a finite number or be 'auto', got inf"),
+        ("abpt", {"alpha": "automatic"}, "alpha must be a number or be 'auto', got 'automatic'"),
+        ("abpt", {"alpha_init": 0.0}, "alpha_init must be greater than 0, got 0.0. What alpha=auto starts"),
+        ("abpt", {"alpha_init": float("nan")}, "alpha_init must be a finite number, got nan"),
+        ("abpt", {"target_entropy": "low"}, "target_entropy must be a number or be 'auto', got 'low'"),
+        ("abpt", {"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
+        ("abpt", {"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
+        ("abpt", {"n_step_return": "abc"}, "n_step_return must be true or false, got 'abc'. Whether J includes J_N"),
+        ("abpt", {"zero_step_return": float("nan")}, "zero_step_return must be true or false, got nan"),
+        ("abpt", {"num_qvalue_nets": 0}, "num_qvalue_nets must be at least 1, got 0. The critics made from it"),
+        ("abpt", {"num_qvalue_nets": 2.5}, "num_qvalue_nets must be a whole number, got 2.5"),
+        ("abpt", {"simulated_steps": -1}, "simulated_steps must be at least 0, got -1. Control steps"),
+        (
+            "sapo",
+            {"alpha": 0.0},
+            "alpha must be greater than 0 or be 'auto', got 0.0. .* without .* take SHACLoss",
+        ),
+        ("sapo", {"target_entropy": 1.0}, "must be at most -0.001 or be 'auto', got 1.0. .* a negative number"),
+        ("sapo", {"target_entropy": "low"}, "target_entropy must be a number or be 'auto', got 'low'"),
+        ("sapo", {"num_value_nets": 0}, "num_value_nets must be at least 1, got 0"),
+        ("sapo", {"terminal_gradient": "no"}, "terminal_gradient must be true or false, got 'no'"),
+        ("ahac", {"horizon": 4, "min_horizon": 8}, "horizon=4 must lie between min_horizon=8 and max_horizon=8"),
+        ("ahac", {"horizon": 0}, "horizon must be at least 1, got 0. Control steps of the first rollout"),
+        ("ahac", {"max_stiffness": 1.0}, "max_stiffness must be greater than 1, got 1.0. .*1.5 to 5 are usual"),
+        ("ahac", {"horizon_lr": 1.0}, "horizon_lr must be less than 1, got 1.0"),
+        ("hybrid", {"gradient_lmbda": 0.0}, "gradient_lmbda must be greater than 0"),
+        ("hybrid", {"clip_epsilon": 1.0}, "clip_epsilon must be less than 1"),
+        ("hybrid", {"entropy_coeff": -0.1}, "entropy_coeff must be at least 0"),
+        ("hybrid", {"decay": 1.0}, "decay must be less than 1"),
+        ("hybrid", {"average": 3}, "average must be a function, or None; got int"),
     ],
 )
-def test_bad_arguments_say_what_is_allowed(kwargs, message):
-    actor, _, qvalue = make_networks()
-    with pytest.raises(ValueError, match=message):
-        ABPTLoss(actor, qvalue, **kwargs)
+def test_bad_arguments_say_what_is_allowed(name, options, message):
+    actor, value, qvalue = make_networks()
+    cls = {"abpt": ABPTLoss, "sapo": SAPOLoss, "ahac": AHACLoss, "hybrid": HybridLoss}[name]
+    with pytest.raises(UserError, match=message):
+        cls(actor, qvalue if name == "abpt" else value, **options)
 
 
 @pytest.mark.parametrize(
-    ("numbers", "must"),
-    [({"gamma": 2.0}, "at most 1"), ({"gamma": float("nan")}, "a finite number"), ({"lmbda": -0.1}, "at least 0")],
+    ("call", "message"),
+    [
+        (lambda bptt, shac: shac.make_value_estimator(gamma=2.0), "gamma must be at most 1, got 2.0"),
+        (lambda bptt, shac: shac.make_value_estimator(gamma=float("nan")), "gamma must be a finite number, got nan"),
+        (lambda bptt, shac: shac.make_value_estimator(lmbda=-0.1), "lmbda must be at least 0, got -0.1"),
+        (
+            lambda bptt, shac: bptt.make_value_estimator(lmbda=0.9),
+            "BPTTLoss estimates .* TD1, which takes no 'lmbda'",
+        ),
+        (
+            lambda bptt, shac: shac.make_value_estimator(lambda_=0.9),
+            "by TDLambda, which takes no 'lambda_'. Choose",
+        ),
+        (
+            lambda bptt, shac: shac.make_value_estimator("abc"),
+            "not implemented for loss SHACLoss. Choose from: td0",
+        ),
+        (lambda bptt, shac: shac.set_keys(value_target=5), "value_target must be the name of an entry, .*, got 5"),
+        (lambda bptt, shac: shac.set_keys(rewards="gain"), "SHACLoss reads no 'rewards'. Choose from: "),
+    ],
 )
-def test_discounts_lie_between_0_and_1(numbers, must):
+def test_an_estimator_takes_its_own_numbers_alone_and_keys_are_names(call, message):
     actor, value, _ = make_networks()
-    ((name, number),) = numbers.items()
-    with pytest.raises(ValueError, match=f"{name} must be {must}, got {number}"):
-        SHACLoss(actor, value).make_value_estimator(**numbers)
-
-
-def test_an_estimator_takes_its_own_numbers_alone():
-    actor, value, _ = make_networks()
-    with pytest.raises(
-        UserTypeError, match="BPTTLoss estimates its returns by TD1, which takes no 'lmbda'. Choose from"
-    ):
-        BPTTLoss(actor).make_value_estimator(gamma=0.9, lmbda=0.9)
-    with pytest.raises(UserTypeError, match="SHACLoss estimates its returns by TDLambda, which takes no 'lambda_'"):
-        SHACLoss(actor, value).make_value_estimator(lambda_=0.9)
-    with pytest.raises(UserValueError, match="'abc' is not implemented for loss SHACLoss. Choose from: td0, tdlambda"):
-        SHACLoss(actor, value).make_value_estimator("abc")
-    assert SHACLoss(actor, value).make_value_estimator("TD0", gamma=0.5).value_type is ValueEstimators.TD0
-    with pytest.raises(UserValueError, match="value_target must be the name of an entry, such as .*, got 5"):
-        SHACLoss(actor, value).set_keys(value_target=5)
+    with pytest.raises(UserError, match=message):
+        call(BPTTLoss(actor), SHACLoss(actor, value))
 
 
 def test_plain_modules_are_refused(env):
@@ -199,12 +223,8 @@ def test_plain_modules_are_refused(env):
 def test_a_rollout_without_its_graph_is_refused_with_advice():
     actor, value, qvalue = make_networks()
     detached = make_rollout(actor).detach()
-    for loss in (
-        BPTTLoss(actor),
-        SHACLoss(actor, value),
-        ABPTLoss(actor, qvalue),
-        ABPTLoss(actor, qvalue, n_step_return=False),
-    ):
+    abpt = ABPTLoss(actor, qvalue), ABPTLoss(actor, qvalue, n_step_return=False)
+    for loss in (BPTTLoss(actor), SHACLoss(actor, value), *abpt):
         with pytest.raises(RuntimeError, match="carries no gradient.*Use differentiable_rollout"):
             loss.loss_actor(detached)
         with torch.no_grad():
@@ -219,20 +239,12 @@ def test_the_entropy_bonus_needs_the_log_probability():
 
 def test_a_rollout_without_a_time_dimension_is_refused(env, flight):
     rollout, carry = flight
-    message = (
-        r"needs a rollout of batch size \(\*, horizon\), whose last dimension is time; got \({}.*Give it what diff"
-    )
+    message = r"{} needs a rollout of batch size \(\*, horizon\), whose last .* is time; got \({}.*Give it what diff"
+    wrong = [(rollout[:, 0], "4,"), (rollout.reshape(-1), "12,"), (rollout[:, :0], "4, 0"), (carry, "4,")]
     for loss in losses(env):
-        for wrong, shape in (
-            (rollout[:, 0], "4,"),
-            (rollout.reshape(-1), "12,"),
-            (rollout[:, :0], "4, 0"),
-            (carry, "4,"),
-        ):
-            with pytest.raises(ValueError, match=f"{type(loss).__name__} {message.format(shape)}"):
-                loss(wrong)
-        with pytest.raises(ValueError, match=message.format("3, 4")):
-            loss(rollout.transpose(0, 1))
+        for data, shape in (*wrong, (rollout.transpose(0, 1), "3, 4")):
+            with pytest.raises(ValueError, match=message.format(type(loss).__name__, shape)):
+                loss(data)
         loss(rollout[0])  # a single flight, whose dimension has the name of time
 
 
@@ -254,19 +266,14 @@ def test_an_entry_of_another_shape_is_refused(env, flight):
             wrong["next"] = wrong["next"].copy().set(key, wrong["next", key].squeeze(-1))
             with pytest.raises(ValueError, match=rf"'{key}'\) of shape \(4, 3, 1\) in this rollout; got \(4, 3\)"):
                 loss(wrong)
-    shac = losses(env)[1]
-    with pytest.raises(
-        ValueError, match=r"'value_target' has shape \(4, 3\), and the critic's predictions \(4, 3, 1\)"
-    ):
-        shac(flight[0].copy().set("value_target", torch.zeros(4, 3)))
+    with pytest.raises(ValueError, match=r"'value_target' has shape \(4, 3\), and the critic's pred.* \(4, 3, 1\)"):
+        losses(env)[1](flight[0].copy().set("value_target", torch.zeros(4, 3)))
 
 
 def test_a_wrong_tensor_key_is_refused(env, flight):
     for loss in losses(env):
         loss.set_keys(reward="gain")
-        with pytest.raises(
-            ValueError, match=r"reads \('next', 'gain'\), which is not in the rollout. If it has another"
-        ):
+        with pytest.raises(ValueError, match=r"reads \('next', 'gain'\), which is not in the rollout. If it has"):
             loss(flight[0])
 
 
@@ -283,9 +290,7 @@ def test_swapped_networks_are_refused(env, flight):
         (ABPTLoss(actor, value), "'state_action_value' of its qvalue_network", "state_value"),
         (SHACLoss(value, actor), "'state_value' of its value_network", "loc, scale, action"),
     ):
-        with pytest.raises(
-            ValueError, match=f"reads {reads}, which writes {writes}. Give another network, or set_keys"
-        ):
+        with pytest.raises(ValueError, match=f"reads {reads}, which writes {writes}. Give another network, or set"):
             loss(flight[0])
 
 

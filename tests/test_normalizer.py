@@ -126,11 +126,10 @@ def test_the_normalizer_is_saved_and_leaves_out_what_is_not_finite():
 
 
 def test_the_normalizer_names_what_it_can_normalise(env):
-    with pytest.raises(ValueError, match="The environment does not observe 'obs'. Choose from: observation, "):
-        ObservationNormalizer(env, "obs")
-    with pytest.raises(ValueError, match='is part of the state .* normalise "features"'):
-        ObservationNormalizer(env, ("state", "position"))
-    with pytest.raises(
-        ValueError, match="min_scale must be greater than 0, got 0.0. The least standard deviation to divide by"
+    for options, message in (
+        ({"key": "obs"}, "The environment does not observe 'obs'. Choose from: observation, "),
+        ({"key": ("state", "position")}, 'is part of the state .* normalise "features"'),
+        ({"min_scale": 0.0}, "min_scale must be greater than 0, got 0.0. The least standard deviation to divide by"),
     ):
-        ObservationNormalizer(env, min_scale=0.0)
+        with pytest.raises(ValueError, match=message):
+            ObservationNormalizer(env, **options)

@@ -70,10 +70,11 @@ VARIANTS = {
     "abpt-now": Variant("abpt", "ABPT, present dynamics"),
     "abpt-no-visited": Variant("abpt", "ABPT without visited states", ("buffer.fraction=null", "restart_fraction=0")),
     # Relaxed gate bonus.
-    "bptt-log": Variant("bptt", "BPTT, log bonus", ("env.gate_bonus=log",)),
-    "shac-log": Variant("shac", "SHAC, log bonus", ("env.gate_bonus=log",)),
-    "bptt-reciprocal": Variant("bptt", "BPTT, reciprocal bonus", ("env.gate_bonus=reciprocal",)),
-    "shac-reciprocal": Variant("shac", "SHAC, reciprocal bonus", ("env.gate_bonus=reciprocal",)),
+    **{
+        f"{name}-{bonus}": Variant(name, f"{name.upper()}, {bonus} bonus", (f"env.gate_bonus={bonus}",))
+        for bonus in ("log", "reciprocal")
+        for name in ("bptt", "shac")
+    },
     # The other reward of racing.
     **{
         f"{name}-velocity": Variant(
@@ -87,17 +88,16 @@ VARIANTS = {
     ),
     # Settings in which the paper's text and its published code differ.
     "abpt-entropy": Variant("abpt", "ABPT, entropy bonus", ("loss.alpha=auto",)),
-    "abpt-horizon-32": Variant("abpt", "ABPT, horizon 32", horizon=32),
-    "abpt-horizon-96": Variant("abpt", "ABPT, horizon 96", horizon=96),
-    "shac-horizon-32": Variant("shac", "SHAC, horizon 32", horizon=32),
-    "shac-horizon-96": Variant("shac", "SHAC, horizon 96", horizon=96),
+    **{
+        f"{name}-horizon-{steps}": Variant(name, f"{name.upper()}, horizon {steps}", horizon=steps)
+        for name in ("abpt", "shac")
+        for steps in (32, 96)
+    },
     # Better critics: the recipes have 4 updates in an iteration (landing 16, racing 8), and the paper 10. Added after
     # the first seeds of the ablation.
     "abpt-critic": Variant("abpt", "ABPT, 64 critic updates", ("critic.updates=64",)),
     # Lower learning rates than the search found. Added after the first seeds of the main experiment.
-    "abpt-slow": Variant("abpt", "ABPT, 0.3 of the rate", rate=0.3),
-    "shac-slow": Variant("shac", "SHAC, 0.3 of the rate", rate=0.3),
-    "bptt-slow": Variant("bptt", "BPTT, 0.3 of the rate", rate=0.3),
+    **{f"{x}-slow": Variant(x, f"{x.upper()}, 0.3 of the rate", rate=0.3) for x in ("abpt", "shac", "bptt")},
 }
 
 

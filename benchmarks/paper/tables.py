@@ -123,13 +123,11 @@ def methods_table(results: Results) -> Table:
     ]
 
 
-def best_level(results: Results, task: str) -> float:
-    """Give the return at which a method counts as converged in the tables: nearly the highest of the mean ends."""
-    return results.level(task, max((results.end(task, method) for method in METHODS), key=np.mean))
-
-
 def ends_table(results: Results, experiment: str) -> Table:
-    """Show where the curves of an experiment end, means over seeds, and when they converge, medians."""
+    """Show where the curves of an experiment end, means over seeds, and when they converge, medians.
+
+    That is nearly at the highest of the methods' mean ends.
+    """
     rows = []
     for task, variant in product(TASKS, EXPERIMENTS[experiment]):
         row = {"experiment": experiment, "task": task, "method": VARIANTS[variant].label}
@@ -139,8 +137,9 @@ def ends_table(results: Results, experiment: str) -> Table:
                     name: spread(results.end(task, variant, name))
                 }
             if experiment not in ("reward", "relaxation"):  # whose returns are of another kind
+                level = results.level(task, max((results.end(task, x) for x in METHODS), key=np.mean))
                 for axis in ("steps", "seconds"):
-                    until = np.median(results.until(task, variant, axis, best_level(results, task)))
+                    until = np.median(results.until(task, variant, axis, level))
                     row[f"{axis} to converge"] = f"{until:.4g}" if np.isfinite(until) else "never"
         except NotRunError:
             continue

@@ -77,7 +77,8 @@ def plot_flight(
     Raises:
         ImportError: matplotlib is missing.
         TypeError: ``env`` is not a quadrotor environment.
-        ValueError: the rollout has another shape, lacks the position or the reward, or ``num_envs`` is less than 1.
+        ValueError: the rollout has another shape, or lacks the position or the reward; ``num_envs`` is less than 1; or
+            matplotlib does not know the suffix.
     """
     flight = Flight("plot_flight", rollout, env, control_dt, [*state_keys("position"), ("next", "reward")], num_envs)
     position = flight.position
@@ -126,15 +127,12 @@ def plot_episode(
     line the distance from which a state fulfils the task, if the markers name it. PDF and SVG embed their fonts, PNG
     has 300 dots per inch.
 
-    The other arguments are those of :func:`plot_flight`.
+    The other arguments, and errors, are those of :func:`plot_flight`; the rollout needs velocity and action, too.
 
     Args:
         env_index: which environment.
 
     Raises:
-        ImportError, TypeError: as in :func:`plot_flight`.
-        ValueError: the rollout has another shape, lacks position, velocity, action or reward, or matplotlib does not
-            know the suffix.
         IndexError: there is no such environment.
     """
     keys = [*state_keys("position", "velocity"), ("action",), ("next", "reward")]
@@ -221,12 +219,7 @@ def plot_from_above(
     Environments with obstacles of their own get a panel each; those that share them, one for all. A cross marks a
     crash, a ring the start. Only what stands between the least and the greatest height of the flight is drawn.
 
-    The arguments are those of :func:`plot_flight`; the task has a scene.
-
-    Raises:
-        ImportError, TypeError: as in :func:`plot_flight`.
-        ValueError: the environment has no scene; the rollout has another shape, lacks position or velocity; or
-            ``num_envs`` is less than 1.
+    Arguments and errors are those of :func:`plot_flight`; the environment has a scene, and the rollout the velocity.
     """
     flight = Flight("plot_from_above", rollout, env, 0.02, state_keys("position", "velocity"), num_envs)
     if flight.solids(0) is None:

@@ -63,7 +63,7 @@ def write_replay(
     needs no network. A drone stays where its episode ended, and the page says how it ended: "success" if the last state
     fulfils the task.
 
-    The other arguments are those of :func:`plot_flight`.
+    The other arguments, and errors, are those of :func:`plot_flight`.
 
     Args:
         rollout: (num_envs, time), of any task. It must hold ``("next", "state", "position")`` and ``("next", "state",
@@ -75,9 +75,7 @@ def write_replay(
 
     Raises:
         ImportError: plotly is not installed.
-        TypeError: ``env`` is not a quadrotor environment.
-        ValueError: the rollout is not (num_envs, time), or has no position or quaternion; ``num_envs`` is less than 1;
-            or ``env`` has individual drones, for fewer environments than the page shows.
+        ValueError: ``env`` has individual drones, for fewer environments than the page shows.
     """
     try:
         from plotly.offline import get_plotlyjs
@@ -85,7 +83,8 @@ def write_replay(
         raise MissingPackage("Replays need plotly: pip install '.[render]' in a clone.") from error
     needed = [("next", "state", name) for name in ("position", "quaternion")]
     flight = Flight("write_replay", rollout, env, control_dt, needed, num_envs)
-    replay = page_of(json.dumps(_content(flight)), flight.title if title is None else title, get_plotlyjs())
+    content = json.dumps(_content(flight), default=_encoded)
+    replay = page_of(content, flight.title if title is None else title, get_plotlyjs())
     if path is not None:
         with replacing(path) as temporary:
             temporary.write_text(replay.html, encoding="utf-8")
@@ -124,30 +123,23 @@ def _content(flight: Flight) -> dict[str, Any]:
         "ended": (steps - first).tolist(),
         "endings": _endings(rollout),
         "knows_drone": flight.env is not None,
-        "rotors": _encoded(rotors),
-        "position": _encoded(frames(flight.position)),
-        "quaternion": _encoded(frames(flight.state("quaternion"))),
-        "lift": _encoded(lift),
-        "target": _encoded(frames(flight.target)),
-        "gates": _encoded(markers.rings()),
-        "gate": _encoded(frames(gate)),
-        "places": _encoded(markers.places),
-        "curve": _encoded(markers.curve),
-        "shapes": [
-            {
-                "points": _encoded(shape.points),
-                "faces": _encoded(shape.faces),
-                **{key: getattr(shape, key) for key in ("name", "color", "opacity")},
-            }
-            for shape in markers.shapes
-        ],
+        "rotors": rotors,
+        "position": frames(flight.position),
+        "quaternion": frames(flight.state("quaternion")),
+        "lift": lift,
+        "target": frames(flight.target),
+        "gates": markers.rings(),
+        "gate": frames(gate),
+        "places": markers.places,
+        "curve": markers.curve,
+        "shapes": [vars(shape) for shape in markers.shapes],
         "obstacles": _obstacles(flight),
         "images": _images(flight, first),
         "panels": [
             {
                 "label": label,
                 "names": list(lines),
-                "values": _encoded(torch.stack([x.masked_fill(over, math.nan) for x in lines.values()], -1)[:, first:]),
+                "values": torch.stack([x.masked_fill(over, math.nan) for x in lines.values()], -1)[:, first:],
                 **options,
             }
             for label, lines, options in _panels(flight)
@@ -155,16 +147,14 @@ def _content(flight: Flight) -> dict[str, Any]:
     }
 
 
-def _obstacles(flight: Flight) -> list[dict[str, str | None]]:
+def _obstacles(flight: Flight) -> list[dict[str, Any]]:
     """The obstacles of each environment, or of the first if all share them; none without a scene."""
+    count = len(flight) if flight.has_own_obstacles else 1
     if flight.solids(0) is None:
         return []
-    found = []
-    for i in range(len(flight) if flight.has_own_obstacles else 1):
-        shapes = obstacle_shapes(flight.solids(i))
-        points, faces = (shapes[0].points, shapes[0].faces) if shapes else (torch.zeros(0, 3),) * 2
-        found.append({"points": _encoded(points), "faces": _encoded(faces)})
-    return found
+    nothing = {"points": torch.zeros(0, 3), "faces": torch.zeros(0, 3)}
+    shapes = (obstacle_shapes(flight.solids(i)) for i in range(count))
+    return [vars(shape[0]) if shape else nothing for shape in shapes]
 
 
 def _images(flight: Flight, first: int) -> dict[str, Any] | None:
@@ -249,9 +239,9 @@ def _rotors(flight: Flight, speed: Tensor | None) -> tuple[Tensor, Tensor | None
     return field("rotor_positions")[:, 0].expand(n, 4, 2), speed
 
 
-def _encoded(value: Tensor | None) -> str | None:
+def _encoded(value: Tensor) -> str:
     """Numbers as base64 of little-endian float32."""
-    return None if value is None else base64.b64encode(value.contiguous().numpy().astype("<f4").tobytes()).decode()
+    return base64.b64encode(value.contiguous().numpy().astype("<f4").tobytes()).decode()
 
 
 def _asset(name: str) -> str:

@@ -146,7 +146,7 @@ def animate_flight(
     A task with a camera shows the first drone's depth image, the nearer the brighter. Where each episode has obstacles
     of its own, the film shows only the first environment.
 
-    The other arguments are those of :func:`plot_flight`.
+    The other arguments, and errors, are those of :func:`plot_flight`; the rollout needs the quaternion.
 
     Args:
         path: the film to write: GIF, or MP4 (H.264) with ``imageio-ffmpeg`` of the extra ``render``, by its suffix.
@@ -157,10 +157,7 @@ def animate_flight(
         labels: a word for each of the two, in their corners.
 
     Raises:
-        ImportError: matplotlib is missing; or no ffmpeg works, for an MP4: ``NoFfmpeg``.
-        TypeError: ``env`` is not a quadrotor environment.
-        ValueError: the rollout has another shape or lacks the position or the quaternion, a number is not positive, or
-            the suffix is another.
+        NoFfmpeg: no ffmpeg works, for an MP4; an ImportError.
     """
     write = {".gif": _write_gif, ".mp4": _write_mp4}.get(Path(path).suffix.lower())
     if write is None:

@@ -141,7 +141,7 @@ def test_a_disturbance_or_a_loss_of_your_own_that_does_not_fit_is_refused(words,
         check(composed("abpt", *overrides), overrides)
 
 
-def test_what_is_your_own_trains_resumes_and_is_evaluated_as_what_ships(train, launch, refused, tmp_path):
+def test_what_is_your_own_trains_resumes_is_evaluated_and_exported_as_what_ships(train, launch, refused, tmp_path):
     own = ["task._target_=own_task.CornerEnv", "env.disturbances=[{_target_: own_parts.Push, strength: 0.1}]"]
     own += ["loss._target_=own_parts.ThriftyLoss", "loss.effort=0.2"]
     first = train("abpt", tmp_path, *own, "env.reach=0.1")
@@ -190,3 +190,5 @@ def test_a_metric_that_is_described_and_not_given_is_named():
 
     with pytest.raises(ValueError, match=r"SilentEnv.metrics\(state\) lacks corner_error, which metric_info describes"):
         SilentEnv()
+    printed = launch("export", f"checkpoint={tmp_path}/checkpoint.pt", trust, "episodes=4")
+    assert "policy: flies own_task.CornerEnv; its actions differ by at most" in printed

@@ -66,10 +66,7 @@ class Bundle:
         self.folder, self.contract, self.on_fault = folder, contract, on_fault
         self.faults: Counter[str] = Counter()
         self.last_fault: Fault | None = None
-        output = contract["output"]
-        self._half_thrust = 0.5 * output["thrust"]["range"][1]
-        self._max_rates = np.array(output["body_rate"]["range"])[:, 1]
-        self._hover = np.array(output["hover_action"], np.float32)
+        self._hover = np.array(contract["output"]["hover_action"], np.float32)
         self._limits, self._camera, self._dtype = contract["limits"], contract["camera"], contract["task"]["dtype"]
         self.reset()
 
@@ -139,9 +136,15 @@ class Bundle:
             after["action"] = self._hover.copy()
         action = after["action"]
         after["queue"] = np.concatenate((self.queue[1:], action[None])) if len(self.queue) else self.queue
-        command = self._half_thrust * (float(action[0]) + 1.0), self._max_rates * action[1:].astype(float)
+        command = self.command(action)
         vars(self).update(after)  # from here on nothing fails
         return command
+
+    def command(self, action: NDArray[Any]) -> tuple[float, NDArray[np.float64]]:
+        """The collective thrust [N] and the body rates (3) [rad/s] that an action (4) commands."""
+        output = self.contract["output"]
+        thrust = 0.5 * output["thrust"]["range"][1] * (float(action[0]) + 1.0)
+        return thrust, np.array(output["body_rate"]["range"])[:, 1] * action[1:].astype(float)
 
     def starts(self) -> Arrays:
         """The fresh starts that came with it: ``position``, ``quaternion``, ``velocity`` and ``angular_velocity``, as a

@@ -191,17 +191,16 @@ def _export(rules: _Methods, methods: list[Method]) -> tuple[Any, list[str]]:
     return program, [*whole.found(*rules.inputs.values())]
 
 
+HOW = (
+    " What is exported consists of torch operations on the state, for any number of drones: no .item(), no Python `if` "
+    "on values (write torch.where), and no tensor with one row per environment (keep it in an entry of the state)."
+)
 RANDOM = "it draws random numbers ({}). Draw them in initial_state, and keep them in an entry of the state."
 
 
 def _refusal(env: QuadrotorEnv, what: str, why: Exception) -> UserValueError:
-    how = (
-        "What is exported consists of torch operations on the state, for any number of drones: no .item(), no Python "
-        "`if` on values (write torch.where), and no tensor with one row per environment (keep it in an entry of the "
-        "state)."
-    )
-    end = "" if isinstance(why, UserValueError) else f" {how}"
-    return UserValueError(f"export_policy: {type(env).__name__}: {what}: {one_line(why)}{end}")
+    end = "" if isinstance(why, UserValueError) else HOW
+    return UserValueError(f"export_policy: {type(env).__name__}: {what}: {one_line(why).rstrip('.')}.{end}")
 
 
 @contextlib.contextmanager

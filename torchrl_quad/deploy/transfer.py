@@ -114,7 +114,8 @@ def _fly(
     world.reset({name: starts[name] for name in MEASURED})
     pilots = [_pilot(bundle, {k: x[i] for k, x in starts.items()}) for i in range(n)]
     delay = late + (contract["action_delay"] if mutant.delay is None else mutant.delay)
-    queue = deque([np.tile(_hover(contract), (n, 1))] * delay)
+    thrust, rates = bundle.command(bundle._hover)
+    queue = deque([np.tile([thrust, *rates], (n, 1))] * delay)
     state = world.state()
     seen = deque([state] * (contract["observation_delay"] + 1), contract["observation_delay"] + 1)
     flight = {name: np.repeat(x[:, None], steps + 1, 1) for name, x in state.items()}
@@ -164,13 +165,6 @@ def other_drone(contract: Mapping[str, Any], scale: Mapping[str, float]) -> dict
     if scale and (problem := drone_problem(scaled)):
         raise UserValueError(f"scale: {problem}. Choose other factors.")
     return scaled
-
-
-def _hover(contract: dict[str, Any]) -> Array:
-    """The command (4) that hovers: N, rad/s."""
-    output, action = contract["output"], np.array(contract["output"]["hover_action"])
-    most = np.array(output["body_rate"]["range"])[:, 1]
-    return np.append(0.5 * output["thrust"]["range"][1] * (action[0] + 1.0), most * action[1:])
 
 
 def _pilot(bundle: Bundle, start: dict[str, Any]) -> Bundle:

@@ -116,7 +116,7 @@ def differentiable_rollout(
     specs = (*observed(env).keys(True, True), *state.keys(True, True), *cast(Iterable[NestedKey], env.action_keys))
     known = set(map(unravel_key, specs))
     written = end.select(*(key for key in actor.out_keys if unravel_key(key) not in known), strict=False).clone()
-    # A reset keeps nothing that it does not know, such as noise, and an environment with a state of its own its graph.
+    # A reset drops entries that it does not know, such as noise; an environment that keeps its state keeps its graph.
     carry = env.maybe_reset(end).detach().update(written)
     done = leaf(rollout, ("next", "done"))[..., -1, :]
     for key in memory_keys(actor):

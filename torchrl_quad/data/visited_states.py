@@ -1,4 +1,4 @@
-"""Where the next horizon starts: in visited states (paper, section IV), afresh, or where the last one ended."""
+"""Where the next horizon starts: in visited states (paper, section IV), fresh starts, or where the last one ended."""
 
 from __future__ import annotations
 
@@ -327,7 +327,7 @@ def _fresh(env: EnvBase, keys: Sequence[NestedKey]) -> TensorDictBase:
 
 
 def _draws_starts(base: EnvBase) -> bool:
-    # Of the class: environments in processes of their own die when they are asked for what they do not have.
+    # Of the class: environments in other processes die when asked for a missing attribute.
     return hasattr(type(base), "sample_start")
 
 

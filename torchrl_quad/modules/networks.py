@@ -171,7 +171,7 @@ def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[B
         first = torch.as_tensor(action_init)
         fits = not first.is_complex() and first.shape == spec.shape
         fits = fits and bool(((low < first.to(middle)) & (first.to(middle) < high)).all())
-    except (TypeError, ValueError, RuntimeError, OverflowError):  # of what is no tensor, and cannot become one
+    except (TypeError, ValueError, RuntimeError, OverflowError):  # raised for what cannot become a tensor
         fits = False
     if not fits:
         is_tensor = isinstance(action_init, Tensor) and not action_init.is_meta
@@ -236,7 +236,7 @@ def network_of(
     layer_norm: bool = False,
     more: int = 0,
 ) -> Network:
-    """A network on entries of an environment; it reads ``more`` numbers first, which are none of these entries."""
+    """A network on entries of an environment; before them it reads ``more`` numbers."""
     check_env(env)
     specs = [_spec(env, key) for key in in_keys]
     own = len(in_keys) - (action_scale is not None)  # without the action of a critic
@@ -274,7 +274,7 @@ def check_memory(weights: Sequence[int]) -> None:
 
 
 def _single(env: EnvBase) -> EnvBase:
-    """The environment under transforms; for several in processes of their own, a new one like theirs."""
+    """The environment under transforms; a new one like those that run in other processes."""
     env = base_env(env)
     if isinstance(env, BatchedEnvBase):
         return _single(env.create_env_fn[0](**env.create_env_kwargs[0]))

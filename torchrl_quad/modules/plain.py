@@ -99,7 +99,7 @@ class Critic(ValueOperator):
     def plain(self) -> Callable[[Mapping[str, Tensor], Sequence[Tensor]], Tensor] | None:
         """The prediction (*, 1) as a pure function of the parameters, by name, and the inputs, each (*, k).
 
-        None if somebody has changed its parts, or hooks it.
+        None if its parts were changed or hooked.
         """
         network = self.module
         if type(self) is not Critic or type(network) is not Network or type(network.mlp) is not MLP:
@@ -184,7 +184,7 @@ class TanhGaussianActor(ProbabilisticActor):
         return tensordict.update(written).set("noise", head.next(before, xi))
 
     def plain(self) -> PlainTanhGaussian | None:
-        """The policy as pure functions of its present weights; None if somebody has changed its parts, or hooks it."""
+        """The policy as pure functions of its present weights; None if its parts were changed or hooked."""
         is_random, network = self.is_random, getattr(self[0], "module", None)
         if is_random is None or type(self) is not TanhGaussianActor or len(self.module) != 2:
             return None
@@ -361,7 +361,7 @@ def _concatenated(inputs: Sequence[Tensor], scales: Sequence[float]) -> Tensor:
 
 
 def is_hooked(module: nn.Module) -> bool:
-    """Whether somebody watches or changes what a module or one of its parts reads or returns."""
+    """Whether a module or one of its parts has hooks."""
     hooks = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
     return any(getattr(part, name) for part in module.modules() for name in hooks)
 

@@ -198,7 +198,7 @@ class VisualActor(TanhGaussianActor):
         return None if self.is_random is None else Replay(self)
 
     def parts(self) -> Parts | None:
-        """The parts as :func:`~torchrl_quad.make_visual_actor` builds them; None if somebody changed or hooks them."""
+        """The parts as :func:`~torchrl_quad.make_visual_actor` builds them; None if they were changed or hooked."""
         if type(self) is not VisualActor or len(self.module) != 2 or is_hooked(self) or self.is_random is None:
             return None
         if self.sampler.distribution_class is not TanhNormal or type(self[0]) is not TensorDictSequential:

@@ -169,7 +169,8 @@ class HybridLoss(SHACLoss):
         check_tensordict(self._name, tensordict)
         keys = self.tensor_keys
         lost = [key for key in (keys.advantage, keys.location_gradient, keys.latent) if key not in tensordict]
-        if lost and not {keys.location_gradient, keys.latent} <= set(lost):  # an advantage alone is somebody else's
+        # An advantage without the other two comes from another estimator.
+        if lost and not {keys.location_gradient, keys.latent} <= set(lost):
             raise UserValueError(
                 f"HybridLoss reads {lost[0]!r}, which write_targets writes and these samples have lost. Give samples "
                 "of all that it returned."
@@ -202,7 +203,7 @@ class HybridLoss(SHACLoss):
             with torch.enable_grad():
                 (grad,) = torch.autograd.grad((plain.action(loc, scale, xi) * grad).sum(), loc)
         if plain.rho:
-            # Noise goes on in later actions of the episode: the gradient is that in its new part, divided by the scale.
+            # Noise lasts into later actions of the episode: the gradient is that in its new part, divided by the scale.
             decay = plain.rho * (self._gamma * cast(Tensor, self.value_estimator.lmbda))
             in_noise, steps, done = torch.zeros_like(grad[..., 0, :]), [], self._next(data, "done")
             for g, s, end in zip(*(x.unbind(-2)[::-1] for x in (grad, scale, done)), strict=True):

@@ -130,7 +130,7 @@ class PathwiseLoss(LossModule):
     # -- keys and parameters -------------------------------------------------------------------------------------------
 
     @property
-    def in_keys(self) -> list[NestedKey]:  # pyrefly: ignore[bad-override]  # nobody sets them
+    def in_keys(self) -> list[NestedKey]:  # pyrefly: ignore[bad-override]  # without its setter
         """The keys of a rollout that :meth:`forward` reads; others do no harm."""
         keys = self.tensor_keys
         names = {keys.action, *self._network_in_keys()}

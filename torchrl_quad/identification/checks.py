@@ -120,7 +120,7 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
 
     The note that it returns says by which time the gyro lags the attitude.
     """
-    q, given = at["quaternion"], signals.get("quaternion") or signals["euler"]
+    q, given = at["quaternion"], signals["quaternion"]
     last, first = np.roll(q, 1, -1), np.roll(q, -1, -1)
     hypotheses = {
         "as given": q,

@@ -19,6 +19,7 @@ from torchrl_quad.identification.layouts import QUANTITIES, Columns, Layout, gat
 from torchrl_quad.identification.signals import LARGEST, Array, Signal, Stream, clean, cover, on_grid
 from torchrl_quad.identification.sources import read_streams
 from torchrl_quad.options import NonNegative, checked
+from torchrl_quad.rotations import from_euler
 
 _LONGEST = 3000  # letters of an error: it lists up to 60 columns
 LEAST_STEP, MAX_STEPS = 1e-3, 1_000_000  # [s] of a log, and how many: 17 minutes at 1 kHz, half a gigabyte
@@ -200,13 +201,16 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
             continue
         signals[quantity], dropped = clean(signal)
         notes += dropped
+    if "quaternion" not in signals:
+        euler = signals.pop("euler")
+        signals["quaternion"] = replace(euler, values=from_euler(euler.values))
     notes += checks.check_motors(signals["motor_command"])
     return signals
 
 
 def _grid(signals: Mapping[str, Signal], main: Sequence[Signal], dt: float | None, name: str) -> tuple[Array, float]:
     """The times that all streams share, in uniform steps, and the step [s]."""
-    attitude = signals.get("quaternion") or signals["euler"]
+    attitude = signals["quaternion"]
     step = dt or max(round(attitude.step, 5), LEAST_STEP)
     if not 0.0 < attitude.step < 0.5:
         raise WrongUnit(

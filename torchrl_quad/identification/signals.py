@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.identification.errors import ClockJumpsBack, NotFiniteLog, UnreadableLog
-from torchrl_quad.rotations import conjugate, continuous, from_euler, multiply, rotate
+from torchrl_quad.rotations import conjugate, continuous, multiply, rotate
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -134,12 +134,8 @@ def cover(main: Sequence[Signal], grid: Array, step: float, max_gap: float, note
 
 def on_grid(signals: Mapping[str, Signal], grid: Array, step: float) -> dict[str, Array]:
     """Every quantity of the schema at the times of the grid, derived from others where the file lacks it."""
-    signals = dict(signals)
-    if "quaternion" not in signals:
-        euler = signals.pop("euler")
-        signals["quaternion"] = replace(euler, values=from_euler(euler.values))
     q = signals["quaternion"]
-    signals["quaternion"] = replace(q, values=continuous(q.values))
+    signals = {**signals, "quaternion": replace(q, values=continuous(q.values))}
     at = {name: resample(s, grid, step, hold=name.startswith("setpoint.")) for name, s in signals.items()}
     at["quaternion"] /= np.linalg.norm(at["quaternion"], axis=-1, keepdims=True)
     if "velocity_body" in at:

@@ -31,15 +31,20 @@ def test_the_gradients_of_every_method_are_compared_with_the_simulator(launch, n
         run_main(monkeypatch, reproduce, *ascent, tmp_path / "ppo/checkpoint.pt")
 
 
-def test_backpropagation_through_all_steps_knows_the_true_slopes():
-    smooth = {"velocity": 0.0, "angular_velocity": 0.0}  # norms, which have a kink where the drone rests
-    env = make_env("hovering", num_envs=16, seed=0, dtype=torch.float64, weights=smooth)
-    loss = BPTTLoss(make_actor(env, scale_init=1e-4)).make_value_estimator(gamma=0.9)
-    start = env.reset()
-    rollout, _ = differentiable_rollout(env, loss.actor_network, start, 20)
+@pytest.fixture
+def smooth():
+    """An environment without the norms that have a kink where the drone rests."""
+    weights = {"velocity": 0.0, "angular_velocity": 0.0}
+    return make_env("hovering", num_envs=16, seed=0, dtype=torch.float64, weights=weights)
+
+
+def test_backpropagation_through_all_steps_knows_the_true_slopes(smooth):
+    loss = BPTTLoss(make_actor(smooth, scale_init=1e-4)).make_value_estimator(gamma=0.9)
+    start = smooth.reset()
+    rollout, _ = differentiable_rollout(smooth, loss.actor_network, start, 20)
     estimated = gradients.estimates(loss, rollout)["objective"]
     action = rollout["action"][:, 0].detach()
-    true = gradients.slopes(env, loss, start, lambda change: {"action": action + change}, steps=20, size=1e-3)
+    true = gradients.slopes(smooth, loss, start, lambda change: {"action": action + change}, steps=20, size=1e-3)
     assert torch.nn.functional.cosine_similarity(estimated, true, dim=-1).min() > 0.99
     torch.testing.assert_close(estimated.norm(), true.norm(), rtol=0.02, atol=0.0)
 
@@ -57,20 +62,16 @@ def test_the_phases_of_the_hybrid_are_flown_and_measured_once(run_here, monkeypa
     assert len(tables.phases_table(tmp_path)) == len(rows)
 
 
-def test_the_pathwise_gradient_of_the_hybrid_is_what_the_phases_measure():
-    smooth = {"velocity": 0.0, "angular_velocity": 0.0}  # norms, which have a kink where the drone rests
-    env = make_env("hovering", num_envs=16, seed=0, dtype=torch.float64, weights=smooth)
-    value = make_value(env)
-    loss = HybridLoss(
-        make_actor(env, scale_init=0.01, learn_scale=False, noise_correlation=0.9), value, gradient_lmbda=1.0
-    ).make_value_estimator(gamma=0.9, lmbda=1.0)
+def test_the_pathwise_gradient_of_the_hybrid_is_what_the_phases_measure(smooth):
+    actor = make_actor(smooth, scale_init=0.01, learn_scale=False, noise_correlation=0.9)
+    loss = HybridLoss(actor, make_value(smooth), gradient_lmbda=1.0).make_value_estimator(gamma=0.9, lmbda=1.0)
     loss.clip, loss.decay = None, 1.0
     loss.pathwise_weight.fill_(1.0)
     loss.value_network_params.apply_(torch.zero_)  # nothing is known of the time after the horizon
-    start = env.reset()
-    rollout, _ = differentiable_rollout(env, loss.actor_network, start, 20)
+    start = smooth.reset()
+    rollout, _ = differentiable_rollout(smooth, loss.actor_network, start, 20)
     first = loss.write_targets(rollout)[:, 0]
-    true = gradients.slopes(env, loss, start, gradients.in_the_mean(first, 0.9), steps=20, size=1e-4)
+    true = gradients.slopes(smooth, loss, start, gradients.in_the_mean(first, 0.9), steps=20, size=1e-4)
     estimated = first["location_gradient"]  # times a number, the same for all
     assert torch.nn.functional.cosine_similarity(estimated, true, dim=-1).min() > 0.99
     assert torch.nn.functional.cosine_similarity(estimated.flatten(), true.flatten(), dim=0) > 0.99

@@ -1,4 +1,4 @@
-"""Fly with commands of your own, thrust and body rates, read the state on the way, and save a picture of the flight."""
+"""Fly with your own commands of thrust and body rates, read the state, and save a picture of the flight."""
 
 import torch
 

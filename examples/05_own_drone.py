@@ -1,4 +1,4 @@
-"""A drone of your own is a mapping of sixteen fields. A mistyped one is refused, with the allowed values."""
+"""Your own drone is a mapping of sixteen fields. A mistyped one is refused, with the allowed values."""
 
 from torchrl_quad import HoveringEnv
 

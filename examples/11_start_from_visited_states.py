@@ -1,4 +1,4 @@
-"""Horizons from visited states see far more of a race than horizons from the start line alone."""
+"""Horizons from visited states cover far more of a race than horizons from the start line."""
 
 import torch
 

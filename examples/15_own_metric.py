@@ -1,4 +1,4 @@
-"""Measure the energy and the tilt of a flight, and print and draw them like the metrics that ship."""
+"""Measure the energy and the tilt of a flight, and print and draw them like the metrics of the package."""
 
 import math
 

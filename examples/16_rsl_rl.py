@@ -1,4 +1,4 @@
-"""Train PPO of rsl-rl to hover, as robots are trained in Isaac Lab."""
+"""Train PPO of rsl-rl to hover."""
 
 import torch
 from rsl_rl.runners import OnPolicyRunner

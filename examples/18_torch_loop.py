@@ -1,4 +1,4 @@
-"""Train PPO in a loop of plain torch tensors, in the manner of CleanRL."""
+"""Train PPO in a loop of plain torch tensors, as CleanRL does."""
 
 import torch
 from torch import nn

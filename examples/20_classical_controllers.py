@@ -1,4 +1,4 @@
-"""Fly classical controllers, which know the drone and learn nothing, and compare them with a policy that learns."""
+"""Compare classical controllers, which know the drone's parameters, with a policy that learns."""
 
 import time
 

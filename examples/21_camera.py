@@ -1,4 +1,4 @@
-"""Put a depth camera on a hovering drone, and look: pillars, a wall and the ground, while it turns on the spot."""
+"""Film what a depth camera on a hovering drone measures: pillars, a wall and the ground, while it turns on the spot."""
 
 import torch
 

@@ -21,7 +21,7 @@ wanted = ["thrust_map", "linear_drag", "drag_height", "inertia", "command_delay"
 result = identify(log, guess, {"mass": 0.027}, wanted, iterations=ITERATIONS)
 print(result)
 
-print("\nerror of predictions over half a second, from the motor commands alone")
+print("\nerror of predictions over half a second, from motor commands only")
 for name, drone in (("constant velocity", "constant_velocity"), ("guess", guess), ("fitted", result)):
     errors = prediction_error(log, drone)
     print(f"{name:18}", ", ".join(f"{quantity} {errors[quantity][0.5]:.3f}" for quantity in errors))

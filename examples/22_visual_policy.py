@@ -1,4 +1,4 @@
-"""Train a policy that sees the trees of a forest and remembers them, and see how far it comes in fresh forests."""
+"""Train a policy of depth images with a memory to fly through forests, and measure how far it gets in new ones."""
 
 import torch
 from torchrl.envs.utils import ExplorationType
@@ -15,12 +15,12 @@ def train(iterations):
     torch.manual_seed(0)
     env = ForestEnv(num_envs=32, **TASK)  # compile=True is three times as fast, after a minute
     actor = make_visual_actor(env, hidden_size=32, input_scale=0.2)
-    # A drone that is about to crash has gradients many times as long as those of all others.
+    # A drone that is about to crash has gradients many times as large as all others.
     loss = BPTTLoss(actor, clip_action_gradient=2.0).make_value_estimator(gamma=0.99)
     optimizer = torch.optim.Adam(actor.parameters(), lr=3e-3)
     carry = None
     for i in range(iterations):
-        # What the policy remembers goes through the horizon with its graph, and on into the next one without.
+        # The memory keeps its graph within a horizon, and enters the next one without it.
         rollout, end = differentiable_rollout(env, actor, carry, 32)
         optimizer.zero_grad()
         loss(rollout)["loss_actor"].backward()
@@ -33,7 +33,7 @@ def train(iterations):
 
 
 def distance_flown(actor, steps):
-    """How far drones come in forests that nobody has seen, on average [m]; 30 m is the other side."""
+    """The mean distance [m] that drones fly in new forests; 30 m is the other side."""
     env = ForestEnv(num_envs=16, seed=1, **TASK)
     with torch.no_grad():
         flight, _ = differentiable_rollout(env, actor, None, steps, exploration_type=ExplorationType.DETERMINISTIC)
@@ -41,4 +41,4 @@ def distance_flown(actor, steps):
 
 
 if __name__ == "__main__":
-    print(f"trained drones come {distance_flown(train(ITERATIONS), STEPS):.1f} m far")
+    print(f"trained drones fly {distance_flown(train(ITERATIONS), STEPS):.1f} m")

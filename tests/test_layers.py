@@ -23,7 +23,7 @@ ALLOWED = {  # what each part of the package may import of the others: parts, or
     "modules": {UNWRAP},
     "objectives": {UNWRAP},
     "data": set(),
-    "deploy": {"data", "dynamics", "envs", "files", "rotations"},
+    "deploy": {"data", "dynamics", "engine", "envs", "files", "rotations", "vision"},
     "rotations": set(),
     "errors": set(),
     "options": set(),

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from torchrl_quad.deploy import contract as contracts
 from torchrl_quad.deploy.contract import (
     MEASURED,
+    Arrays,
     BrokenPolicy,
     Fault,
+    Fields,
     MissingQuantity,
     NegativeDepth,
     NotFinite,
@@ -30,7 +32,6 @@ from torchrl_quad.errors import UserTypeError, UserValueError, shown
 START = np.array([1.0, 0.0, 0.0, 0.0])  # the quaternion that the first one of a flight takes its sign from
 MOST = 1e6  # of a number that says where a flight starts in the task
 SINCE = {"age": ", the time since it was measured [s]", "depth_age": ", the time since the image was taken [s]"}
-Arrays = dict[str, NDArray[Any]]
 
 
 class Bundle:
@@ -173,7 +174,7 @@ class Bundle:
             )
         return error
 
-    def _later(self, now: Arrays) -> dict[str, Any]:
+    def _later(self, now: Arrays) -> Fields:
         """The attributes that follow from a control step that leads to these measurements (1, ...)."""
         progress = self._progress
         if self._before is not None and "advance" in self.graphs:
@@ -182,7 +183,7 @@ class Bundle:
         step = self._step if self._before is None else self._step + 1
         return {"_progress": progress, "_step": step, "_before": now}
 
-    def _read(self, state: Mapping[str, Any]) -> dict[str, Any]:
+    def _read(self, state: Mapping[str, Any]) -> Fields:
         """What follows from a state: the attributes that this step changes."""
         if not isinstance(state, Mapping):
             raise MissingQuantity(f"The state must be a mapping of {', '.join(MEASURED)} and age, got {shown(state)}.")

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_quad.errors import MissingPackage, UserError, UserValueError, shown
 
@@ -23,6 +24,9 @@ OTHERS = ("README.md", "policy.c", "policy.h", "starts.npz", "vectors.npz")  # f
 MEASURED = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}  # what each state must have
 ENDS = ("crash", "success", "terminated", "truncated")  # how a state ends an episode
 MOST_PIXELS = 2**18  # of an image; 256 of them are in vectors.npz
+Contract = Mapping[str, Any]  # the content of contract.json, or a part of it
+Fields = dict[str, Any]  # the same while it is written
+Arrays = dict[str, NDArray[Any]]  # by name
 Signature = dict[str, tuple[tuple[int, ...], str]]  # shapes, without batch and time, and dtypes by name
 
 
@@ -66,7 +70,7 @@ class BrokenPolicy(Fault):
     """The network failed, or answered something else than four numbers from -1 to 1."""
 
 
-def schema() -> dict[str, Any]:
+def schema() -> Fields:
     """The JSON schema of ``contract.json``."""
     return json.loads((resources.files("torchrl_quad.deploy") / "contract.schema.json").read_text())
 
@@ -77,7 +81,7 @@ def schema_table() -> str:
     return "\n".join(("| field | meaning | numbers |", "|---|---|---|", *rows))
 
 
-def _fields(part: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
+def _fields(part: Contract, prefix: str = "") -> Iterator[tuple[str, Contract]]:
     for name, entry in part["properties"].items():
         yield prefix + name, entry
         for key, between in (("properties", "."), ("items", "[]."), ("additionalProperties", ".*.")):
@@ -86,7 +90,7 @@ def _fields(part: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Ma
                 yield from _fields(inside, f"{prefix}{name}{between}")
 
 
-def _range(entry: Mapping[str, Any]) -> str:
+def _range(entry: Contract) -> str:
     """The range of a field's numbers as an interval: [0, 1] with its ends, (0, 1) without."""
     while "prefixItems" in entry or "items" in entry:
         entry = entry["prefixItems"][-1] if "prefixItems" in entry else entry["items"]
@@ -115,13 +119,13 @@ def sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def digest(contract: Mapping[str, Any]) -> str:
+def digest(contract: Contract) -> str:
     """The checksum of a contract, of all its fields but ``digest``."""
     rest = {key: value for key, value in contract.items() if key != "digest"}
     return sha256(json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False).encode())
 
 
-def writer(contract: Mapping[str, Any]) -> str:
+def writer(contract: Contract) -> str:
     """The package that wrote a contract, of which nothing is known yet."""
     origin = contract.get("origin")
     package = origin.get("package") if isinstance(origin, dict) else None
@@ -143,12 +147,12 @@ _MUST = {
 }
 
 
-def problem(contract: Mapping[str, Any]) -> str | None:
+def problem(contract: Contract) -> str | None:
     """Where a contract does not fit its schema, or contradicts itself, if anywhere."""
     return next(itertools.chain(_misfits(contract), _contradictions(contract)), None)
 
 
-def check(contract: Mapping[str, Any], path: Path) -> None:
+def check(contract: Contract, path: Path) -> None:
     """Hold a contract against its schema, and what it says against itself, before anything uses it.
 
     Raises:
@@ -162,12 +166,12 @@ def check(contract: Mapping[str, Any], path: Path) -> None:
         )
 
 
-def drone_problem(contract: Mapping[str, Any]) -> str | None:
+def drone_problem(contract: Contract) -> str | None:
     """What is wrong with the drone of a contract that flies, the nominal one with the fields of ``plant``, or None."""
     return next(_plant_problems(contract), None)
 
 
-def _plant_problems(contract: Mapping[str, Any]) -> Iterator[str]:
+def _plant_problems(contract: Contract) -> Iterator[str]:
     flies = {**contract["drone"], **contract["plant"]}
     yield from _misfits(flies, "drone", "plant")
     yield from _contradictions_of_a_drone(flies, "plant")
@@ -204,7 +208,7 @@ def _misfits(value: Any, part: str | None = None, *at: str) -> Iterator[str]:
             yield f"{place} is {shown(error.instance)}, and must be {must}"
 
 
-def _contradictions(contract: Mapping[str, Any]) -> Iterator[str]:
+def _contradictions(contract: Contract) -> Iterator[str]:
     """Where a contract that fits the schema contradicts itself."""
     drone, output, limits = contract["drone"], contract["output"], contract["limits"]
     thrust, rates, ratio = output["thrust"], output["body_rate"]["range"], drone["max_thrust_to_weight"]
@@ -244,7 +248,7 @@ def _contradictions(contract: Mapping[str, Any]) -> Iterator[str]:
     yield from _contradictions_of_the_graphs(contract)
 
 
-def _contradictions_of_the_graphs(contract: Mapping[str, Any]) -> Iterator[str]:
+def _contradictions_of_the_graphs(contract: Contract) -> Iterator[str]:
     """Where graphs read what nobody gives them, or write what nobody reads."""
     task, graphs, floats = contract["task"], contract["graphs"], contract["task"]["dtype"]
     judged = {"judge", "episode"} & graphs.keys()
@@ -294,17 +298,17 @@ def _contradictions_of_the_graphs(contract: Mapping[str, Any]) -> Iterator[str]:
         yield f"graphs.policy.reads must have {', '.join(policy)}"
 
 
-def signature(tensors: Mapping[str, Any]) -> Signature:
+def signature(tensors: Contract) -> Signature:
     """The shapes and types of what a graph reads or writes, by name."""
     return {name: ((*x["shape"],), x["dtype"]) for name, x in tensors.items()}
 
 
-def files(contract: Mapping[str, Any]) -> tuple[str, ...]:
+def files(contract: Contract) -> tuple[str, ...]:
     """The names of all files of a bundle but contract.json."""
     return (*OTHERS, *(f"{name}.onnx" for name in GRAPHS if name in contract["graphs"]))
 
 
-def _contradictions_of_a_drone(drone: Mapping[str, Any], name: str, hovers: bool = False) -> Iterator[str]:
+def _contradictions_of_a_drone(drone: Contract, name: str, hovers: bool = False) -> Iterator[str]:
     """Why these parts do not make a drone, or one that hovers."""
     (k2, k1, k0), low, high = drone["thrust_map"], drone["rotor_speed_min"], drone["rotor_speed_max"]
     if not (k2 > 0 and k1 + 2 * k2 * low >= 0):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from torchrl_quad.data.unwrap import leaf
-from torchrl_quad.deploy.contract import GRAPHS, MEASURED
+from torchrl_quad.deploy.contract import GRAPHS, MEASURED, Contract, Fields
 from torchrl_quad.deploy.simulators.vehicle import bandwidth, damping_ratio
 from torchrl_quad.deploy.tracing import Rules
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
@@ -22,6 +22,10 @@ from torchrl_quad.envs import TASKS, QuadrotorEnv
 from torchrl_quad.envs.disturbances import DroneRandomization, Sensors, Wind
 from torchrl_quad.envs.metrics import describe_metric
 from torchrl_quad.errors import UserValueError
+from torchrl_quad.vision import DepthCamera
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
 
 DTYPES = {1: "float32", 11: "float64", 7: "int64", 9: "bool"}  # by their numbers in ONNX
 UNITS = {  # unit and frame of what is measured and commanded
@@ -49,7 +53,7 @@ def numbers(x: Any) -> Any:
 # -- the contract ------------------------------------------------------------------------------------------------------
 
 
-def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, Any], memory: int, visual: bool) -> dict[str, Any]:
+def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, ModelProto], memory: int, visual: bool) -> Fields:
     """What a contract says of an environment, before anything has flown.
 
     Args:
@@ -109,7 +113,7 @@ def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, Any], memory:
     }
 
 
-def _task(env: QuadrotorEnv, rules: Rules) -> dict[str, Any]:
+def _task(env: QuadrotorEnv, rules: Rules) -> Fields:
     cls, bounds = type(env), env.state_bounds()
     entries = {}
     for name, key in rules.entries.items():
@@ -137,7 +141,7 @@ def _task(env: QuadrotorEnv, rules: Rules) -> dict[str, Any]:
     }
 
 
-def _graph(model: Any) -> dict[str, Any]:
+def _graph(model: ModelProto) -> Fields:
     """What an ONNX model reads and writes."""
     described = {}
     for side, ends in (("reads", model.graph.input), ("writes", model.graph.output)):
@@ -149,7 +153,7 @@ def _graph(model: Any) -> dict[str, Any]:
     return described
 
 
-def _camera(camera: Any) -> dict[str, Any]:
+def _camera(camera: DepthCamera) -> Fields:
     """A depth camera, in numbers alone."""
     fields = {k: v for k, v in vars(camera).items() if k not in ("pitch", "differentiable")}
     mount = numbers(camera.mount(torch.zeros((), dtype=torch.float64)) + 0.0)
@@ -167,7 +171,7 @@ def _single(name: str, value: Tensor, dim: int) -> Tensor:
     return value[0]
 
 
-def _fields(params: QuadrotorParams) -> dict[str, Any]:
+def _fields(params: QuadrotorParams) -> Fields:
     fields = {}
     for name, value in params.fields().items():
         one = numbers(_single(f"drone field {name!r}", value, QuadrotorParams.dim(name)))
@@ -175,13 +179,13 @@ def _fields(params: QuadrotorParams) -> dict[str, Any]:
     return fields
 
 
-def _randomized(env: QuadrotorEnv) -> dict[str, Any]:
+def _randomized(env: QuadrotorEnv) -> Fields:
     found = [x for x in env.disturbances.values() if isinstance(x, DroneRandomization)]
     spec = {name: value for x in found for name, value in x.spec.items()}
     return {name: {kind: list(map(float, pair)) for kind, pair in spec[name].items()} for name in spec}
 
 
-def _disturbances(env: QuadrotorEnv) -> dict[str, Any]:
+def _disturbances(env: QuadrotorEnv) -> Fields:
     described = {}
     for name, x in env.disturbances.items():
         if x is env.disturbances.get("camera"):
@@ -201,7 +205,7 @@ def _is_plain(x: Any) -> bool:
     return False
 
 
-def _rate_loop(env: QuadrotorEnv, drone: Mapping[str, Any]) -> dict[str, Any] | None:
+def _rate_loop(env: QuadrotorEnv, drone: Contract) -> Fields | None:
     """The rate loop about hover, a second-order system per axis; None where rates follow the command at once."""
     if "rotor_speed" not in env.dynamics.sizes:
         return None
@@ -219,23 +223,23 @@ def _rate_loop(env: QuadrotorEnv, drone: Mapping[str, Any]) -> dict[str, Any] | 
 # -- what has flown ----------------------------------------------------------------------------------------------------
 
 
-def seen_ranges(observation: np.ndarray) -> dict[str, Any]:
+def seen_ranges(observation: np.ndarray) -> Fields:
     """The range of each entry in observations (n, k)."""
     marks = np.percentile(observation, (0, 1, 99, 100), axis=0).astype(np.float32)
     seen = dict(zip(("least", "p1", "p99", "greatest"), numbers(marks), strict=True))
     return {"size": observation.shape[1], "seen": seen}
 
 
-def results(env: QuadrotorEnv, flight: TensorDictBase) -> dict[str, Any]:
+def results(env: QuadrotorEnv, flight: TensorDictBase) -> Fields:
     """How well a flight (num_envs, time) from fresh starts went; None where no episode has a value."""
-    summary: dict[str, Any] = {"episodes": env.num_envs}
+    summary: Fields = {"episodes": env.num_envs}
     for name, values in env.episode_metrics(flight).items():
         value = describe_metric(name, env.metric_info).summarise(values)
         summary[name] = None if math.isnan(value) else value
     return summary
 
 
-def envelope(flight: TensorDictBase) -> dict[str, Any]:
+def envelope(flight: TensorDictBase) -> Fields:
     """Where a flight has been: the range of its positions, its greatest speed, body rate and tilt."""
     position, quaternion, *rates = (leaf(flight, ("state", name)).flatten(0, 1) for name in MEASURED)
     velocity, angular_velocity = rates

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -33,6 +34,7 @@ from torchrl_quad.deploy.network import write_c, write_onnx
 from torchrl_quad.deploy.page import write_page
 from torchrl_quad.deploy.reading import MOST_BYTES
 from torchrl_quad.deploy.tracing import Rules, trace
+from torchrl_quad.engine.packing import Key
 from torchrl_quad.envs import QuadrotorEnv
 from torchrl_quad.errors import MissingPackage, UserValueError
 from torchrl_quad.files import check_place, replacing_folder
@@ -220,7 +222,7 @@ def _fly(env: QuadrotorEnv, policy: TensorDictModuleBase, count: int) -> _Flight
 
 
 @torch.no_grad()
-def _act(policy: TensorDictModuleBase, env: QuadrotorEnv, seen: Mapping[Any, Tensor]) -> TensorDictBase:
+def _act(policy: TensorDictModuleBase, env: QuadrotorEnv, seen: Mapping[NestedKey, Tensor]) -> TensorDictBase:
     """What the policy does, as it is and not folded, with what it reads: in single steps (n), or in an episode
     (1, time), in which its memory builds up again."""
     shape = seen["observation"].shape[:-1]
@@ -239,7 +241,7 @@ def _vectors(policy: TensorDictModuleBase, env: QuadrotorEnv, chosen: TensorDict
     vectors = {name: seen[name] for name in ("observation", "depth") if name in seen}
     vectors |= {"memory": seen[memory[0]].flatten(1)} if memory else {}
     vectors |= {"action": leaf(acted, "action")}
-    vectors |= {"next_memory": leaf(acted, _below("next", memory[0])).flatten(1)} if memory else {}
+    vectors |= {"next_memory": leaf(acted, _below("next", cast(Key, memory[0]))).flatten(1)} if memory else {}
     return {name: _array(x.float()) for name, x in vectors.items()}
 
 
@@ -305,7 +307,7 @@ def _check_the_flight(
             )
 
 
-def _below(group: str, key: Any) -> tuple[str, ...]:
+def _below(group: str, key: Key) -> tuple[str, ...]:
     return (group, key) if isinstance(key, str) else (group, *key)
 
 

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
-from torchrl_quad.deploy.contract import BrokenPolicy, TamperedBundle
+from torchrl_quad.deploy.contract import Arrays, BrokenPolicy, Contract, TamperedBundle
 from torchrl_quad.errors import MissingPackage, one_line
 
 OPSET, IR_VERSION = 20, 10  # onnxruntime reads both since 1.18
 AGAIN = "Export the policy again."
-Arrays = Mapping[str, NDArray[Any]]
 # What the network of a policy computes; see network.py. SiLU and Mish are two operators.
 POLICY_OPERATORS = {
     *("Celu", "Clip", "Concat", "Conv", "Elu", "Flatten", "GRU", "Gelu", "Gemm", "HardSwish", "LeakyRelu", "Max"),
@@ -39,7 +36,7 @@ class Graph:
         ImportError: onnxruntime is missing.
     """
 
-    def __init__(self, path: Path, content: bytes, about: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, content: bytes, about: Contract) -> None:
         try:
             import onnxruntime
         except ImportError as error:
@@ -65,7 +62,7 @@ class Graph:
         self.name, self.reads = path.stem, [*about["reads"]]
         self.writes = {name: tuple(x["shape"]) for name, x in about["writes"].items()}
 
-    def __call__(self, given: Arrays) -> dict[str, NDArray[Any]]:
+    def __call__(self, given: Arrays) -> Arrays:
         """What the graph makes of arrays (n, ...), by name; what it does not read is ignored.
 
         Raises:

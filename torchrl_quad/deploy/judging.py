@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.bundle import Bundle
-from torchrl_quad.deploy.contract import ENDS, MEASURED
+from torchrl_quad.deploy.contract import ENDS, MEASURED, Arrays, Contract
 from torchrl_quad.errors import UserValueError
-
-Arrays = Mapping[str, NDArray[Any]]
 
 
 class Judge:
@@ -36,11 +33,11 @@ class Judge:
         self.queue = np.tile(hover, (n, contract["action_delay"], 1))
         self.state = self._drone(starts) | {name: starts[name] for name in self.entries}
         self.state["step"] = np.zeros((n, 1), np.int64)
-        self.states: list[dict[str, NDArray[Any]]] = [self.state]
+        self.states: list[Arrays] = [self.state]
         self.actions: list[NDArray[Any]] = []
-        self.found: list[dict[str, NDArray[Any]]] = []
+        self.found: list[Arrays] = []
 
-    def _drone(self, state: Arrays) -> dict[str, NDArray[Any]]:
+    def _drone(self, state: Arrays) -> Arrays:
         queue = {"action_queue": self.queue} if self.queue.shape[1] else {}
         return {name: np.asarray(state[name], self.dtype) for name in MEASURED} | queue
 
@@ -59,12 +56,12 @@ class Judge:
         self.found.append(found)
         return found["done"][:, 0]
 
-    def flight(self) -> dict[str, NDArray[Any]]:
+    def flight(self) -> Arrays:
         """The task's entries (n, time + 1, ...), and how states end their episode (n, time)."""
         entries = {name: np.stack([x[name] for x in self.states], 1) for name in self.entries}
         return entries | {name: np.stack([x[name][:, 0] for x in self.found], 1) for name in (*ENDS, "done")}
 
-    def metrics(self) -> dict[str, NDArray[Any]]:
+    def metrics(self) -> Arrays:
         """What the first episodes come to, by name, each (n): ``solved`` and ``crash``, 0 or 1, and the task's metrics,
         in SI units."""
         flight = {"action": np.stack(self.actions, 1)}
@@ -75,7 +72,7 @@ class Judge:
         return self.graphs["episode"](flight)
 
 
-def judge(bundle: Bundle, flight: Arrays) -> dict[str, NDArray[Any]]:
+def judge(bundle: Bundle, flight: Arrays) -> Arrays:
     """Judge the first episodes of a flight.
 
     Args:
@@ -90,7 +87,7 @@ def judge(bundle: Bundle, flight: Arrays) -> dict[str, NDArray[Any]]:
     return found.metrics()
 
 
-def summary(metrics: Mapping[str, Any], values: Arrays) -> dict[str, str]:
+def summary(metrics: Contract, values: Arrays) -> dict[str, str]:
     """The metrics of a contract summed up over episodes (n), as print shows them."""
     shown = {}
     for name, about in metrics.items():

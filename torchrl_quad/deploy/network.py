@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.deploy.graphs import IR_VERSION, OPSET
 
 Array = NDArray[np.float32]
@@ -173,7 +174,7 @@ def _update_first(rows: Array) -> Array:
 # -- C -----------------------------------------------------------------------------------------------------------------
 
 
-def write_c(network: Network, contract: Mapping[str, Any], vectors: Mapping[str, Array]) -> dict[str, bytes]:
+def write_c(network: Network, contract: Contract, vectors: Mapping[str, Array]) -> dict[str, bytes]:
     """The network as C99: the files ``policy.h`` and ``policy.c``.
 
     Args:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Mapping
-from typing import Any
 
 from torchrl_quad.deploy import contract as contracts
+from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.deploy.network import fill_in
 
 
-def write_page(contract: Mapping[str, Any], documentation: str | None) -> bytes:
+def write_page(contract: Contract, documentation: str | None) -> bytes:
     """The content of ``README.md``.
 
     Args:

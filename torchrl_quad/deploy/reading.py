@@ -6,7 +6,6 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +17,9 @@ from torchrl_quad.deploy.contract import (
     MEASURED,
     OTHERS,
     VERSION,
+    Arrays,
+    Contract,
+    Fields,
     Signature,
     TamperedBundle,
     UnknownContract,
@@ -37,10 +39,10 @@ MOST_BYTES = {"contract.json": 2**20, **dict.fromkeys((*OTHERS, *(f"{name}.onnx"
 class Content(NamedTuple):
     """What a bundle flies with."""
 
-    contract: dict[str, Any]
+    contract: Contract
     graphs: dict[str, Graph]
-    vectors: dict[str, NDArray[Any]]
-    starts: dict[str, NDArray[Any]]
+    vectors: Arrays
+    starts: Arrays
 
 
 def read(folder: Path) -> Content:
@@ -102,7 +104,7 @@ def _content(path: Path) -> bytes:
     return content
 
 
-def _parsed(path: Path) -> dict[str, Any]:
+def _parsed(path: Path) -> Fields:
     """The JSON of a contract, stricter than Python reads it."""
     try:
         contract = json.loads(
@@ -122,7 +124,7 @@ def _parsed(path: Path) -> dict[str, Any]:
     return contract
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique(pairs: list[tuple[str, Any]]) -> Fields:
     found = dict(pairs)
     if len(found) < len(pairs):
         raise ValueError("a key stands twice in one object")
@@ -145,7 +147,7 @@ def _finite(text: str) -> float:
 # -- its arrays --------------------------------------------------------------------------------------------------------
 
 
-def _arrays(path: Path, content: bytes, expected: Signature) -> dict[str, NDArray[Any]]:
+def _arrays(path: Path, content: bytes, expected: Signature) -> Arrays:
     """The arrays (n, ...) of a file, of these shapes without n, all finite."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -168,7 +170,7 @@ def _arrays(path: Path, content: bytes, expected: Signature) -> dict[str, NDArra
     return arrays
 
 
-def _starts(path: Path, content: bytes, contract: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+def _starts(path: Path, content: bytes, contract: Contract) -> Arrays:
     task, limits = contract["task"], contract["limits"]
     expected = {name: ((size,), task["dtype"]) for name, size in MEASURED.items()} | signature(task["entries"])
     starts = _arrays(path, content, expected)
@@ -183,7 +185,7 @@ def _starts(path: Path, content: bytes, contract: Mapping[str, Any]) -> dict[str
     return starts
 
 
-def within(values: NDArray[Any], about: Mapping[str, Any]) -> NDArray[np.bool_]:
+def within(values: NDArray[Any], about: Contract) -> NDArray[np.bool_]:
     """Which values of an entry of the task are between the bounds that the contract gives for it."""
     low, high = (np.inf * sign if about[end] is None else about[end] for end, sign in (("low", -1), ("high", 1)))
     values = values.astype(float)  # bounds of a damaged contract may be beyond float32

@@ -9,19 +9,25 @@ from __future__ import annotations
 import contextlib
 import logging
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, NamedTuple, cast
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.export import ExportedProgram
 
 from torchrl_quad.deploy.contract import ENDS, MEASURED
 from torchrl_quad.deploy.graphs import IR_VERSION, NOT_IN_TASKS, OPSET
+from torchrl_quad.engine.packing import Key
+from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import QuadrotorEnv
 from torchrl_quad.envs.guard import is_unit
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.errors import UserValueError, one_line
+
+if TYPE_CHECKING:
+    from onnx import ModelProto, ValueInfoProto
 
 Tensors = dict[str, Tensor]
 Method = Callable[[Tensors], Tensors]
@@ -32,12 +38,14 @@ METHODS = {"observe": "observe", "judge": "is_crash and is_success", "measure": 
 class Rules(NamedTuple):
     """What a task computes outside the network."""
 
-    graphs: dict[str, Any]  #: ONNX models by name, "observe" and those that there are of "advance", "judge", "episode"
-    entries: dict[str, Any]  #: the keys in the state of the task's own entries that these read, by name
+    graphs: dict[
+        str, ModelProto
+    ]  #: ONNX models by name, "observe" and those that there are of "advance", "judge", "episode"
+    entries: dict[str, Key]  #: the keys in the state of the task's own entries that these read, by name
     unjudged: str | None  #: why there are no graphs "judge" and "episode", or None
 
 
-def trace(env: QuadrotorEnv, state: Mapping[Any, Tensor]) -> Rules:
+def trace(env: QuadrotorEnv, state: State) -> Rules:
     """The rules of an environment's task as ONNX.
 
     Args:
@@ -59,7 +67,7 @@ def trace(env: QuadrotorEnv, state: Mapping[Any, Tensor]) -> Rules:
     return _Cut(model, [*rules.inputs], outputs, map(name_of, env.task_entries)).rules(rules)
 
 
-def name_of(key: Any) -> str:
+def name_of(key: Key) -> str:
     """The name of an entry of the state in ONNX and in a contract."""
     return key if isinstance(key, str) else ".".join(key)
 
@@ -75,7 +83,7 @@ class _Methods:
     ...), and ``hidden.`` those of what a bundle does not know.
     """
 
-    def __init__(self, env: QuadrotorEnv, state: Mapping[Any, Tensor]) -> None:
+    def __init__(self, env: QuadrotorEnv, state: State) -> None:
         self.env, self.unjudged = env, None if env.scene is None else "its drones crash into obstacles"
         self.changing = [*MEASURED, *(["action_queue"] if "action_queue" in state else [])]
         self.known = {name_of(key): key for key in (*self.changing, *env.task_entries, "step")}
@@ -102,7 +110,7 @@ class _Methods:
             self.flight[name] = path
             self.inputs[name] = torch.stack(STEPS * [value], 1)
 
-    def state(self, x: Tensors) -> dict[Any, Tensor]:
+    def state(self, x: Tensors) -> State:
         """The state, by the keys that the task knows."""
         return {key: x[name] for name, key in (self.known | self.hidden).items()}
 
@@ -166,7 +174,7 @@ class _Whole(nn.Module):
         return tuple(self.found(*tensors).values())
 
 
-def _exported(rules: _Methods) -> tuple[Any, list[str]]:
+def _exported(rules: _Methods) -> tuple[ExportedProgram, list[str]]:
     """All methods as one exported program, and the names of its outputs."""
     try:
         return _export(rules, rules.methods)
@@ -180,7 +188,7 @@ def _exported(rules: _Methods) -> tuple[Any, list[str]]:
         raise _refusal(rules.env, "its rules cannot be exported together", error) from error
 
 
-def _export(rules: _Methods, methods: list[Method]) -> tuple[Any, list[str]]:
+def _export(rules: _Methods, methods: list[Method]) -> tuple[ExportedProgram, list[str]]:
     whole = _Whole(rules.inputs, methods)
     batch, time = torch.export.Dim("batch"), torch.export.Dim("time")
     shapes = [{0: batch, 1: time} if name in rules.flight else {0: batch} for name in rules.inputs]
@@ -248,7 +256,7 @@ class _Cut:
         entries: names of the task's own entries.
     """
 
-    def __init__(self, model: Any, inputs: list[str], outputs: list[str], entries: Iterable[str]) -> None:
+    def __init__(self, model: ModelProto, inputs: list[str], outputs: list[str], entries: Iterable[str]) -> None:
         graph = model.graph
         self.nodes, self.constants = list(graph.node), {x.name: x for x in graph.initializer}
         self.maker = {name: node for node in self.nodes for name in node.output}
@@ -319,7 +327,7 @@ class _Cut:
             value = self.maker[value].input[0]
         return self.inputs.get(value) == entry
 
-    def _graph(self, task: str, name: str, wanted: list[str]) -> Any:
+    def _graph(self, task: str, name: str, wanted: list[str]) -> ModelProto:
         """The ONNX with these outputs alone. Values are numbered, so that the same rules give the same bytes."""
         import onnx
         from onnx import helper, numpy_helper
@@ -356,7 +364,7 @@ class _Cut:
         onnx.checker.check_model(model, full_check=True)
         return model
 
-    def _end(self, name: str, source: str) -> Any:
+    def _end(self, name: str, source: str) -> ValueInfoProto:
         """An input or output of a graph: its axes of batch and time are free."""
         from onnx import helper
 

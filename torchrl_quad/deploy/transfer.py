@@ -13,19 +13,22 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.bundle import Bundle, load_bundle
-from torchrl_quad.deploy.contract import ENDS, MEASURED, drone_problem, naming
+from torchrl_quad.deploy.contract import ENDS, MEASURED, Arrays, Contract, Fields, drone_problem, naming
 from torchrl_quad.deploy.judging import Judge
 from torchrl_quad.deploy.simulators import make_simulator
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 
 Array = NDArray[np.float64]
 # Fields of the rate loop, which does not know the true drone.
+if TYPE_CHECKING:
+    from tensordict import TensorDict
+
 OF_THE_LOOP = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
 MOST_LATE, MOST_SCALE = 1000, 1000.0
 MOST_STATES = 10_000_000  # of a flight, which take 2 GB
@@ -66,7 +69,7 @@ def fly(
     scale: Mapping[str, float] | None = None,
     late: int = 0,
     episodes: int | None = None,
-) -> dict[str, Any]:
+) -> Fields:
     """Fly a bundle from its fresh starts, one episode each, in a simulator.
 
     The simulator applies the contract's ``action_delay``: the hover command is on its way at the start. It reports
@@ -97,9 +100,7 @@ def fly(
         return _fly(bundle, simulator, loop, mutant, scale, late, MOST_STATES if episodes is None else episodes)
 
 
-def _fly(
-    bundle: Bundle, simulator: str, loop: str, mutant: Mutant, scale: Any, late: Any, episodes: Any
-) -> dict[str, Any]:
+def _fly(bundle: Bundle, simulator: str, loop: str, mutant: Mutant, scale: Any, late: Any, episodes: Any) -> Fields:
     for name, value, least, most in (("late", late, 0, MOST_LATE), ("episodes", episodes, 1, MOST_STATES)):
         if not (isinstance(value, int) and not isinstance(value, bool) and least <= value <= most):
             raise UserValueError(f"{name} must be a whole number from {least} to {most}, got {shown(value)}.")
@@ -145,7 +146,7 @@ def _fly(
     return flight | judge.flight() | found
 
 
-def other_drone(contract: Mapping[str, Any], scale: Mapping[str, float]) -> dict[str, Any]:
+def other_drone(contract: Contract, scale: Mapping[str, float]) -> Fields:
     """The contract with another drone in its ``plant``: fields times a factor.
 
     Raises:
@@ -167,7 +168,7 @@ def other_drone(contract: Mapping[str, Any], scale: Mapping[str, float]) -> dict
     return scaled
 
 
-def _pilot(bundle: Bundle, start: dict[str, Any]) -> Bundle:
+def _pilot(bundle: Bundle, start: Arrays) -> Bundle:
     """Another bundle of the same policy, with a flight and a memory of its own."""
     pilot = copy.copy(bundle)
     pilot.faults = Counter()
@@ -186,7 +187,7 @@ def _ask(pilot: Bundle, state: dict[str, Array], mutant: Mutant) -> Array:
     return np.array([thrust, *rates])
 
 
-def as_rollout(flight: Mapping[str, Any]) -> Any:
+def as_rollout(flight: Contract) -> TensorDict:
     """What :func:`fly` returns as a rollout (n, time) for the package's pictures; this needs torch."""
     import torch
     from tensordict import TensorDict

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.errors import MissingPackage, UserValueError, shown
 
 Array = NDArray[np.float64]
@@ -34,7 +35,7 @@ class Simulator(Protocol):
     version: str  #: name and version
     loops: tuple[str, ...]  #: the rate loops that it can fly with
 
-    def __init__(self, contract: Mapping[str, Any], loop: str, motors: Sequence[int]) -> None: ...
+    def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None: ...
 
     def reset(self, starts: Mapping[str, Array]) -> None:
         """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
@@ -66,7 +67,7 @@ def simulator_class(name: str) -> type[Simulator]:
 
 
 def make_simulator(
-    name: str, contract: Mapping[str, Any], loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
+    name: str, contract: Contract, loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
 ) -> Simulator:
     """Build a simulator by its name.
 
@@ -81,7 +82,7 @@ def make_simulator(
     return kind(contract, loop, motors)
 
 
-def check_open_air(contract: Mapping[str, Any]) -> None:
+def check_open_air(contract: Contract) -> None:
     """Refuse a bundle that needs obstacles or images: no simulator here has any.
 
     Raises:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from crazyflow.sim.sim import clip_rotor_vel_cmd
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy import frames
+from torchrl_quad.deploy.contract import Contract, Fields
 from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone
 
 RATE = 1000.0  # [Hz], of the physics and of the rate loop
@@ -33,7 +33,7 @@ class Crazyflow:
 
     loops = tuple(LOOPS)
 
-    def __init__(self, contract: Mapping[str, Any], loop: str, motors: Sequence[int]) -> None:
+    def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         self.version = f"Crazyflow {version('crazyflow')}"
         self.substeps = max(round(contract["control_dt"] * RATE), 1)
         self.rate = round(self.substeps / contract["control_dt"])
@@ -91,7 +91,7 @@ class Crazyflow:
         self.loop.keep(chosen)
 
 
-def _parameters(drone: Drone, frame: frames.Convention) -> dict[str, Any]:
+def _parameters(drone: Drone, frame: frames.Convention) -> Fields:
     """Crazyflow's parameters of a drone; lengths of arms are in its mixing matrix."""
     order = list(frame.motors)
     k2, k1, k0 = drone.thrust_map

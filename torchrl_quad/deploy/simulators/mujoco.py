@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
 from mujoco import rollout
 from numpy.typing import NDArray
 
+from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone
 from torchrl_quad.errors import UserValueError
 
@@ -66,7 +66,7 @@ class MuJoCo:
 
     loops = tuple(LOOPS)
 
-    def __init__(self, contract: Mapping[str, Any], loop: str, motors: Sequence[int]) -> None:
+    def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         self.version = f"MuJoCo {mujoco.__version__}"
         self.substeps = max(round(contract["control_dt"] * RATE), 1)
         timestep = contract["control_dt"] / self.substeps

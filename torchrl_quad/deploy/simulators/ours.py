@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.deploy.simulators.vehicle import Array
 from torchrl_quad.dynamics import DYNAMICS, load_drone
 from torchrl_quad.errors import UserValueError, shown
@@ -18,7 +20,7 @@ class Ours:
 
     loops = ("contract",)
 
-    def __init__(self, contract: Mapping[str, Any], loop: str, motors: Sequence[int]) -> None:
+    def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         if tuple(motors) != (0, 1, 2, 3):
             raise UserValueError("torchrl_quad flies motors as they are: swap them in another simulator.")
         about = contract["simulator"]
@@ -50,6 +52,6 @@ class Ours:
         action = self.dynamics.controller.encode(command)
         self.now = self.dynamics.control_step(self.now, action, self.params, None)
 
-    def keep(self, chosen: NDArray[Any]) -> None:
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
         """Continue with only these drones (n)."""
         self.now = {name: x[torch.from_numpy(chosen)] for name, x in self.now.items()}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rotorpy.vehicles.multirotor import Multirotor
 
 from torchrl_quad.deploy import frames
+from torchrl_quad.deploy.contract import Contract, Fields
 from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone, damping_ratio
 
 NAMES = {"position": "x", "quaternion": "q", "velocity": "v", "angular_velocity": "w"}
@@ -32,7 +32,7 @@ class RotorPy:
 
     loops = (*LOOPS, "own")
 
-    def __init__(self, contract: Mapping[str, Any], loop: str, motors: Sequence[int]) -> None:
+    def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         self.version = f"RotorPy {version('rotorpy')}"
         self.dt = contract["simulator"]["dt"]
         self.substeps = round(contract["control_dt"] / self.dt)
@@ -81,7 +81,7 @@ class RotorPy:
             self.loop.keep(chosen)
 
 
-def _squared(fields: Mapping[str, Any], speed: Array) -> Drone:
+def _squared(fields: Contract, speed: Array) -> Drone:
     """The drone with thrust k w^2 that is its own at a speed (4) [rad/s] of the rotors, and with its limits."""
     drone = Drone(fields)
     k = float((drone.thrust(speed) / speed**2).mean())
@@ -89,7 +89,7 @@ def _squared(fields: Mapping[str, Any], speed: Array) -> Drone:
     return Drone({**fields, "thrust_map": [k, 0.0, 0.0], "rotor_speed_min": least, "rotor_speed_max": greatest})
 
 
-def _parameters(drone: Drone, frame: frames.Convention) -> dict[str, Any]:
+def _parameters(drone: Drone, frame: frames.Convention) -> Fields:
     """RotorPy's parameters of a drone."""
     k, order = float(drone.thrust_map[0]), list(frame.motors)
     at_hover = 4.0 * float(drone.hover_speed.mean())

@@ -5,12 +5,10 @@ Arrays are (n, ...), one row for each drone. Nothing here imports torch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.rotations import cross, rotate, rotate_inverse
 
@@ -46,7 +44,7 @@ class Drone:
     rate_gain: Array
     rate_damping: Array
 
-    def __init__(self, fields: Mapping[str, Any]) -> None:
+    def __init__(self, fields: Contract) -> None:
         self.fields = {name: np.array(value, float) for name, value in fields.items()}
         unknown = ["drag_height"] if self.fields.get("drag_height", np.zeros(1)).any() else []
         unknown += ["two motor_time_constants"] if self.fields["motor_time_constant"].size > 1 else []

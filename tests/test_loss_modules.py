@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from test_objectives import GAMMA, make_networks, make_rollout
 from torch import nn
 from torchrl.envs import PendulumEnv
+from torchrl.modules import MLP
 from torchrl.objectives import SoftUpdate, ValueEstimators
 
 from torchrl_quad import (
@@ -297,43 +298,18 @@ def test_swapped_networks_are_refused(env, flight):
 # -- another environment -----------------------------------------------------------------------------------------------
 
 
-class CosSin(nn.Module):
-    def forward(self, th, thdot):
-        return torch.stack((th.cos(), th.sin(), thdot / 8), -1)
-
-
 def pendulum_networks(env):
-    spec = env.action_spec_unbatched
-    features = TensorDictModule(CosSin(), in_keys=["th", "thdot"], out_keys=["observation"])
+    assert env.action_spec_unbatched.shape == (1,)
+    angles, state = ["th", "thdot"], ["observation"]
+    features = TensorDictModule(lambda th, thdot: torch.stack((th.cos(), th.sin(), thdot / 8), -1), angles, state)
+    torque = TensorDictModule(lambda x: 2 * x.tanh(), ["raw"], ["action"])
 
-    def mlp(inputs, outputs):
-        return nn.Sequential(nn.Linear(inputs, 32), nn.Tanh(), nn.Linear(32, outputs))
+    def network(in_keys, inputs, out_key, *more):
+        mlp = MLP(inputs, 1, num_cells=[32], activation_class=nn.Tanh)
+        return TensorDictSequential(features, TensorDictModule(mlp, in_keys, [out_key]), *more)
 
-    class Policy(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.net = mlp(3, 1)
-
-        def forward(self, x):
-            return 2 * self.net(x).tanh()
-
-    class Critic(nn.Module):
-        def __init__(self, inputs):
-            super().__init__()
-            self.net = mlp(inputs, 1)
-
-        def forward(self, *x):
-            return self.net(torch.cat(x, -1))
-
-    def module(net, in_keys, out_key):
-        return TensorDictSequential(features, TensorDictModule(net, in_keys=in_keys, out_keys=[out_key]))
-
-    assert spec.shape == (1,)
-    return (
-        module(Policy(), ["observation"], "action"),
-        module(Critic(3), ["observation"], "state_value"),
-        module(Critic(4), ["observation", "action"], "state_action_value"),
-    )
+    qvalue = network([*state, "action"], 4, "state_action_value")
+    return network(state, 3, "raw", torque), network(state, 3, "state_value"), qvalue
 
 
 @pytest.mark.parametrize("name", ["bptt", "shac", "abpt"])

@@ -1,4 +1,4 @@
-"""Classical controllers, to compare with: policies that learn nothing, and know the drone and the task instead."""
+"""Classical controllers as baselines: policies that learn nothing, and are given the drone and the task."""
 
 from torchrl_quad.controllers.geometric import GeometricController
 from torchrl_quad.controllers.mpc import MPC

@@ -136,7 +136,7 @@ class VelocityController(TiltController):
         super().__init__(nominal, max_tilt)
         nominal = self.nominal
         # Sideways it acts through the tilt: its lag, and the time to tilt fully at the greatest rate. Upwards it acts
-        # through the rotors alone, as the tilt does.
+        # only through the rotors, as the tilt does.
         tilt_gain = self.tilt_gain.amin(-1, keepdim=True)
         sideways = 0.5 / (1.0 / tilt_gain + self.max_tilt / self.tilt_rate.amin(-1, keepdim=True))
         self.velocity_gain = join(sideways, sideways, tilt_gain)

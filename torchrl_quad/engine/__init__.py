@@ -1,4 +1,4 @@
-"""The engine: a pure control step becomes a fast horizon with its graph. It knows no quadrotor.
+"""The engine: a pure control step becomes a fast horizon with its graph. It is independent of quadrotors.
 
 It takes a :class:`Simulation`, packs its entries into rows, compiles it and its derivative where asked to, and loops it
 through the ends of episodes.

@@ -16,7 +16,7 @@ from torchrl_quad.engine.simulation import State
 from torchrl_quad.engine.stepper import Stepper
 
 Entries = dict[Any, Tensor]
-_NAMES: Any = [None, "time"]  # of the dimensions; tensordict's annotations know no None
+_NAMES: Any = [None, "time"]  # of the dimensions; tensordict's annotations leave out None
 
 
 class Source(Protocol):

@@ -22,7 +22,7 @@ class Transition(NamedTuple):
 class Simulation(Protocol):
     """A control step, whole for an eager flight, and in three parts for a compiled one.
 
-    The parts exist because a compiler that sees a whole step unrolls its physics steps and takes minutes.
+    The parts exist because a compiler that gets a whole step unrolls its physics steps and takes minutes.
     """
 
     substeps: int

@@ -33,7 +33,7 @@ class Stepper:
         state, outputs = simulation.example()
         self.layout = Layout(state)
         self.output_layout = Layout({key: x for key, x in flat(outputs).items() if key != "observation"})
-        meaningful = torch.ones(0, dtype=torch.bool)  # of an example nobody asks
+        meaningful = torch.ones(0, dtype=torch.bool)  # an example needs none
         self.example = record(Transition(state, outputs, meaningful), self.layout, self.output_layout)
         self.steps: dict[int, StepProgram] = {}  # by the number of the simulation's parameters
         self.policies: dict[Hashable, PolicyProgram] = {}  # by signature

@@ -129,7 +129,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
     module = TensorDictModule(nn.Linear(13, 4), in_keys=["observation"], out_keys=["action"])
     refuses("exports what make_actor and make_visual_actor build, .* This TensorDictModule is something else", module)
     refuses(
-        r"reads \['observation', \('state', 'rotor_speed'\)\]. A drone can give it",
+        r"reads \['observation', \('state', 'rotor_speed'\)\]. A drone only has",
         make_actor(env, in_keys=["observation", ("state", "rotor_speed")]),
     )
     leaky = make_actor(env)
@@ -140,7 +140,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
     refuses("exports what make_actor and make_visual_actor build", hooked)
     refuses("the bundle observes something else than Counting does, by", env=Counting(num_envs=16, max_episode_steps=8))
     refuses("the policy reads 13 numbers, the environment observes 40", env=make_env("tracking", num_envs=2))
-    refuses("knows one transform, a single ObservationNormalizer", env=TransformedEnv(env, RewardSum()))
+    refuses("supports only one transform, an ObservationNormalizer", env=TransformedEnv(env, RewardSum()))
     broken = make_actor(env)
     with torch.no_grad():
         broken[0].module.mlp[0].bias[0] = math.nan

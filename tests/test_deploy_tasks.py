@@ -145,7 +145,7 @@ WRONGS = {
     "is_crash and is_success cannot be exported: .* no Python `if` on values": method(
         "is_crash", lambda self, state: state["position"][:, 2:] < (1 if state["position"].mean() > 0 else 2)
     ),
-    "observation cannot be exported: it follows from 'rotor_speed', which no drone knows. A drone": method(
+    "observation cannot be exported: it follows from 'rotor_speed', which no drone measures. A drone": method(
         "observe", lambda self, state: torch.cat((state["position"], state["rotor_speed"]), -1)
     ),
 }
@@ -166,7 +166,7 @@ def test_a_task_that_cannot_be_judged_without_its_reward_still_flies(tmp_path):
     env = method("episode_metrics", by_return)(4, max_episode_steps=8)
     bundle = load_bundle(export_policy(make_actor(env, (4,)), env, tmp_path / "policy"))
     bundle(resting())
-    why = "solved: it follows from 'next.reward', which no drone knows"
+    why = "solved: it follows from 'next.reward', which no drone measures"
     assert bundle.contract["task"]["unjudged"] == why and bundle.graphs.keys() == {"policy", "observe"}
     with pytest.raises(UserValueError, match=f"cannot fly this bundle of the task .*: {why}. Fly it in the package's"):
         fly(bundle, "torchrl_quad")

@@ -146,7 +146,7 @@ def test_a_visual_policy_that_was_built_for_another_camera_or_changed_is_refused
     for changed in (hooked, deeper):
         refuses("exports what make_actor and make_visual_actor build, .* This VisualActor is something", changed)
     velocity = make_visual_actor(forest, in_keys=[("state", "velocity")])
-    refuses(r"reads \['depth', \('state', 'velocity'\)\]. A drone can give it", velocity)
+    refuses(r"reads \['depth', \('state', 'velocity'\)\]. A drone only has", velocity)
     flatter = make_visual_actor(forest)
     flatter[0][0].module.convolutions[1] = nn.ELU(0.5)
     refuses("cannot write ELU.alpha=0.5", flatter)

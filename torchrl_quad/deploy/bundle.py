@@ -72,7 +72,7 @@ class Bundle:
         self.reset()
 
     def reset(self, **entries: Any) -> None:
-        """Start a new flight; the counts of faults go on.
+        """Start a new flight; the counts of faults continue.
 
         Args:
             entries: where the flight starts in the task, by the names of ``contract["task"]["entries"]``: numbers, or
@@ -121,7 +121,7 @@ class Bundle:
 
         Raises:
             Fault: the policy cannot fly from this state; the bundle is as before the call, as after any other error.
-                With ``on_fault="hover"`` the command is to hover instead, the time goes on with the drone where it was
+                With ``on_fault="hover"`` the command is to hover instead, time continues with the drone where it was
                 measured last, and :attr:`faults` counts it. A gate that is passed meanwhile counts with the next good
                 state.
         """
@@ -156,7 +156,7 @@ class Bundle:
         """Run the policy on all observations that came with it.
 
         Returns:
-            the greatest difference from the actions, and memories, that came with them.
+            the greatest difference from the actions and memories stored with them.
 
         Raises:
             WrongActions: the difference is above the tolerance.
@@ -229,7 +229,7 @@ class Bundle:
             given = np.asarray(value)
             fits = given.dtype.kind in kinds and (given.shape == shape or (given.ndim == 0 and shape == (1,)))
             fits = fits and bool((np.abs(given.astype(float)) <= MOST).all() and within(given, about).all())
-        except Exception:  # whatever the conversion of somebody else's type raises
+        except Exception:  # whatever a foreign type raises when converted
             fits = False
         if fits:
             return given.astype(dtype).reshape(1, *shape)
@@ -270,7 +270,7 @@ class Bundle:
             numbers = None if numbers is None else numbers.astype(float, copy=False)
         except OverflowError:
             raise NotFinite(f"Not finite, or beyond {self._limits['max_value']:g}: {name}.") from None
-        except Exception:  # whatever the conversion of somebody else's type raises
+        except Exception:  # whatever a foreign type raises when converted
             numbers = None
         if numbers is None:
             wanted = f"{math.prod(shapes[0])} numbers" if shapes[0] else "a number [s]"
@@ -281,7 +281,7 @@ class Bundle:
 
 
 def load_bundle(folder: str | Path, on_fault: Literal["raise", "hover"] = "raise") -> Bundle:
-    """Load what :func:`~torchrl_quad.deploy.export_policy` wrote, and check that nobody changed it since.
+    """Load what :func:`~torchrl_quad.deploy.export_policy` wrote, and check that it is unchanged.
 
     Checksums show accidents only: whoever changes a file on purpose writes new ones. So the contract is also held
     against its schema and against itself, and the other files against the contract, before anything is used.

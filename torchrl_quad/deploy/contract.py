@@ -161,7 +161,7 @@ def check(contract: Contract, path: Path) -> None:
     """
     if said := problem(contract):
         raise UnknownContract(
-            f"{path}: {said}. This torchrl_quad does not fly that; it was written by {writer(contract)}: use that "
+            f"{path}: {said}. This torchrl_quad cannot fly it. It was written by {writer(contract)}: use that "
             "one, or export again."
         )
 
@@ -249,7 +249,7 @@ def _contradictions(contract: Contract) -> Iterator[str]:
 
 
 def _contradictions_of_the_graphs(contract: Contract) -> Iterator[str]:
-    """Where graphs read what nobody gives them, or write what nobody reads."""
+    """Where graphs read what no bundle has, or write something else than it reads."""
     task, graphs, floats = contract["task"], contract["graphs"], contract["task"]["dtype"]
     judged = {"judge", "episode"} & graphs.keys()
     if judged != (set() if task["unjudged"] else {"judge", "episode"}):

@@ -1,4 +1,4 @@
-"""Describe an environment as a contract: what its policy reads and writes, the drone, and the task beside it."""
+"""Describe an environment as a contract: what its policy reads and writes, the drone, and its task."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def _graph(model: ModelProto) -> Fields:
 
 
 def _camera(camera: DepthCamera) -> Fields:
-    """A depth camera, in numbers alone."""
+    """A depth camera as numbers."""
     fields = {k: v for k, v in vars(camera).items() if k not in ("pitch", "differentiable")}
     mount = numbers(camera.mount(torch.zeros((), dtype=torch.float64)) + 0.0)
     return fields | {"position": list(map(float, camera.position)), "quaternion": mount}

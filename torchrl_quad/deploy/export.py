@@ -166,8 +166,8 @@ def _unwrapped(
     if isinstance(env, TransformedEnv):
         if not isinstance(env.transform, ObservationNormalizer) or isinstance(env.base_env, TransformedEnv):
             raise UserValueError(
-                "export_policy knows one transform, a single ObservationNormalizer: what others do to the observation "
-                f"would be missing on the drone. Got {env.transform}."
+                "export_policy supports only one transform, an ObservationNormalizer: what others do to the "
+                f"observation would be missing on the drone. Got {env.transform}."
             )
         normalizer = env.transform if normalizer is None else normalizer
     base = base_env(env)
@@ -192,7 +192,7 @@ class _Flight(NamedTuple):
 
 @torch.no_grad()
 def _fly(env: QuadrotorEnv, policy: TensorDictModuleBase, count: int) -> _Flight:
-    """Fly, and choose single steps; the environment then goes on as if there was no flight."""
+    """Fly, and choose single steps; the environment then continues as if there was no flight."""
     steps = max(env.max_episode_steps, -(-VECTORS // env.num_envs))
     at = torch.linspace(0, env.num_envs * steps - 1, count).long()
     drone, step = at // steps, at % steps
@@ -248,7 +248,7 @@ def _vectors(policy: TensorDictModuleBase, env: QuadrotorEnv, chosen: TensorDict
 def _check_the_flight(
     folder: Path, env: QuadrotorEnv, policy: TensorDictModuleBase, flights: TensorDictBase, rules: Rules
 ) -> None:
-    """Fly the bundle through the first episodes of flights, from what a drone knows.
+    """Fly the bundle through the first episodes of flights, from what a drone measures.
 
     Compare what it observes with what the environment did, what it then does and remembers with what the policy does,
     in the same order, with the same observations, and what it makes of the episodes with the environment's metrics.
@@ -270,7 +270,7 @@ def _check_the_flight(
         bundle.reset(**{name: x[0] for name, x in entries.items()})
         observations, actions = [], []
         for t in range(length):
-            if not observes_truth:  # from which the environment advances the task; a drone only knows its measurements
+            if not observes_truth:  # from which the environment advances the task; a drone only has measurements
                 bundle._progress, bundle._step, bundle._before = {k: x[t][None] for k, x in entries.items()}, t, None
             bundle({name: x[t] for name, x in states.items()} | {"age": 0.0, "depth_age": 0.0})
             observations.append(bundle.observation)

@@ -120,7 +120,7 @@ def _layers(
 def _check_keys(found: Sequence[Any], known: list[str]) -> None:
     if found != known:
         raise UserValueError(
-            f'export_policy: the policy reads {found}. A drone can give it the "observation" alone: train it with '
+            f'export_policy: the policy reads {found}. A drone only has the "observation": train it with '
             'in_keys=[\'observation\']. A visual policy may also read "depth", with image_key="depth".'
         )
 

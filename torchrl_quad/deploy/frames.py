@@ -9,7 +9,7 @@
     thrust_z = px4.thrust(thrust, full_thrust=weight / hover_thrust)
 
 Ours: a world with z up, in which x and y may point anywhere; body x forward, y left, z up (FLU); quaternions
-(w, x, y, z) from body to world; rotors front left, back left, back right, front right. Where a target knows north, say
+(w, x, y, z) from body to world; rotors front left, back left, back right, front right. Where a target has a north, say
 where our x and y point: ``world="enu"``, x east and y north, or ``world="nwu"``, x north and y west.
 
 Everything broadcasts over leading dimensions. ``docs/deploy_autopilots.md`` says which facts were read in the source of

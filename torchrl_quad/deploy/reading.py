@@ -154,7 +154,7 @@ def _arrays(path: Path, content: bytes, expected: Signature) -> Arrays:
             stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.infolist())
             names = sorted(entry.filename for entry in archive.infolist())
         if not stored or names != sorted(f"{name}.npy" for name in expected):
-            raise ValueError(f"it must hold {', '.join(sorted(expected))} alone, and not compressed")
+            raise ValueError(f"it must hold only {', '.join(sorted(expected))}, not compressed")
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {name: file[name] for name in expected}
     except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds for damaged files

@@ -78,9 +78,9 @@ def name_of(key: Key) -> str:
 class _Methods:
     """The rules of a task as functions of tensors by name, with an example of what they read.
 
-    What a bundle knows has the names of the state: the drone's quantities, the task's entries, ``step`` and
+    What a bundle has, keeps its name in the state: the drone's quantities, the task's entries, ``step`` and
     ``action_queue``. ``previous.`` begins the names of the step before, ``flight.`` those of whole flights (n, time,
-    ...), and ``hidden.`` those of what a bundle does not know.
+    ...), and ``hidden.`` those of what a bundle does not have.
     """
 
     def __init__(self, env: QuadrotorEnv, state: State) -> None:
@@ -111,7 +111,7 @@ class _Methods:
             self.inputs[name] = torch.stack(STEPS * [value], 1)
 
     def state(self, x: Tensors) -> State:
-        """The state, by the keys that the task knows."""
+        """The state, by its own keys."""
         return {key: x[name] for name, key in (self.known | self.hidden).items()}
 
     def observe(self, x: Tensors) -> Tensors:
@@ -294,14 +294,14 @@ class _Cut:
     def _why_not(self, output: str) -> str | None:
         """Why a bundle cannot compute an output, if it cannot."""
         hidden = sorted(x.removeprefix("hidden.") for x in self._follows_from(output) if x.startswith("hidden."))
-        return f"it follows from {hidden[0]!r}, which no drone knows" if hidden else None
+        return f"it follows from {hidden[0]!r}, which no drone measures" if hidden else None
 
     def rules(self, rules: _Methods) -> Rules:
         """The graphs, with the entries that they need, and none of what they do not."""
         task = type(rules.env).__name__
         if why := self._why_not("observation"):
             raise UserValueError(
-                f"export_policy: {task}: its observation cannot be exported: {why}. A drone knows "
+                f"export_policy: {task}: its observation cannot be exported: {why}. A drone has "
                 f"{', '.join(rules.known)}."
             )
         unjudged = rules.unjudged
@@ -328,7 +328,7 @@ class _Cut:
         return self.inputs.get(value) == entry
 
     def _graph(self, task: str, name: str, wanted: list[str]) -> ModelProto:
-        """The ONNX with these outputs alone. Values are numbered, so that the same rules give the same bytes."""
+        """The ONNX with only these outputs. Values are numbered, so that the same rules give the same bytes."""
         import onnx
         from onnx import helper, numpy_helper
 

@@ -45,7 +45,7 @@ class Mutant:
     commanded: tuple[float, ...] = (1.0, 1.0, 1.0)  #: times the body rates that it commands
     motors: tuple[int, ...] = (0, 1, 2, 3)  #: for each rotor the motor whose command it gets
     delay: int | None = None  #: control steps until a command takes effect, instead of the contract's
-    keeps_queue: bool = True  #: whether the bundle knows the commands on their way
+    keeps_queue: bool = True  #: whether the bundle keeps the commands on their way
 
 
 MUTANTS = {
@@ -73,7 +73,7 @@ def fly(
     """Fly a bundle from its fresh starts, one episode each, in a simulator.
 
     The simulator applies the contract's ``action_delay``: the hover command is on its way at the start. It reports
-    states as late as the contract's ``observation_delay``, and otherwise exactly.
+    states as late as the contract's ``observation_delay``, but exactly.
 
     Args:
         folder: a bundle.

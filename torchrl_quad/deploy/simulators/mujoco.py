@@ -1,4 +1,4 @@
-"""Fly the drone of a contract in MuJoCo: a rigid body with four rotors, built from numbers alone."""
+"""Fly the drone of a contract in MuJoCo: a rigid body with four rotors, built only from numbers."""
 
 from __future__ import annotations
 

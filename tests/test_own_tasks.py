@@ -159,6 +159,8 @@ def test_what_is_your_own_trains_resumes_is_evaluated_and_exported_as_what_ships
     assert "abpt on own_task.CornerEnv" in printed and "distance to the corner" in printed
     summary = json.loads((tmp_path / "evaluation.json").read_text())
     assert summary["corner_error"] == json.loads((tmp_path / "summary.json").read_text())["corner_error"]
+    printed = launch("export", f"checkpoint={tmp_path}/checkpoint.pt", trust, "episodes=4")
+    assert "policy: flies own_task.CornerEnv; its actions differ by at most" in printed
 
 
 @pytest.mark.usefixtures("importable", "no_pictures")
@@ -190,5 +192,3 @@ def test_a_metric_that_is_described_and_not_given_is_named():
 
     with pytest.raises(ValueError, match=r"SilentEnv.metrics\(state\) lacks corner_error, which metric_info describes"):
         SilentEnv()
-    printed = launch("export", f"checkpoint={tmp_path}/checkpoint.pt", trust, "episodes=4")
-    assert "policy: flies own_task.CornerEnv; its actions differ by at most" in printed

@@ -28,7 +28,7 @@ def evaluate(actor, seed=99, **options):
 
 def test_shac_learns_to_hover_in_seconds():
     coarse = {"num_envs": 64, "control_dt": 0.05, "dt": 0.025, "max_episode_steps": 100}  # few steps a second of flight
-    iterations = 80
+    iterations = 64
     env = HoveringEnv(seed=0, **coarse)
     actor = make_actor(env, input_scale=0.5)
     loss = SHACLoss(actor, make_value(env, input_scale=0.5))

@@ -50,8 +50,9 @@ napoleon_use_rtype = False  # "Returns:" is a sentence here; its types are in th
 nitpick_ignore_regex = [
     (r"py:.*", r"(torch|torchrl|tensordict|gymnasium|numpy|np|matplotlib)\..*"),
     (r"py:.*", r"(collections\.abc|pathlib|dataclasses|enum)\..*"),
-    (r"py:class", r"Arrays|Contract|Fields|Key|Length|ModelProto|Path|State|Tensor|TensorDict|TensorDictBase|Vector"),  # in annotations that keep the name alone
-    (r"py:class", r"torchrl_quad\.(engine\.\w+|deploy\.(reading|contract)|identification\.parameters|options)\.\w+"),  # their own
+    # In annotations that only keep the name, and those of modules without a page.
+    (r"py:class", r"Arrays|Contract|Fields|Key|Length|ModelProto|Path|State|Tensor|TensorDict|TensorDictBase|Vector"),
+    (r"py:class", r"torchrl_quad\.(engine\.\w+|deploy\.(reading|contract)|identification\.parameters|options)\.\w+"),
     (r"py:(exc|class|obj)", r"[A-Z][A-Za-z]*Error|ResetNeeded|NoFfmpeg|None|bool|dict|float|int|list|str|tuple|type"),
 ]
 

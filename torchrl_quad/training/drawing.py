@@ -64,7 +64,7 @@ def draw_transfer(bundle: Bundle, simulator: str, loop: str, path: Path, drones:
     title = f"drones 1 to {drones}: {labels[0]}; {drones + 1} to {2 * drones}, from the same starts: {labels[1]}"
     page = path.with_suffix(".html")
     with _or_without(page):
-        write_replay(cast("TensorDict", torch.cat((ours, theirs))), page, title=title, **about)
+        write_replay(cast("TensorDict", torch.cat(cast("Any", (ours, theirs)))), page, title=title, **about)
 
 
 def environment_beside(bundle: Bundle) -> EnvBase | None:

@@ -1,6 +1,6 @@
 """Rays per second of the depth camera on one core, compared with MuJoCo's ray casting.
 
-python benchmarks/camera.py
+python -m benchmarks.camera
 
 Trees are upright cylinders; the mixed scenes have a third each of balls, cylinders and boxes turned at random. Every
 camera has a scene of its own. MuJoCo casts the same rays, those of one camera in one call of ``mj_multiRay``, without
@@ -16,10 +16,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-from report import RESULTS, save
 from torch import Tensor
 from tqdm import tqdm
 
+from benchmarks.report import RESULTS, save
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.vision import DepthCamera, Primitives
 

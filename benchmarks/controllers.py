@@ -1,6 +1,6 @@
 """Classical controllers beside learned policies: success, error, gates, and milliseconds per control step.
 
-python benchmarks/controllers.py --checkpoints outputs/.../checkpoint.pt ...
+python -m benchmarks.controllers --checkpoints outputs/.../checkpoint.pt ...
 
 All fly the same fresh starts with the same delay and limits, as the recipes configure each task. "Other drones" are the
 same starts with mass and motors drawn at random in each episode, which neither the controllers nor the policies know. A
@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from report import RESULTS, save
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
+from benchmarks.report import RESULTS, save
 from torchrl_quad import MPC, GeometricController
 from torchrl_quad.files import read_rows, replacing
 from torchrl_quad.training.building import build_env

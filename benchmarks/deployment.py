@@ -1,6 +1,6 @@
 """How far torch, ONNX and C differ on what a policy has visited, and how long a call takes.
 
-python benchmarks/deployment.py --checkpoints outputs/.../checkpoint.pt ...
+python -m benchmarks.deployment --checkpoints outputs/.../checkpoint.pt ...
 
 Each policy is exported as it is, and once more behind an ObservationNormalizer. Fresh flights give the observations. A
 time is the median over single calls from Python: of C with what ctypes takes, of the bundle from the named quantities
@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from report import RESULTS, save
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
+from benchmarks.report import RESULTS, save
 from torchrl_quad import ObservationNormalizer, differentiable_rollout, make_actor, make_env, make_visual_actor
 from torchrl_quad.deploy import export_policy, load_bundle
 from torchrl_quad.envs import TASKS

@@ -1,7 +1,7 @@
 """Fit simulated flights whose truth is known: how close does the fit come, and do its intervals hold the truth?
 
-python benchmarks/identification.py            # ten flights: minutes; writes results/identification.csv
-python benchmarks/identification.py --seeds 1
+python -m benchmarks.identification            # ten flights: minutes; writes results/identification.csv
+python -m benchmarks.identification --seeds 1
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from report import RESULTS, save
 from scipy.signal import savgol_filter
 from tqdm import tqdm
 
+from benchmarks.report import RESULTS, save
 from torchrl_quad import QuadrotorParams, load_drone
 from torchrl_quad.dynamics import MotorCommand, quaternion
 from torchrl_quad.dynamics.modes import make_controller

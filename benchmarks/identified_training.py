@@ -1,6 +1,6 @@
 """Train on an identified drone and on another one, and fly both policies on a third that neither has seen.
 
-    python benchmarks/identified_training.py --drones before=old.yaml fitted=outputs/real_flights/fitted/drone.yaml \\
+    python -m benchmarks.identified_training --drones before=old.yaml fitted=outputs/real_flights/fitted/drone.yaml \\
         --randomize fitted=outputs/real_flights/fitted/randomization.yaml --judge outputs/judge/drone.yaml
 
 Each policy flies with the controller of the drone that it was trained on, as it would on board. Writes
@@ -13,10 +13,10 @@ import argparse
 from pathlib import Path
 
 import torch
-from report import RESULTS, save
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
+from benchmarks.report import RESULTS, save
 from torchrl_quad import BPTTLoss, VisitedStateBuffer, differentiable_rollout, load_drone, make_actor, make_env
 
 

@@ -1,6 +1,6 @@
 """Memory that the graph of a horizon holds, per environment and control step, and what keeping less of it costs.
 
-python benchmarks/memory.py --num-envs 1024
+python -m benchmarks.memory --num-envs 1024
 
 =========  =============================================================================================
 eager      autograd keeps every intermediate result
@@ -20,11 +20,11 @@ import time
 from pathlib import Path
 
 import torch
-from report import RESULTS, in_own_process, save
 from torch.utils.checkpoint import checkpoint
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
+from benchmarks.report import RESULTS, in_own_process, save
 from torchrl_quad import ActionSequence, differentiable_rollout, make_env
 
 MODES = ["eager", "recompute", "compiled"]

@@ -1,6 +1,6 @@
 """What a training iteration spends its time on, per algorithm.
 
-python benchmarks/profile_recipes.py --algorithms bptt abpt --overrides num_envs=256 horizon=32
+python -m benchmarks.profile_recipes --algorithms bptt abpt --overrides num_envs=256 horizon=32
 
 Runs the recipes themselves, with clocks around their parts; a clock stops while one inside it runs. Writes
 ``benchmarks/results/profile.csv``: per cent of the wall-clock time of the iterations, evaluations left out.
@@ -16,9 +16,10 @@ from collections import defaultdict
 from pathlib import Path
 
 import torch
-from report import RESULTS, in_own_process, save
 from tensordict.nn import ProbabilisticTensorDictSequential
 from tqdm import tqdm
+
+from benchmarks.report import RESULTS, in_own_process, save
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 

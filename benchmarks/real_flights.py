@@ -1,6 +1,6 @@
 """Fit a drone to real flights, and judge it on flights of other shapes, next to what published drones predict.
 
-    python benchmarks/real_flights.py --flights FOLDER    # minutes; writes results/real_flights.csv
+    python -m benchmarks.real_flights --flights FOLDER    # minutes; writes results/real_flights.csv
 
 The rows: constant velocity, the preset before and after, the parameters that others published, the fit, and a small
 network that learns on the same flights what the fitted physics leaves out.
@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from report import RESULTS, save
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from benchmarks.report import RESULTS, save
 from torchrl_quad import QuadrotorParams, load_drone
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.rigid_body import RigidBodyState

@@ -1,6 +1,6 @@
 """Control steps per second, forward alone and with the gradient of a horizon to all its actions.
 
-python benchmarks/throughput.py --num-envs 64 256 1024 --threads 1
+python -m benchmarks.throughput --num-envs 64 256 1024 --threads 1
 
 ==========  ============================================================================================
 physics     the control step alone: rate controller, rotors and rigid body, four physics steps
@@ -29,13 +29,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from report import RESULTS, save
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
+from benchmarks.report import RESULTS, save
 from torchrl_quad import ActionSequence, differentiable_rollout, make_actor, make_env
 from torchrl_quad.engine import Stepper, Transition
 from torchrl_quad.engine.policy import GivenActions

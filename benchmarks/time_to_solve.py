@@ -1,6 +1,6 @@
 """Seconds from the start of the process until hovering is solved, per algorithm, eager and compiled, cold and warm.
 
-python benchmarks/time_to_solve.py --algorithms abpt --seeds 0 1 2
+python -m benchmarks.time_to_solve --algorithms abpt --seeds 0 1 2
 
 Runs the recipes, and takes the first evaluation, on fresh starts, in which at least 99 % of the episodes succeed.
 Nothing is left out of the clock: imports, compilation and evaluations count. "Cold" is an empty compile cache. Writes
@@ -17,9 +17,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from report import RESULTS, save
 from tqdm import tqdm
 
+from benchmarks.report import RESULTS, save
 from torchrl_quad.files import read_rows
 
 RECIPES = Path(__file__).parents[1] / "recipes"

@@ -24,9 +24,8 @@ def run(tmp_path, monkeypatch):
         output = tmp_path / "results.csv"
         monkeypatch.chdir(tmp_path)
         monkeypatch.setenv("OMP_NUM_THREADS", "1")
-        monkeypatch.syspath_prepend(BENCHMARKS)
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments.split(), "--output", str(output)])
-        module = importlib.import_module(name)
+        module = importlib.import_module(f"benchmarks.{name}")
         change(module)
         module.main()
         with open(output, newline="") as file:
@@ -83,7 +82,7 @@ def test_the_benchmark_of_exported_policies_writes_a_table(run, monkeypatch):
 def test_the_benchmark_of_controllers_writes_a_table(run):
     rows = run("controllers", "--tasks hovering --starts 2 --mpc-starts 1 --steps 2 --calls 1")
     assert [row["policy"] for row in rows] == ["geometric", "mpc"]
-    module = importlib.import_module("controllers")
+    module = importlib.import_module("benchmarks.controllers")
     assert module.table(rows).count("\n") == 3
 
 

@@ -98,7 +98,6 @@ def understands(words, monkeypatch):
     script, *arguments = words
     is_run(script)
     arguments = [re.sub(r"\b(mypackage|shuttle)\.\w+", "own_task.CornerEnv", x) for x in arguments]
-    monkeypatch.syspath_prepend((ROOT / script).parent)  # as python does
     if script == "recipes/transfer.py":
         runpy.run_path(str(ROOT / script))["settings"](arguments)
     elif Path(script).parent.name == "recipes":

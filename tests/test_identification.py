@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +28,12 @@ from torchrl_quad.identification.parameters import UNKNOWNS, Model
 
 ROOT = Path(__file__).parents[1]
 REAL = ROOT / "examples/data/figure8.csv.gz"
-sys.path.insert(0, str(ROOT / "benchmarks"))
 pytestmark = pytest.mark.usefixtures("quick_fits")
 
 
 @pytest.fixture(scope="module")
 def benchmark():
-    import identification
+    from benchmarks import identification
 
     return identification
 

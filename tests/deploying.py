@@ -9,14 +9,13 @@ import pytest
 import torch
 from filelock import FileLock
 from torch import nn
-from torch.onnx._internal.exporter._registration import ONNXRegistry
 from torchrl.envs import TransformedEnv
 
 from torchrl_quad import ObservationNormalizer, make_actor, make_env, make_visual_actor
 from torchrl_quad.deploy import export, export_policy
 
 # torch.onnx builds its table of operators again in each call, which takes longer than most of a small export.
-ONNXRegistry.from_torchlib = functools.cache(ONNXRegistry.from_torchlib)
+ONNXRegistry.from_torchlib = staticmethod(functools.cache(ONNXRegistry.from_torchlib))  # called of an instance, too
 
 GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
 CAMERA = {"width": 6, "height": 5, "pitch": 0.2, "rate": 2, "delay": 1, "noise": 0.02, "dropout": 0.05}

@@ -9,6 +9,7 @@ import pytest
 import torch
 from filelock import FileLock
 from torch import nn
+from torch.onnx._internal.exporter._registration import ONNXRegistry
 from torchrl.envs import TransformedEnv
 
 from torchrl_quad import ObservationNormalizer, make_actor, make_env, make_visual_actor

@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 import yaml
 
 from torchrl_quad import HoveringEnv, QuadrotorParams, available_drones, load_drone
+from torchrl_quad.dynamics import presets
 from torchrl_quad.errors import UserValueError, shown
 
 VISFLY = {name: value.squeeze().tolist() for name, value in load_drone("visfly").fields().items()}
@@ -58,11 +60,11 @@ def test_a_bad_file_is_refused_with_its_field_and_what_is_allowed(tmp_path, chan
 
 
 def test_what_is_no_drone_is_refused_by_name(tmp_path):
-    assert available_drones() == ["crazyflie", "flightmare", "small_racer", "visfly"]
+    assert available_drones() == sorted(path.stem for path in Path(presets.__file__).parent.glob("drones/*.yaml"))
     (tmp_path / "list.yaml").write_text("- 1\n- 2\n")
     (tmp_path / "bad.yaml").write_text("mass: [1")
     for drone, message in (
-        ("visflu", "Unknown drone 'visflu'. Choose from: crazyflie, flightmare, small_racer, visfly"),
+        ("visflu", f"Unknown drone 'visflu'. Choose from: {', '.join(available_drones())}"),
         (tmp_path / "list.yaml", "expected a mapping of names to values, got list"),
         (tmp_path / "bad.yaml", "bad.yaml: not a YAML file"),
     ):

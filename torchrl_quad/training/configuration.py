@@ -122,7 +122,8 @@ def own_recipe(config: str, settings: Mapping[str, Any]) -> str:
     name = settings.get("algorithm")
     if not isinstance(name, str) or (CONFIG / f"{name}.yaml").exists():
         raise UserValueError(
-            f"A recipe of your own needs its own name: @recipe({config!r}, algorithm='my_{config}', ...); got {name!r}."
+            f"A recipe of your own needs its own name: @recipe({config!r}, algorithm='my_{config}', ...); {name!r} "
+            + ("is a recipe that ships." if isinstance(name, str) else "is no name.")
         )
     OWN[name] = config, settings
     node = OmegaConf.load(CONFIG / f"{config}.yaml")

@@ -15,7 +15,7 @@ def test_the_gradients_of_every_method_are_compared_with_the_simulator(launch, n
     for folder, algorithm in zip([*folders, other], ("abpt", "shac", "bptt", "bptt"), strict=True):
         launch(algorithm, *running.QUICK, f"seed={7 if folder == other else 42}", f"hydra.run.dir={folder}")
     checkpoints = [folder / "checkpoint.pt" for folder in (*folders, other)]
-    ascent = "ascent --states 4 --repeats 2 --steps 8 --data", tmp_path
+    ascent = "ascent --states 2 --repeats 2 --steps 4 --data", tmp_path
     for some in (checkpoints[:1], checkpoints):
         run_main(monkeypatch, reproduce, *ascent, *some)
     rows = read_rows(tmp_path / "ascent.csv")

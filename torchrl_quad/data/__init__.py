@@ -18,6 +18,7 @@ attribute           meaning
 
 from torchrl_quad.data.normalizer import ObservationNormalizer
 from torchrl_quad.data.rollout import DifferentiableCollector, differentiable_rollout
+from torchrl_quad.data.transforms import flight_mode
 from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.data.visited_states import VisitedStateBuffer, restart
 
@@ -27,5 +28,6 @@ __all__ = [
     "VisitedStateBuffer",
     "base_env",
     "differentiable_rollout",
+    "flight_mode",
     "restart",
 ]

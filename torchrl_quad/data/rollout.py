@@ -17,7 +17,7 @@ from torchrl.data import Composite
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad.data.normalizer import NormalizedPolicy, ObservationNormalizer
+from torchrl_quad.data.transforms import check_statistics, under_transforms
 from torchrl_quad.data.unwrap import (
     base_env,
     check_actor,
@@ -80,6 +80,7 @@ def differentiable_rollout(
         )
     try:
         check_whole_state(env)
+        check_statistics(env)
         carry = env.reset() if carry is None else carry.copy()
         _check_start(env, actor, carry)
         if carry.numel() * horizon > 1_000_000:
@@ -164,22 +165,12 @@ def _check_memory(carry: TensorDictBase, horizon: int) -> None:
 
 
 def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> TensorDictBase:
-    """The environment's own rollout.
-
-    If its only transform is our normaliser, the environment inside flies, compiled if it can, and what it observed is
-    normalised afterwards.
-    """
-    options = {"auto_reset": False, "break_when_any_done": False}
-    if not (isinstance(env, TransformedEnv) and type(env.transform) is ObservationNormalizer):
-        return env.rollout(horizon, actor, tensordict=start, **options)
-    normalizer = env.transform
-    (key,) = normalizer.in_keys
-    if key in start:  # otherwise the environment complains
-        start.set(key, normalizer.undo(leaf(start, key)))
-    rollout = env.base_env.rollout(horizon, NormalizedPolicy(actor, normalizer), tensordict=start, **options)
-    for name in (key, ("next", key)):
-        rollout.set(name, normalizer.normalize(leaf(rollout, name)))
-    return rollout
+    """The environment's own rollout, under transforms that allow it that of the environment inside."""
+    flown = under_transforms(env, actor) if isinstance(env, TransformedEnv) else ""
+    rollout = None if isinstance(flown, str) else flown.fly(env, actor, start, horizon)
+    if rollout is not None:
+        return rollout
+    return env.rollout(horizon, actor, tensordict=start, auto_reset=False, break_when_any_done=False)
 
 
 @checked

@@ -82,8 +82,9 @@ class Stepper:
         """A compiled horizon with its graph, as one node.
 
         Gradients reach its start, what the policy draws (steps, n, k), its weights, and the parameters. They reach the
-        actions as well: the node of all that is flown has ``actions``, a tensor (steps, n, k) that stands for them, and
-        ``learns``, to be switched off for a backward pass that wants no gradient of the policy's weights.
+        actions as well: the node of all that is flown has ``actions``, a tensor (steps, n, k) that stands for them,
+        ``applied``, which makes them of the policy's, and ``learns``, to be switched off for a backward pass that wants
+        no gradient of the policy's weights.
 
         Args:
             valid: where the start is meaningful, bool (n); elsewhere the episode ends with the first step.
@@ -94,7 +95,8 @@ class Stepper:
         if self.options is None:
             raise RuntimeError("Only a compiled stepper flies horizons.")
         drawn, parameters = policy.drawn(steps, len(valid), before or {}), self.simulation.parameters
-        self.simulation.check_action(drawn[0, :, : policy.size])
+        applied = getattr(policy, "applied", lambda action: action)  # by transforms between policy and simulation
+        self.simulation.check_action(applied(drawn[0, :, : policy.size]))
         if len(parameters) not in self.steps:
             program = StepProgram(self.simulation, self.layout, self.output_layout, self.options)
             self.steps[len(parameters)] = program
@@ -109,7 +111,8 @@ class Stepper:
         actions = drawn.new_zeros(()).expand(drawn[..., : policy.size].shape).requires_grad_(keeps)
         leaves = _Horizon.apply(horizon, keeps, actions, *tensors)
         if keeps:
-            leaves[0].grad_fn.actions, leaves[0].grad_fn.learns = actions, True
+            node: Any = leaves[0].grad_fn
+            node.actions, node.applied, node.learns = actions, applied, True
         return Flight(Record.of(leaves), dict(zip(policy.out_keys, leaves[7:], strict=True)), horizon.restarts)
 
 
@@ -267,7 +270,8 @@ class _Policy:
         """The gradient of each weight, over all steps."""
         if self.steps and self.program is not None:
             self._learn(self.program)
-        return self.total or [None] * len(self.weights)
+        total = self.total or []
+        return [*total, *[None] * (len(self.weights) - len(total))]  # constants have none
 
     def _learn(self, program: PolicyProgram) -> None:
         traces = self.steps[0] if len(self.steps) == 1 else [torch.cat(x) for x in zip(*self.steps, strict=True)]

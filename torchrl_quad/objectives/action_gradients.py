@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.autograd.graph import GradientEdge
+from torch.func import vjp
 
 from torchrl_quad.errors import Unsupported, UserValueError
 from torchrl_quad.objectives.calls import act
@@ -31,7 +32,7 @@ def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
             (grad,) = torch.autograd.grad(objective, steps, retain_graph=True)
         finally:
             node.learns = True
-        return grad.movedim(0, -2)
+        return vjp(node.applied, action.detach())[1](grad.movedim(0, -2))[0]
     dim = None if steps is None else node._saved_dim  # of the stack; -2 is kept without its sign
     if steps is None or len(steps) != action.shape[-2] or dim not in (action.ndim - 2, 2**64 - 2):
         raise UserValueError(

@@ -1,0 +1,469 @@
+"""Fly under transforms as fast as without: what they do to a policy's inputs and actions, and to a whole horizon."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torch.func import vjp
+from torchrl.envs import (
+    ActionScaling,
+    CatTensors,
+    ClipTransform,
+    Compose,
+    DoubleToFloat,
+    DTypeCastTransform,
+    EnvBase,
+    ExcludeTransform,
+    InitTracker,
+    ObservationNorm,
+    RenameTransform,
+    RewardClipping,
+    RewardScaling,
+    RewardSum,
+    SelectTransform,
+    StepCounter,
+    TargetReturn,
+    TensorDictPrimer,
+    TrajCounter,
+    Transform,
+    TransformedEnv,
+    VecNorm,
+    VecNormV2,
+)
+
+from torchrl_quad.data.normalizer import ObservationNormalizer
+from torchrl_quad.data.unwrap import base_env, check_actor, check_env, leaf, memory_keys, observed
+from torchrl_quad.engine.packing import flat, looks_are_free
+from torchrl_quad.engine.policy import GivenActions, PlainPolicy, plain
+from torchrl_quad.errors import UserValueError
+
+ELEMENTWISE = (ObservationNorm, ObservationNormalizer, ClipTransform, DTypeCastTransform, DoubleToFloat, ActionScaling)
+OF_REWARDS = (RewardScaling, RewardClipping)
+COUNTERS = (RewardSum, TargetReturn, StepCounter, InitTracker, TrajCounter)
+OF_KEYS = (CatTensors, RenameTransform, SelectTransform, ExcludeTransform)
+OUTER = "action_of_policy"  # before the transforms, where these change it on its way to the environment
+
+
+class Value(NamedTuple):
+    """How an entry follows from those of the environment inside."""
+
+    kind: str  # entry, normalize, scale, clip, cast or cat
+    about: Any  # the key of an entry, the type or the dimension
+    parts: tuple[Value, ...] = ()
+    constants: tuple[Tensor | None, ...] = ()
+
+    def compute(self, entries: Mapping[Any, Tensor], given: Iterator[Tensor] | None = None) -> Tensor:
+        """The value (*, k) from entries (*, ...); with ``given`` instead of the constants, in the same order."""
+        if self.kind == "entry":
+            return entries[self.about]
+        x, *more = (part.compute(entries, given) for part in self.parts)
+        a, b = cast(Any, [c if c is None or given is None else next(given) for c in self.constants or (None, None)])
+        if self.kind == "normalize":
+            return (x - a) / b
+        if self.kind == "scale":
+            return x * b + a
+        if self.kind == "clip":
+            return x.clamp(a, b)
+        return x.to(self.about) if self.kind == "cast" else torch.cat([x, *more], self.about)
+
+    def sources(self) -> list[Any]:
+        """The entries of the environment that it reads."""
+        return [self.about] if self.kind == "entry" else [key for part in self.parts for key in part.sources()]
+
+    def tensors(self) -> list[Tensor]:
+        """All constants, in the order in which :meth:`compute` takes them."""
+        return [x for part in self.parts for x in part.tensors()] + [x for x in self.constants if x is not None]
+
+    def describe(self) -> tuple[Any, ...]:
+        """What it computes, apart from the numbers."""
+        shapes = tuple(None if x is None else x.shape for x in self.constants)
+        return self.kind, self.about, shapes, *(part.describe() for part in self.parts)
+
+
+Known = dict[Any, Value | None]  # by key; None for what is known only after the flight, such as counters
+
+
+class Flown(NamedTuple):
+    """An environment under transforms with which a policy flies as it does in the environment inside."""
+
+    transforms: list[Transform]
+    known: Known
+    policy: TensorDictModuleBase
+
+    def fly(self, env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> Any:
+        """The rollout as TorchRL's own loop writes it; None if ``start`` is not what transforms make of its state."""
+        inside = self.start(env, start)
+        counted = [key for t in self.transforms if isinstance(t, COUNTERS) for key in _counted(t)]
+        if inside is None or any(key not in start for key in counted):
+            return None
+        options: dict[str, Any] = {"auto_reset": False, "break_when_any_done": False}
+        root = base_env(env).rollout(horizon, self.policy, tensordict=inside, **options)
+        after = cast(TensorDictBase, root.pop("next"))
+        done = leaf(after, "done")
+        own = {*map(unravel_key, self.policy.out_keys), "is_init"}
+        written = {key: root.pop(key) for key in own if key in root}
+        memory = {key: after.pop(key) for key in ("is_init", *memory_keys(actor)) if key in after}
+        for transform in self.transforms:
+            if isinstance(transform, COUNTERS):
+                _count(transform, root, after, start, done)
+            elif not isinstance(transform, TensorDictPrimer):
+                root, after = transform._reset(start, root), transform._call(after)
+        for key, value in self.known.items():  # the first step is that of the start
+            if key in start and value != Value("entry", key) and key in root:
+                root.set(key, torch.cat((leaf(start, key).unsqueeze(1), leaf(root, key)[:, 1:]), 1))
+        if OUTER in written:
+            written[cast(Any, env).action_key] = (written.pop("action"), written.pop(OUTER))[1]
+        return root.update(written).set("next", after.update(memory))
+
+    def start(self, env: EnvBase, start: TensorDictBase) -> TensorDictBase | None:
+        """What the environment inside would have written where ``start`` stands."""
+        base = base_env(env)
+        entries = start
+        if any(unravel_key(key) in self.known for t in self.transforms for key in t.in_keys_inv or ()):
+            entries = start.copy().set(cast(Any, env).action_key, cast(Any, env).action_spec.zero())
+            while isinstance(env, TransformedEnv):
+                env, entries = env.base_env, env.transform.inv(entries)
+        wanted = [unravel_key(key) for key in (*observed(base).keys(True, True), *cast(Any, base).done_keys)]
+        same = {x.about: key for key, x in self.known.items() if x is not None and x.kind == "entry"}
+        state = {unravel_key(key) for key in cast(Any, base).state_keys}
+        names = {key: key if key in state else same.get(key) for key in wanted}
+        found: Any = {key: entries.get(name, None) for key, name in names.items() if name is not None}
+        if not set(wanted) <= {key for key, x in found.items() if x is not None}:
+            step, missing = cast(Any, base).control_step, {key for key in wanted if found.get(key) is None}
+            present = {key: entries.get(unravel_key(("state", key))) for key in step.safe_state}
+            again = flat(step.measure(present))
+            if not missing <= set(again):
+                again = dict(base.reset(entries.select("state"), set_state=True).items(True, True))
+            found = {key: again.get(key) if found.get(key) is None else found[key] for key in wanted}
+        policy = self.policy
+        if isinstance(policy, PolicyUnder) and looks_are_free(start.device or torch.device("cpu")):
+            for key, value in policy.reads.items():
+                seen, now = leaf(start, key), value.compute(found)
+                if seen.shape != now.shape or not torch.allclose(seen, now, 1e-4, 1e-5):
+                    return None
+        own = {unravel_key(key) for key in (*policy.in_keys, *policy.out_keys)}
+        kept = start.select(*(key for key in own if key not in found and key != "action"), strict=False)
+        return TensorDict(found, start.batch_size, start.device).update(kept)
+
+
+class PolicyUnder(TensorDictModuleBase):
+    """A policy under transforms, as one of the environment inside.
+
+    Args:
+        policy: reads and writes what is outside.
+        reads: how each entry that it reads follows from those inside.
+        action: how the action inside follows from what it writes.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, reads: dict[Any, Value], action: Value) -> None:
+        passed = [key for key in policy.in_keys if unravel_key(key) not in reads]
+        self.in_keys = [*dict.fromkeys([*(key for x in reads.values() for key in x.sources()), *passed])]
+        changes = action != Value("entry", "action")
+        self.own = action.sources()[0]  # the key under which the policy writes its action
+        self.out_keys = [OUTER if changes and unravel_key(key) == self.own else key for key in policy.out_keys]
+        self.out_keys += ["action"] if changes else []
+        super().__init__()
+        self.policy, self.reads, self.action, self.changes = policy, reads, action, changes
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write what the policy writes, and the action inside; all else stays as it is."""
+        read = tensordict.copy()
+        for key, value in self.reads.items():
+            if all(name in tensordict for name in value.sources()):  # otherwise the policy complains
+                read.set(key, value.compute({name: leaf(tensordict, name) for name in value.sources()}))
+        written = self.policy(read).select(*self.policy.out_keys, strict=False)
+        if self.changes:
+            outer = leaf(written, self.own)
+            written = written.exclude(self.own).set(OUTER, outer).set("action", self.action.compute({self.own: outer}))
+        return tensordict.update(written)
+
+    def plain(self) -> Any:
+        """The same on plain tensors, if the policy has such a form."""
+        inner = plain(self.policy)
+        if inner is None or isinstance(inner, GivenActions):
+            return None if self.changes else inner
+        return _PlainUnder(inner, self)
+
+
+class _PlainUnder:
+    """See the engine's ``PlainPolicy``."""
+
+    def __init__(self, inner: PlainPolicy, under: PolicyUnder) -> None:
+        self.reads = [under.reads.get(unravel_key(key), Value("entry", unravel_key(key))) for key in inner.in_keys]
+        self.in_keys = [*dict.fromkeys(key for x in self.reads for key in x.sources())]
+        self.action, self.own, self.size = under.action if under.changes else None, under.own, inner.size
+        self.out_keys = [OUTER if self.action and unravel_key(key) == self.own else key for key in inner.out_keys]
+        self.out_keys += ["action"] if self.action else []
+        values = [*self.reads, *([self.action] if self.action else [])]
+        self.signature = (inner.signature, *map(str, (self.out_keys, *(value.describe() for value in values))))
+        self.inner, self.count = inner, len(inner.weights)
+        self.constants = tuple(x for value in values for x in value.tensors())
+
+    @property
+    def weights(self) -> tuple[Tensor, ...]:
+        """What the policy learns, and the constants of the transforms."""
+        return (*self.inner.weights, *self.constants)
+
+    @weights.setter
+    def weights(self, weights: tuple[Tensor, ...]) -> None:
+        self.inner = copy.copy(self.inner)
+        self.inner.weights, self.constants = weights[: self.count], weights[self.count :]
+
+    def fits(self, inputs: Sequence[Tensor]) -> bool:
+        """Whether the policy can read what the transforms make of these."""
+        return self.inner.fits(self._read(self.weights, [x[:1] for x in inputs])[0])
+
+    def drawn(self, steps: int, n: int, before: Mapping[Any, Tensor]) -> Tensor:
+        """What the policy draws."""
+        return self.inner.drawn(steps, n, before)
+
+    def applied(self, action: Tensor) -> Tensor:
+        """What the transforms make of an action of the policy."""
+        return action if self.action is None else self.action.compute({self.own: action})
+
+    def forward(
+        self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
+    ) -> tuple[list[Tensor], dict[Any, Tensor]]:
+        """What the policy keeps and writes."""
+        read, constants = self._read(weights, inputs)
+        kept, written = self.inner.forward(weights[: self.count], read, drawn)
+        if self.action is None:
+            return kept, written
+        outer = written.pop(self.own)
+        return [*kept, outer], {**written, OUTER: outer, "action": self.action.compute({self.own: outer}, constants)}
+
+    def adjoint(
+        self,
+        weights: Sequence[Tensor],
+        inputs: Sequence[Tensor],
+        kept: Sequence[Tensor],
+        drawn: Tensor,
+        grads: dict[Any, Tensor],
+    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
+        """The gradients through policy and transforms."""
+        read, pull = vjp(lambda *x: tuple(self._read(weights, x)[0]), *inputs)[:2]
+        if self.action is not None:
+            action, (*kept, outer), constants = self.action, kept, self._read(weights, inputs)[1]
+            (grad,) = vjp(lambda x: action.compute({self.own: x}, constants), outer)[1](grads["action"])
+            others = {key: x for key, x in grads.items() if key not in (OUTER, "action")}
+            grads = {**others, self.own: grads[OUTER] + grad}
+        traces, of_read, of_drawn = self.inner.adjoint(weights[: self.count], read, kept, drawn, grads)
+        return traces, list(pull(tuple(of_read))), of_drawn
+
+    def weight_gradient(self, traces: Sequence[Tensor]) -> list[Tensor]:
+        """Those of the policy; constants have none."""
+        return self.inner.weight_gradient(traces)
+
+    def _read(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> tuple[list[Tensor], Iterator[Tensor]]:
+        """What the policy reads, and the constants of its action."""
+        entries, constants = dict(zip(self.in_keys, inputs, strict=True)), iter(weights[self.count :])
+        return [value.compute(entries, constants) for value in self.reads], constants
+
+
+def transforms_of(env: EnvBase) -> list[Transform]:
+    """All transforms of an environment, the innermost first."""
+    transforms: list[Transform] = []
+    while isinstance(env, TransformedEnv):
+        transforms = [*_parts(env.transform), *transforms]
+        env = env.base_env
+    return transforms
+
+
+def check_statistics(env: EnvBase) -> None:
+    """Raise a UserValueError for statistics that change at each step, which breaks ``backward``."""
+    for transform in transforms_of(env):
+        if isinstance(transform, VecNorm | VecNormV2) and not getattr(transform, "frozen", False):
+            raise UserValueError(
+                f"{type(transform).__name__} changes its statistics in place at each step, and a graph through several "
+                "steps needs those of before. Take torchrl_quad.ObservationNormalizer(env), whose statistics are fixed "
+                "within a horizon: call its update(rollout) between horizons."
+            )
+
+
+class FlightMode(NamedTuple):
+    """How a policy flies, and why not faster."""
+
+    mode: Literal["inside", "called", "loop"]
+    reason: str
+
+
+def flight_mode(env: EnvBase, actor: TensorDictModuleBase) -> FlightMode:
+    """How :func:`differentiable_rollout` flies a policy in an environment, under transforms or without.
+
+    ``"inside"`` the compiled step, which is fastest; ``"called"`` before each step of the engine; or in TorchRL's own
+    ``"loop"``. The numbers are the same. ``reason`` names the transform or the entry that prevents the next faster
+    way; it is empty for ``"inside"``.
+    """
+    check_env(env)
+    check_actor(actor, "actor")
+    flown = under_transforms(env, actor)
+    if isinstance(flown, str):
+        return FlightMode("loop", flown)
+    base: Any = base_env(env)
+    if base.flies_inside(flown.policy):
+        return FlightMode("inside", "")
+    if not base.is_compiled:
+        return FlightMode("called", "the environment is not compiled: build it with compile=True")
+    return FlightMode("called", f"{type(actor).__name__} has no form on plain tensors: build it by make_actor")
+
+
+def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
+    """How a policy flies under the transforms of an environment as it does in the one inside, or why it cannot."""
+    base, transforms = base_env(env), transforms_of(env)
+    if not hasattr(base, "flies_inside"):
+        return f"{type(base).__name__} has only TorchRL's own loop"
+    memory = {unravel_key(key) for key in memory_keys(actor)}
+    known: Known = {unravel_key(key): Value("entry", unravel_key(key)) for key in observed(base).keys(True, True)}
+    for transform in transforms:
+        name, kind = type(transform).__name__, type(transform)
+        if kind is StepCounter and transform.max_steps is not None:
+            return "StepCounter(max_steps=...) ends episodes; give the environment max_episode_steps instead"
+        if (
+            kind is TensorDictPrimer
+            and {unravel_key(key) for key in cast(Any, transform.primers).keys(True, True)} <= memory
+        ):
+            continue
+        if kind not in (*ELEMENTWISE, *OF_REWARDS, *COUNTERS, *OF_KEYS):
+            return f"{name} is none of the transforms that are pure functions of entries"
+        try:
+            _follow(transform, known)
+        except (NotImplementedError, KeyError, RuntimeError) as error:
+            return f"{name}: {error}"
+    reads = {}
+    for key in map(unravel_key, actor.in_keys):
+        if key in memory or (memory and key == "is_init") or key in map(unravel_key, actor.out_keys):
+            continue
+        value = known.get(key)
+        if value is None:
+            return f"the policy reads {key!r}, which " + ("is counted outside" if key in known else "nobody writes")
+        reads[key] = value
+    actions: Known = {unravel_key(key): Value("entry", unravel_key(key)) for key in actor.out_keys}
+    for transform in reversed(transforms):
+        pairs = zip(transform.in_keys_inv or (), transform.out_keys_inv or (), strict=True)
+        for inner, outer in ((unravel_key(a), unravel_key(b)) for a, b in pairs):
+            if outer in actions:
+                x = cast(Value, actions.pop(outer) if type(transform) is RenameTransform else actions[outer])
+                actions[inner] = _inverse(transform, x)
+    if (action := actions.get("action")) is None or action.sources()[0] not in map(unravel_key, actor.out_keys):
+        return "the policy writes no action that the transforms pass on"
+    if action == Value("entry", "action") and all(x == Value("entry", key) for key, x in reads.items()):
+        return Flown(transforms, known, actor)
+    return Flown(transforms, known, PolicyUnder(actor, reads, action))
+
+
+def _parts(transform: Transform) -> list[Transform]:
+    return [x for part in transform for x in _parts(part)] if isinstance(transform, Compose) else [transform]
+
+
+def _follow(transform: Any, known: Known) -> None:
+    """What the entries that a transform reads and writes are made of, after it."""
+    ins, outs = list(map(unravel_key, transform.in_keys or ())), _counted(transform)
+    if isinstance(transform, OF_REWARDS):
+        if set(known) & {*ins, *outs}:
+            raise NotImplementedError("a reset leaves what it writes as it was, which is followed for rewards alone")
+    elif isinstance(transform, COUNTERS):
+        known.update(dict.fromkeys(outs))
+    elif isinstance(transform, ExcludeTransform):
+        if transform.inverse:
+            raise NotImplementedError("inverse=True is left to TorchRL")
+        _keep(known, lambda key: not _below(key, transform.excluded_keys))
+    elif isinstance(transform, SelectTransform):
+        kept = [*transform.selected_keys, *cast(Any, transform.parent).state_spec.keys(True, True)]
+        _keep(known, lambda key: _below(key, kept))
+    elif isinstance(transform, RenameTransform):
+        for a, b in zip(ins, outs, strict=True):
+            known[b] = known[a] if transform.create_copy else known.pop(a)
+    elif isinstance(transform, CatTensors):
+        if transform.dim >= 0 or transform.unsqueeze_if_oor or not transform._initialized:
+            raise NotImplementedError("only in_keys that are named, and a negative dim, mean the same in a horizon")
+        parts = tuple(cast(Value, known[key]) for key in ins)
+        known[outs[0]] = None if None in parts else Value("cat", transform.dim, parts)
+        _keep(known, lambda key: not transform._del_keys or key not in ins or key == outs[0])
+    elif not isinstance(transform, ActionScaling):
+        for a, b in zip(ins, outs, strict=True):
+            if a in known:
+                known[b] = None if (x := known[a]) is None else _elementwise(transform, x)
+
+
+def _counted(transform: Any) -> list[Any]:
+    """The entries that a transform writes."""
+    keys = transform.step_count_keys if isinstance(transform, StepCounter) else transform.out_keys
+    return list(map(unravel_key, keys or ()))
+
+
+def _keep(known: Known, wanted: Any) -> None:
+    for key in [key for key in known if not wanted(key)]:
+        del known[key]
+
+
+def _below(key: Any, groups: Sequence[NestedKey]) -> bool:
+    """Whether an entry is one of some, or in a group of them."""
+    path = key if isinstance(key, tuple) else (key,)
+    return any(path[: len(g)] == g for g in ((x,) if isinstance(x, str) else x for x in map(unravel_key, groups)))
+
+
+def _elementwise(transform: Any, x: Value) -> Value:
+    """What a transform makes of an entry."""
+    if isinstance(transform, ObservationNorm):
+        if not transform.initialized or max(transform.loc.ndim, transform.scale.ndim) > 1:
+            raise NotImplementedError("statistics are vectors, or numbers; call init_stats")
+        kind = "normalize" if transform.standard_normal else "scale"
+        return Value(kind, None, (x,), (transform.loc, transform.scale))
+    if isinstance(transform, ClipTransform):
+        return Value("clip", None, (x,), (transform.low, transform.high))
+    return Value("cast", transform.dtype_out, (x,))
+
+
+def _inverse(transform: Any, x: Value) -> Value:
+    """What a transform makes of an action on its way to the environment."""
+    if isinstance(transform, RenameTransform):
+        return x
+    if isinstance(transform, ClipTransform):
+        return Value("clip", None, (x,), (transform.low, transform.high))
+    if isinstance(transform, DTypeCastTransform):
+        return Value("cast", transform.dtype_in, (x,))
+    if isinstance(transform, ActionScaling):
+        transform._ensure_initialized()
+        loc, scale = transform.loc, transform.scale
+        return Value("scale", None, (x,), (loc, scale) if transform.standard_normal else (loc - scale, 2.0 * scale))
+    kind = "scale" if transform.standard_normal else "normalize"
+    return Value(kind, None, (x,), (transform.loc, transform.scale))
+
+
+def _count(transform: Any, root: TensorDictBase, after: TensorDictBase, start: TensorDictBase, done: Tensor) -> None:
+    """Write what a counter has at both ends of each step of a horizon, which began at ``start``; done is (n, T, 1)."""
+    begun = torch.cat((torch.zeros_like(done[:, :1]), done[:, :-1]), 1)  # an episode at this step
+    steps = torch.arange(done.shape[1], device=done.device).unsqueeze(-1)
+    first = torch.where(begun, steps, -1).cummax(1).values  # step of the present episode; -1 where it began before
+    for i, key in enumerate(_counted(transform)):
+        if isinstance(transform, RewardSum | TargetReturn):
+            is_sum = isinstance(transform, RewardSum)
+            value, roots, ends = leaf(start, key), [], []
+            for reward, restarts in zip(leaf(after, transform.in_keys[i]).unbind(1), begun.unbind(1), strict=True):
+                value = torch.where(restarts, 0.0 if is_sum else cast(float, transform.target_return), value)
+                roots.append(value)
+                value = value + reward if is_sum else value - reward if transform.mode == "reduce" else value
+                ends.append(value)
+            root.set(key, torch.stack(roots, 1))
+            after.set(key, torch.stack(ends, 1))
+        elif isinstance(transform, StepCounter):
+            root.set(key, torch.where(first < 0, leaf(start, key).unsqueeze(1) + steps, steps - first))
+            after.set(key, leaf(root, key) + 1)
+        elif isinstance(transform, InitTracker):
+            root.set(key, torch.cat((leaf(start, key).unsqueeze(1), begun[:, 1:]), 1))
+            after.set(key, torch.zeros_like(done))
+        else:
+            flown = begun.transpose(0, 1).flatten().cumsum(0).view(begun.shape[1], -1, 1).transpose(0, 1)
+            with transform._traj_count:
+                fresh = transform._traj_count.value + flown - 1
+                transform._traj_count.value += int(flown[-1, -1])
+            count = torch.where(first < 0, leaf(start, key).unsqueeze(1), fresh.gather(1, first.clamp_min(0)))
+            root.set(key, count)
+            after.set(key, count.clone())

@@ -13,7 +13,7 @@ from torch.nn.functional import normalize, pad
 from torchrl_quad.controllers.policy import Controller, State
 from torchrl_quad.controllers.references import Reference, follow
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.dynamics.modes import Tilt
+from torchrl_quad.dynamics.control import Tilt
 from torchrl_quad.options import between
 
 LEAST_LIFT = 0.3  # vertical part of the thrust, in weights: the drone never turns over to dive

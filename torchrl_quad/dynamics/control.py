@@ -363,7 +363,7 @@ def make_controller(control: str | Mapping[str, Any], nominal: QuadrotorParams) 
         choices = f'Choose from: {", ".join(CONTROLS)}; or {{"mode": "velocity", "max_speed": 5.0}}.'
         raise UserValueError(f"{what}. {choices}")
     known = [x.name for x in inspect.signature(CONTROLS[mode]).parameters.values() if x.kind is x.KEYWORD_ONLY]
-    for name in limits.keys() - known:
+    for name in (name for name in limits if name not in known):
         has = f"Choose from: {', '.join(known)}" if known else "It has none; those of the drone hold"
         raise UserValueError(f"control: {mode!r} has no limit {shown(name)}. {has}.")
     try:

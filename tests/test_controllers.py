@@ -11,7 +11,7 @@ from torch import nn
 from torchrl_quad import MPC, ActionSequence, GeometricController, HoveringEnv, LandingEnv, RacingEnv, TrackingEnv
 from torchrl_quad.controllers import follow
 from torchrl_quad.controllers.mpc import feedback
-from torchrl_quad.controllers.references import basis, plan_lap
+from torchrl_quad.controllers.policy import basis, plan_lap
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs import TASKS
 

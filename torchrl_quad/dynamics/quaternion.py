@@ -1,7 +1,6 @@
 """Unit quaternions (w, x, y, z) that turn body-frame vectors into world-frame vectors.
 
-All functions broadcast over leading dimensions and have finite derivatives for every finite input. What a physics step
-needs takes vectors in either form (:mod:`~torchrl_quad.dynamics.vector`).
+All functions broadcast over leading dimensions and have finite derivatives for every finite input.
 """
 
 import torch
@@ -60,22 +59,9 @@ def from_axis_angle(axis_angle: Tensor) -> Tensor:
 
 
 def distance(p: Tensor, q: Tensor) -> Tensor:
-    """Attitude error min(|p - q|, |p + q|), (*, 1): 0 for the same attitude, sqrt(2) for half a turn.
-
-    p and -p are one attitude, so the error does not depend on either sign.
-    """
+    """Attitude error min(|p - q|, |p + q|), (*, 1), as q and -q are one: 0 for the same, sqrt(2) for half a turn."""
     flip = torch.where(dot(p, q) < 0, -1.0, 1.0).to(p)
     return torch.linalg.vector_norm(p - flip * q, dim=-1, keepdim=True)
-
-
-def to_xyzw(q: Tensor) -> Tensor:
-    """Reorder (w, x, y, z) into the (x, y, z, w) that ROS and SciPy use, (*, 4)."""
-    return q.roll(-1, -1)
-
-
-def from_xyzw(q_xyzw: Tensor) -> Tensor:
-    """Reorder (x, y, z, w) into (w, x, y, z), (*, 4)."""
-    return q_xyzw.roll(1, -1)
 
 
 def _rotate(q: Vector, v: Vector, sign: float) -> Vector:

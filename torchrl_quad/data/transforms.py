@@ -41,7 +41,7 @@ from torchrl.envs import (
 from torchrl_quad.data.normalizer import ObservationNormalizer
 from torchrl_quad.data.unwrap import base_env, check_actor, check_env, leaf, memory_keys, observed
 from torchrl_quad.engine.packing import flat, looks_are_free
-from torchrl_quad.engine.policy import GivenActions, PlainPolicy, plain
+from torchrl_quad.engine.policy import GivenActions, PlainPolicy
 from torchrl_quad.errors import UserValueError
 
 ELEMENTWISE = (ObservationNorm, ObservationNormalizer, ClipTransform, DTypeCastTransform, DoubleToFloat, ActionScaling)
@@ -186,7 +186,8 @@ class PolicyUnder(TensorDictModuleBase):
 
     def plain(self) -> Any:
         """The same on plain tensors, if the policy has such a form."""
-        inner = plain(self.policy)
+        make = getattr(self.policy, "plain", None)
+        inner = make() if callable(make) else None
         if inner is None or isinstance(inner, GivenActions):
             return None if self.changes else inner
         return _PlainUnder(inner, self)
@@ -203,7 +204,7 @@ class _PlainUnder:
         self.out_keys += ["action"] if self.action else []
         values = [*self.reads, *([self.action] if self.action else [])]
         self.signature = (inner.signature, *map(str, (self.out_keys, *(value.describe() for value in values))))
-        self.inner, self.count = inner, len(inner.weights)
+        self.inner, self.count, self.memory = inner, len(inner.weights), inner.memory
         self.constants = tuple(x for value in values for x in value.tensors())
 
     @property
@@ -257,9 +258,9 @@ class _PlainUnder:
         traces, of_read, of_drawn = self.inner.adjoint(weights[: self.count], read, kept, drawn, grads)
         return traces, list(pull(tuple(of_read))), of_drawn
 
-    def weight_gradient(self, traces: Sequence[Tensor]) -> list[Tensor]:
+    def weight_gradient(self, weights: Sequence[Tensor], traces: Sequence[Tensor]) -> list[Tensor]:
         """Those of the policy; constants have none."""
-        return self.inner.weight_gradient(traces)
+        return self.inner.weight_gradient(weights[: self.count], traces)
 
     def _read(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> tuple[list[Tensor], Iterator[Tensor]]:
         """What the policy reads, and the constants of its action."""

@@ -95,15 +95,22 @@ class _Loop:
             return (self.restarted(end, done), done[0]) if _may_restart(done) else None
 
         flight = self.stepper.fly(acts, start, valid, steps, self.source.noise, restarted, self.before)
+        restarts, written = flight.restarts, flight.written
         roots = []
         for i, (first, ends) in enumerate(zip(start.leaves, flight.ends.leaves, strict=True)):
-            dim = 0 if i < 6 else 1  # of time: only observations have the environments first
-            steps_from = [first, *ends.unbind(dim)[:-1]]
-            for t, fresh, done in flight.restarts:
-                mask = done.unsqueeze(1) if dim else done
-                steps_from[t + 1] = torch.where(mask, fresh.leaves[i], steps_from[t + 1])
-            roots.append(torch.stack(steps_from, dim))
-        return self.entries(Record.of(roots)), self.entries(flight.ends, "next"), flight.written
+            fresh = {t: (leaves.leaves[i], done.unsqueeze(1) if i == 6 else done) for t, leaves, done in restarts}
+            roots.append(_roots(first, ends, fresh, int(i == 6)))  # only observations have the environments first
+        for key in acts.memory:
+            ends = written[unravel_key(("next", key))]
+            first = self.before[key] if key in self.before else torch.zeros_like(ends[:, 0])
+            fresh = {t: (torch.zeros_like(first), like(done, first)) for t, _, done in restarts}
+            written[key] = _roots(first, ends, fresh, 1)
+        if acts.memory:
+            no = torch.zeros((len(valid), steps, 1), dtype=torch.bool, device=valid.device)
+            fresh = {t: (torch.ones_like(no[:, 0]), done.unsqueeze(1)) for t, _, done in restarts}
+            written["is_init"] = _roots(self.before.get("is_init", no[:, 0]), no, fresh, 1)
+            written["next", "is_init"] = no
+        return self.entries(Record.of(roots)), self.entries(flight.ends, "next"), written
 
     def called(self, start: Record, valid: Tensor, steps: int) -> tuple[Entries, ...]:
         """With a policy that is called before each compiled step."""
@@ -204,10 +211,20 @@ def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | GivenActions | None:
     acts = make() if stepper.is_compiled and callable(make) else None
     if acts is None:
         return None
-    state = stepper.layout.unpack(stepper.example.state)
-    if not {unravel_key(key) for key in acts.in_keys} <= {"observation", *_of_state(state)}:
+    known = {"observation", *acts.memory, *stepper.output_layout.place, *map(_in_state, stepper.layout.place)}
+    if not set(map(unravel_key, acts.in_keys)) <= known - {"reward"}:
         return None
-    return acts if acts.fits(policy_inputs(acts, state, stepper.example.observation)) else None
+    at, n = stepper.example, len(stepper.example.observation)
+    memory = {key: at.observation.new_zeros((n, *size)) for key, size in acts.memory.items()}
+    return acts if acts.fits(policy_inputs(acts, stepper.layout, stepper.output_layout, at, memory)) else None
+
+
+def _roots(first: Tensor, ends: Tensor, fresh: dict[int, tuple[Tensor, Tensor]], dim: int) -> Tensor:
+    """Where the steps of a horizon began, from where the first did and all ended, with fresh starts after some."""
+    roots = [first, *ends.unbind(dim)[:-1]]
+    for t, (start, mask) in fresh.items():
+        roots[t + 1] = torch.where(mask, start, roots[t + 1])
+    return torch.stack(roots, dim)
 
 
 def _entries(tensordict: TensorDictBase, keys: list[Any]) -> Entries:
@@ -226,7 +243,11 @@ def _over_time(steps: list[Entries]) -> Entries:
 
 def _of_state(state: State) -> Entries:
     """The entries of a state by their names in a tensordict."""
-    return {unravel_key(("state", key)): x for key, x in state.items()}
+    return {_in_state(key): x for key, x in state.items()}
+
+
+def _in_state(key: Any) -> Any:
+    return unravel_key(("state", key))
 
 
 def _may_restart(done: Tensor) -> bool:

@@ -67,11 +67,13 @@ class Layout:
 
     def unpack(self, rows: Rows) -> dict[Key, Tensor]:
         """Views of the entries, each (n, ...), or (n, time, ...) of a horizon."""
-        entries = {}
-        for key, (kind, where, shape) in self.place.items():
-            x = rows[kind][..., where, :].movedim(-1, 0)
-            entries[key] = x if len(shape) == 1 else x.unflatten(-1, shape)
-        return entries
+        return {key: self.read(rows, key) for key in self.place}
+
+    def read(self, rows: Rows, key: Key) -> Tensor:
+        """A view of one entry."""
+        kind, where, shape = self.place[key]
+        x = rows[kind][..., where, :].movedim(-1, 0)
+        return x if len(shape) == 1 else x.unflatten(-1, shape)
 
     def add(self, floats: Tensor, entries: Entries) -> Tensor:
         """The rows of floats with some entries (n, ...) added to their own."""

@@ -21,10 +21,13 @@ class PlainPolicy(Protocol):
 
     #: Policies with the same signature compute the same function of their tensors, and share what is compiled.
     signature: Hashable
-    in_keys: Sequence[Any]  #: the entries that it reads, of the state or the observation
+    in_keys: Sequence[Any]  #: the entries that it reads: observation, ("state", ...), other outputs, its memory
     out_keys: Sequence[Any]  #: the entries that it writes
     weights: tuple[Tensor, ...]  #: the tensors that it learns, of which gradients are wanted
     size: int | None  #: the entries of an action, of those drawn; None for all of them
+    #: What it reads as it was written below "next" in the step before, with the shape apart from n; an episode begins
+    #: with zeros.
+    memory: Mapping[Any, tuple[int, ...]]
 
     def fits(self, inputs: Sequence[Tensor]) -> bool:
         """Whether it can read inputs of this width, precision and device; otherwise it is called, and can complain."""
@@ -50,7 +53,7 @@ class PlainPolicy(Protocol):
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """Traces for ``weight_gradient``, each (n, ...), and the gradients of its inputs and of what was drawn."""
 
-    def weight_gradient(self, traces: Sequence[Tensor]) -> list[Tensor]:
+    def weight_gradient(self, weights: Sequence[Tensor], traces: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of its weights, over a batch (n) of any steps."""
 
 
@@ -58,6 +61,7 @@ class GivenActions:
     """Actions that are known beforehand, whatever the state; also those of a policy that can only be called."""
 
     in_keys, out_keys, weights, size = (), ("action",), (), None
+    memory: Mapping[Any, tuple[int, ...]] = {}
 
     def __init__(self, take: Callable[[int], Tensor]) -> None:
         self.take = take  # from a number of steps to their actions (steps, n, k)

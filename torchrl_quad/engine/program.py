@@ -11,14 +11,14 @@ import os
 import shutil
 import types
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.func import vjp
 
-from torchrl_quad.engine.packing import Layout, Rows, like, record
+from torchrl_quad.engine.packing import Layout, Record, Rows, like, record
 from torchrl_quad.engine.policy import GivenActions, PlainPolicy
 from torchrl_quad.engine.simulation import Simulation, State
 
@@ -256,9 +256,21 @@ class PolicyProgram:
         return inputs[:first], inputs[first : first + count], inputs[first + count :]
 
 
-def policy_inputs(policy: PlainPolicy | GivenActions, state: State, observation: Tensor) -> list[Tensor]:
-    """The entries that a policy reads."""
-    return [observation if key == "observation" else state[name_in_state(key)] for key in policy.in_keys]
+def policy_inputs(
+    policy: PlainPolicy | GivenActions, layout: Layout, output_layout: Layout, at: Record, memory: Mapping[Any, Tensor]
+) -> list[Tensor]:
+    """The entries that a policy reads, of what is known of a state and what it remembers."""
+    inputs = []
+    for key in policy.in_keys:
+        if key == "observation":
+            inputs.append(at.observation)
+        elif key in memory:
+            inputs.append(memory[key])
+        elif key in output_layout.place:
+            inputs.append(output_layout.read(at.outputs, key))
+        else:
+            inputs.append(layout.read(at.state, name_in_state(key)))
+    return inputs
 
 
 def name_in_state(key: tuple[str, ...]) -> Any:

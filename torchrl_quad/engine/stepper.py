@@ -7,9 +7,10 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 import torch
+from tensordict.utils import unravel_key
 from torch import Tensor
 
-from torchrl_quad.engine.packing import Layout, Record, Rows, flat, nested, record
+from torchrl_quad.engine.packing import Layout, Record, Rows, flat, like, nested, record
 from torchrl_quad.engine.policy import GivenActions, PlainPolicy
 from torchrl_quad.engine.program import PolicyProgram, StepProgram, name_in_state, policy_inputs
 from torchrl_quad.engine.simulation import Simulation, State, Transition
@@ -106,7 +107,10 @@ class Stepper:
                 self.policies[policy.signature] = PolicyProgram(policy, self.options)
             acts = self.policies[policy.signature]
         horizon = Horizon(self.steps[len(parameters)], policy, acts, start, valid, steps, noise, restarted, [])
-        tensors = start.state.floats, start.observation, drawn, *policy.weights, *parameters
+        known, n = before or {}, len(valid)
+        memory = [known[key] if key in known else drawn.new_zeros((n, *size)) for key, size in policy.memory.items()]
+        leaves = start.state.floats, start.outputs.floats, start.observation
+        tensors = *leaves, drawn, *memory, *policy.weights, *parameters
         keeps = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
         actions = drawn.new_zeros(()).expand(drawn[..., : policy.size].shape).requires_grad_(keeps)
         leaves = _Horizon.apply(horizon, keeps, actions, *tensors)
@@ -134,33 +138,36 @@ class _Horizon(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, horizon: Horizon, keeps: bool, _: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
         step, policy = horizon.step, _Policy(horizon)
-        floats, observation, drawn, *others = (x.detach().contiguous() for x in tensors)
-        count = len(policy.weights)
-        policy.weights, parameters = others[:count], others[count:]
-        rows, valid = Rows(floats, *horizon.start.state[1:]), horizon.valid
-        saved, ends, entries = [], [], []
+        floats, outputs, observation, drawn, *others = (x.detach().contiguous() for x in tensors)
+        memory, (first, count) = policy.memory, (len(policy.memory), len(policy.weights))
+        remembered = dict(zip(memory, others, strict=False))
+        policy.weights, parameters = others[first : first + count], others[first + count :]
+        states_start, outputs_start = horizon.start.state, horizon.start.outputs
+        at = Record(Rows(floats, *states_start[1:]), Rows(outputs, *outputs_start[1:]), observation)
+        valid, saved, ends, entries = horizon.valid, [], [], []
         leaves = written = ()
         for t in range(horizon.steps):
-            inputs = policy.inputs(rows, observation)
+            inputs = policy.inputs(at, remembered)
             kept, written = policy.forward(inputs, drawn[t], is_first=t == 0)
             noise = horizon.noise()
             step.noise_names = tuple(noise)
             # The stride of a single row can be anything, and a compiler takes another one for another kind of input.
-            fixed = (x.reshape(-1).view(x.shape) for x in rows[1:])
-            start = (rows.floats, *fixed, valid, written[policy.action], *parameters, *noise.values())
+            fixed = (x.reshape(-1).view(x.shape) for x in at.state[1:])
+            start = (at.state.floats, *fixed, valid, written[policy.action], *parameters, *noise.values())
             states_end = (step.forward if t == 0 else step.forward.again)(*start)
             states, leaves = states_end[: step.substeps], states_end[step.substeps :]
-            end = Record.of(leaves)
+            at = Record.of(leaves)
+            remembered = {key: written[place] for key, place in memory.items()}
             if keeps:
                 saved.append((start, states, inputs, kept, drawn[t]))
             ends.append(leaves)
             entries.append(written)
             if t == 0:
                 valid = torch.ones_like(valid)  # a step leads to meaningful states
-            if t < horizon.steps - 1 and (again := horizon.restarted(end)) is not None:
+            if t < horizon.steps - 1 and (again := horizon.restarted(at)) is not None:
                 horizon.restarts.append((t, *again))
-                end = again[0]
-            rows, observation = end.state, end.observation
+                at = again[0]
+                remembered = {key: torch.where(like(again[1], x), 0.0, x) for key, x in remembered.items()}
         ctx.horizon = horizon
         ctx.like = [(x.shape, x.dtype, x.device) for x in (leaves[0], leaves[3], leaves[6], *written)]
         ctx.shapes = [tuple(map(len, parts[:4])) for parts in saved]
@@ -188,33 +195,36 @@ class _Horizon(torch.autograd.Function):
         zeros = [torch.zeros(shape, dtype=dtype, device=device) for shape, dtype, device in ctx.like]
         restarted = {t: who for t, _, who in horizon.restarts}
         of_end, of_written = (grads[0], grads[3], grads[6]), grads[7:]
-        grad_floats: Tensor | None = None
-        grad_observation: Tensor | None = None
+        # Gradients after a step: in the state, the outputs, the observation, and what the policy remembers.
+        after: list[Tensor | None] = [None] * (3 + len(policy.memory))
         grads_action, grads_drawn, grads_parameter = [], [], []
         for t in reversed(range(horizon.steps)):
             start, states, inputs, kept, drawn = steps[t]
-            if t in restarted and grad_floats is not None:
-                grad_floats = torch.where(restarted[t], 0.0, grad_floats)
-            if t in restarted and grad_observation is not None:
-                grad_observation = torch.where(restarted[t].unsqueeze(1), 0.0, grad_observation)
+            if t in restarted:
+                who = restarted[t]  # states and outputs are rows
+                zeroed = (
+                    x if x is None else torch.where(who if i < 2 else like(who, x), 0.0, x) for i, x in enumerate(after)
+                )
+                after = list(zeroed)
             end = [None if g is None else g[:, t] if i == 2 else g[t] for i, g in enumerate(of_end)]
-            end[0], end[2] = _add(end[0], grad_floats), _add(end[2], grad_observation)
+            end = [_add(g, more) for g, more in zip(end, after, strict=False)]
             end = [zero if g is None else g.contiguous() for g, zero in zip(end, zeros, strict=False)]
             is_first = t == horizon.steps - 1
             adjoint = step.adjoint if is_first else step.adjoint.again
             grad_floats, grad_action, *grad_parameters = adjoint(*start, *states, *end)
             written = [None if g is None else g[:, t] for g in of_written]
-            written[policy.action] = _add(written[policy.action], grad_action)
+            for place, grad in zip((policy.action, *policy.memory.values()), (grad_action, *after[3:]), strict=True):
+                written[place] = _add(written[place], grad)
             grads_action.append(written[policy.action])
             written = [zero if g is None else g.contiguous() for g, zero in zip(written, zeros[3:], strict=True)]
             grad_inputs, grad_drawn = policy.adjoint(inputs, kept, drawn, written, is_first=is_first)
-            grad_floats, grad_observation = policy.add(grad_floats, grad_inputs)
+            after = policy.before(grad_floats, zeros[1], grad_inputs)
             grads_drawn.append(grad_drawn)
             grads_parameter.append(grad_parameters)
         actions = torch.stack(grads_action[::-1]) if ctx.needs_input_grad[2] else None
-        drawn = torch.stack(grads_drawn[::-1]) if ctx.needs_input_grad[5] else None
+        drawn = torch.stack(grads_drawn[::-1]) if ctx.needs_input_grad[6] else None
         parameters = (torch.stack(x).sum(0) for x in zip(*grads_parameter, strict=True))
-        return None, None, actions, grad_floats, grad_observation, drawn, *policy.weight_gradients(), *parameters
+        return None, None, actions, *after[:3], drawn, *after[3:], *policy.weight_gradients(), *parameters
 
 
 class _Policy:
@@ -222,17 +232,17 @@ class _Policy:
 
     def __init__(self, horizon: Horizon, learns: bool = True) -> None:
         self.learns = learns
-        self.policy, self.program, self.layout = horizon.policy, horizon.policy_program, horizon.step.layout
+        self.policy, self.program, self.step = horizon.policy, horizon.policy_program, horizon.step
         self.weights: Sequence[Tensor] = self.policy.weights
-        self.action = list(self.policy.out_keys).index("action")
+        place = {unravel_key(key): i for i, key in enumerate(self.policy.out_keys)}
+        self.action = place["action"]
+        self.memory = {key: place[unravel_key(("next", key))] for key in self.policy.memory}
         self.steps: list[Sequence[Tensor]] = []  # whose gradient in the weights is still to be taken
         self.total: list[Tensor] | None = None
 
-    def inputs(self, rows: Rows, observation: Tensor) -> list[Tensor]:
+    def inputs(self, at: Record, memory: Mapping[Any, Tensor]) -> list[Tensor]:
         """What it reads."""
-        if tuple(self.policy.in_keys) == ("observation",):
-            return [observation]
-        return policy_inputs(self.policy, self.layout.unpack(rows) if self.policy.in_keys else {}, observation)
+        return policy_inputs(self.policy, self.step.layout, self.step.output_layout, at, memory)
 
     def forward(
         self, inputs: list[Tensor], drawn: Tensor, *, is_first: bool
@@ -260,11 +270,13 @@ class _Policy:
                 self._learn(self.program)
         return values[end:-1], values[-1]
 
-    def add(self, grad_floats: Tensor, grad_inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor | None]:
-        """The gradients of the state's floats, the policy's share included, and of the observation."""
-        of_state = dict(zip(self.policy.in_keys, grad_inputs, strict=True))
-        of_observation = of_state.pop("observation", None)
-        return self.layout.add(grad_floats, {name_in_state(key): g for key, g in of_state.items()}), of_observation
+    def before(self, floats: Tensor, zeros: Tensor, grad_inputs: Sequence[Tensor]) -> list[Tensor | None]:
+        """The gradients before a step, the policy's share included: in state, outputs, observation and memory."""
+        of = dict(zip(self.policy.in_keys, grad_inputs, strict=True))
+        outputs = {key: of.pop(key) for key in self.step.output_layout.place if key in of}
+        memory, observation = [of.pop(key) for key in self.memory], of.pop("observation", None)
+        floats = self.step.layout.add(floats, {name_in_state(key): g for key, g in of.items()})
+        return [floats, self.step.output_layout.add(zeros, outputs) if outputs else None, observation, *memory]
 
     def weight_gradients(self) -> Sequence[Tensor | None]:
         """The gradient of each weight, over all steps."""
@@ -275,7 +287,7 @@ class _Policy:
 
     def _learn(self, program: PolicyProgram) -> None:
         traces = self.steps[0] if len(self.steps) == 1 else [torch.cat(x) for x in zip(*self.steps, strict=True)]
-        grads = program.policy.weight_gradient(traces)
+        grads = program.policy.weight_gradient(self.weights, traces)
         self.total = grads if self.total is None else [a + b for a, b in zip(self.total, grads, strict=True)]
         self.steps = []
 

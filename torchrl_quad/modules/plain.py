@@ -212,6 +212,7 @@ class PlainTanhGaussian:
         network = actor.last
         self.scales, self.widths = network.scales, network.widths
         self.in_keys, self.out_keys = list(actor[0].in_keys)[: len(self.scales)], list(actor.out_keys)
+        self.memory: dict[NestedKey, tuple[int, ...]] = {}
         self.activations, self.is_random = activations, is_random
         self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
         self._take_head(actor)
@@ -308,7 +309,7 @@ class PlainTanhGaussian:
         of_inputs = [g if scale == 1.0 else g * scale for g, scale in zip(of_inputs, self.scales, strict=True)]
         return [*read[::-1], *grads_kept[::-1]], of_inputs, grad_drawn
 
-    def weight_gradient(self, traces: Sequence[Tensor]) -> list[Tensor]:
+    def weight_gradient(self, weights: Sequence[Tensor], traces: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of weight and bias of each layer, over a batch."""
         count = len(traces) // 2
         pairs = zip(traces[:count], traces[count:], strict=True)

@@ -19,7 +19,7 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_quad.data.unwrap import base_env, check_env, observed
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.modules.plain import Critic, GaussianHead, Network, TanhGaussianActor
+from torchrl_quad.modules.plain import Critic, GaussianHead, Network, TanhGaussianActor, layout
 from torchrl_quad.options import AfterValidator, Below1, Entries, Field, Scale, Width, checked
 
 OBSERVATION = ("observation",)
@@ -120,7 +120,7 @@ def make_value(
         in_keys: the entries that it reads, each (*, k), in a list: ["observation"].
     """
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
-    return Critic(net, in_keys=list(in_keys))
+    return Critic(net, in_keys)
 
 
 @checked
@@ -146,7 +146,7 @@ def make_qvalue(
     """
     in_keys = [*in_keys, "action"]
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, action_scale, layer_norm=True)
-    return Critic(net, in_keys=in_keys)
+    return Critic(net, in_keys)
 
 
 def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[Bounded, Tensor]:
@@ -222,6 +222,7 @@ def sampled(cls: type[Actor], params: TensorDictModule, spec: Bounded, return_lo
     )
     if "noise_before" in actor.in_keys:
         actor.out_keys = [*actor.out_keys, "noise_before", "noise"]
+    actor.built = layout(actor)
     return actor
 
 

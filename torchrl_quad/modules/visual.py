@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple, cast
 
 import torch
@@ -13,8 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase, TensorDictPrimer
-from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, TanhNormal, set_recurrent_mode
-from torchrl.modules.models.utils import SquashDims
+from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, set_recurrent_mode
 from torchrl.modules.tensordict_module.rnn import GRU
 
 from torchrl_quad.data.unwrap import check_env, leaf, observed
@@ -31,14 +30,7 @@ from torchrl_quad.modules.networks import (
     start_near,
     with_head,
 )
-from torchrl_quad.modules.plain import (
-    GaussianHead,
-    Network,
-    PlainTanhGaussian,
-    TanhGaussianActor,
-    is_hooked,
-    is_pointwise,
-)
+from torchrl_quad.modules.plain import Network, PlainTanhGaussian, TanhGaussianActor, is_pointwise, layout
 from torchrl_quad.options import Below1, Entries, Entry, Field, Scale, Width, checked
 
 MEMORY = "recurrent_state"
@@ -199,40 +191,20 @@ class VisualActor(TanhGaussianActor):
 
     def parts(self) -> Parts | None:
         """The parts as :func:`~torchrl_quad.make_visual_actor` builds them; None if they were changed or hooked."""
-        if type(self) is not VisualActor or len(self.module) != 2 or is_hooked(self) or self.is_random is None:
-            return None
-        if self.sampler.distribution_class is not TanhNormal or type(self[0]) is not TensorDictSequential:
-            return None
-        if len(self[0].module) not in (2, 3):
+        if layout(self) != self.built or self.is_random is None:
             return None
         first, *memory, last = cast(Any, self[0].module)
-        features: Any = getattr(first, "module", None)
-        network: Any = getattr(last, "module", None)
-        if type(features) is not VisualFeatures or not _is_network(features.trunk, nn.Identity):
-            return None
-        if not _is_network(network, GaussianHead) or len(network.mlp) != 1 or not _is_linear(network.mlp[0]):
-            return None
-        convolutions, trunk = list(features.convolutions), [*features.trunk.mlp, features.activation]
-        if type(features.convolutions) is not ConvNet or type(convolutions.pop()) is not SquashDims:
-            return None
-        if features.convolutions[-1].ndims_in != 3 or any(scale != 1.0 for scale in network.scales):
-            return None
-        if not _alternates(convolutions, _halves) or not _alternates(trunk, _is_linear):
-            return None
-        if memory and not _is_memory(memory[0]):
-            return None
-        head, reads = network.head, ["features", "recalled"][: len(memory) + 1]
-        wanted = [reads + ["noise_before"] * bool(head.rho), *([["features", MEMORY, "is_init"]] if memory else [])]
-        if [list(part.in_keys) for part in (last, *memory)] != wanted or len(network.scales) != len(reads):
+        features, head = first.module, last.module.head
+        if not features.trunk.is_plain or not is_pointwise(features.activation):
             return None
         return Parts(
-            convolutions,
+            list(features.convolutions)[:-1],
             NEAREST,
-            trunk,
+            [*features.trunk.mlp, features.activation],
             features.trunk.widths,
             features.trunk.scales,
             memory[0].gru if memory else None,
-            network.mlp[0],
+            last.module.mlp[0],
             head.size,
             head.max_loc,
         )
@@ -272,32 +244,3 @@ class Replay(PlainTanhGaussian):
         """What it writes in the states of a rollout (*, horizon), with the noise of the rollout."""
         noise = self.drawn_again(tensordict)[:, : self.size].view_as(leaf(tensordict, "action"))
         return self._squash(*self.distribution(tensordict), noise, self.log_prob_key)
-
-
-def _is_network(module: Any, head: type[nn.Module]) -> bool:
-    return type(module) is Network and type(module.mlp) is MLP and type(module.head) is head
-
-
-def _alternates(layers: list[nn.Module], is_known: Callable[[nn.Module], bool]) -> bool:
-    """Whether these are layers of a known kind, each followed by its activation."""
-    return len(layers) % 2 == 0 and all(map(is_known, layers[::2])) and all(map(is_pointwise, layers[1::2]))
-
-
-def _is_linear(layer: nn.Module) -> bool:
-    return type(layer) is nn.Linear and layer.bias is not None
-
-
-def _halves(layer: nn.Module) -> bool:
-    """Whether it is a convolution, 3 x 3, that halves height and width."""
-    if type(layer) is not nn.Conv2d or layer.bias is None or (layer.groups, layer.padding_mode) != (1, "zeros"):
-        return False
-    found = layer.kernel_size, layer.stride, layer.padding, layer.dilation
-    return found == ((3, 3), (2, 2), (1, 1), (1, 1))
-
-
-def _is_memory(module: nn.Module) -> bool:
-    """Whether it is a GRU of one layer that goes forwards."""
-    gru: Any = getattr(module, "gru", None)
-    if type(module) is not GRUModule or type(gru) not in (GRU, nn.GRU):
-        return False
-    return (gru.num_layers, gru.bias, gru.bidirectional) == (1, True, False)

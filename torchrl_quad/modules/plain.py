@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import NormalParamExtractor, ProbabilisticTensorDictModule, dispatch
+from tensordict.nn import NormalParamExtractor, TensorDictSequential, dispatch
 from tensordict.nn.utils import biased_softplus
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -85,8 +85,17 @@ class Network(nn.Module):
     def forward(self, *inputs: Tensor) -> Any:
         """The head's output for inputs (*, k_i); the head receives (*, out_features), and the further inputs."""
         own = len(self.scales)
-        check_widths(inputs[:own], self.widths)
-        return self.head(self.mlp(_concatenated(inputs[:own], self.scales)), *inputs[own:])
+        return self.head(self.mlp(self.joined(inputs[:own])), *inputs[own:])
+
+    def joined(self, inputs: Sequence[Tensor]) -> Tensor:
+        """What the first layer reads; a UserValueError for inputs that the network was not built for."""
+        found = tuple(x.shape[-1] for x in inputs)
+        if found != self.widths:
+            raise UserValueError(
+                f"This network was built for entries of {', '.join(map(str, self.widths))} numbers, and reads some of "
+                f"{', '.join(map(str, found))}: those of another environment, or of other options. Build one for this."
+            )
+        return _concatenated(inputs, self.scales)
 
 
 class Critic(ValueOperator):
@@ -106,8 +115,7 @@ class Critic(ValueOperator):
             return None
 
         def predict(params: Mapping[str, Tensor], inputs: Sequence[Tensor]) -> Tensor:
-            check_widths(inputs, network.widths)
-            x = _concatenated(inputs, network.scales)
+            x = network.joined(inputs)
             for name, layer in network.mlp.named_children():
                 weight, bias = (params.get(f"module.mlp.{name}.{kind}") for kind in ("weight", "bias"))
                 if isinstance(layer, nn.LayerNorm):
@@ -132,12 +140,13 @@ class TanhGaussianActor(ProbabilisticActor):
     @property
     def last(self) -> Network:
         """The network that ends in the head."""
-        return cast(Network, self[0].module)
+        parts: Any = self[0]
+        return cast(Network, (parts[-1] if isinstance(parts, TensorDictSequential) else parts).module)
 
     @property
-    def sampler(self) -> ProbabilisticTensorDictModule:
+    def sampler(self) -> Any:
         """The part that samples."""
-        return cast(ProbabilisticTensorDictModule, self[1])
+        return self[1]
 
     @property
     def is_random(self) -> bool | None:
@@ -273,8 +282,7 @@ class PlainTanhGaussian:
         grads: dict[NestedKey, Tensor],
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """What each layer read, and the gradient of what it returned; the gradients of inputs and noise."""
-        pull = vjp(self._sample, kept[-1], drawn)[1]
-        grad, grad_drawn = pull(grads)
+        grad, grad_drawn = vjp(self._sample, kept[-1], drawn)[1](grads)
         read, grads_kept = [], [grad]
         for weight, activation, x in zip(weights[-2:0:-2], self.activations[::-1], kept[-2::-1], strict=True):
             activated, pull = vjp(activation, x)[:2]
@@ -322,16 +330,6 @@ class PlainTanhGaussian:
 def _first_noise(x: Tensor, is_random: bool | None) -> Tensor:
     """Standard normal numbers into zeros (*, k), or the zeros where nothing is random."""
     return x.normal_() if is_random else x
-
-
-def check_widths(inputs: Sequence[Tensor], widths: Sequence[int]) -> None:
-    """Raise a UserValueError for inputs that a network was not built for."""
-    found = tuple(x.shape[-1] for x in inputs)
-    if found != tuple(widths):
-        raise UserValueError(
-            f"This network was built for entries of {', '.join(map(str, widths))} numbers, and reads some of "
-            f"{', '.join(map(str, found))}: those of another environment, or of other options. Build one for this."
-        )
 
 
 def _concatenated(inputs: Sequence[Tensor], scales: Sequence[float]) -> Tensor:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
+from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Unbounded
@@ -18,18 +17,7 @@ from torchrl.modules.tensordict_module.rnn import GRU
 
 from torchrl_quad.data.unwrap import check_env, leaf, observed
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.modules.networks import (
-    OBSERVATION,
-    Activation,
-    Cells,
-    ScaleInit,
-    check_memory,
-    first_action,
-    network_of,
-    sampled,
-    start_near,
-    with_head,
-)
+from torchrl_quad.modules.networks import OBSERVATION, Activation, Cells, ScaleInit, first_action, network_of, policy_of
 from torchrl_quad.modules.plain import Network, PlainTanhGaussian, TanhGaussianActor, is_pointwise, layout
 from torchrl_quad.options import Below1, Entries, Entry, Field, Scale, Width, checked
 
@@ -93,12 +81,7 @@ def make_visual_actor(
             f"{', '.join(map(str, known))}."
         )
     spec, first = first_action(env, action_init, "make_visual_actor")
-    image, size = known[image_key], len(first)
-    filters = [9 * a * b for a, b in itertools.pairwise((image.shape[-3], *channels))]
-    check_memory([*filters, 3 * hidden_size * (num_cells[-1] + hidden_size) if recurrent else 0])
-    height, width = image.shape[-2:]
-    for _ in channels:
-        height, width = (height + 1) // 2, (width + 1) // 2
+    image = known[image_key]
     convolutions = ConvNet(
         in_features=image.shape[-3],
         num_cells=list(channels),
@@ -109,9 +92,8 @@ def make_visual_actor(
         activation_class=activation,
         device=env.device,
     ).to(image.dtype)
-    trunk = network_of(
-        env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale, more=channels[-1] * height * width
-    )
+    seen = convolutions(image.zero()).shape[-1]
+    trunk = network_of(env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale, more=seen)
     features = VisualFeatures(convolutions, trunk, activation())
     parts: list[Any] = [TensorDictModule(features, in_keys=[image_key, *in_keys], out_keys=["features"])]
     widths = [num_cells[-1]]
@@ -126,13 +108,10 @@ def make_visual_actor(
         ).to(image.dtype)
         parts.append(memory)
         widths.append(hidden_size)
-    outputs = 2 * size if learn_scale else size
-    last = MLP(sum(widths), outputs, num_cells=[], device=env.device).to(image.dtype)
-    start_near(last, first)
-    head = Network(last, [1.0] * len(widths), widths)
-    read = ["features", "recalled"][: len(widths)]
-    parts.append(with_head(head, size, scale_init, noise_correlation, read, return_log_prob))
-    return sampled(VisualActor, TensorDictSequential(*parts), spec, return_log_prob)
+    size = 2 * len(first) if learn_scale else len(first)
+    last = Network(MLP(sum(widths), size, num_cells=[], device=env.device).to(image.dtype), [1.0] * len(widths), widths)
+    read, options = ["features", "recalled"][: len(widths)], (scale_init, noise_correlation, return_log_prob)
+    return policy_of(VisualActor, parts, last, read, spec, first, *options)
 
 
 class VisualFeatures(nn.Module):
@@ -163,11 +142,6 @@ class Parts(NamedTuple):
 
 class VisualActor(TanhGaussianActor):
     """What :func:`~torchrl_quad.make_visual_actor` builds."""
-
-    @property
-    def last(self) -> Network:
-        """The network that ends in the head."""
-        return cast(Any, self[0])[-1].module
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:

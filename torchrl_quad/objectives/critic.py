@@ -84,7 +84,7 @@ class PathwiseCriticLoss(PathwiseLoss):
         return self._critics(tensordict, target=target).amin(0)
 
     def _critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        check_tensordict(self._name, tensordict)
+        check_tensordict(str(type(self).__name__), tensordict)
         key = self.tensor_keys.value_target
         missing = [name for name in getattr(self, self.critic_name).in_keys if name not in tensordict]
         if missing:

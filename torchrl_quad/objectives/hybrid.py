@@ -166,7 +166,7 @@ class HybridLoss(SHACLoss):
         return self._reduce_loss(-objective), metadata
 
     def _with_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
-        check_tensordict(self._name, tensordict)
+        check_tensordict(str(type(self).__name__), tensordict)
         keys = self.tensor_keys
         lost = [key for key in (keys.advantage, keys.location_gradient, keys.latent) if key not in tensordict]
         # An advantage without the other two comes from another estimator.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import torch
-from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
@@ -28,7 +29,7 @@ from torchrl_quad.data.unwrap import (
 from torchrl_quad.errors import UserTypeError, UserValueError, WrongState, one_line
 from torchrl_quad.options import Device, Entries, Fraction, Seed, Size, checked
 
-Kinds = dict[NestedKey, tuple[torch.Size, torch.dtype]]  # of the entries of one state
+Kinds = dict[NestedKey, tuple[torch.Size, bool]]  # of the entries of one state: shape, and whether these are floats
 
 
 @checked
@@ -65,13 +66,14 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         if actor is not None:
             check_actor(actor, "actor")
         generator = torch.Generator(device=device).manual_seed(seed)
-        # Of each part of a state, as far as it is known.
-        self.kinds: dict[NestedKey, Kinds] = {} if env is None else _kinds_of(env)
         if state_keys is None:
             state_keys = ("state",) if env is None else _state_keys(env)
         self.state_keys = tuple(state_keys)
         self.memory_keys = () if actor is None else memory_keys(actor)
         self.names = (*self.state_keys, *self.memory_keys)
+        known: Any = TensorDict() if env is None else observed(env).zero().reshape(-1)
+        # Of each part of a state, as far as it is known.
+        self.kinds: dict[NestedKey, Kinds] = {name: _kinds(known, name) for name in self.names if name in known}
         super().__init__(storage=LazyTensorStorage(capacity, device=device), generator=generator)
 
     def extend(self, tensordicts: TensorDictBase) -> Tensor:
@@ -159,25 +161,18 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
                 "The visited-state buffer is empty. Fly a first horizon from env.reset() and extend the buffer with it."
             )
         visited = cast(TensorDictBase, self.sample(fresh.numel())).select(*self.names).to(fresh.device)
-        # A transform may have changed the precision of a rollout.
-        self._check_same(cast(TensorDictBase, fresh.reshape(-1)), exact=False)
+        self._check_same(cast(TensorDictBase, fresh.reshape(-1)))
         pick = torch.rand(fresh.shape, generator=self._rng, device=self._rng.device) < fraction
         pick = pick.to(fresh.device)
         visited = cast(TensorDictBase, visited.reshape(fresh.shape))
         return visited.select(*self.state_keys).where(pick, fresh), visited, pick
 
-    def _check_same(self, states: TensorDictBase, exact: bool = True) -> None:
+    def _check_same(self, states: TensorDictBase) -> None:
         """Raise a UserValueError for states (n) of another kind than the kept ones, which would broadcast silently."""
         different: set[str] = set()
         for name in filter(states.__contains__, self.names):
             theirs = _kinds(states, name)
-            ours = self.kinds.get(name, theirs)
-            if not exact:
-                theirs, ours = (
-                    {key: (shape, kind.is_floating_point) for key, (shape, kind) in kinds.items()}
-                    for kinds in (theirs, ours)
-                )
-            different |= {str(key) for key, _ in ours.items() ^ theirs.items()}
+            different |= {str(key) for key, _ in self.kinds.get(name, theirs).items() ^ theirs.items()}
         if different:
             raise UserValueError(
                 f"These are other states than those in the visited-state buffer: {', '.join(sorted(different))} differ "
@@ -201,15 +196,30 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         Raises:
             ValueError: the content does not fit the buffer, which stays as it is.
         """
-        states, cursor, generator = self._read(state_dict)
+        generator, most = torch.Generator(device=self._rng.device), self._storage.max_size
+        try:
+            entries, cursor = state_dict["states"], operator.index(state_dict["cursor"])
+            n = len(next(iter(entries.values()), ()))
+            if not (0 <= cursor <= n <= most):
+                raise UserValueError(f"it has {n:,} states, and its cursor is {cursor}")
+            states = TensorDict(entries, [n]).detach().unflatten_keys(".").select(*self.names if n else ())
+            generator.set_state(state_dict["random"])
+        except Exception as error:  # of tensordict and torch: one for each thing that may be wrong
+            raise UserValueError(
+                f"The content does not fit this visited-state buffer of {most:,} states: {one_line(error)}. Take what "
+                "a buffer of the same task and options has saved."
+            ) from None
+        self._check_same(states)
+        if cursor < n < most:  # of a smaller buffer that was full: its oldest state is at the cursor
+            states, cursor = states[torch.arange(n).roll(-cursor)], n
         storage = cast(LazyTensorStorage, self._storage)
         storage._empty()
-        if len(states):
+        if n:
             states = states.to(storage.device)
             self.kinds = {name: _kinds(states, name) for name in self.names}
-            index = torch.arange(len(states), device=states.device)
+            index = torch.arange(n, device=states.device)
             cast(Any, storage).set(index, states.set("index", index))
-        self._writer.load_state_dict({"_cursor": cursor, "_write_count": len(states)})
+        self._writer.load_state_dict({"_cursor": cursor % most, "_write_count": n})
         self.set_rng(generator)
 
     def dumps(self, path: str | Path) -> None:
@@ -218,62 +228,8 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         torch.save(self.state_dict(), Path(path) / "buffer.pt")
 
     def loads(self, path: str | Path) -> None:
-        """Read from a folder what :meth:`dumps` has written.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file is damaged, or its content does not fit.
-        """
-        file = Path(path) / "buffer.pt"
-        with file.open("rb") as opened:
-            try:
-                content = torch.load(opened, map_location="cpu", weights_only=True)
-            except Exception as error:
-                said = one_line(error) or type(error).__name__
-                raise UserValueError(f"{file} is damaged, or no buffer that dumps wrote: {said}") from None
-        self.load_state_dict(content)
-
-    def _read(self, content: Mapping[str, Any]) -> tuple[TensorDict, int, torch.Generator]:
-        """The states, the place of the next one and the generator of a content that fits."""
-        most = self._storage.max_size
-
-        def refuse(what: str) -> NoReturn:
-            raise UserValueError(
-                f"The content does not fit this visited-state buffer of {most:,} states: {what}. Take what a buffer of "
-                "the same task and options has saved."
-            )
-
-        try:
-            entries, cursor, random = content["states"], content["cursor"], content["random"]
-        except (TypeError, KeyError, ValueError, IndexError):
-            refuse("it lacks the states, the cursor or the random generator")
-        if not isinstance(entries, Mapping) or not all(isinstance(x, Tensor) for x in entries.values()):
-            refuse("its states are no tensors by name")
-        n = max((len(x) for x in entries.values() if x.ndim), default=0)
-        if n > most:
-            refuse(f"it has {n:,} states")
-        if type(cursor) is not int or not 0 <= cursor <= n:
-            refuse(f"its cursor is {cursor!r}, with {n} states")
-        for name, x in entries.items():
-            if x.layout is not torch.strided or x.is_meta or x.ndim == 0 or len(x) != n:
-                refuse(f"{name} has shape {tuple(x.shape)}")
-            if not x.isfinite().all():
-                refuse(f"{name} is not finite")
-        states = TensorDict({str(name): x.detach() for name, x in entries.items()}, [n]).unflatten_keys(".")
-        if n:
-            lost = [name for name in self.names if name not in states]
-            more = set(states.keys(True, True)) - set(states.select(*self.names, strict=False).keys(True, True))
-            if lost or more:
-                refuse(f"it lacks or adds {(*lost, *more)[:1]}")
-            self._check_same(states)
-        if cursor < n < most:  # of a smaller buffer that was full: its oldest state is at the cursor
-            states, cursor = states[torch.arange(n).roll(-cursor)], n
-        generator = torch.Generator(device=self._rng.device)
-        try:
-            generator.set_state(random)
-        except (RuntimeError, TypeError) as error:
-            refuse(f"its random generator is none ({one_line(error)})")
-        return states, cursor % most, generator
+        """Read from a folder what :meth:`dumps` has written."""
+        self.load_state_dict(torch.load(Path(path) / "buffer.pt", map_location="cpu", weights_only=True))
 
 
 @checked
@@ -332,15 +288,6 @@ def _draws_starts(base: EnvBase) -> bool:
 
 
 def _kinds(states: TensorDictBase, name: NestedKey) -> Kinds:
-    """Shape and type of each entry of states (n) under a name."""
-    return {key: (x.shape[1:], x.dtype) for key, x in states.select(name).items(True, True)}
-
-
-def _kinds_of(env: EnvBase) -> dict[NestedKey, Kinds]:
-    """The same for each part of an environment's state that its rollouts hold."""
-    kinds: dict[NestedKey, Kinds] = {}
-    for key, spec in observed(env).items(True, True):
-        if key in state_keys(env):
-            name = key if isinstance(key, str) else key[0]
-            kinds.setdefault(name, {})[unravel_key(key)] = (spec.shape[env.ndim :], spec.dtype)
-    return kinds
+    """The kind of each entry of states (n) under a name."""
+    entries = cast(TensorDictBase, states.select(name)).items(True, True)
+    return {key: (x.shape[1:], x.is_floating_point()) for key, x in entries}

@@ -8,18 +8,17 @@ from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar, cast
 
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
-from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_quad.data.unwrap import base_env, check_env, observed
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.modules.plain import Critic, GaussianHead, Network, TanhGaussianActor
+from torchrl_quad.modules.plain import Critic, GaussianHead, Network, TanhGaussianActor, layout
 from torchrl_quad.options import AfterValidator, Below1, Entries, Field, Scale, Width, checked
 
 OBSERVATION = ("observation",)
@@ -89,11 +88,10 @@ def make_actor(
             network has more than 100 million weights.
     """
     spec, first = first_action(env, action_init, "make_actor")
-    size = spec.shape[-1]
-    net = network_of(env, in_keys, 2 * size if learn_scale else size, num_cells, activation, input_scale)
-    start_near(net.mlp, first)
-    params = with_head(net, size, scale_init, noise_correlation, in_keys, return_log_prob)
-    return sampled(TanhGaussianActor, params, spec, return_log_prob)
+    size = 2 * len(first) if learn_scale else len(first)
+    net = network_of(env, in_keys, size, num_cells, activation, input_scale)
+    options = scale_init, noise_correlation, return_log_prob
+    return policy_of(TanhGaussianActor, [], net, in_keys, spec, first, *options)
 
 
 @checked
@@ -115,12 +113,11 @@ def make_value(
     the body frame.
 
     Args:
-        env, activation, input_scale: as for :func:`make_actor`, and so are the errors.
+        env, activation, input_scale, in_keys: as for :func:`make_actor`, and so are the errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
-        in_keys: the entries that it reads, each (*, k), in a list: ["observation"].
     """
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
-    return Critic(net, in_keys=list(in_keys))
+    return Critic(net, in_keys)
 
 
 @checked
@@ -139,14 +136,13 @@ def make_qvalue(
     wrong; an ``action_scale`` below one makes it rely on the state first.
 
     Args:
-        env, activation, input_scale: as for :func:`make_actor`, and so are the errors.
+        env, activation, input_scale, in_keys: as for :func:`make_actor`, and so are the errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
-        in_keys: the entries that it reads, each (*, k), in a list: ["observation"].
         action_scale: the action is multiplied by this.
     """
     in_keys = [*in_keys, "action"]
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, action_scale, layer_norm=True)
-    return Critic(net, in_keys=in_keys)
+    return Critic(net, in_keys)
 
 
 def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[Bounded, Tensor]:
@@ -161,67 +157,62 @@ def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[B
             "transform such as MultiAction asks for several actions at once. Leave it out. To hold each action longer, "
             "give the environment a longer control step, control_dt=0.04."
         )
-    low, high = bounds_of(spec)
+    low, high = spec.low, spec.high
     middle = 0.5 * (low + high)
     if action_init is None:
         action_init = getattr(_single(env), "neutral_action", middle)
         action_init = action_init.mean(0) if action_init.dim() > middle.dim() else action_init
     first = middle
     try:
-        first = torch.as_tensor(action_init)
-        fits = not first.is_complex() and first.shape == spec.shape
-        fits = fits and bool(((low < first.to(middle)) & (first.to(middle) < high)).all())
+        first = torch.as_tensor(action_init).to(middle)
+        fits = first.shape == spec.shape and bool(((low < first) & (first < high)).all())
     except (TypeError, ValueError, RuntimeError, OverflowError):  # raised for what cannot become a tensor
         fits = False
     if not fits:
-        is_tensor = isinstance(action_init, Tensor) and not action_init.is_meta
-        given = action_init.tolist() if is_tensor else action_init
         raise UserValueError(
             f"action_init must be {spec.shape[-1]} numbers strictly between {low.tolist()} and {high.tolist()}, got "
-            f"{shown(given)}."
+            f"{shown(action_init)}."
         )
-    return spec, torch.atanh((first.to(middle) - middle) / (0.5 * (high - low)))
+    return spec, torch.atanh((first - middle) / (0.5 * (high - low)))
 
 
-def start_near(mlp: MLP, first: Tensor) -> None:
-    """Let the last layer of a policy begin with actions of mean ``first`` (k), before the tanh, whatever it reads."""
-    layer = cast(nn.Linear, mlp[-1])
+def policy_of(
+    cls: type[Actor],
+    parts: Sequence[Any],
+    network: Network,
+    in_keys: Sequence[NestedKey],
+    spec: Bounded,
+    first: Tensor,
+    scale_init: float,
+    rho: float,
+    return_log_prob: bool,
+) -> Actor:
+    """A tanh-Gaussian policy of some parts and a last network, which reads ``in_keys``.
+
+    It begins with actions of mean ``first`` (k), before the tanh, whatever it reads.
+    """
+    layer = cast(nn.Linear, network.mlp[-1])
     with torch.no_grad():
         layer.weight.mul_(0.01)
         layer.bias.zero_()
         layer.bias[: len(first)] = first
-
-
-def with_head(
-    network: Network, size: int, scale_init: float, rho: float, in_keys: Sequence[NestedKey], return_log_prob: bool
-) -> TensorDictModule:
-    """Give the last network of a policy, which reads ``in_keys``, a normal distribution of an action of ``size``."""
     least = min(0.01, 0.1 * scale_init)  # to which training can bring the scale down
     max_loc = 5.0 if return_log_prob else math.inf  # as far as TorchRL's TanhNormal goes with tanh_loc=True
-    network.head = GaussianHead(size, f"biased_softplus_{scale_init}_{least}", max_loc, rho)
+    network.head = GaussianHead(len(first), f"biased_softplus_{scale_init}_{least}", max_loc, rho)
     read = [*in_keys, "noise_before"] if rho else list(in_keys)
-    return TensorDictModule(network, in_keys=read, out_keys=["loc", "scale"])
-
-
-def bounds_of(spec: Bounded) -> tuple[Tensor, Tensor]:
-    """The least and the greatest action."""
-    space = cast(ContinuousBox, spec.space)
-    return space.low, space.high
-
-
-def sampled(cls: type[Actor], params: TensorDictModule, spec: Bounded, return_log_prob: bool) -> Actor:
-    """A policy that samples a tanh-Gaussian action within the bounds of its spec."""
-    low, high = bounds_of(spec)
+    last = TensorDictModule(network, in_keys=read, out_keys=["loc", "scale"])
+    low, high = spec.low, spec.high
     actor = cls(
-        params,
+        TensorDictSequential([*parts, last]) if parts else last,
         in_keys=["loc", "scale"],
         spec=spec,
         distribution_class=TanhNormal,
         distribution_kwargs={} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high},
         return_log_prob=return_log_prob,
     )
-    if "noise_before" in actor.in_keys:
+    if rho:
         actor.out_keys = [*actor.out_keys, "noise_before", "noise"]
+    actor.built = layout(actor)
     return actor
 
 
@@ -247,30 +238,26 @@ def network_of(
         )
     if action_scale is not None:
         scales.append(action_scale)
-    sizes = [more + sum(spec.shape[-1] for spec in specs), *num_cells, out_features]
-    check_memory([a * b for a, b in itertools.pairwise(sizes)])
-    norm_kwargs = [{"normalized_shape": cells} for cells in num_cells] if layer_norm else None
+    widths = [spec.shape[-1] for spec in specs]
+    if more:
+        scales, widths = [1.0, *scales], [more, *widths]
+    weights = sum(a * b for a, b in itertools.pairwise([sum(widths), *num_cells, out_features]))
+    if weights > MOST_WEIGHTS:
+        raise UserValueError(
+            f"A network of this many cells has {weights:,} weights, more than {MOST_WEIGHTS:,}: write smaller widths, "
+            "such as num_cells=[256, 256]."
+        )
     mlp = MLP(
-        in_features=sizes[0],
+        in_features=sum(widths),
         out_features=out_features,
         num_cells=list(num_cells),
         activation_class=activation,
         norm_class=nn.LayerNorm if layer_norm else None,
-        norm_kwargs=norm_kwargs,
+        norm_kwargs=[{"normalized_shape": cells} for cells in num_cells] if layer_norm else None,
         device=env.device,
     )
     dtype = next((spec.dtype for spec in specs if spec.dtype.is_floating_point), None)
-    widths = [spec.shape[-1] for spec in specs]
-    return Network(mlp.to(dtype), [1.0, *scales] if more else scales, [more, *widths] if more else widths)
-
-
-def check_memory(weights: Sequence[int]) -> None:
-    """Raise a UserValueError for layers of more than 100 million weights, before they are made."""
-    if sum(weights) > MOST_WEIGHTS:
-        raise UserValueError(
-            f"A network of this many cells has {sum(weights):,} weights, more than {MOST_WEIGHTS:,}: write smaller "
-            "widths, such as num_cells=[256, 256]."
-        )
+    return Network(mlp.to(dtype), scales, widths)
 
 
 def _single(env: EnvBase) -> EnvBase:

@@ -52,9 +52,6 @@ class ABPTLoss(PathwiseCriticLoss):
             nothing before step d + 1: take 1 + d or more. J_0 ends with its segment at the latest.
         delay_qvalue: whether the critics have target networks, updated with :class:`torchrl.objectives.SoftUpdate`.
         **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
-
-    Raises:
-        ValueError: both returns are switched off.
     """
 
     @dataclass
@@ -134,12 +131,6 @@ class ABPTLoss(PathwiseCriticLoss):
         index, (_, end) = step_in_segment(done), segments(done)
         is_first = index < self.simulated_steps
         return is_first, is_first & (end | (index == self.simulated_steps - 1))
-
-    def _check_rollout(self, tensordict: TensorDictBase) -> None:
-        key, written = self.tensor_keys.action, self.actor_network.out_keys
-        if key not in written:
-            raise UserValueError(f"ABPTLoss samples {key!r} of its actor_network, which writes {written}.")
-        super()._check_rollout(tensordict)
 
     def _beside_actions(self, tensordict: TensorDictBase) -> Tensor | float:
         fixed, parts = tensordict.detach(), []

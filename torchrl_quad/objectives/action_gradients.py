@@ -19,10 +19,7 @@ from torchrl_quad.objectives.calls import act
 def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
     """The gradient of a scalar in each action of a rollout, by all that follows from it, the policy included.
 
-    ``action`` is ``rollout["action"]`` (*, horizon, k) as it was flown, with its graph, which is kept.
-
-    Raises:
-        ValueError: the action is a copy or a part of the rollout's, whose steps cannot be told apart.
+    ``action`` is ``rollout["action"]`` (*, horizon, k) as it was flown, no copy or part, with its graph, which is kept.
     """
     node: Any = action.grad_fn
     steps = sources_of_steps(action)
@@ -62,11 +59,7 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
 
     The values are those of the rollout as long as the policy has not changed. The gradients reach the policy's
     parameters alone, neither earlier states nor the noise. A memory is built up again from that at the start.
-    Actions within 1e-6 of a bound count as if they were that far from it. ``tensordict`` is the rollout (*), with all
-    that the policy wrote.
-
-    Raises:
-        NotImplementedError: the policy is another one than these build, whose noise is not known.
+    Actions within 1e-6 of a bound count as if they were that far from it.
     """
     with params.to_module(actor):
         plain = plain_of(actor)

@@ -44,20 +44,14 @@ class AHACLoss(SHACLoss):
         loss.adapt_horizon(losses["stiffness"])
 
     Args:
-        actor_network: the policy that flew the rollout, as :func:`~torchrl_quad.make_actor` builds it.
-        value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
+        actor_network, value_network: as for :class:`SHACLoss`; the policy is one of :func:`~torchrl_quad.make_actor`.
         horizon: control steps of the first rollout.
         min_horizon: the shortest horizon; null for a quarter of the first.
         max_horizon: the longest horizon; null for twice the first.
         max_stiffness: the bound on the growth of action gradients along a horizon, beyond which it gets shorter; 1.5 to
             5 are usual.
         horizon_lr: the share by which the horizon may change in an iteration.
-        num_value_nets: the critics made from ``value_network``, each initialised independently.
-        **kwargs: ``terminal_gradient`` and ``average_over_horizon`` of :class:`SHACLoss`, and those of
-            :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
-
-    Raises:
-        ValueError: the horizon is not between its bounds, or the policy writes no ``loc`` and ``scale``.
+        num_value_nets, **kwargs: as for :class:`SHACLoss`.
     """
 
     measured_of_actions = ["stiffness"]
@@ -101,9 +95,8 @@ class AHACLoss(SHACLoss):
     def adapt_horizon(self, stiffness: Tensor) -> None:
         """Shorten the horizon if the stiffness is above its bound, and lengthen it if it is below.
 
-        Args:
-            stiffness: as ``loss_actor`` measured it, a scalar; of several processes their mean. Infinity, which stands
-                for a gradient that is not finite, shortens the horizon; NaN, for no gradient at all, changes nothing.
+        The stiffness is a scalar, as ``loss_actor`` measured it, of several processes their mean. Infinity, for a
+        gradient that is not finite, shortens the horizon; NaN, for no gradient at all, changes nothing.
         """
         if stiffness.isnan():
             return

@@ -18,10 +18,7 @@ from torchrl_quad.errors import UserTypeError, UserValueError
 
 
 def sample_action(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> TensorDictBase:
-    """The states (*) with what a policy writes in them, sampled, with gradients in its parameters and in the states.
-
-    Its method ``plain()``, if it has one, gives the policy as pure functions of tensors.
-    """
+    """The states (*) with what a policy writes in them, sampled, with gradients in its parameters and in the states."""
     tensordict = tensordict.copy()
     with set_exploration_type(ExplorationType.RANDOM), params.to_module(actor):
         plain = actor.plain() if hasattr(actor, "plain") else None
@@ -37,12 +34,8 @@ def predict(
 ) -> Tensor:
     """What critics predict under ``key`` that share a module and have parameters of their own: (critics, *, k).
 
-    Args:
-        critic: the module; its method ``plain()``, if it has one, gives it as a function of tensors.
-        params: the parameters of one critic, or of several, stacked: (critics).
-        tensordict: what they read, (*); it is not modified.
-        key: under which they write.
-        learning: keep the gradient in the parameters and cut that in the inputs; otherwise the other way round.
+    The parameters are those of one critic, or of several, stacked. ``learning`` keeps the gradient in them, and cuts
+    that in the inputs (*); otherwise it is the other way round.
     """
     plain = critic.plain() if hasattr(critic, "plain") else None
     if plain is None:
@@ -55,13 +48,11 @@ def predict(
         return torch.stack(predictions)
     tensors = [leaf(tensordict, name) for name in critic.in_keys]
     _check_precision(critic, critic.in_keys, tensors, params)
-    weights = {".".join(cast(tuple[str, ...], name)): x for name, x in params.items(True, True)}
-    if learning:
-        tensors = [x.detach() for x in tensors]
-    else:
-        weights = {name: x.detach() for name, x in weights.items()}
-    copies = zip(*(x.unbind(0) for x in weights.values()), strict=True) if params.batch_dims else [weights.values()]
-    return torch.stack([plain(dict(zip(weights, own, strict=True)), tensors) for own in copies])
+    tensors = [x.detach() for x in tensors] if learning else tensors
+    names = [".".join(cast(tuple[str, ...], name)) for name in params.keys(True, True)]
+    weights = [x if learning else x.detach() for x in params.values(True, True)]
+    copies = zip(*(x.unbind(0) for x in weights), strict=True) if params.batch_dims else [weights]
+    return torch.stack([plain(dict(zip(names, own, strict=True)), tensors) for own in copies])
 
 
 def _check_precision(
@@ -98,12 +89,6 @@ def with_fixed(loss: Any, given: Mapping[str, Any], **fixed: Any) -> dict[str, A
     return {**given, **fixed}
 
 
-def check_function(name: str, value: Any) -> None:
-    """Raise a UserTypeError for what is neither None nor can be called."""
-    if not (value is None or callable(value)):
-        raise UserTypeError(f"{name} must be a function, or None; got {type(value).__name__}.")
-
-
 def total(parts: Iterable[Tensor]) -> Tensor:
     """The sum of some tensors, at least one."""
     return cast(Tensor, sum(parts))
@@ -117,10 +102,7 @@ def act(plain: Any, tensordict: TensorDictBase, drawn: Tensor) -> dict[NestedKey
 
 
 def segments(done: Tensor) -> tuple[Tensor, Tensor]:
-    """Mark the first and the last step of each segment, between ends of episodes and of the horizon.
-
-    ``done`` is bool (*, horizon, 1), and so are the results.
-    """
+    """The first and the last step of each segment, between ends of episodes and of the horizon: bool, as ``done``."""
     end = done.clone()
     end[..., -1, :] = True
     return end.roll(1, -2), end

@@ -68,23 +68,22 @@ class PathwiseCriticLoss(PathwiseLoss):
 
     def _critics(self, tensordict: TensorDictBase, *, target: bool = False, learning: bool = False) -> Tensor:
         """The prediction of each critic or of its target, (critics, *, 1); for ``learning`` see ``predict``."""
-        network = getattr(self, self.critic_name)
         params = getattr(self, f"{'target_' if target else ''}{self.critic_name}_params")
-        key = getattr(self.tensor_keys, self.prediction_key)
-        predictions = predict(network, params, tensordict, key, learning=learning)
-        if predictions.shape[1:] != (*tensordict.shape, 1):
+        key, shape = getattr(self.tensor_keys, self.prediction_key), (*tensordict.shape, 1)
+        found = predict(getattr(self, self.critic_name), params, tensordict, key, learning=learning)
+        if found.shape[1:] != shape:
             raise UserValueError(
-                f"{self.critic_name} must write one number for each state, {key!r} of shape "
-                f"{(*tensordict.shape, 1)}; got {tuple(predictions.shape[1:])}."
+                f"{self.critic_name} must write one number for each state, {key!r} of shape {shape}; got "
+                f"{tuple(found.shape[1:])}."
             )
-        return predictions
+        return found
 
     def _value(self, tensordict: TensorDictBase, *, target: bool) -> Tensor:
         """The value (*, 1) of states: the least of the predictions of the critics or of their targets."""
         return self._critics(tensordict, target=target).amin(0)
 
     def _critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        check_tensordict(self._name, tensordict)
+        check_tensordict(str(type(self).__name__), tensordict)
         key = self.tensor_keys.value_target
         missing = [name for name in getattr(self, self.critic_name).in_keys if name not in tensordict]
         if missing:
@@ -107,8 +106,7 @@ class PathwiseCriticLoss(PathwiseLoss):
 
     def _terminal_value(self, tensordict: TensorDictBase) -> Tensor:
         """gamma^n V(s_n) of each segment that did not terminate, summed over the segments: (*)."""
-        _, end = segments(self._next(tensordict, "done"))
-        return self._discounted_value(tensordict, end)
+        return self._discounted_value(tensordict, segments(self._next(tensordict, "done"))[1])
 
     def _discounted_value(self, tensordict: TensorDictBase, after: Tensor) -> Tensor:
         """gamma^(t+1) V(s_(t+1)) after steps (*, horizon, 1), but for those that terminated, summed over steps: (*)."""

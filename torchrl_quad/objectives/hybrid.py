@@ -19,7 +19,7 @@ from torchrl.objectives.utils import ValueEstimators
 from torchrl_quad.data.unwrap import check_tensordict, group, leaf
 from torchrl_quad.errors import UserValueError, WrongState
 from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again, plain_of
-from torchrl_quad.objectives.calls import check_function, discounts, segments, takes_rollout
+from torchrl_quad.objectives.calls import discounts, segments, takes_rollout
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Coefficient, Field, Positive, Share
 
@@ -52,8 +52,7 @@ class HybridLoss(SHACLoss):
             (losses["loss_actor"] + losses["loss_value"]).backward()
 
     Args:
-        actor_network: the policy that flew the rollout, as ``make_actor`` builds it.
-        value_network: the critic V(s).
+        actor_network, value_network: as for :class:`SHACLoss`; the policy is one of :func:`~torchrl_quad.make_actor`.
         gradient_lmbda: the lambda of the return that the pathwise gradient differentiates; 0.9 is usual. That of the
             advantage and of the critic's targets is ``make_value_estimator(lmbda=...)``.
         clip_epsilon: how far the ratio of probabilities may move from 1; 0.2 is usual.
@@ -63,9 +62,6 @@ class HybridLoss(SHACLoss):
         decay: the share of the running weight that a rollout leaves as it is.
         average: of a scalar over the processes that train together, if there are several.
         reduction: mean, sum or none, over samples.
-
-    Raises:
-        NotImplementedError: (in use) the policy is another one than ``make_actor`` builds.
     """
 
     @dataclass
@@ -97,14 +93,8 @@ class HybridLoss(SHACLoss):
         average: Callable[[Tensor], Tensor] | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
-        check_function("average", average)
-        super().__init__(
-            actor_network,
-            value_network,
-            delay_value=False,
-            clip_action_gradient=clip_action_gradient,
-            reduction=reduction,
-        )
+        own = {"clip_action_gradient": clip_action_gradient, "reduction": reduction}
+        super().__init__(actor_network, value_network, delay_value=False, **own)
         self.gradient_lmbda, self.clip_epsilon, self.entropy_coeff = gradient_lmbda, clip_epsilon, entropy_coeff
         self.decay, self.average = decay, average
         self.out_keys = [name for name in self.out_keys if name != "clipped"]  # minibatches clip no gradient
@@ -122,11 +112,10 @@ class HybridLoss(SHACLoss):
         return super().forward(self._with_targets(tensordict))
 
     def write_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Differentiate a rollout (*, horizon), update the weight, and write what the minibatches read.
+        """Differentiate a rollout (*, horizon), update the weight, and return what the minibatches read.
 
-        Returns:
-            the rollout without its graph, with ``advantage``, ``location_gradient``, ``latent`` and ``value_target``
-            under their tensor keys.
+        This is the rollout without its graph, with ``advantage``, ``location_gradient``, ``latent`` and
+        ``value_target`` under their tensor keys.
         """
         self._check_rollout(tensordict)
         if not torch.is_grad_enabled():
@@ -141,9 +130,7 @@ class HybridLoss(SHACLoss):
             predicted = (grad * (latent - leaf(data, "loc"))).sum(-1, keepdim=True)
             weight = self._regress(advantage, predicted)
         data.set(keys.advantage, advantage - weight * (predicted - predicted.mean()))
-        data.set(keys.location_gradient, weight * grad)
-        data.set(keys.latent, latent)
-        return data
+        return data.set(keys.location_gradient, weight * grad).set(keys.latent, latent)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss of what :meth:`forward` takes, and the weight, KL(policy that flew || policy), entropy."""
@@ -166,7 +153,7 @@ class HybridLoss(SHACLoss):
         return self._reduce_loss(-objective), metadata
 
     def _with_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
-        check_tensordict(self._name, tensordict)
+        check_tensordict(str(type(self).__name__), tensordict)
         keys = self.tensor_keys
         lost = [key for key in (keys.advantage, keys.location_gradient, keys.latent) if key not in tensordict]
         # An advantage without the other two comes from another estimator.
@@ -185,8 +172,7 @@ class HybridLoss(SHACLoss):
         goes_on = group(tensordict, "next").select(*self._critic_inputs())[~terminated.squeeze(-1)]
         value = self._value(cast(TensorDictBase, goes_on), target=False).to(reward.dtype)
         done = self._next(tensordict, "done")
-        _, end = segments(done)
-        bootstrap = torch.where(end, 1.0, 1.0 - self.gradient_lmbda).to(reward.dtype)
+        bootstrap = torch.where(segments(done)[1], 1.0, 1.0 - self.gradient_lmbda).to(reward.dtype)
         bootstrap = bootstrap * torch.zeros_like(reward).masked_scatter(~terminated, value)
         discount = discounts(done, gamma * self.gradient_lmbda)
         objective = (discount * (reward + gamma * bootstrap)).sum()

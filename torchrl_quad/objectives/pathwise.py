@@ -13,15 +13,12 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import ValueEstimators, default_value_kwargs, dispatch_value_estimator
-from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_quad.data.unwrap import check_tensordict, leaf
 from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, WrongState, shown
 from torchrl_quad.objectives.action_gradients import MedianClip, act_again, action_gradient
 from torchrl_quad.objectives.calls import discounts, takes_rollout, total
-from torchrl_quad.options import Coefficient, Device, Entry, Fraction, Positive, Scale, between, check_value, checked
-
-MOST_WEIGHTS = 100_000_000  # of all copies of a critic; more fit into no memory that trains on a horizon
+from torchrl_quad.options import Coefficient, Entry, Fraction, Positive, Scale, between, check_value, checked
 
 
 @checked
@@ -112,18 +109,11 @@ class PathwiseLoss(LossModule):
         self.out_keys = [*self.out_keys, *self.measured_of_actions, *of_entropy]
 
     def convert_to_functional(self, module: TensorDictModule, module_name: str, *args: Any, **kwargs: Any) -> None:
-        """As TorchRL's, for a TensorDictModule alone, and no more copies than fit into memory."""
+        """As TorchRL's, for a TensorDictModule alone."""
         if not isinstance(module, TensorDictModuleBase):
             raise UserTypeError(
                 f"{module_name} must be a TensorDictModule, got {type(module).__name__}. Wrap a plain module: "
                 'TensorDictModule(module, in_keys=["observation"], out_keys=[...]).'
-            )
-        copies = kwargs.get("expand_dim") or 1
-        weights = copies * sum(p.numel() for p in module.parameters() if not torch.nn.parameter.is_lazy(p))
-        if weights > MOST_WEIGHTS:
-            raise UserValueError(
-                f"{copies} copies of this {module_name} have {weights:,} weights, more than {MOST_WEIGHTS:,}. Take "
-                "fewer copies, or a smaller network."
             )
         super().convert_to_functional(module, module_name, *args, **kwargs)
 
@@ -159,10 +149,6 @@ class PathwiseLoss(LossModule):
         *,
         gamma: Fraction | None = None,
         lmbda: Fraction | None = None,
-        average_rewards: bool | None = None,
-        differentiable: bool | None = None,
-        vectorized: bool | None = None,
-        device: Device | None = None,
         **more: Any,
     ) -> Self:
         """Choose the return estimator and its parameters.
@@ -171,23 +157,16 @@ class PathwiseLoss(LossModule):
         environments (torchrl 0.14).
 
         Args:
-            value_type: one of ``supported_value_estimators``, or an estimator of TorchRL; by default that of the loss.
+            value_type: one of ``supported_value_estimators``; by default that of the loss.
             gamma: the discount of future rewards per control step; 0.99 is usual.
             lmbda: the lambda of the TD(lambda) targets; 0.95 is usual.
-            average_rewards, differentiable, vectorized, device: as for TorchRL's estimator.
-            **more: of an estimator that is given as a class.
+            **more: as for TorchRL's estimator.
 
         Raises:
             NotImplementedError: the loss does not support the estimator.
             TypeError: the estimator takes no such argument; only TD(lambda) takes a lambda.
         """
         value_type = self.default_value_estimator if value_type is None else value_type
-        options = {"gamma": gamma, "lmbda": lmbda, "average_rewards": average_rewards, "device": device}
-        options |= {"differentiable": differentiable, "vectorized": vectorized}
-        given: dict[str, Any] = {name: x for name, x in options.items() if x is not None}
-        is_class = isinstance(value_type, type) and issubclass(value_type, ValueEstimatorBase)
-        if is_class or isinstance(value_type, ValueEstimatorBase):
-            return super().make_value_estimator(cast(Any, value_type), **given, **more)
         supported = {x.name.lower(): x for x in self.supported_value_estimators}
         chosen = supported.get(value_type.lower()) if isinstance(value_type, str) else value_type
         if not isinstance(chosen, ValueEstimators) or chosen not in self.supported_value_estimators:
@@ -195,18 +174,15 @@ class PathwiseLoss(LossModule):
                 f"{shown(value_type)} is not implemented for loss {type(self).__name__}. Choose from: "
                 f"{', '.join(supported)}."
             )
-        of_lambda = {"lmbda", "vectorized"}
-        known = set(options) if chosen is ValueEstimators.TDLambda else set(options) - of_lambda
-        if unknown := {*more, *given} - known:
-            raise UserTypeError(
-                f"{type(self).__name__} estimates its returns by {chosen.name}, which takes no {min(unknown)!r}. "
-                f"Choose from: {', '.join(sorted(known))}."
-            )
+        given: dict[str, Any] = {name: x for name, x in (("gamma", gamma), ("lmbda", lmbda)) if x is not None}
         if chosen is ValueEstimators.TDLambda:
-            given = {"vectorized": False, **given}
-        estimator = dispatch_value_estimator(
-            self, chosen, supported=self.supported_value_estimators, value_network=None, **given
-        )
+            more = {"vectorized": False, **more}
+        try:
+            estimator = dispatch_value_estimator(
+                self, chosen, supported=self.supported_value_estimators, value_network=None, **given, **more
+            )
+        except TypeError as error:
+            raise UserTypeError(f"{type(self).__name__} estimates its returns by {chosen.name}: {error}.") from None
         given = {**default_value_kwargs(self.value_type), **given}
         for name in {"gamma", "lmbda"} & given.keys():  # TorchRL makes them float32 whatever the rollout is
             buffer = getattr(estimator, name)
@@ -294,10 +270,6 @@ class PathwiseLoss(LossModule):
         return reward
 
     @property
-    def _name(self) -> str:
-        return str(type(self).__name__)
-
-    @property
     def _gamma(self) -> Tensor:
         return cast(Tensor, self.value_estimator.gamma)
 
@@ -336,7 +308,7 @@ class PathwiseLoss(LossModule):
         return float(self.target_entropy)
 
     def _check_rollout(self, tensordict: TensorDictBase) -> None:
-        name = self._name
+        name = str(type(self).__name__)
         check_tensordict(name, tensordict)
         shape = tuple(tensordict.batch_size)
         names = tensordict.names
@@ -359,13 +331,9 @@ class PathwiseLoss(LossModule):
                 f"loss.set_keys(...), which takes {', '.join(vars(self.tensor_keys))}."
             )
         for what in ("reward", "done", "terminated"):
-            key = ("next", getattr(self.tensor_keys, what))
-            entry = leaf(tensordict, key)
-            if (got := tuple(entry.shape)) != (*shape, 1):
+            key, got = ("next", getattr(self.tensor_keys, what)), tuple(self._next(tensordict, what).shape)
+            if got != (*shape, 1):
                 raise UserValueError(f"{name} needs {key!r} of shape {(*shape, 1)} in this rollout; got {got}.")
-            if not (entry.is_floating_point() if what == "reward" else entry.dtype == torch.bool):
-                kind = "floating-point numbers" if what == "reward" else "bool"
-                raise UserValueError(f"{name} needs {key!r} as {kind}; got {entry.dtype}.")
         device, own = self._next(tensordict, "reward").device, self._default_device
         if own not in (None, device):
             raise UserValueError(f"{name} is on {own}, and the rollout on {device}: loss.to({str(device)!r}) moves it.")

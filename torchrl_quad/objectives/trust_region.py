@@ -14,7 +14,6 @@ from torch.distributions import Normal, kl_divergence
 
 from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.errors import UserTypeError, UserValueError
-from torchrl_quad.objectives.calls import check_function
 from torchrl_quad.options import NonNegative, Positive, checked
 
 
@@ -44,7 +43,6 @@ class TrustRegion:
 
     Raises:
         TypeError: the actor is no such policy.
-        ValueError: (in use) the rollout has no ``loc`` and ``scale``.
     """
 
     def __init__(
@@ -60,7 +58,6 @@ class TrustRegion:
                 f"actor must be a policy as make_actor builds it, which writes loc and scale; got "
                 f"{type(actor).__name__}."
             )
-        check_function("average", average)
         self.actor, self.max_kl, self.min_scale, self.average = actor, max_kl, min_scale, average
         self.metrics: dict[str, Tensor] = {}
 

@@ -95,7 +95,7 @@ class Network(nn.Module):
                 f"This network was built for entries of {', '.join(map(str, self.widths))} numbers, and reads some of "
                 f"{', '.join(map(str, found))}: those of another environment, or of other options. Build one for this."
             )
-        return _concatenated(inputs, self.scales)
+        return concatenated(inputs, self.scales)
 
 
 class Critic(ValueOperator):
@@ -203,9 +203,13 @@ class PlainTanhGaussian:
         self.activations, layers = list(network.mlp)[1::2], cast(list[nn.Linear], list(network.mlp)[::2])
         self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
         self._take_head(actor)
+        self.signature = (*self._describe(), str(self.activations))
+
+    def _describe(self) -> tuple[Any, ...]:
+        """What it computes, apart from its activations."""
         mapping = cast(biased_softplus, self.head.scale_mapping)
-        self.signature = (
-            *map(str, (self.in_keys, self.out_keys, self.scales, self.activations, self.low, self.high)),
+        return (
+            *map(str, (self.in_keys, self.out_keys, self.scales, self.low, self.high)),
             *(tuple(x.shape) for x in self.weights),
             (self.head.scale_lb, mapping.bias, mapping.min_val, self.rho, self.head.max_loc),
         )
@@ -290,7 +294,7 @@ class PlainTanhGaussian:
             (grad,) = pull(grad @ weight)
             read.append(activated)
             grads_kept.append(grad)
-        read.append(_concatenated(inputs, self.scales))
+        read.append(concatenated(inputs, self.scales))
         of_inputs = (grad @ weights[0]).split([x.shape[-1] for x in inputs], -1)
         of_inputs = [g if scale == 1.0 else g * scale for g, scale in zip(of_inputs, self.scales, strict=True)]
         return [*read[::-1], *grads_kept[::-1]], of_inputs, grad_drawn
@@ -307,7 +311,7 @@ class PlainTanhGaussian:
 
     def _layers(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
         """What each layer returns before its activation, for inputs (n, k_i)."""
-        x, kept = _concatenated(inputs, self.scales), []
+        x, kept = concatenated(inputs, self.scales), []
         for weight, bias, activation in zip(weights[::2], weights[1::2], [*self.activations, None], strict=True):
             kept.append(torch.addmm(bias, x, weight.t()))
             x = kept[-1] if activation is None else activation(kept[-1])
@@ -325,7 +329,7 @@ class PlainTanhGaussian:
         written = self._squash(loc, scale, xi, self.log_prob_key)
         if before:
             written |= {"noise_before": before[0], "noise": self.head.next(before[0], xi)}
-        return {key: written[key] for key in self.out_keys}
+        return {key: x for key, x in written.items() if key in self.out_keys}
 
 
 def _first_noise(x: Tensor, is_random: bool | None) -> Tensor:
@@ -333,7 +337,8 @@ def _first_noise(x: Tensor, is_random: bool | None) -> Tensor:
     return x.normal_() if is_random else x
 
 
-def _concatenated(inputs: Sequence[Tensor], scales: Sequence[float]) -> Tensor:
+def concatenated(inputs: Sequence[Tensor], scales: Sequence[float]) -> Tensor:
+    """Vectors (*, k_i), each times its scale, as one."""
     return torch.cat([x if scale == 1.0 else x * scale for x, scale in zip(inputs, scales, strict=True)], -1)
 
 

@@ -8,8 +8,9 @@ from typing import Annotated, Any, NamedTuple, cast
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
+from torch.func import vjp
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase, TensorDictPrimer
 from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, set_recurrent_mode
@@ -18,7 +19,7 @@ from torchrl.modules.tensordict_module.rnn import GRU
 from torchrl_quad.data.unwrap import check_env, leaf, observed
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.modules.networks import OBSERVATION, Activation, Cells, ScaleInit, first_action, network_of, policy_of
-from torchrl_quad.modules.plain import Network, PlainTanhGaussian, TanhGaussianActor, is_pointwise, layout
+from torchrl_quad.modules.plain import Network, PlainTanhGaussian, TanhGaussianActor, concatenated, is_pointwise, layout
 from torchrl_quad.options import Below1, Entries, Entry, Field, Scale, Width, checked
 
 MEMORY = "recurrent_state"
@@ -111,7 +112,7 @@ def make_visual_actor(
     size = 2 * len(first) if learn_scale else len(first)
     last = Network(MLP(sum(widths), size, num_cells=[], device=env.device).to(image.dtype), [1.0] * len(widths), widths)
     read, options = ["features", "recalled"][: len(widths)], (scale_init, noise_correlation, return_log_prob)
-    return policy_of(VisualActor, parts, last, read, spec, first, *options)
+    return policy_of(ComposedActor, parts, last, read, spec, first, *options)
 
 
 class VisualFeatures(nn.Module):
@@ -140,7 +141,7 @@ class Parts(NamedTuple):
     max_loc: float  #: the largest mean action before the tanh
 
 
-class VisualActor(TanhGaussianActor):
+class ComposedActor(TanhGaussianActor):
     """What :func:`~torchrl_quad.make_visual_actor` builds."""
 
     @dispatch(auto_batch_size=False)
@@ -158,6 +159,11 @@ class VisualActor(TanhGaussianActor):
                 "actor.make_tensordict_primer()))."
             )
         return super().forward(tensordict, **kwargs)
+
+    def plain(self) -> PlainParts | None:
+        """The policy as pure functions of its present weights; None if its parts were changed or hooked."""
+        parts = self.parts()
+        return None if parts is None else PlainParts(self, parts)
 
     def replayed(self) -> Replay | None:
         """The policy as losses let it act again in a whole rollout, or None if it explores in another way."""
@@ -197,10 +203,110 @@ class VisualActor(TanhGaussianActor):
         raise UserValueError("This policy has no memory: it was built with recurrent=False, and needs no primer.")
 
 
+class PlainParts(PlainTanhGaussian):
+    """A policy with eyes, with memory or with both on plain tensors; see the engine's ``PlainPolicy``.
+
+    Its adjoint computes the network again. What it saw has no gradient where ``constants`` says so, and is then
+    convolved only once.
+    """
+
+    def __init__(self, actor: ComposedActor, parts: Parts) -> None:
+        first, *_ = cast(Any, actor[0].module)
+        self.parts, self.is_random, self.scales, self.widths = parts, actor.is_random, parts.scales, parts.widths
+        self.sees = bool(parts.convolutions)
+        self.memory = {MEMORY: (1, parts.memory.hidden_size)} if parts.memory else {}
+        self.in_keys, self.out_keys = [*map(unravel_key, first.in_keys), *self.memory], list(actor.out_keys)
+        self.constants: frozenset[NestedKey] = frozenset()
+        self._take_head(actor)
+        layers: list[Any] = [*parts.convolutions[::2], *parts.trunk[::2], parts.head]
+        gru = parts.memory
+        remembering = (gru.weight_ih_l0, gru.bias_ih_l0, gru.weight_hh_l0, gru.bias_hh_l0) if gru else ()
+        self.weights = (*(x for layer in layers for x in (layer.weight, layer.bias)), *cast(Any, remembering))
+        activations = [parts.convolutions[1::2], parts.trunk[1::2]]
+        self.signature = (*self._describe(), str((activations, parts.nearest, self.sees, list(self.memory))))
+
+    def fits(self, inputs: Sequence[Tensor]) -> bool:
+        """Whether the network can read inputs of this width, precision and device."""
+        like = self.weights[0]
+        vectors = inputs[self.sees : len(inputs) - len(self.memory)]
+        fits = [x.shape[-1] for x in vectors] == list(self.widths[self.sees :])
+        return fits and all((x.dtype, x.device) == (like.dtype, like.device) for x in inputs)
+
+    def forward(
+        self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
+    ) -> tuple[list[Tensor], dict[NestedKey, Tensor]]:
+        """What was seen, and loc, scale, action, features, memory, and log-probability if wanted."""
+        seen = self._see(weights, inputs)
+        raw, features, *recalled = self._network(weights, inputs, seen)
+        written = {**self._sample(raw, drawn), "features": features}
+        for x in recalled:
+            written |= {"recalled": x, ("next", MEMORY): x.unsqueeze(-2)}
+        return seen, {key: written[key] for key in self.out_keys}
+
+    def adjoint(
+        self,
+        weights: Sequence[Tensor],
+        inputs: Sequence[Tensor],
+        kept: Sequence[Tensor],
+        drawn: Tensor,
+        grads: dict[NestedKey, Tensor],
+    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
+        """What the network read, and the gradients of what it returned; the gradients of inputs and noise."""
+        is_constant = self.sees and self.in_keys[0] in self.constants
+        read = inputs[1:] if is_constant else inputs
+
+        def network(*read: Tensor) -> tuple[Tensor, ...]:
+            every = [inputs[0], *read] if is_constant else read
+            return tuple(self._network(weights, every, kept if is_constant else self._see(weights, every)))
+
+        (raw, *_), pull = vjp(network, *read)[:2]
+        own = {key: x for key, x in grads.items() if key not in ("features", "recalled", ("next", MEMORY))}
+        grad_raw, grad_drawn = vjp(self._sample, raw, drawn)[1](own)
+        grads_out = [grad_raw, grads["features"]]
+        if self.memory:
+            grads_out.append(grads["recalled"] + grads["next", MEMORY].squeeze(-2))
+        of_read = list(pull(tuple(grads_out)))
+        of_inputs = [torch.zeros_like(inputs[0]), *of_read] if is_constant else of_read
+        return [*inputs, *grads_out], of_inputs, grad_drawn
+
+    def weight_gradient(self, weights: Sequence[Tensor], traces: Sequence[Tensor]) -> list[Tensor]:
+        """The gradients of all weights, over a batch."""
+        inputs, grads = traces[: len(self.in_keys)], traces[len(self.in_keys) :]
+        _, pull = vjp(lambda *own: tuple(self._network(own, inputs, self._see(own, inputs))), *weights)[:2]
+        return list(pull(tuple(grads)))
+
+    def _see(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
+        """What the convolutions return of a depth image (n, channels, height, width) [m], (n, k); nothing if blind."""
+        if not self.sees:
+            return []
+        x, layers = inputs[0].clamp_min(self.parts.nearest).reciprocal(), self.parts.convolutions
+        for i, activation in enumerate(layers[1::2]):
+            x = activation(nn.functional.conv2d(x, weights[2 * i], weights[2 * i + 1], stride=2, padding=1))
+        return [x.flatten(1)]
+
+    def _network(self, weights: Sequence[Tensor], inputs: Sequence[Tensor], seen: Sequence[Tensor]) -> list[Tensor]:
+        """What the head returns, the features, and what is recalled (n, hidden_size)."""
+        weights = weights[len(self.parts.convolutions) :]
+        vectors = inputs[self.sees : len(inputs) - len(self.memory)]
+        x = concatenated([*seen, *vectors], self.scales)
+        layers = len(self.parts.trunk) // 2
+        for i, activation in enumerate(self.parts.trunk[1::2]):
+            x = activation(torch.addmm(weights[2 * i + 1], x, weights[2 * i].t()))
+        head, bias, *gru = weights[2 * layers :]
+        if not self.memory:
+            return [torch.addmm(bias, x, head.t()), x]
+        h = inputs[-1].squeeze(-2)
+        of_x, of_h = torch.addmm(gru[1], x, gru[0].t()).chunk(3, 1), torch.addmm(gru[3], h, gru[2].t()).chunk(3, 1)
+        reset, keep = (of_x[0] + of_h[0]).sigmoid(), (of_x[1] + of_h[1]).sigmoid()
+        new = (of_x[2] + reset * of_h[2]).tanh()
+        recalled = new + keep * (h - new)
+        return [torch.addmm(bias, torch.cat((x, recalled), 1), head.t()), x, recalled]
+
+
 class Replay(PlainTanhGaussian):
     """A visual policy in the states of a rollout that it has flown, in which its memory is built up again."""
 
-    def __init__(self, actor: VisualActor) -> None:
+    def __init__(self, actor: ComposedActor) -> None:
         self.actor = actor
         self._take_head(actor)
 

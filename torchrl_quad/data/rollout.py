@@ -18,15 +18,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.normalizer import NormalizedPolicy, ObservationNormalizer
-from torchrl_quad.data.unwrap import (
-    base_env,
-    check_actor,
-    check_env,
-    check_whole_state,
-    leaf,
-    memory_keys,
-    observed,
-)
+from torchrl_quad.data.unwrap import base_env, check_actor, check_env, check_whole_state, leaf, memory_keys, observed
 from torchrl_quad.data.visited_states import restart
 from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.options import Field, Fraction, Horizon, accepted, checked
@@ -65,12 +57,11 @@ def differentiable_rollout(
         exploration_type: RANDOM samples the policy, DETERMINISTIC takes its mode.
 
     Returns:
-        the rollout, of batch size (*env.batch_size, horizon), and the carry to continue from: detached, and reset in
-        the environments whose last step was done.
+        the rollout (*env.batch_size, horizon), and the carry to continue from: detached, and reset where the last step
+        was done.
 
     Raises:
-        ValueError: the actor reads an entry that is missing, or a transform
-            overwrites or leaves out a part of the state.
+        ValueError: the actor reads an entry that is missing, or a transform changes a part of the state.
     """
     check_env(env)
     check_actor(actor, "actor")
@@ -137,14 +128,11 @@ def _check_start(env: EnvBase, actor: TensorDictModuleBase, carry: TensorDictBas
 
 
 def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> TensorDictBase:
-    """The environment's own rollout.
-
-    If its only transform is our normaliser, the environment inside flies, compiled if it can, and what it observed is
-    normalised afterwards.
-    """
+    """The environment's own rollout."""
     options = {"auto_reset": False, "break_when_any_done": False}
     if not (isinstance(env, TransformedEnv) and type(env.transform) is ObservationNormalizer):
         return env.rollout(horizon, actor, tensordict=start, **options)
+    # The environment inside flies, compiled if it can, and what it observed is normalised afterwards.
     normalizer = env.transform
     (key,) = normalizer.in_keys
     if key in start:  # otherwise the environment complains

@@ -17,7 +17,7 @@ from torchrl_quad import (
     make_qvalue,
     make_value,
 )
-from torchrl_quad.objectives.action_gradients import MedianClip, action_gradient, sources_of_steps
+from torchrl_quad.objectives.calls import MedianClip, action_gradient, sources_of_steps
 
 LOSSES = {
     "bptt": lambda env, actor, **options: BPTTLoss(actor, **options),

@@ -32,7 +32,7 @@ from torchrl.envs import (
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor
 from torchrl_quad.data import flight_mode
 from torchrl_quad.data.transforms import transforms_of
-from torchrl_quad.objectives.action_gradients import action_gradient
+from torchrl_quad.objectives.calls import action_gradient
 
 OBSERVATION = ["observation"]
 

@@ -18,15 +18,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.transforms import check_statistics, under_transforms
-from torchrl_quad.data.unwrap import (
-    base_env,
-    check_actor,
-    check_env,
-    check_whole_state,
-    leaf,
-    memory_keys,
-    observed,
-)
+from torchrl_quad.data.unwrap import base_env, check_actor, check_env, check_whole_state, leaf, memory_keys, observed
 from torchrl_quad.data.visited_states import restart
 from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.options import Field, Fraction, Horizon, accepted, checked
@@ -65,12 +57,11 @@ def differentiable_rollout(
         exploration_type: RANDOM samples the policy, DETERMINISTIC takes its mode.
 
     Returns:
-        the rollout, of batch size (*env.batch_size, horizon), and the carry to continue from: detached, and reset in
-        the environments whose last step was done.
+        the rollout (*env.batch_size, horizon), and the carry to continue from: detached, and reset where the last step
+        was done.
 
     Raises:
-        ValueError: the actor reads an entry that is missing, or a transform
-            overwrites or leaves out a part of the state.
+        ValueError: the actor reads an entry that is missing, or a transform changes a part of the state.
     """
     check_env(env)
     check_actor(actor, "actor")

@@ -36,10 +36,9 @@ Kinds = dict[NestedKey, tuple[torch.Size, bool]]  # of the entries of one state:
 class VisitedStateBuffer(TensorDictReplayBuffer):
     """States that the policy has visited, from which horizons and episodes can start.
 
-    The buffer keeps states and no transitions, so it is no replay for off-policy learning. A state is the complete
-    Markov state, including commands on their way and whatever the task keeps, detached from any graph. ``state_dict``
-    and ``dumps(path)`` save the states and the buffer's random generator, which draws them and decides which
-    environments get one.
+    A state is the complete Markov state, including commands on their way and whatever the task keeps, detached from any
+    graph. ``state_dict`` and ``dumps(path)`` save the states and the random generator, which draws them and decides
+    which environments get one.
 
     Args:
         capacity: visited states kept; the oldest go first.
@@ -80,9 +79,6 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         """Add the states in which the steps of a rollout (any batch size) started, and return the indices written.
 
         Terminated states and states that are not finite are left out.
-
-        Raises:
-            ValueError: the rollout lacks an entry of the state, or its states differ in kind from the buffer's.
         """
         check_tensordict("The visited-state buffer", tensordicts)
         missing = [key for key in self.names if key not in tensordicts]
@@ -112,9 +108,6 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         Args:
             env: an environment that can be set to a state, also under transforms.
             fraction: the share of horizons that start in visited states, a probability for each member of the batch.
-
-        Raises:
-            RuntimeError: the buffer is empty.
         """
         check_env(env)
         mixed, visited, pick = self._mixed(_fresh(env, self.state_keys), fraction)
@@ -135,10 +128,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
 
         Returns:
             a function from n to n states: the tensordict (n) that ``env`` keeps under its one state key, or a
-            tensordict (n) with all of several keys. It raises what :meth:`initial_state` does.
-
-        Raises:
-            TypeError: the environment has no ``sample_start``.
+            tensordict (n) with all of several keys.
         """
         check_env(env)
         base: Any = base_env(env)
@@ -179,8 +169,6 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
                 "in name, shape or type. Keep a buffer for each task and its options, such as action_delay."
             )
 
-    # -- saving and loading --------------------------------------------------------------------------------------------
-
     def state_dict(self) -> dict[str, Any]:
         """The states (n), in their places, the place of the next one, and the random generator."""
         states = self._storage[: len(self)].select(*self.names).flatten_keys(".") if len(self) else TensorDict()
@@ -191,11 +179,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Hold what :meth:`state_dict` has returned, also that of a smaller buffer.
-
-        Raises:
-            ValueError: the content does not fit the buffer, which stays as it is.
-        """
+        """Hold what :meth:`state_dict` has returned, also that of a smaller buffer; what does not fit is refused."""
         generator, most = torch.Generator(device=self._rng.device), self._storage.max_size
         try:
             entries, cursor = state_dict["states"], operator.index(state_dict["cursor"])
@@ -236,18 +220,14 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
 def restart(env: EnvBase, carry: TensorDictBase, fraction: Fraction) -> TensorDictBase:
     """Give a random fraction of the environments fresh starts, and let the others continue; the carry for a rollout.
 
-    Most flights then last for many horizons. The choice draws from torch's global generator, the fresh starts from the
-    environment's own. The flights that continue keep the memory of a recurrent policy. Transforms with a memory, such
-    as StepCounter or a primer, begin again in all environments, and so does the correlated noise of a policy without
-    memory.
+    The choice draws from torch's global generator, the fresh starts from the environment's own. The flights that
+    continue keep the memory of a recurrent policy. Transforms with a memory, such as StepCounter or a primer, begin
+    again in all environments, and so does the correlated noise of a policy without memory.
 
     Args:
         env: an environment that can be set to a state, also under transforms.
         carry: where the environments are, as ``differentiable_rollout`` returns it.
         fraction: the share of flights that are given up for a fresh start, a probability for each.
-
-    Raises:
-        ValueError: the carry lacks an entry of the state or has another batch size.
     """
     check_env(env)
     if not isinstance(carry, TensorDictBase):

@@ -59,8 +59,8 @@ def make_actor(
 ) -> ProbabilisticActor:
     """A tanh-Gaussian policy a = tanh(mu(s) + sigma(s) noise), stretched to the bounds of the action.
 
-    The weights of its last layer start near zero: the first actions are close to ``action_init``, with noise of about
-    ``scale_init`` (before the tanh, in units of half the range). It writes ``loc``, ``scale`` and ``action``.
+    The weights of its last layer start near zero: the first actions are close to ``action_init``. It writes ``loc``,
+    ``scale`` and ``action``.
 
     Args:
         env: any TorchRL environment, for the sizes of its entries, the action's bounds, device and floating-point type.
@@ -68,12 +68,12 @@ def make_actor(
         in_keys: the entries that are concatenated into the network's input, each (*, k), in a list: ["observation"].
         activation: of the hidden layers; smooth ones give smooth policy gradients.
         input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``. What the tasks observe
-            is of one to ten [m, m/s, rad/s, ten times the quaternion]; entries of the state may be far larger.
+            is of one to ten; entries of the state may be far larger.
         action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``,
             averaged over environments, if there is one (see :mod:`torchrl_quad.data`; a drone's is to hover), and the
             middle of the range otherwise.
-        scale_init: the standard deviation of the policy's noise at the start, before the tanh. Training brings it down
-            to 0.01 at least, or to a tenth of this.
+        scale_init: the standard deviation of the policy's noise at the start, before the tanh, in units of half the
+            range. Training brings it down to 0.01 at least, or to a tenth of this.
         learn_scale: whether this noise changes with the state and in training. Otherwise neither a gradient through the
             simulator nor a KL bound takes the exploration away.
         noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise. Correlated noise moves a
@@ -83,9 +83,8 @@ def make_actor(
             mu then stays between -5 and 5: further out, rounding of the action determines the log-probability.
 
     Raises:
-        ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one; the
-            number of scales is not that of the entries; the first action is not strictly inside the bounds; or the
-            network has more than 100 million weights.
+        ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one; or
+            the first action is not strictly inside the bounds.
     """
     spec, first = first_action(env, action_init, "make_actor")
     size = 2 * len(first) if learn_scale else len(first)
@@ -106,11 +105,9 @@ def make_value(
     """A state value V(s), written to ``state_value``, (*, 1).
 
     LayerNorm normalises its hidden layers: without it the gradient of the critic, which the policy follows, is far off.
-
     A critic may read more than the actor does, such as ``in_keys=("observation", ("state", "rotor_speed"))``. Rotors
     turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one. Among obstacles,
-    ``"obstacle"`` (*, 4) is the distance from the drone's surface to the nearest [m], and the direction away from it in
-    the body frame.
+    ``"obstacle"`` (*, 4) is the distance to the nearest [m], and the direction away from it in the body frame.
 
     Args:
         env, activation, input_scale, in_keys: as for :func:`make_actor`, and so are the errors.
@@ -132,13 +129,11 @@ def make_qvalue(
 ) -> ValueOperator:
     """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); otherwise as :func:`make_value`.
 
-    A policy's action reveals the state. A critic that reads the state off the action gets its gradient in the action
-    wrong; an ``action_scale`` below one makes it rely on the state first.
-
     Args:
         env, activation, input_scale, in_keys: as for :func:`make_actor`, and so are the errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
-        action_scale: the action is multiplied by this.
+        action_scale: the action is multiplied by this. It reveals the state, and a critic that reads the state off it
+            gets its gradient in the action wrong: below one it relies on the state first.
     """
     in_keys = [*in_keys, "action"]
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, action_scale, layer_norm=True)

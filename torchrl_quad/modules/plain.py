@@ -305,10 +305,6 @@ class PlainTanhGaussian:
         pairs = zip(traces[:count], traces[count:], strict=True)
         return [g for x, grad in pairs for g in (grad.t() @ x, grad.sum(0))]
 
-    def action(self, loc: Tensor, scale: Tensor, xi: Tensor) -> Tensor:
-        """The action (*, k) of a normal distribution and the noise in it, each (*, k)."""
-        return self._squash(loc, scale, xi, None)["action"]
-
     def _layers(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
         """What each layer returns before its activation, for inputs (n, k_i)."""
         x, kept = concatenated(inputs, self.scales), []
@@ -317,16 +313,17 @@ class PlainTanhGaussian:
             x = kept[-1] if activation is None else activation(kept[-1])
         return kept
 
-    def _squash(
-        self, loc: Tensor, scale: Tensor, xi: Tensor, log_prob_key: NestedKey | None
+    def squash(
+        self, loc: Tensor, scale: Tensor, xi: Tensor, log_prob_key: NestedKey | None = None
     ) -> dict[NestedKey, Tensor]:
+        """What :func:`tanh_gaussian` writes, within the bounds of the action."""
         bounds = None if self.low is None else (loc.new_tensor(self.low), loc.new_tensor(self.high))
         return tanh_gaussian(loc, scale, xi, bounds, log_prob_key)
 
     def _sample(self, raw: Tensor, drawn: Tensor) -> dict[NestedKey, Tensor]:
         xi, *before = drawn.split(self.size, -1)
         loc, scale = self.head(raw, *before)
-        written = self._squash(loc, scale, xi, self.log_prob_key)
+        written = self.squash(loc, scale, xi, self.log_prob_key)
         if before:
             written |= {"noise_before": before[0], "noise": self.head.next(before[0], xi)}
         return {key: x for key, x in written.items() if key in self.out_keys}

@@ -48,7 +48,7 @@ def make_visual_actor(
 
     TorchRL's ConvNet reads the inverse of the depth, 1 / max(depth, 0.3 m), which weights near depths most. A
     multi-layer perceptron reads its features and the vectors; its output goes to TorchRL's GRUModule, and both outputs
-    to the head, as in :func:`~torchrl_quad.make_actor`.
+    to the head.
 
     The policy of a recurrent network also reads ``recurrent_state`` (*, 1, hidden_size) and ``is_init`` (*, 1), and
     writes ``("next", "recurrent_state")``. Environments of this package that fly without transforms hand the memory on,
@@ -146,11 +146,7 @@ class ComposedActor(TanhGaussianActor):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
-        """Write loc, scale and action, the memory, correlated noise, and the log-probability if wanted.
-
-        Raises:
-            ValueError: "is_init", which marks the first steps of episodes, is missing.
-        """
+        """Write loc, scale and action, the memory, correlated noise, and the log-probability if wanted."""
         if "is_init" in self.in_keys and "is_init" not in tensordict:
             raise UserValueError(
                 "A policy with memory reads 'is_init', which says where episodes begin. Fly it by "
@@ -190,11 +186,7 @@ class ComposedActor(TanhGaussianActor):
         )
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """TorchRL's transform that gives an environment the memory of this policy, in its precision.
-
-        Raises:
-            ValueError: the policy has no memory.
-        """
+        """TorchRL's transform that gives an environment the memory of this policy, in its precision."""
         for part in self.modules():
             if isinstance(part, GRUModule):
                 weight = cast(Tensor, part.gru.weight_hh_l0)
@@ -323,4 +315,4 @@ class Replay(PlainTanhGaussian):
     def replay(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
         """What it writes in the states of a rollout (*, horizon), with the noise of the rollout."""
         noise = self.drawn_again(tensordict)[:, : self.size].view_as(leaf(tensordict, "action"))
-        return self._squash(*self.distribution(tensordict), noise, self.log_prob_key)
+        return self.squash(*self.distribution(tensordict), noise, self.log_prob_key)

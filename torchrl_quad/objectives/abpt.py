@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.calls import sample_action, segments, step_in_segment, total
-from torchrl_quad.objectives.critic import PathwiseCriticLoss
+from torchrl_quad.objectives.pathwise import PathwiseCriticLoss
 from torchrl_quad.options import Copies, Field
 
 

@@ -10,8 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.objectives.action_gradients import median_length
-from torchrl_quad.objectives.calls import with_fixed
+from torchrl_quad.objectives.calls import median_length, with_fixed
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Copies, Field, Horizon
 

@@ -40,9 +40,6 @@ class TrustRegion:
 
     Attributes:
         metrics: ``kl``, the divergence of the last update before it was shortened; empty without a bound.
-
-    Raises:
-        TypeError: the actor is no such policy.
     """
 
     def __init__(

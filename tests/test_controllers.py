@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 from torch import nn
 
+from benchmarks.laps import basis, plan_lap, racing
 from torchrl_quad import MPC, ActionSequence, GeometricController, HoveringEnv, LandingEnv, RacingEnv, TrackingEnv
 from torchrl_quad.controllers import follow
 from torchrl_quad.controllers.mpc import feedback
-from torchrl_quad.controllers.policy import basis, plan_lap
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs import TASKS
 
@@ -182,7 +182,7 @@ def test_the_lap_passes_the_gates_within_the_limits_of_the_drone():
     rate = torch.linalg.cross(force, jerk).norm(dim=1) / force.square().sum(1)
     assert rate.max() < 2.0 and force.norm(dim=1).max() < 3 * 9.81
     assert 2.5 < lap.period < 4.0
-    flight = env.rollout(100, GeometricController(env), break_when_any_done=False)
+    flight = env.rollout(100, GeometricController(env, reference=racing(env)), break_when_any_done=False)
     assert flight["next", "state", "gates_passed"][0, -1] >= 1
 
 

@@ -3,28 +3,24 @@
 import pytest
 import torch
 
-from torchrl_quad import HoveringEnv, available_drones, load_drone
-from torchrl_quad.dynamics import FlightController, quaternion
+from torchrl_quad import available_drones, load_drone
+from torchrl_quad.dynamics import FlightController
 from torchrl_quad.dynamics.control import Setpoint
 from torchrl_quad.dynamics.vector import matvec, stack, unbind
 
 F64 = torch.float64
-each_drone = pytest.mark.parametrize("drone", available_drones())
+each_drone = pytest.mark.parametrize("controller", available_drones(), indirect=True)
 
 
-def controller_of(drone):
-    return FlightController(load_drone(drone, dtype=F64))
+@pytest.fixture
+def controller(request):
+    return FlightController(load_drone(request.param, dtype=F64))
 
 
 def asked_wrench(controller, setpoint):
     """What the controller asks of a drone that is level, still and without torque, (n, 4)."""
     torque = controller.nominal.inertia * controller.nominal.rate_gain * setpoint.body_rate
     return torch.cat((setpoint.thrust, torque), -1)
-
-
-def flown_wrench(controller, setpoint):
-    """What the rotors make of that once they have reached the commanded speeds, (n, 4)."""
-    return controller.rotors.wrench(speeds(controller, setpoint))
 
 
 def speeds(controller, setpoint):
@@ -40,24 +36,10 @@ def setpoints(controller, n, size):
 
 
 @each_drone
-def test_full_yaw_leaves_the_height_alone(drone):
-    env = HoveringEnv(num_envs=1, drone=drone)
-    td, action = env.reset(), env.hover_action.repeat(1, 1)
-    action[:, 3] = 1.0
-    for _ in range(50):
-        td = env.step_mdp(env.step(td.set("action", action)))
-    assert td["state", "angular_velocity"][0, 2] > 0.5 * env.nominal.max_body_rate[2]
-    assert td["state", "velocity"][0, 2].abs() < 0.15
-    up = quaternion.rotate(td["state", "quaternion"], torch.tensor([[0.0, 0.0, 1.0]]))
-    assert up[0, 2] > 0.999
-
-
-@each_drone
-def test_thrust_roll_and_pitch_are_exact_where_yaw_alone_saturates(drone):
-    controller = controller_of(drone)
+def test_thrust_roll_and_pitch_are_exact_where_yaw_alone_saturates(controller):
     setpoint = setpoints(controller, 500, 0.1)
     setpoint.body_rate[:, 2] = 1e3 * controller.nominal.max_body_rate[2]
-    asked, flown = asked_wrench(controller, setpoint), flown_wrench(controller, setpoint)
+    asked, flown = asked_wrench(controller, setpoint), controller.rotors.wrench(speeds(controller, setpoint))
     level = matvec(controller.mixer, asked * torch.tensor([1.0, 1.0, 1.0, 0.0], dtype=F64))
     feasible = ((level >= controller.thrust_min) & (level <= controller.thrust_max)).all(-1)
     assert feasible.sum() > 50
@@ -71,8 +53,7 @@ def test_thrust_roll_and_pitch_are_exact_where_yaw_alone_saturates(drone):
 
 
 @each_drone
-def test_where_nothing_saturates_the_mixer_is_untouched_to_the_last_bit(drone):
-    controller = controller_of(drone)
+def test_where_nothing_saturates_the_mixer_is_untouched_to_the_last_bit(controller):
     setpoint = setpoints(controller, 500, 0.02)
     plain = matvec(controller.mixer, asked_wrench(controller, setpoint))
     assert ((plain >= controller.thrust_min) & (plain <= controller.thrust_max)).all()
@@ -80,8 +61,7 @@ def test_where_nothing_saturates_the_mixer_is_untouched_to_the_last_bit(drone):
 
 
 @each_drone
-def test_no_command_asks_more_of_a_rotor_than_it_can_give(drone):
-    controller = controller_of(drone)
+def test_no_command_asks_more_of_a_rotor_than_it_can_give(controller):
     setpoint = setpoints(controller, 500, 30.0)
     thrust = controller.rotors.thrust(speeds(controller, setpoint))
     slack = 1e-6 * controller.thrust_max
@@ -89,8 +69,7 @@ def test_no_command_asks_more_of_a_rotor_than_it_can_give(drone):
 
 
 @each_drone
-def test_the_saturated_mixer_has_exact_derivatives(drone):
-    controller = controller_of(drone)
+def test_the_saturated_mixer_has_exact_derivatives(controller):
     setpoint, rate = setpoints(controller, 20, 3.0), controller.nominal.max_body_rate
     weight = controller.nominal.mass * controller.nominal.gravity
 
@@ -105,8 +84,7 @@ def test_the_saturated_mixer_has_exact_derivatives(drone):
 
 @each_drone
 @pytest.mark.parametrize("size", [0.02, 3.0])
-def test_arrays_and_components_give_the_same_commands(drone, size):
-    controller = controller_of(drone)
+def test_arrays_and_components_give_the_same_commands(controller, size):
     setpoint = setpoints(controller, 200, size)
     rates = torch.randn(200, 3, dtype=F64)
     wrench = matvec(controller.rotors.allocation, controller.thrust_max * torch.rand(200, 4, dtype=F64))

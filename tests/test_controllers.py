@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 from torch import nn
 
+from benchmarks.laps import basis, plan_lap, racing
 from torchrl_quad import MPC, ActionSequence, GeometricController, HoveringEnv, LandingEnv, RacingEnv, TrackingEnv
 from torchrl_quad.controllers import follow
 from torchrl_quad.controllers.mpc import feedback
-from torchrl_quad.controllers.policy import basis, plan_lap
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs import TASKS
 
@@ -35,36 +35,27 @@ def test_a_drone_that_hovers_where_it_shall_gets_exactly_the_action_that_hovers(
     torch.testing.assert_close(action, env.hover_action.expand(2, 4), rtol=0, atol=1e-9)
 
 
-def turned(x, y, z):
-    """By how much to change the quaternion of a level drone to turn it by a small angle [rad] about an axis."""
-    level = torch.tensor([1.0, 0.0, 0.0, 0.0])
-    return (quaternion.from_axis_angle(torch.tensor([x, y, z])) - level).tolist()
-
-
-SIGNS = {  # what is wrong, and the signs of (thrust beyond hovering, roll rate, pitch rate, yaw rate) that mend it
-    "ahead: nose up": ({"position": [0.1, 0, 0]}, [0, 0, -1, 0]),
-    "on the left: roll right": ({"position": [0, 0.1, 0]}, [0, 1, 0, 0]),
-    "too high: less thrust": ({"position": [0, 0, 0.1]}, [-1, 0, 0, 0]),
-    "flies ahead: nose up": ({"velocity": [0.1, 0, 0]}, [0, 0, -1, 0]),
-    "flies left: roll right": ({"velocity": [0, 0.1, 0]}, [0, 1, 0, 0]),
-    "climbs: less thrust": ({"velocity": [0, 0, 0.1]}, [-1, 0, 0, 0]),
-    "rolled right: roll left": ({"quaternion": turned(0.1, 0, 0)}, [0, -1, 0, 0]),
-    "nose down: nose up": ({"quaternion": turned(0, 0.1, 0)}, [0, 0, -1, 0]),
-    "heads left: turn right": ({"quaternion": turned(0, 0, 0.1)}, [0, 0, 0, -1]),
+SIGNS = {  # what is wrong along x, y or z, and what mends it: action, sign (0 thrust, 1 roll, 2 pitch, 3 yaw rate)
+    "position": [(2, -1), (1, 1), (0, -1)],  # ahead: nose up; on the left: roll right; too high: less thrust
+    "velocity": [(2, -1), (1, 1), (0, -1)],
+    "quaternion": [(1, -1), (2, -1), (3, -1)],  # rolled right: roll left; nose down: nose up; heads left: turn right
 }
 
 
-@pytest.mark.parametrize("case", SIGNS)
-def test_errors_of_each_axis_are_mended_in_the_right_direction(case):
-    changes, signs = SIGNS[case]
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("entry", SIGNS)
+def test_errors_of_each_axis_are_mended_in_the_right_direction(entry, axis):
     env = HoveringEnv(num_envs=1, action_delay=0, **DOUBLE)
-    more = GeometricController(env, heading=0.0)(at(env, **changes))["action"][0] - env.hover_action
-    wanted = torch.tensor(signs, dtype=env.dtype)
-    assert (more[wanted != 0] * wanted[wanted != 0] > 0.01).all()
-    assert more[1:][wanted[1:] == 0].abs().max() < 1e-9
-    if "quaternion" not in changes:  # the planner agrees; what a tilt costs it trades off
-        more = MPC(env, horizon=12)(at(env, **changes))["action"][0] - env.hover_action
-        assert (more[wanted != 0] * wanted[wanted != 0] > 0.01).all()
+    wrong, (action, sign) = 0.1 * torch.eye(3, dtype=env.dtype)[axis], SIGNS[entry][axis]
+    if entry == "quaternion":  # turned by a small angle
+        wrong = quaternion.from_axis_angle(wrong) - quaternion.identity(wrong)
+    td = at(env, **{entry: wrong.tolist()})
+    more = sign * (GeometricController(env, heading=0.0)(td.copy())["action"][0] - env.hover_action)
+    assert more[action] > 0.01
+    assert all(more[i].abs() < 1e-9 for i in {1, 2, 3} - {action})
+    if entry != "quaternion":  # the planner agrees; what a tilt costs it trades off
+        more = sign * (MPC(env, horizon=12)(td)["action"][0] - env.hover_action)
+        assert more[action] > 0.01
 
 
 def test_the_geometric_law_is_that_of_the_formulas():
@@ -191,7 +182,7 @@ def test_the_lap_passes_the_gates_within_the_limits_of_the_drone():
     rate = torch.linalg.cross(force, jerk).norm(dim=1) / force.square().sum(1)
     assert rate.max() < 2.0 and force.norm(dim=1).max() < 3 * 9.81
     assert 2.5 < lap.period < 4.0
-    flight = env.rollout(100, GeometricController(env), break_when_any_done=False)
+    flight = env.rollout(100, GeometricController(env, reference=racing(env)), break_when_any_done=False)
     assert flight["next", "state", "gates_passed"][0, -1] >= 1
 
 

@@ -42,11 +42,11 @@ def entries(flight):
 @pytest.mark.parametrize("options", [{}, EVERYTHING], ids=["plain", "everything"])
 @pytest.mark.parametrize("task", TASKS)
 def test_the_quick_rollout_is_that_of_torchrl_in_every_entry_and_gradient(task, options):
-    env = make_env(task, num_envs=3, max_episode_steps=15, dtype=torch.float64, **options)
+    env = make_env(task, num_envs=3, max_episode_steps=7, dtype=torch.float64, **options)
     actor = make_actor(env)
-    quick, quick_grad = fly(env.rollout, env, actor, env.reset(), 40)
+    quick, quick_grad = fly(env.rollout, env, actor, env.reset(), 20)
     env.set_seed(0)
-    slow, slow_grad = fly(torchrls_loop(env), env, actor, env.reset(), 40)
+    slow, slow_grad = fly(torchrls_loop(env), env, actor, env.reset(), 20)
     assert quick.names == slow.names and quick.shape == slow.shape
     assert quick["next", "done"].sum() >= 6
     torch.testing.assert_close(entries(quick), entries(slow))
@@ -55,12 +55,10 @@ def test_the_quick_rollout_is_that_of_torchrl_in_every_entry_and_gradient(task, 
 
 
 def test_episodes_that_end_on_the_way_start_anew_from_different_states():
-    env = HoveringEnv(num_envs=8, max_episode_steps=20)
-    flight = env.rollout(100, make_actor(env), break_when_any_done=False)
-    starts = flight["state", "position"][:, ::20]
-    assert (flight["state", "step"][:, ::20] == 0).all()
-    distances = torch.cdist(starts.flatten(0, 1), starts.flatten(0, 1)).fill_diagonal_(1.0)
-    assert (distances > 0).sum() > 0.9 * distances.numel()
+    env = HoveringEnv(num_envs=8, max_episode_steps=5)
+    flight = env.rollout(25, make_actor(env), break_when_any_done=False)
+    assert (flight["state", "step"][:, ::5] == 0).all()
+    assert len(flight["state", "position"][:, ::5].flatten(0, 1).unique(dim=0)) == 40
 
 
 def test_a_policy_may_read_the_state_and_any_other_flies_in_torchrls_loop(env):
@@ -129,53 +127,51 @@ def break_drones(env, parameter):
 
 def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
     options = {**EVERYTHING, "reward": "position", "control": "velocity"}
-    env = RacingEnv(num_envs=4, max_episode_steps=20, dtype=torch.float64, **options)
+    env = RacingEnv(num_envs=4, max_episode_steps=11, dtype=torch.float64, **options)
     drag = env.nominal.linear_drag.clone().requires_grad_()
     env.params = env.nominal.replace(linear_drag=drag)
     actor = make_actor(env, in_keys=["observation", ("state", "velocity")], return_log_prob=True)
     called = TensorDictSequential(actor)
     explorer = make_actor(env, in_keys=actor.in_keys, return_log_prob=True, noise_correlation=0.9)
 
-    def train(policy):
-        """Two horizons, through the ends of episodes, from a start that wants a gradient."""
+    def seeded():
         env.set_seed(0)
         torch.manual_seed(0)
+
+    def train(policy):
+        """Two horizons, through the ends of episodes, from a start that wants a gradient."""
+        seeded()
         start = env.reset()
         start["state", "position"][:2] = start["state", "target"][:2] - torch.tensor([0.5, 0.0, 0.0])
         start["state", "velocity"][:2, 0] = 3.0  # through the gate, which is an event
         start["state", "velocity"].requires_grad_()
-        flight, carry = differentiable_rollout(env, policy, start, 24)
+        flight, carry = differentiable_rollout(env, policy, start, 14)
         assert flight["next", "state", "gate_passed"].any()
-        more, _ = differentiable_rollout(env, policy, carry, 7)
+        more, _ = differentiable_rollout(env, policy, carry, 3)
         wanted = [drag, start["state", "velocity"], *policy.parameters()]
         return flight, torch.autograd.grad(losses_of(flight) + losses_of(more), wanted)
 
-    def train_in_torchrls_loop():
-        env.set_seed(0)
-        return fly(torchrls_loop(env), env, actor, env.reset(), 22)
-
     def optimise_actions():
-        env.set_seed(0)
-        actions = (env.hover_action + 0.05 * torch.ones(24, 4, 4, dtype=env.dtype)).requires_grad_()
-        flight, _ = differentiable_rollout(env, ActionSequence(actions), None, 24)
+        seeded()
+        actions = (env.hover_action + 0.05 * torch.ones(14, 4, 4, dtype=env.dtype)).requires_grad_()
+        flight, _ = differentiable_rollout(env, ActionSequence(actions), None, 14)
         torch.testing.assert_close(flight["action"], actions.transpose(0, 1))
         return flight, torch.autograd.grad(losses_of(flight), actions)
 
     def train_with_clipped_gradients():
-        env.set_seed(0)
-        torch.manual_seed(0)
-        flight, _ = differentiable_rollout(env, actor, None, 24)
+        seeded()
+        flight, _ = differentiable_rollout(env, actor, None, 14)
         loss = BPTTLoss(actor, clip_action_gradient=2.0).loss_actor(flight)[0]
         return flight, torch.autograd.grad(loss, list(actor.parameters()))
 
-    def as_on_an_accelerator():
+    def all_ways():
+        seeded()
+        in_torchrls_loop = fly(torchrls_loop(env), env, actor, env.reset(), 12)
         with monkeypatch.context() as patch:
             look_at_nothing(patch)
-            return train(actor)
-
-    def all_ways():
-        more = train_in_torchrls_loop(), optimise_actions(), as_on_an_accelerator(), train_with_clipped_gradients()
-        return train(actor), train(called), train(explorer), *more
+            as_on_an_accelerator = train(actor)
+        flights = train(actor), train(called), train(explorer), optimise_actions(), train_with_clipped_gradients()
+        return *flights, in_torchrls_loop, as_on_an_accelerator
 
     eager, (broken, broken_grads) = all_ways(), break_drones(env, drag)
     env.compile()
@@ -184,11 +180,11 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
     compiled_so_far = counters["stats"]["unique_graphs"]
     compiled, (end, end_grads) = all_ways(), break_drones(env, drag)
     with torch.no_grad():
-        train_free = env.rollout(11, actor, break_when_any_done=False)
+        train_free = env.rollout(4, actor, break_when_any_done=False)
         env.rollout(3, actor)
     env.rollout(3)
     env.set_initial_state_source(lambda n: train_free["next", "state"][:, 2])
-    env.rollout(22, actor, break_when_any_done=False)["next", "reward"].sum().backward()
+    env.rollout(12, actor, break_when_any_done=False)["next", "reward"].sum().backward()
     assert counters["stats"]["unique_graphs"] == compiled_so_far
     for (flight, grads), (expected, expected_grads) in zip(compiled, eager, strict=True):
         torch.testing.assert_close(entries(flight), entries(expected))
@@ -248,7 +244,6 @@ def test_an_entry_of_a_task_may_have_more_than_one_dimension():
     start = env.reset()
     flight = env.rollout(5, make_actor(env), tensordict=start.clone(), auto_reset=False, break_when_any_done=False)
     torch.testing.assert_close(flight["next", "state", "waypoints"][:, 0], start["state", "waypoints"].roll(-1, 1))
-    torch.testing.assert_close(flight["next", "state", "waypoints"][:, 2], start["state", "waypoints"])
     start["state", "velocity"][1] = torch.nan  # its state cannot go on, and its waypoints stay
     after = env.step(start.set("action", env.hover_action.repeat(3, 1)))["next", "state", "waypoints"]
     torch.testing.assert_close(after[1], start["state", "waypoints"][1])
@@ -325,11 +320,11 @@ def test_policies_that_somebody_has_changed_are_called():
     actor[0].module.mlp[1] = nn.PReLU()
     other_head = make_actor(env)
     other_head[0].module.head = nn.Identity()
+    windy = HoveringEnv(num_envs=2, wind={"gust": 0.5})
     others = [actor, other_head, make_actor(env, activation=nn.RReLU)]
-    others += [
-        make_actor(HoveringEnv(num_envs=2, **x)) for x in ({"dtype": torch.float64}, {"observe_last_action": True})
-    ]
-    others += [make_actor(HoveringEnv(num_envs=2, wind={"gust": 0.5}), in_keys=["observation", ("state", "wind")])]
+    others += [make_actor(HoveringEnv(num_envs=2, dtype=torch.float64))]
+    others += [make_actor(HoveringEnv(num_envs=2, observe_last_action=True))]
+    others += [make_actor(windy, in_keys=["observation", ("state", "wind")])]
     others += [TensorDictModule(nn.Linear(13, 4), ["observation"], ["action"])]
     others += [make_actor(env, in_keys=["observation", "observation"])]
     for change in ({0: nn.Linear(13, 64, bias=False)}, {1: nn.ELU(inplace=True)}, {5: nn.Tanh()}):

@@ -63,11 +63,12 @@ def test_every_drone_flies_within_5_percent_of_a_commanded_velocity_but_for_what
 
 
 def test_one_rotor_alone_rolls_and_pitches_away_from_itself_and_yaws_by_its_spin():
-    share = 0.25 * 9.81 * load_drone("visfly").mass.item()
+    drone = load_drone("visfly", F64)
+    share = 0.25 * 9.81 * drone.mass.item()
     commands = torch.full((4, 4), share).fill_diagonal_(1.1 * share).tolist()
     state = commanded(2, *commands, control="rotor_thrusts")[-1]
-    x, y = load_drone("visfly").rotor_positions.unbind(-1)
-    signs = torch.stack((y.sign(), -x.sign(), load_drone("visfly").rotor_spin), -1).to(F64)
+    x, y = drone.rotor_positions.unbind(-1)
+    signs = torch.stack((y.sign(), -x.sign(), drone.rotor_spin), -1)
     assert (state["angular_velocity"].sign() == signs).all()
     assert (state["velocity"][:, 2] > 0).all()
 
@@ -77,14 +78,13 @@ def test_one_rotor_alone_rolls_and_pitches_away_from_itself_and_yaws_by_its_spin
 def test_the_hover_action_hovers_and_is_the_command_that_it_stands_for(control, drone):
     env = HoveringEnv(num_envs=1, control=control, drone=drone, dtype=F64)
     controller = env.dynamics.controller
-    rest, weight = env.dynamics.rest(torch.zeros(1, 3, dtype=F64)), 9.81 * env.nominal.mass.item()
-    state = rest
+    rest = state = env.dynamics.rest(torch.zeros(1, 3, dtype=F64))
     for _ in range(20):
         state = env.dynamics.control_step(state, env.hover_action.expand(1, 4), env.nominal, None)
     torch.testing.assert_close(state, rest, atol=1e-9, rtol=1e-9)
-    command = dict(zip(env.action_units, controller.decode(env.hover_action).tolist(), strict=True))
-    thrust = sum(x for name, x in command.items() if env.action_units[name] == "N")
-    assert thrust == pytest.approx(0 if control == "velocity" else weight)
+    command = zip(env.action_units.values(), controller.decode(env.hover_action).tolist(), strict=True)
+    weight = 0 if control == "velocity" else 9.81 * env.nominal.mass.item()
+    assert sum(x for unit, x in command if unit == "N") == pytest.approx(weight)
     torch.testing.assert_close(controller.encode(controller.decode(env.hover_action)), env.hover_action)
     assert (env.reset()["state", "action_queue"] == env.hover_action).all()
 
@@ -147,25 +147,25 @@ def test_limits_can_be_chosen_and_gymnasium_takes_them():
 
 
 @pytest.mark.parametrize(
-    ("control", "message"),
+    ("options", "message"),
     [
-        ("thrust", "Unknown control 'thrust'. Choose from: rates, attitude, rotor_thrusts, velocity; or"),
-        ({"max_tilt": 0.5}, r"control=\{'max_tilt': 0.5\} has no .mode. key. Choose from: rates, "),
-        (None, "control must be a name, such as rates, or a mapping with limits, got None"),
+        ({"control": "thrust"}, "Unknown control 'thrust'. Choose from: rates, attitude, rotor_thrusts, velocity; or"),
+        ({"control": {"max_tilt": 0.5}}, r"control=\{'max_tilt': 0.5\} has no .mode. key. Choose from: rates, "),
+        ({"control": None}, "control must be a name, such as rates, or a mapping with limits, got None"),
         ({"mode": "attitude", "max_speed": 1.0}, "'attitude' has no limit 'max_speed'. Choose from: max_tilt"),
         ({"mode": "rates", "max_tilt": 1.0}, "'rates' has no limit 'max_tilt'. It has none; those of the drone hold"),
         ({"mode": "attitude", "max_tilt": 30}, "control: max_tilt must be at most 1.5, got 30"),
         ({"mode": "velocity", "max_speed": "5"}, "control: max_speed must be a number, got '5'"),
+        ({"control": "velocity", "dynamics": "own"}, "'own' takes no control: .* Leave out control='velocity'"),
+        ({"control": "rotor_thrusts", "dynamics": "point_mass"}, 'control="rotor_thrusts" commands nothing'),
+        ({"integrator": "rk4", "dynamics": "point_mass"}, 'supports only the integrator "semi_implicit_euler"'),
+        (
+            {"randomize": {"inertia": {"scale": [0.9, 1.1]}}, "dynamics": "point_mass"},
+            "unknown field 'inertia'. ",
+        ),
     ],
 )
-def test_a_mode_or_a_limit_that_makes_no_sense_is_refused(control, message):
-    with pytest.raises(ValueError, match=message):
-        HoveringEnv(num_envs=1, control=control)
-
-
-def test_models_without_rotors_or_without_modes_refuse_them(monkeypatch):
-    with pytest.raises(ValueError, match='"point_mass" has no rotors, so control="rotor_thrusts" commands nothing'):
-        HoveringEnv(num_envs=1, control="rotor_thrusts", dynamics="point_mass")
+def test_a_mode_or_a_limit_that_makes_no_sense_or_that_a_model_does_not_have_is_refused(options, message, monkeypatch):
     monkeypatch.setitem(DYNAMICS, "own", lambda nominal, dt, substeps, integrator: None)
-    with pytest.raises(ValueError, match="'own' takes no control: .* Leave out control='velocity'"):
-        HoveringEnv(num_envs=1, control="velocity", dynamics="own")
+    with pytest.raises(ValueError, match=message):
+        HoveringEnv(num_envs=1, **({"control": options} if "mode" in options else options))

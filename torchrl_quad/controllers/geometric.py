@@ -63,7 +63,8 @@ class GeometricController(Controller):
     ) -> None:
         super().__init__(env, reference)
         self.position_gain, self.velocity_gain, self.max_error = position_gain, velocity_gain, max_error
-        self.max_tilt, self.heading = max_tilt, heading
+        self.max_tilt, like = max_tilt, self.nominal.mass
+        self.ahead = None if heading is None else like.new_tensor((math.cos(heading), math.sin(heading), 0.0))
         lag = (1.0 + self.nominal.rate_damping / self.nominal.inertia) / self.nominal.rate_gain  # of the rate loop [s]
         self.attitude_gain = 0.5 / lag if attitude_gain is None else torch.full_like(lag, attitude_gain)
         self.gravity = pad(self.nominal.gravity, (2, 0))
@@ -80,7 +81,8 @@ class GeometricController(Controller):
         up = normalize(force, dim=-1)
         axes = torch.eye(3).to(attitude).expand(len(attitude), 3, 3)
         rotation = quaternion.rotate(attitude.unsqueeze(1), axes).mT
-        left = normalize(torch.linalg.cross(up, self.first_axis(rotation)), dim=-1)
+        ahead = rotation[..., 0] if self.ahead is None else self.ahead.expand_as(up)  # body x keeps close to this
+        left = normalize(torch.linalg.cross(up, ahead), dim=-1)
         wanted = torch.stack((torch.linalg.cross(left, up), left, up), -1)
         difference = wanted.mT @ rotation
         skew = 0.5 * (difference - difference.mT)
@@ -100,10 +102,3 @@ class GeometricController(Controller):
         room = torch.minimum((greatest.square() - lift.square()).sqrt(), math.tan(self.max_tilt) * lift)
         sideways = torch.linalg.vector_norm(force[..., :2], dim=-1, keepdim=True)
         return torch.cat((force[..., :2] * (room / torch.maximum(sideways, room)), lift), -1)
-
-    def first_axis(self, rotation: Tensor) -> Tensor:
-        """The direction that body x keeps close to, (n, 3): the heading, or its present one."""
-        if self.heading is None:
-            return rotation[..., 0]
-        ahead = (math.cos(self.heading), math.sin(self.heading), 0.0)
-        return rotation.new_tensor(ahead).expand(rotation.shape[:-1])

@@ -18,8 +18,7 @@ from torch.nn.functional import pad
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
-from torchrl_quad.dynamics.rigid_body import drag, drag_moment, gyroscopic_torque
-from torchrl_quad.dynamics.rotors import Rotors, thrust_limits
+from torchrl_quad.dynamics.rigid_body import Rotors, drag, drag_moment, gyroscopic_torque, thrust_limits
 from torchrl_quad.dynamics.vector import (
     Vector,
     cat,

@@ -11,8 +11,7 @@ from torch import Tensor
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Nominal, RotorThrustController, make_controller
 from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams, RawParams
-from torchrl_quad.dynamics.rigid_body import INTEGRATORS, Integrator, RigidBodyState, accelerations, drag
-from torchrl_quad.dynamics.rotors import Rotors
+from torchrl_quad.dynamics.rigid_body import INTEGRATORS, Integrator, RigidBodyState, Rotors, accelerations, drag
 from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, clamp, stack
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import between, checked
@@ -46,17 +45,14 @@ class Dynamics(Protocol):
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
         """The state of a drone that hovers at the positions (n, 3) [m]."""
-        ...
 
     def control_step(
         self, state: dict[str, Tensor], action: Tensor, params: QuadrotorParams, wind: Tensor | None
     ) -> dict[str, Tensor]:
         """Its entries (n, k) after a control step under an action (n, 4): the drone ``params`` in the wind (n, 3)."""
-        ...
 
     def setpoint_rows(self, action: Tensor) -> Tensor:
         """What an action (n, 4) asks for, as rows (k, n) that ``rows_step`` reads."""
-        ...
 
     def rows_step(self) -> Callable[..., Tensor]:
         """One physics step for a compiler: ``step(x, setpoint, plant, wind)``, which returns the next ``x``.
@@ -64,7 +60,6 @@ class Dynamics(Protocol):
         ``x`` are the state's entries below each other (rows, n). ``plant`` are the ``plant_fields`` as rows (k, n), or
         empty for the nominal drone. ``wind`` holds one tensor (3, n) or none.
         """
-        ...
 
 
 @checked

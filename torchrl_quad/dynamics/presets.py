@@ -59,9 +59,7 @@ def parse(content: bytes, source: str) -> Any:
         ValueError: the content is too large, too deep, not in UTF-8, no YAML, or not plain values that come once.
     """
     if len(content) > MAX_BYTES:
-        raise UserValueError(
-            f"{source}: has more than {MAX_BYTES:,} bytes, more than settings need. Leave out the rest."
-        )
+        raise UserValueError(f"{source}: has more than {MAX_BYTES:,} bytes. Settings need less: leave out the rest.")
     try:
         return _Loader(content.decode()).get_single_data()
     except UnicodeDecodeError as error:

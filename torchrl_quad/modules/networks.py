@@ -14,12 +14,12 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
-from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import MLP, TanhNormal, ValueOperator
 
 from torchrl_quad.data.unwrap import base_env, check_env, observed
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.modules.plain import Critic, GaussianHead, Network, TanhGaussianActor, layout
-from torchrl_quad.options import AfterValidator, Below1, Entries, Field, Scale, Width, checked
+from torchrl_quad.options import AfterValidator, Entries, Field, Scale, Width, checked
 
 OBSERVATION = ("observation",)
 MOST_WEIGHTS = 100_000_000  # of a network
@@ -44,56 +44,6 @@ ScaleInit = Annotated[float, Field(ge=1e-4, le=100)]  # TorchRL's mapping to a s
 
 
 @checked
-def make_actor(
-    env: EnvBase,
-    num_cells: Cells = (64, 64),
-    *,
-    in_keys: Entries = OBSERVATION,
-    activation: Activation = nn.ELU,
-    input_scale: Scale | Sequence[Scale] = 1.0,
-    action_init: Tensor | None = None,
-    scale_init: ScaleInit = 0.1,
-    learn_scale: bool = True,
-    noise_correlation: Below1 = 0.0,
-    return_log_prob: bool = False,
-) -> ProbabilisticActor:
-    """A tanh-Gaussian policy a = tanh(mu(s) + sigma(s) noise), stretched to the bounds of the action.
-
-    The weights of its last layer start near zero: the first actions are close to ``action_init``. It writes ``loc``,
-    ``scale`` and ``action``.
-
-    Args:
-        env: any TorchRL environment, for the sizes of its entries, the action's bounds, device and floating-point type.
-        num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
-        in_keys: the entries that are concatenated into the network's input, each (*, k), in a list: ["observation"].
-        activation: of the hidden layers; smooth ones give smooth policy gradients.
-        input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``. What the tasks observe
-            is of one to ten; entries of the state may be far larger.
-        action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``,
-            averaged over environments, if there is one (see :mod:`torchrl_quad.data`; a drone's is to hover), and the
-            middle of the range otherwise.
-        scale_init: the standard deviation of the policy's noise at the start, before the tanh, in units of half the
-            range. Training brings it down to 0.01 at least, or to a tenth of this.
-        learn_scale: whether this noise changes with the state and in training. Otherwise neither a gradient through the
-            simulator nor a KL bound takes the exploration away.
-        noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise. Correlated noise moves a
-            drone where independent noise averages out; try 0.9 at 50 Hz. Then loc, scale and the log-probability are
-            those of the action given the noise of the step before, ``noise_before``; ``noise`` is that of the step.
-        return_log_prob: whether it also writes the log-probability of the action, which an entropy bonus and PPO need.
-            mu then stays between -5 and 5: further out, rounding of the action determines the log-probability.
-
-    Raises:
-        ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one; or
-            the first action is not strictly inside the bounds.
-    """
-    spec, first = first_action(env, action_init, "make_actor")
-    size = 2 * len(first) if learn_scale else len(first)
-    net = network_of(env, in_keys, size, num_cells, activation, input_scale)
-    options = scale_init, noise_correlation, return_log_prob
-    return policy_of(TanhGaussianActor, [], net, in_keys, spec, first, *options)
-
-
-@checked
 def make_value(
     env: EnvBase,
     num_cells: Cells = (64, 64),
@@ -110,7 +60,7 @@ def make_value(
     ``"obstacle"`` (*, 4) is the distance to the nearest [m], and the direction away from it in the body frame.
 
     Args:
-        env, activation, input_scale, in_keys: as for :func:`make_actor`, and so are the errors.
+        env, activation, input_scale, in_keys: as for :func:`~torchrl_quad.make_actor`, and so are the errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
     """
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
@@ -130,7 +80,7 @@ def make_qvalue(
     """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); otherwise as :func:`make_value`.
 
     Args:
-        env, activation, input_scale, in_keys: as for :func:`make_actor`, and so are the errors.
+        env, activation, input_scale, in_keys: as for :func:`~torchrl_quad.make_actor`, and so are the errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
         action_scale: the action is multiplied by this. It reveals the state, and a critic that reads the state off it
             gets its gradient in the action wrong: below one it relies on the state first.

@@ -1,4 +1,4 @@
-"""Visual policies: a convolutional network on depth images, memory in a GRU, and the tanh-Gaussian head."""
+"""Policies: a tanh-Gaussian head on layers, on memory in a GRU, and on convolutions of depth images."""
 
 from __future__ import annotations
 
@@ -24,6 +24,67 @@ from torchrl_quad.options import Below1, Entries, Entry, Field, Scale, Width, ch
 
 MEMORY = "recurrent_state"
 NEAREST = 0.3  # [m]; closer depths are clamped
+
+
+@checked
+def make_actor(
+    env: EnvBase,
+    num_cells: Cells = (64, 64),
+    *,
+    in_keys: Entries = OBSERVATION,
+    activation: Activation = nn.ELU,
+    input_scale: Scale | Sequence[Scale] = 1.0,
+    action_init: Tensor | None = None,
+    scale_init: ScaleInit = 0.1,
+    learn_scale: bool = True,
+    noise_correlation: Below1 = 0.0,
+    return_log_prob: bool = False,
+    recurrent: bool = False,
+    hidden_size: Width = 64,
+) -> ProbabilisticActor:
+    """A tanh-Gaussian policy a = tanh(mu(s) + sigma(s) noise), stretched to the bounds of the action.
+
+    The weights of its last layer start near zero: the first actions are close to ``action_init``. It writes ``loc``,
+    ``scale`` and ``action``.
+
+    Args:
+        env: any TorchRL environment, for the sizes of its entries, the action's bounds, device and floating-point type.
+        num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
+        in_keys: the entries that are concatenated into the network's input, each (*, k), in a list: ["observation"].
+        activation: of the hidden layers; smooth ones give smooth policy gradients.
+        input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``. What the tasks observe
+            is of one to ten; entries of the state may be far larger.
+        action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``,
+            averaged over environments, if there is one (see :mod:`torchrl_quad.data`; a drone's is to hover), and the
+            middle of the range otherwise.
+        scale_init: the standard deviation of the policy's noise at the start, before the tanh, in units of half the
+            range. Training brings it down to 0.01 at least, or to a tenth of this.
+        learn_scale: whether this noise changes with the state and in training. Otherwise neither a gradient through the
+            simulator nor a KL bound takes the exploration away.
+        noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise. Correlated noise moves a
+            drone where independent noise averages out; try 0.9 at 50 Hz. Then loc, scale and the log-probability are
+            those of the action given the noise of the step before, ``noise_before``; ``noise`` is that of the step.
+        return_log_prob: whether it also writes the log-probability of the action, which an entropy bonus and PPO need.
+            mu then stays between -5 and 5: further out, rounding of the action determines the log-probability.
+        recurrent: whether it has a memory: a GRU reads the last hidden layer, and the last layer reads both. See
+            :func:`make_visual_actor` for the entries that this adds.
+        hidden_size: numbers in that memory.
+
+    Raises:
+        ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one; or
+            the first action is not strictly inside the bounds.
+    """
+    head = action_init, scale_init, learn_scale, noise_correlation, return_log_prob
+    if recurrent:
+        if not num_cells:
+            raise UserValueError("A memory reads the last hidden layer: give num_cells at least one, such as [64].")
+        trunk = network_of(env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale)
+        return _composed(env, "make_actor", Features(None, trunk, activation()), in_keys, hidden_size, *head)
+    spec, first = first_action(env, action_init, "make_actor")
+    size = 2 * len(first) if learn_scale else len(first)
+    net = network_of(env, in_keys, size, num_cells, activation, input_scale)
+    options = scale_init, noise_correlation, return_log_prob
+    return policy_of(TanhGaussianActor, [], net, in_keys, spec, first, *options)
 
 
 @checked
@@ -81,7 +142,6 @@ def make_visual_actor(
             f'none there. Give it a camera, camera={{"width": 16, "height": 12}}, or choose image_key from: '
             f"{', '.join(map(str, known))}."
         )
-    spec, first = first_action(env, action_init, "make_visual_actor")
     image = known[image_key]
     convolutions = ConvNet(
         in_features=image.shape[-3],
@@ -95,42 +155,64 @@ def make_visual_actor(
     ).to(image.dtype)
     seen = convolutions(image.zero()).shape[-1]
     trunk = network_of(env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale, more=seen)
-    features = VisualFeatures(convolutions, trunk, activation())
-    parts: list[Any] = [TensorDictModule(features, in_keys=[image_key, *in_keys], out_keys=["features"])]
-    widths = [num_cells[-1]]
-    if recurrent:
+    features, head = Features(convolutions, trunk, activation()), (action_init, scale_init, learn_scale)
+    keys, size = [image_key, *in_keys], hidden_size if recurrent else 0
+    return _composed(env, "make_visual_actor", features, keys, size, *head, noise_correlation, return_log_prob)
+
+
+def _composed(
+    env: EnvBase,
+    name: str,
+    features: Features,
+    in_keys: Sequence[NestedKey],
+    hidden_size: int,
+    action_init: Tensor | None,
+    scale_init: float,
+    learn_scale: bool,
+    noise_correlation: float,
+    return_log_prob: bool,
+) -> ComposedActor:
+    """A policy of features, a memory if it has a size, and a head."""
+    spec, first = first_action(env, action_init, name)
+    width, dtype = cast(nn.Linear, features.trunk.mlp[-1]).out_features, next(features.parameters()).dtype
+    parts: list[Any] = [TensorDictModule(features, in_keys=list(in_keys), out_keys=["features"])]
+    widths = [width]
+    if hidden_size:
         memory = GRUModule(
-            input_size=num_cells[-1],
+            input_size=width,
             hidden_size=hidden_size,
             python_based=True,
             device=env.device,
             in_keys=["features", MEMORY],
             out_keys=["recalled", ("next", MEMORY)],
-        ).to(image.dtype)
+        ).to(dtype)
         parts.append(memory)
         widths.append(hidden_size)
     size = 2 * len(first) if learn_scale else len(first)
-    last = Network(MLP(sum(widths), size, num_cells=[], device=env.device).to(image.dtype), [1.0] * len(widths), widths)
+    last = Network(MLP(sum(widths), size, num_cells=[], device=env.device).to(dtype), [1.0] * len(widths), widths)
     read, options = ["features", "recalled"][: len(widths)], (scale_init, noise_correlation, return_log_prob)
     return policy_of(ComposedActor, parts, last, read, spec, first, *options)
 
 
-class VisualFeatures(nn.Module):
-    """Features (*, k) of an image and of vectors: convolutions, and a trunk that reads their output and the vectors."""
+class Features(nn.Module):
+    """Features (*, k) of vectors, and of an image where there are convolutions, whose output the trunk reads, too."""
 
-    def __init__(self, convolutions: ConvNet, trunk: Network, activation: nn.Module) -> None:
+    def __init__(self, convolutions: ConvNet | None, trunk: Network, activation: nn.Module) -> None:
         super().__init__()
         self.convolutions, self.trunk, self.activation = convolutions, trunk, activation
 
-    def forward(self, depth: Tensor, *vectors: Tensor) -> Tensor:
-        """The features of a depth image (*, channels, height, width) [m] and of vectors (*, k_i)."""
-        return self.activation(self.trunk(self.convolutions(depth.clamp_min(NEAREST).reciprocal()), *vectors))
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """The features of a depth image (*, channels, height, width) [m], unless blind, and of vectors (*, k_i)."""
+        if self.convolutions is not None:
+            depth, *vectors = inputs
+            inputs = self.convolutions(depth.clamp_min(NEAREST).reciprocal()), *vectors
+        return self.activation(self.trunk(*inputs))
 
 
 class Parts(NamedTuple):
-    """What a visual policy is made of, in the order in which it computes."""
+    """What a policy with eyes or memory is made of, in the order in which it computes."""
 
-    convolutions: list[nn.Module]  #: each followed by its activation
+    convolutions: list[nn.Module]  #: each followed by its activation; none if it is blind
     nearest: float  #: [m]; they read 1 / max(depth, nearest)
     trunk: list[nn.Module]  #: linear layers, each followed by its activation; the first reads images, then vectors
     widths: tuple[int, ...]  #: of the output of the convolutions, and of the vectors
@@ -142,7 +224,7 @@ class Parts(NamedTuple):
 
 
 class ComposedActor(TanhGaussianActor):
-    """What :func:`~torchrl_quad.make_visual_actor` builds."""
+    """A policy with eyes or memory, as :func:`make_visual_actor` and :func:`make_actor` build it."""
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
@@ -166,7 +248,7 @@ class ComposedActor(TanhGaussianActor):
         return None if self.is_random is None else Replay(self)
 
     def parts(self) -> Parts | None:
-        """The parts as :func:`~torchrl_quad.make_visual_actor` builds them; None if they were changed or hooked."""
+        """The parts as they were built; None if they were changed or hooked."""
         if layout(self) != self.built or self.is_random is None:
             return None
         first, *memory, last = cast(Any, self[0].module)
@@ -174,7 +256,7 @@ class ComposedActor(TanhGaussianActor):
         if not features.trunk.is_plain or not is_pointwise(features.activation):
             return None
         return Parts(
-            list(features.convolutions)[:-1],
+            list(features.convolutions)[:-1] if features.convolutions else [],
             NEAREST,
             [*features.trunk.mlp, features.activation],
             features.trunk.widths,
@@ -296,7 +378,7 @@ class PlainParts(PlainTanhGaussian):
 
 
 class Replay(PlainTanhGaussian):
-    """A visual policy in the states of a rollout that it has flown, in which its memory is built up again."""
+    """A policy with eyes or memory in the states of a rollout that it flew, in which its memory is built up again."""
 
     def __init__(self, actor: ComposedActor) -> None:
         self.actor = actor

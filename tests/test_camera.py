@@ -18,7 +18,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_quad import ActionSequence, DepthCamera, ForestEnv, HoveringEnv, LandingEnv, differentiable_rollout
 from torchrl_quad.adapters import DronesVecEnv
-from torchrl_quad.render import animate_flight, plot_from_above, write_replay
+from torchrl_quad.render import animate_flight, plot_flight, write_replay
 from torchrl_quad.vision import Primitives, nearest
 
 PILLARS = {
@@ -259,7 +259,7 @@ def test_pictures_show_the_obstacles_and_beside_the_flight_what_the_camera_saw(t
     trees = [(x[:, 2] == 0.0).sum().item() for x in rollout["state", "scene", "cylinders"][:, 0]]
     meshes = [np.frombuffer(base64.b64decode(x["points"]), "<f4").reshape(-1, 3) for x in page["obstacles"]]
     assert [len(mesh) for mesh in meshes] == [96 * count for count in trees]
-    panels = plot_from_above(rollout, tmp_path / "above.png", env=env).axes[:2]
+    panels = plot_flight(rollout, tmp_path / "above.png", env=env, view="above").axes[:2]
     assert [len(panel.patches) for panel in panels] == trees
     assert panels[0].patches[0].get_radius() == rollout["state", "scene", "cylinders"][0, 0, 0, 3].item()
     animate_flight(rollout, tmp_path / "film.gif", env=env, size=200)
@@ -269,5 +269,3 @@ def test_pictures_show_the_obstacles_and_beside_the_flight_what_the_camera_saw(t
     before = env.render(size=150)
     env.reset()
     assert (env.render(size=150) != before).mean() > 0.01, "another episode, another forest"
-    with pytest.raises(ValueError, match="this HoveringEnv has none: build it with a scene"):
-        plot_from_above(rollout, tmp_path / "above.png", env=HoveringEnv(num_envs=2))

@@ -216,7 +216,7 @@ def test_a_reset_mask_leaves_the_other_drones_where_they_are():
     mask = np.array([False, True, False])
     after, info = env.reset(options={"reset_mask": mask})
     assert (before != after).any(1).tolist() == info["_success"].tolist() == mask.tolist()
-    assert env._now["state", "step"].flatten().tolist() == [3, 0, 3]
+    assert env.now["state", "step"].flatten().tolist() == [3, 0, 3]
 
 
 # -- pictures ----------------------------------------------------------------------------------------------------------
@@ -248,10 +248,10 @@ def test_many_drones_give_a_picture_each_of_where_they_are(mode):
         env.reset(options={"reset_mask": over})
     elif mode is AutoresetMode.NEXT_STEP:
         env.step(actions)
-    assert env._now["state", "step"][0] == 0 < env._now["state", "step"][1]  # one has begun anew, the other flies on
+    assert env.now["state", "step"][0] == 0 < env.now["state", "step"][1]  # one has begun anew, the other flies on
     first, second = env.render()
     assert (first != second).any()
-    env.torchrl_env.reset(env._now.clone(), set_state=True)
+    env.torchrl_env.reset(env.now.clone(), set_state=True)
     for i, picture in enumerate((first, second)):
         np.testing.assert_array_equal(picture, env.torchrl_env.render([i]))
 
@@ -325,7 +325,7 @@ def test_no_gradient_is_kept():
     env.reset()
     for actions in some_actions(3, 2):
         env.step(actions)
-    assert not any(x.requires_grad for x in env._now.values(True, True))
+    assert not any(x.requires_grad for x in env.now.values(True, True))
 
 
 def test_options_reach_the_torchrl_environment():

@@ -17,7 +17,6 @@ from torchrl_quad.render import (
     animate_flight,
     plot_episode,
     plot_flight,
-    plot_from_above,
     plot_learning_curve,
     video,
     write_replay,
@@ -319,7 +318,7 @@ def test_without_a_path_a_figure_is_returned_and_shows_itself_in_a_notebook(tmp_
     env = make_env("forest", num_envs=2)
     flight = env.rollout(5, break_when_any_done=False)
     (tmp_path / "metrics.csv").write_text("steps,time/seconds,eval/return\n100,1.0,5.0\n")
-    figures = [draw(flight, env=env) for draw in (plot_flight, plot_episode, plot_from_above)]
+    figures = [draw(flight, env=env) for draw in (plot_flight, plot_episode)]
     for figure in (*figures, plot_learning_curve("metrics.csv")):
         assert isinstance(figure, Figure) and figure._repr_png_().startswith(b"\x89PNG")
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]

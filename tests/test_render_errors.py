@@ -9,7 +9,7 @@ import pytest
 from small_runs import SMALL
 
 from torchrl_quad import HoveringEnv
-from torchrl_quad.render import animate_flight, plot_episode, plot_flight, write_replay
+from torchrl_quad.render import animate_flight, plot_episode, plot_flight, video, write_replay
 from torchrl_quad.render.video import NoFfmpeg
 from torchrl_quad.training import drawing
 
@@ -92,6 +92,8 @@ BROKEN = {
     "killed later": f"{TRIED} head -c 100 >/dev/null; kill -9 $$",
     "killed at the end": f'{TRIED} {WORKS} "$@"; kill -9 $$',
     "forgets the film": f"{TRIED} cat >/dev/null",
+    "hangs": "exec sleep 60",
+    "hangs at the end": "cat >/dev/null; exec sleep 60",
 }
 
 
@@ -116,13 +118,16 @@ def test_where_no_ffmpeg_works_the_film_is_a_gif_and_a_line_says_why(
     drawing.draw_flight(flight, path, env, "one")
     assert path.with_suffix(".mp4").exists() and not capsys.readouterr().err
     broken_ffmpeg(kind)
-    with pytest.raises(NoFfmpeg, match=r"an ffmpeg that writes H.264, and \S+ does not .*unset IMAGEIO_FFMPEG_EXE"):
+    if kind.startswith("hangs"):
+        monkeypatch.setattr(video, "_PATIENCE", 0.5)
+    why = r"\(no progress for 0.5 s\)" if kind.startswith("hangs") else r"\(.+\)"
+    with pytest.raises(NoFfmpeg, match=rf"writes H.264, and \S+ does not {why}. .*unset IMAGEIO_FFMPEG_EXE"):
         animate_flight(flight, tmp_path / "film.mp4", env=env)
     drawing.draw_flight(flight, path, env, "one")
     assert path.with_suffix(".gif").read_bytes().startswith(b"GIF") and not path.with_suffix(".mp4").exists()
     (said,) = capsys.readouterr().err.splitlines()
     assert said.startswith(f"Warning: {path}.gif takes the place of an MP4. Films in MP4 need ")
-    monkeypatch.delenv("IMAGEIO_FFMPEG_EXE")
+    monkeypatch.undo()
     drawing.draw_flight(flight, path, env, "one")
     assert path.with_suffix(".mp4").exists() and not path.with_suffix(".gif").exists()
 

@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import torch
@@ -58,6 +58,7 @@ def plot_flight(
     num_envs: Size = 12,
     control_dt: Positive = 0.02,
     title: str | None = None,
+    view: Literal["space", "above"] = "space",
 ) -> Figure:
     """Draw the first episodes of a flight: their paths in space, and over time how well they go.
 
@@ -73,6 +74,8 @@ def plot_flight(
         num_envs: the maximum number of environments to draw.
         control_dt: control step [s]; used only without ``env``.
         title: of the picture; by default the name of the environment and the number of flights.
+        view: "above" shows the paths alone, coloured by speed, between the obstacles that they could meet. Where each
+            environment has obstacles of its own, it has a panel of its own. A ring is a start, a cross a crash.
 
     Raises:
         ImportError: matplotlib is missing.
@@ -80,7 +83,11 @@ def plot_flight(
         ValueError: the rollout has another shape, or lacks the position or the reward; ``num_envs`` is less than 1; or
             matplotlib does not know the suffix.
     """
-    flight = Flight("plot_flight", rollout, env, control_dt, [*state_keys("position"), ("next", "reward")], num_envs)
+    needed = state_keys("position", "velocity") if view == "above" else [*state_keys("position"), ("next", "reward")]
+    flight = Flight("plot_flight", rollout, env, control_dt, needed, num_envs)
+    title = flight.title if title is None else title
+    if view == "above":
+        return save(_draw_from_above(flight, title), path)
     position = flight.position
     label, log, values, success = flight.progress()
 
@@ -106,7 +113,7 @@ def plot_flight(
         near = "" if flight.markers.progress else "below "
         over_time.axhline(success, color=RED, linestyle="--", linewidth=1.0, label=f"success: {near}{success:g}")
         over_time.legend(loc="best", frameon=False)
-    figure.suptitle(flight.title if title is None else title, x=0.04, y=0.965, ha="left", fontsize=13)
+    figure.suptitle(title, x=0.04, y=0.965, ha="left", fontsize=13)
     return save(figure, path)
 
 
@@ -137,7 +144,7 @@ def plot_episode(
     """
     keys = [*state_keys("position", "velocity"), ("action",), ("next", "reward")]
     flight = Flight("plot_episode", rollout, env, control_dt, keys, env_index=env_index)
-    figure = make_figure(figsize=(_WIDTH, 3.4))
+    figure = make_figure(figsize=(_WIDTH, 3.4))  # first: it says so where matplotlib is missing
     from matplotlib import rc_context
     from matplotlib.ticker import MaxNLocator
 
@@ -155,9 +162,8 @@ def plot_episode(
         set_scale(axes[0], log)
         actions = cast("Tensor", flight.entry("action"))[0].T.numpy()
         actions = np.concatenate((actions, actions[:, -1:]), 1)  # each lasts until the next instant
-        _draw_lines(
-            axes[1], times, dict(zip(flight.action_names, actions, strict=True)), "action", drawstyle="steps-post"
-        )
+        actions = dict(zip(flight.action_names, actions, strict=True))
+        _draw_lines(axes[1], times, actions, "action", drawstyle="steps-post")
         if rotor_speed is not None:
             speeds = {f"rotor {i + 1}": x for i, x in enumerate(rotor_speed[0].T.numpy())}
             _draw_lines(axes[2], times, speeds, "rotor speed\n[rad/s]")
@@ -205,43 +211,23 @@ def _draw_lines(axis: Axes, time: np.ndarray, lines: dict[str, np.ndarray], labe
 # -- from above --------------------------------------------------------------------------------------------------------
 
 
-@checked
-def plot_from_above(
-    rollout: TensorDictBase,
-    path: str | Path | None = None,
-    *,
-    env: EnvBase,
-    num_envs: Size = 4,
-    title: str | None = None,
-) -> Figure:
-    """Draw the first episodes of a flight from above: obstacles, and the paths between them, coloured by speed.
+def _draw_from_above(flight: Flight, title: str) -> Figure:
+    """The paths between the obstacles that stand between the least and the greatest height of the flight."""
+    from matplotlib.collections import LineCollection
 
-    Environments with obstacles of their own get a panel each; those that share them, one for all. A cross marks a
-    crash, a ring the start. Only what stands between the least and the greatest height of the flight is drawn.
-
-    Arguments and errors are those of :func:`plot_flight`; the environment has a scene, and the rollout the velocity.
-    """
-    flight = Flight("plot_from_above", rollout, env, 0.02, state_keys("position", "velocity"), num_envs)
-    if flight.solids(0) is None:
-        raise UserValueError(
-            f"plot_from_above draws obstacles, and this {type(flight.env).__name__} has none: build it with a scene, "
-            "or draw its flights with plot_flight."
-        )
-    position, speed = flight.position, flight.speed
-    groups = [[i] for i in range(len(flight))] if flight.has_own_obstacles else [list(range(len(flight)))]
-    points = position.nan_to_num().flatten(0, 1)
-    low, high = points.amin(0), points.amax(0)
+    position, speed, everyone = flight.position, flight.speed, range(len(flight))
+    groups = [[i] for i in everyone] if flight.has_own_obstacles else [everyone]
+    low, high = bounds(position)
     sides = (high - low)[:2].clamp_min(2.0) + 4.0
     middle, width = 0.5 * (low + high)[:2], 10.0
     left, bottom, right, top = torch.cat((middle - 0.5 * sides, middle + 0.5 * sides)).tolist()
     height = min(0.6 + len(groups) * (0.88 * width * (sides[1] / sides[0]).item() + 0.2), 14.0)
     figure = make_figure(figsize=(width, height), dpi=130, layout="constrained")
-    from matplotlib.collections import LineCollection
-
     axes = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
-    fastest, crash = speed.nan_to_num().amax().item(), flight.rollout.get(("next", "crash"), None)
+    fastest, crash = speed.nan_to_num().amax().item(), flight.entry("next", "crash")
     for axis, group in zip(axes, groups, strict=True):
-        _draw_sections(axis, flight.solids(group[0]), low[2].item(), high[2].item())
+        if (solids := flight.solids(group[0])) is not None:
+            _draw_sections(axis, solids, low[2].item(), high[2].item())
         for i in group:
             flown = position[i, : int(flight.steps[i]) + 1, :2].numpy()
             line = LineCollection(list(itertools.pairwise(flown)), cmap="viridis", linewidth=1.8)
@@ -253,17 +239,15 @@ def plot_from_above(
                 axis.plot(*flown[-1], marker="x", color=RED, markersize=9, markeredgewidth=2)
         axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", ylabel="y [m]")
     axes[-1].set_xlabel("x [m]")
-    figure.suptitle(flight.title if title is None else title, x=0.02, ha="left", fontsize=12)
+    figure.suptitle(title, x=0.02, ha="left", fontsize=12)
     figure.colorbar(axes[-1].collections[-1], ax=list(axes), label="speed [m/s]", shrink=0.6, pad=0.01, aspect=30)
-    return save(figure, path)
+    return figure
 
 
-def _draw_sections(axis: Axes, solids: Primitives | None, low: float, high: float) -> None:
+def _draw_sections(axis: Axes, solids: Primitives, low: float, high: float) -> None:
     """Draw what stands between two heights [m] from above."""
     from matplotlib.patches import Circle, Polygon
 
-    if solids is None:
-        return
     style: dict[str, Any] = {"facecolor": GREEN, "alpha": 0.6, "edgecolor": "none"}
     round_ones = [(x, y, z - r, z + r, r) for x, y, z, r in solids.spheres[0].tolist()]
     round_ones += [(x, y, z, z + height, r) for x, y, z, r, height in solids.cylinders[0].tolist()]

@@ -132,16 +132,15 @@ def quick(monkeypatch):
 def synthetic(tmp_path, strong):
     """Results in which ABPT is as in the paper, or the other way round."""
     rng = np.random.default_rng(0)
-    for task in matrix.TASKS:
-        rows = []
-        for variant in matrix.VARIANTS:
-            for seed in matrix.SEEDS:
-                level = 20.0 if (variant in ("abpt", "abpt-now")) == strong else 10.0
-                returns = level * np.linspace(0.2, 1.0, 10) + 0.1 * rng.normal(size=10)
-                more = {"solved": 0.9, "gates_passed": level, "start_cells": level, "position_error": 0.1}
-                rows += curve(variant, seed, *returns, **more)
-        write_rows(tmp_path / f"curves/{task}.csv", rows)
     runs = [{"task": t, "variant": v, "seed": s} for t in matrix.TASKS for v in matrix.VARIANTS for s in matrix.SEEDS]
+    rows = {task: [] for task in matrix.TASKS}
+    for run in runs:
+        level = 20.0 if (run["variant"] in ("abpt", "abpt-now")) == strong else 10.0
+        returns = level * np.linspace(0.2, 1.0, 10) + 0.1 * rng.normal(size=10)
+        more = {"solved": 0.9, "gates_passed": level, "start_cells": level, "position_error": 0.1}
+        rows[run["task"]] += curve(run["variant"], run["seed"], *returns, **more)
+    for task, of in rows.items():
+        write_rows(tmp_path / f"curves/{task}.csv", of)
     own = {"lr": "", "machine": "a processor", "seconds": 20.0, "solved": 0.9, "revision": 5 * "abcd1234"}
     ends = {"position_error": 0.1, "tracking_rmse": 0.1, "landing_speed": 0.2, "gates_passed": 4, "time_near_gate": 2.0}
     write_rows(tmp_path / "final.csv", [{**run, **own, **ends} for run in runs])

@@ -115,12 +115,11 @@ def audit_reward(
         RuntimeError: the rollout has lost its graph.
     """
     check_tensordict("audit_reward", rollout)
-    for key in (terms_key, reward_key, done_key):
-        if key not in rollout:
-            raise UserValueError(
-                f"audit_reward reads {key!r}, which is not in the rollout. Name the terms, the reward and the ends of "
-                "episodes as the rollout does: terms_key, reward_key, done_key."
-            )
+    if missing := [key for key in (terms_key, reward_key, done_key) if key not in rollout]:
+        raise UserValueError(
+            f"audit_reward reads {missing[0]!r}, which is not in the rollout. Name the terms, the reward and the ends "
+            "of episodes as the rollout does: terms_key, reward_key, done_key."
+        )
     reward, done = leaf(rollout, reward_key), leaf(rollout, done_key)
     if not (isinstance(reward, Tensor) and reward.numel() and reward.is_floating_point() and reward.ndim > 1):
         raise UserValueError(f"{reward_key!r} must be floating-point numbers (*, horizon, 1) of at least one step.")
@@ -180,19 +179,16 @@ def compare_gradients(loss: PathwiseLoss, rollout: TensorDictBase) -> GradientCo
     """Compare the first-order and the value gradient of an objective in the actor's parameters (paper, section IV-B).
 
     With ABPT they are the gradients of the N-step and of the 0-step return, with SHAC those of the rewards of the
-    horizon and of the terminal value. Both carry their weights in the objective, so that their sum is its gradient, and
-    both are means over environments. Without one of them, as with BPTT, its norm and the cosine are NaN. ABPT samples
-    actions for this, as its loss does. ``clip_action_gradient`` is not applied. No ``.grad`` changes.
-
-    Raises:
-        RuntimeError: the rollout has lost its graph.
+    horizon and of the terminal value; their sum, a mean over environments, is the gradient of the objective. Without
+    one of them, as with BPTT, its norm and the cosine are NaN. ABPT samples actions for this, as its loss does.
+    ``clip_action_gradient`` is not applied. No ``.grad`` changes.
     """
     _check_loss(loss)
     parts, sources = loss.objective_parts(rollout), _sources(loss)
     value = [parts.pop(loss.value_part)] if loss.value_part in parts else []
+    nothing = torch.tensor([math.nan], dtype=torch.float64)
     first_order, value = (
-        _gradient(total(part).mean(), sources) if part else torch.full((1,), math.nan, dtype=torch.float64)
-        for part in (parts.values(), value)
+        _gradient(total(part).mean(), sources) if part else nothing for part in (parts.values(), value)
     )
     norms = first_order.norm().item(), value.norm().item()
     cosine = (first_order * value.to(first_order)).sum().item() / (math.prod(norms) or math.nan)
@@ -213,11 +209,7 @@ class GradientStatistics(_Row):
 def gradient_statistics(loss: PathwiseLoss, rollout: TensorDictBase, *, max_envs: Size = 16) -> GradientStatistics:
     """Mean and spread of the policy gradients of single environments, without the entropy bonus.
 
-    Each of the first ``max_envs`` takes a backward pass through the whole rollout. No ``.grad`` changes.
-
-    Raises:
-        ValueError: there are fewer than two environments.
-        RuntimeError: the rollout has lost its graph.
+    Each of the first ``max_envs``, at least two, takes a backward pass through the whole rollout. No ``.grad`` changes.
     """
     _check_loss(loss)
     objectives = total(loss.objective_parts(rollout).values()).flatten()[:max_envs]
@@ -293,10 +285,8 @@ def _gradients(value: Tensor, sources: list[Tensor | GradientEdge]) -> Sequence[
 
 def _gradient(value: Tensor, sources: list[Tensor | GradientEdge]) -> Tensor:
     """The gradient of a scalar as one vector, in double precision: squares of small numbers are not lost."""
-    grads = [
-        torch.zeros_like(x) if g is None and isinstance(x, Tensor) else g
-        for g, x in zip(_gradients(value, sources), sources, strict=True)
-    ]
+    pairs = zip(_gradients(value, sources), sources, strict=True)
+    grads = [torch.zeros_like(x) if g is None and isinstance(x, Tensor) else g for g, x in pairs]
     known = [g.flatten().double() for g in grads if g is not None]
     return torch.cat(known) if known else value.new_zeros(1, dtype=torch.float64)
 
@@ -304,8 +294,8 @@ def _gradient(value: Tensor, sources: list[Tensor | GradientEdge]) -> Tensor:
 def _verdict(term: Tensor, gradient_norm: float) -> str:
     if not math.isfinite(gradient_norm):
         return "not finite"
-    if gradient_norm > 0.0:
-        return "differentiable" if term.any() else "gradient in time only"
     if not term.any():
-        return "not seen"
+        return "gradient in time only" if gradient_norm else "not seen"
+    if gradient_norm:
+        return "differentiable"
     return "constant" if term.min() == term.max() else "no gradient"

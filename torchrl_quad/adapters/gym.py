@@ -1,10 +1,8 @@
 """The tasks as gymnasium environments: numpy arrays in and out, no gradient.
 
 Importing ``torchrl_quad`` registers them, and so does ``gymnasium.make("torchrl_quad:torchrl_quad/Hovering-v0")``.
-
-``AsyncVectorEnv`` and ``vectorization_mode="async"`` start processes that import your program again: torchrl sets
-multiprocessing's start method to "spawn". Put what starts them under ``if __name__ == "__main__":``. A plain
-``make_vec`` flies all drones in one batch, and needs no processes.
+``AsyncVectorEnv`` starts processes that import your program again (torchrl sets multiprocessing's start method to
+"spawn"): put what starts them under ``if __name__ == "__main__":``, or use a plain ``make_vec``, which needs none.
 """
 
 from __future__ import annotations
@@ -25,8 +23,7 @@ from torchrl_quad.envs import QuadrotorEnv, make_env
 from torchrl_quad.errors import UserTypeError, UserValueError, WrongState, shown
 from torchrl_quad.options import Seed, check_value
 
-# An episode ends before an entry of the state exceeds this, where a task does not know better.
-_LIMIT = 1e6
+_LIMIT = 1e6  # of an observation, where a task does not know better: before, the episode ends
 _NO_LIMIT = 10_000_000  # control steps, as many as a task takes: gymnasium.make has a time limit of its own
 INFO = "success", "crash", "reward_terms", "metrics"
 Mode = Literal["NextStep", "SameStep", "Disabled"]
@@ -194,11 +191,7 @@ class GymEnv(gymnasium.Env):
 
     To train, fly a batch, ``gymnasium.make_vec``: it makes hundreds of times as many steps per second. The time limit
     is gymnasium's: ``gymnasium.make`` adds that of the task. ``GymEnv("hovering")`` flies until ``max_episode_steps``,
-    by default ten million. Errors are those of :class:`GymVectorEnv` with "Disabled".
-
-    Args:
-        task: "forest", "hovering", "landing", "racing" or "tracking".
-        **kwargs: as for :class:`GymVectorEnv`, but ``num_envs`` and ``autoreset_mode``.
+    by default ten million. Arguments and errors are those of :class:`GymVectorEnv` with "Disabled".
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}

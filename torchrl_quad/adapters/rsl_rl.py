@@ -30,10 +30,6 @@ class RslRlVecEnv(VecEnv):
 
     Args:
         env: as for :class:`~torchrl_quad.adapters.TorchVectorEnv`; a task, or transforms around one.
-
-    Raises:
-        ImportError: rsl-rl is missing.
-        TypeError, ValueError: the environment is no task; or as :class:`~torchrl_quad.adapters.TorchVectorEnv`.
     """
 
     def __init__(self, env: EnvBase) -> None:

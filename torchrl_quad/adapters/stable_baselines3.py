@@ -31,11 +31,6 @@ class DronesVecEnv(VecEnv):
 
     Args:
         env: a vector environment of gymnasium whose autoreset mode is "SameStep".
-
-    Raises:
-        ImportError: stable-baselines3 is missing.
-        TypeError: it is no vector environment with actions of floats.
-        ValueError: the autoreset mode is another. Of a call: as :class:`~torchrl_quad.adapters.gym.GymVectorEnv`.
     """
 
     def __init__(self, env: VectorEnv) -> None:

@@ -23,9 +23,8 @@ _FLOATS = torch.float16, torch.bfloat16, torch.float32, torch.float64
 class TorchVectorEnv:
     """Tensors in and out, in the manner of gymnasium's vector environments; all stay on the environment's device.
 
-    An episode that ends resets in the same step: ``step`` returns the first observation of the next episode, and
-    ``info["final_obs"]`` has the last of the one before. There is no gradient: for gradients fly the TorchRL
-    environment itself, with :func:`~torchrl_quad.differentiable_rollout`.
+    An episode that ends resets in the same step: ``step`` returns the first observation of the next episode. There is
+    no gradient: for gradients fly the TorchRL environment itself, with :func:`~torchrl_quad.differentiable_rollout`.
 
     ``info`` tells how the step ended, before any reset: ``success`` and ``crash``, bool (num_envs); ``reward_terms``
     and ``metrics``, floats (num_envs) by name; ``final_obs`` (num_envs, k), all observations.
@@ -33,10 +32,6 @@ class TorchVectorEnv:
     Args:
         env: a task, ``HoveringEnv(num_envs=512, compile=True)``, or any TorchRL environment of batch size (num_envs)
             with one ``observation`` and one ``action``; transforms around a task work, too.
-
-    Raises:
-        TypeError: it is no such environment.
-        ValueError: the environment has another batch size.
     """
 
     metadata = {"autoreset_mode": "SameStep"}
@@ -84,10 +79,7 @@ class TorchVectorEnv:
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Fly one control step with actions (num_envs, 4), clipped to the bounds of the action.
 
-        Returns:
-            observations (num_envs, k); rewards, and bool ``terminated`` and ``truncated``, each (num_envs); ``info``.
-
-        Raises as :class:`~torchrl_quad.adapters.GymVectorEnv`; actions must be on the environment's device.
+        Returns observations (num_envs, k); rewards, bool ``terminated`` and ``truncated``, each (num_envs); ``info``.
         """
         now = check_open(self, needed_by="A step")
         self._check_action(action)

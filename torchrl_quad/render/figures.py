@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import itertools
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -79,9 +78,7 @@ def plot_flight(
 
     Raises:
         ImportError: matplotlib is missing.
-        TypeError: ``env`` is not a quadrotor environment.
-        ValueError: the rollout has another shape, or lacks the position or the reward; ``num_envs`` is less than 1; or
-            matplotlib does not know the suffix.
+        TypeError, ValueError: what is given cannot be drawn, or matplotlib does not know the suffix.
     """
     needed = state_keys("position", "velocity") if view == "above" else [*state_keys("position"), ("next", "reward")]
     flight = Flight("plot_flight", rollout, env, control_dt, needed, num_envs)
@@ -90,7 +87,6 @@ def plot_flight(
         return save(_draw_from_above(flight, title), path)
     position = flight.position
     label, log, values, success = flight.progress()
-
     figure = make_figure(figsize=(11, 4.6), dpi=130)
     space = add_space(figure, (0.0, 0.02, 0.46, 0.9))
     over_time = figure.add_axes((0.55, 0.12, 0.43, 0.77))
@@ -126,21 +122,14 @@ def plot_episode(
     env_index: int = 0,
     control_dt: Positive = 0.02,
 ) -> Figure:
-    """Draw the first episode of one drone as a figure for a paper, as wide as a page of two columns (7.16 inches).
+    """Draw the first episode of the environment ``env_index`` for a paper, as wide as a page of two columns.
 
-    Shows its path in space, coloured by speed, with the task's markers and numbers at its gates. Shows over time the
+    Shows its path in space, coloured by speed, with the task's markers and numbers at its gates; and over time the
     distance to the target with the metrics that are lengths (without targets: all metrics, or the reward), the actions,
     and the rotor speeds if the state holds them. Dotted lines mark the times at which the drone passes gates, a dashed
-    line the distance from which a state fulfils the task, if the markers name it. PDF and SVG embed their fonts, PNG
-    has 300 dots per inch.
+    line the distance from which a state fulfils the task. PDF and SVG embed their fonts, PNG has 300 dots per inch.
 
     The other arguments, and errors, are those of :func:`plot_flight`; the rollout needs velocity and action, too.
-
-    Args:
-        env_index: which environment.
-
-    Raises:
-        IndexError: there is no such environment.
     """
     keys = [*state_keys("position", "velocity"), ("action",), ("next", "reward")]
     flight = Flight("plot_episode", rollout, env, control_dt, keys, env_index=env_index)
@@ -272,7 +261,7 @@ def _draw_sections(axis: Axes, solids: Primitives, low: float, high: float) -> N
 def plot_learning_curve(
     csv_path: str | Path, path: str | Path | None = None, *, metrics: Mapping[str, Metric] = EPISODE_METRICS
 ) -> Figure:
-    """Draw the evaluations of a training run over training time, with the control steps at the top.
+    """Draw the evaluations of a training run over training time; the label of its axis says how many steps it took.
 
     Draws up to four of the columns ``eval/NAME``: first those that ``metrics`` describes, in its order, then the
     others.
@@ -301,41 +290,17 @@ def plot_learning_curve(
     def column(name: str) -> np.ndarray:
         return np.array([float(row[name] or "nan") for row in rows])  # a cell may be empty
 
-    seconds = column("time/seconds")
-    known_seconds, known_steps = _knots(seconds, column("steps"))
+    seconds, steps = column("time/seconds"), column("steps")[-1]
     figure = make_figure(figsize=(3.4 * len(names), 3.2), dpi=130, layout="constrained")
-    from matplotlib.ticker import EngFormatter, MaxNLocator
-
     axes = figure.subplots(1, len(names), squeeze=False)
     for axis, name in zip(axes[0], names, strict=True):
         metric = describe_metric(name, metrics)
         values = metric.scale * column(f"eval/{name}")
         axis.plot(seconds, values, color=BLUE, marker="o", markersize=3, linewidth=1.4)
-        axis.set(xlabel="training time [s]", ylabel=metric.axis_label + (", median" if metric.median else ""))
+        axis.set(
+            xlabel=f"training time [s] of {steps:.3g} control steps",
+            ylabel=metric.axis_label + (", median" if metric.median else ""),
+        )
         axis.grid(alpha=0.3)
-        if metric.log:
-            set_scale(axis, log=True)
-        if len(known_steps) > 1:
-            to_steps = partial(np.interp, xp=known_seconds, fp=known_steps)
-            to_seconds = partial(np.interp, xp=known_steps, fp=known_seconds)
-            upper = axis.secondary_xaxis("top", functions=(to_steps, to_seconds))
-            upper.set_xlabel("control steps", color=INK)
-            upper.xaxis.set_major_locator(MaxNLocator(5))
-            upper.xaxis.set_major_formatter(EngFormatter(sep=""))
+        set_scale(axis, metric.log)
     return save(figure, path)
-
-
-def _knots(seconds: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of seconds and steps between which to interpolate, both increasing, from (0, 0) and beyond both ends.
-
-    A constant rate would not do: an iteration that compiles takes far longer than the others.
-    """
-    pairs = [(0.0, 0.0)]
-    for pair in zip(seconds, steps, strict=True):
-        if pair[0] > pairs[-1][0] and pair[1] > pairs[-1][1]:
-            pairs.append(pair)
-    knots = np.array(pairs)
-    if len(knots) > 1:  # the axes have margins: continue at the rates of both ends
-        first, last = (knots[-1, 0] / step[0] * step for step in (knots[1] - knots[0], knots[-1] - knots[-2]))
-        knots = np.concatenate((knots[:1] - first, knots, knots[-1:] + last))
-    return knots[:, 0], knots[:, 1]

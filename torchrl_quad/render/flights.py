@@ -31,14 +31,9 @@ _WALL = 5.0  # [m], half of the sides of the square that stands for an endless w
 
 
 class Flight:
-    """The first episodes of a rollout, without their graph, on the CPU.
+    """The first episodes of a rollout, without their graph, on the CPU; of one alone with an ``env_index``.
 
-    Arguments and errors are those of :func:`plot_flight`, and:
-
-    Args:
-        who: the function that draws, for its errors.
-        needed: keys of the rollout without which nothing can be drawn.
-        env_index: the one environment to keep, up to the end of its first episode.
+    ``who`` draws, and needs the keys ``needed``. The other arguments, and errors, are those of :func:`plot_flight`.
     """
 
     def __init__(
@@ -110,10 +105,10 @@ class Flight:
         return dict(cast("Mapping[str, Tensor]", self.rollout.get(key, {})).items())
 
     def state(self, name: str) -> Tensor | None:
-        """An entry of the state (num_envs, time + 1, k): at the start of the first episode, and after each step.
+        """An entry of the state (num_envs, time + 1, k), at the start of the first episode and after each step.
 
-        After the end of the episode it keeps its last value. It is NaN where it is infinite, and at the start if the
-        rollout does not hold the start. None if there is no such entry, or if the target is not a position.
+        It ends with the episode's last value, and is NaN where it is infinite or not known. None if there is no such
+        entry, or if the target is not a position.
         """
         ends, starts = self.entry("next", "state", name), self.entry("state", name)
         if ends is None or (name == "target" and ends.shape != self.rollout["next", "state", "position"].shape):

@@ -68,14 +68,8 @@ def write_replay(
     Args:
         rollout: (num_envs, time), of any task. It must hold ``("next", "state", "position")`` and ``("next", "state",
             "quaternion")``; the page leaves out whatever else is missing.
-        path: the HTML file to write; None for none.
-        env: the environment that flew, also under transforms. It provides the control step, the markers, the positions
-            of the rotors, and their thrust in newtons. Without it, the page shows an X frame and the squared speed of
-            each rotor.
-
-    Raises:
-        ImportError: plotly is not installed.
-        ValueError: ``env`` has individual drones, for fewer environments than the page shows.
+        env: the environment that flew, also under transforms. Without it, the page shows an X frame and the squared
+            speed of each rotor.
     """
     try:
         from plotly.offline import get_plotlyjs

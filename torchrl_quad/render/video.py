@@ -138,9 +138,8 @@ def animate_flight(
     """Film the first episodes of a flight in real time: drones with trails, their targets, and the task's markers.
 
     A task with a camera shows the first drone's depth image, the nearer the brighter. Where each episode has obstacles
-    of its own, the film shows only the first environment.
-
-    The other arguments, and errors, are those of :func:`plot_flight`; the rollout needs the quaternion.
+    of its own, the film shows only the first environment. The other arguments, and errors, are those of
+    :func:`plot_flight`; the rollout needs the quaternion.
 
     Args:
         path: the film to write: GIF, or MP4 (H.264) with ``imageio-ffmpeg`` of the extra ``render``, by its suffix.
@@ -170,11 +169,9 @@ def animate_flight(
 
     def pictures(flight: Flight, label: str) -> Iterator[np.ndarray]:
         images = None if flight.depth is None else depth_image(flight.depth[0], camera.range if camera else 10.0)
-        markers = with_obstacles(flight.markers, flight.solids(0))
-        pixels = None if images is None else images.shape[1:]
+        pixels, markers = None if images is None else images.shape[1:], with_obstacles(flight.markers, flight.solids(0))
         view = View(everywhere, len(flight), size + size % 2, markers, pixels)
-        attitude = cast("Tensor", flight.state("quaternion"))
-        position, target = flight.position, flight.target
+        position, attitude, target = flight.position, cast("Tensor", flight.state("quaternion")), flight.target
         for t in instants:
             aim, image = None if target is None else target[:, t], None if images is None else images[t]
             trails, text = position[:, max(t - trail, 0) : t + 1], f"{control_dt * t:.1f} s  {label}".rstrip()

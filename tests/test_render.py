@@ -242,9 +242,9 @@ def test_an_episode_of_every_task_is_drawn_with_what_flew(task, tmp_path):
     first = flight[1, :40]
     first = first[: first["next", "done"][:, 0].tolist().index(True) + 1]
     time = 0.02 * torch.arange(len(first) + 1)
-    path = torch.as_tensor(np.asarray(space.collections[0]._segments3d))
-    torch.testing.assert_close(path[:, 1].float(), first["next", "state", "position"].detach())
     target, position = (first["next", "state", name].detach() for name in ("target", "position"))
+    path = torch.as_tensor(np.asarray(space.collections[0]._segments3d))
+    torch.testing.assert_close(path[:, 1].float(), position)
     low, high = torch.tensor([space.get_xlim(), space.get_ylim(), space.get_zlim()]).T
     assert all(((low - 0.1 <= x) & (x <= high + 0.1)).all() for x in (first["state", "target"], position))
     assert (high - low).max() < (9 if task == "racing" else 8)  # and they fill the view, with all gates in it

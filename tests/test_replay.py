@@ -11,7 +11,7 @@ import torch
 from browsing import TIMEOUT
 from torchrl.envs import RewardSum, TransformedEnv
 
-from torchrl_quad import HoveringEnv, RacingEnv, TrackingEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad import HoveringEnv, RacingEnv, differentiable_rollout, make_actor, make_env
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs.metrics import first_episode
 from torchrl_quad.render import write_replay
@@ -53,7 +53,7 @@ def opened(open_page, folder, env, rollout, goal="target"):
     replay = open_page(folder / "replay.html")
     assert type(env).__name__ in replay.page.title()
     np.testing.assert_allclose(replay.bodies()[:, 0], rollout["state", "position"][:, 0], atol=1e-6)
-    success = "  dashed: success below it" if isinstance(env, HoveringEnv | TrackingEnv) else ""
+    success = "  dashed: success below it" if isinstance(env, HoveringEnv) else ""
     panels = ["reward, sum", "action [-1, 1], thrust", "speed [m/s]", f"distance to the {goal} [m]{success}"]
     assert replay.series()[1] == panels
     assert replay.layout("yaxis4.type") == ("linear" if goal == "next gate" else "log")
@@ -61,11 +61,6 @@ def opened(open_page, folder, env, rollout, goal="target"):
         low, high = replay.layout("yaxis4.range")
         assert low < -1 < high and replay.layout("shapes.0.y0") == pytest.approx(0.1)
     return replay
-
-
-def test_a_flight_with_moving_targets_opens_offline_without_errors(open_page, tmp_path):
-    env = make_env("tracking", num_envs=2)  # other tests open pages of hovering and racing
-    opened(open_page, tmp_path, env, env.rollout(12, break_when_any_done=False)).close()
 
 
 def test_positions_and_attitudes_are_all_a_replay_needs(open_page, tmp_path):
@@ -129,7 +124,7 @@ def test_the_slider_scrubs_to_the_state_of_the_rollout(replay, flight):
         np.testing.assert_allclose(lengths, 3 * 0.075 * thrust / hover, rtol=1e-3)
 
 
-@pytest.mark.parametrize("speed", ["0.25", "1", "4"])
+@pytest.mark.parametrize("speed", ["0.25", "4"])
 def test_it_plays_in_real_time_times_the_speed(replay, flight, speed):
     env, _ = flight
     replay.page.select_option("#speed", speed)

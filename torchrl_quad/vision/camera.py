@@ -16,13 +16,7 @@ from torchrl_quad.options import Below1, Delay, Fraction, between, build, checke
 from torchrl_quad.vision.primitives import Primitives
 from torchrl_quad.vision.rays import cast_rays
 
-Angle = Annotated[float, between(0.01, 2.967)]
 Side = Annotated[int, between(1, 10_000)]
-Rate = Annotated[int, between(1, 1_000)]
-Place = Annotated[Sequence[Annotated[float, between(-10.0, 10.0)]], entries(3, 3)]
-Quaternion = Annotated[Sequence[Annotated[float, between(-1.001, 1.001)]], entries(4, 4)]
-Turn = Annotated[float, between(-math.pi, math.pi)]
-Range = Annotated[float, between(0.01, 10_000.0)]
 
 
 @checked
@@ -53,12 +47,12 @@ class DepthCamera:
 
     width: Side = 16
     height: Side = 12
-    field_of_view: Angle = 0.5 * math.pi
-    position: Place = (0.0, 0.0, 0.0)
-    pitch: Turn = 0.0
-    quaternion: Quaternion | None = None
-    range: Range = 10.0
-    rate: Rate = 1
+    field_of_view: Annotated[float, between(0.01, 2.967)] = 0.5 * math.pi
+    position: Annotated[Sequence[Annotated[float, between(-10.0, 10.0)]], entries(3, 3)] = (0.0, 0.0, 0.0)
+    pitch: Annotated[float, between(-math.pi, math.pi)] = 0.0
+    quaternion: Annotated[Sequence[Annotated[float, between(-1.001, 1.001)]], entries(4, 4)] | None = None
+    range: Annotated[float, between(0.01, 10_000.0)] = 10.0
+    rate: Annotated[int, between(1, 1_000)] = 1
     delay: Delay = 0
     noise: Fraction = 0.0
     dropout: Below1 = 0.0

@@ -7,7 +7,7 @@ from torchrl_quad import HoveringEnv, make_env
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.markers import Markers, Shape
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, describe_metric
-from torchrl_quad.render import animate_flight, canvas, figures, plot_episode, plot_flight, video
+from torchrl_quad.render import animate_flight, canvas, plot_episode, plot_flight
 
 
 @pytest.mark.parametrize(
@@ -116,8 +116,7 @@ def test_figures_films_and_frames_show_everything_that_a_task_of_one_s_own_names
         draw(space, markers, *args, **options)
         views.append(space)
 
-    for module in (figures, video):
-        monkeypatch.setattr(module, "draw_markers", look)
+    monkeypatch.setattr(canvas, "draw_markers", look)
     env = own_markers(num_envs=2)
     flight = env.rollout(5, break_when_any_done=False)
     plot_flight(flight, tmp_path / "flight.png", env=env, title="Through a window")

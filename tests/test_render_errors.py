@@ -80,17 +80,13 @@ def test_without_matplotlib_or_ffmpeg_it_says_what_to_install(monkeypatch):
 # -- an ffmpeg that does not work --------------------------------------------------------------------------------------
 
 WORKS = imageio_ffmpeg.get_ffmpeg_exe()
-TRIED = f'case "$*" in *"h264 -") exec {WORKS} "$@";; esac\n'  # the film of one frame comes out well
 BROKEN = {
     "missing": None,
-    "not a program": "",
     "not executable": f'exec {WORKS} "$@"',
     "fails": "echo no encoder >&2; exit 3",
-    "killed": "kill -9 $$",
     "does nothing": "cat >/dev/null",
-    "killed later": f"{TRIED} head -c 100 >/dev/null; kill -9 $$",
-    "killed at the end": f'{TRIED} {WORKS} "$@"; kill -9 $$',
-    "forgets the film": f"{TRIED} cat >/dev/null",
+    "killed later": "head -c 100 >/dev/null; kill -9 $$",
+    "killed at the end": f'{WORKS} "$@"; kill -9 $$',
     "hangs": "exec sleep 60",
     "hangs at the end": "cat >/dev/null; exec sleep 60",
 }
@@ -101,7 +97,7 @@ def broken_ffmpeg(tmp_path, monkeypatch):
     def broken(kind):
         path = tmp_path / "ffmpeg"
         if (script := BROKEN[kind]) is not None:
-            path.write_text(f"#!/bin/sh\n{script}\n" if script else "")
+            path.write_text(f"#!/bin/sh\n{script}\n")
             path.chmod(0o644 if kind == "not executable" else 0o755)
         monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(path))
 
@@ -117,9 +113,10 @@ def test_where_no_ffmpeg_works_the_film_is_a_gif_and_a_line_says_why(
     drawing.draw_flight(flight, path, env, "one")
     assert path.with_suffix(".mp4").exists() and not capsys.readouterr().err
     broken_ffmpeg(kind)
+    why = r"\(.+\)"
     if kind.startswith("hangs"):
         monkeypatch.setattr(video, "_PATIENCE", 0.5)
-    why = r"\(no progress for 0.5 s\)" if kind.startswith("hangs") else r"\(.+\)"
+        why = r"\(no progress for 0.5 s\)"
     with pytest.raises(NoFfmpeg, match=rf"writes H.264, and \S+ does not {why}. .*unset IMAGEIO_FFMPEG_EXE"):
         animate_flight(flight, tmp_path / "film.mp4", env=env)
     drawing.draw_flight(flight, path, env, "one")

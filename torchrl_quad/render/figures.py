@@ -17,21 +17,8 @@ from torchrl.envs import EnvBase
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, describe_metric
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import Positive, Size, checked
-from torchrl_quad.render.canvas import (
-    BLUE,
-    GREEN,
-    INK,
-    RED,
-    add_space,
-    bounds,
-    box,
-    draw_markers,
-    drone_colors,
-    make_figure,
-    save,
-    set_box,
-    set_scale,
-)
+from torchrl_quad.render import canvas
+from torchrl_quad.render.canvas import BLUE, GREEN, INK, RED
 from torchrl_quad.render.flights import Flight, box_shape, state_keys, with_obstacles
 from torchrl_quad.vision import Primitives
 
@@ -84,33 +71,33 @@ def plot_flight(
     flight = Flight("plot_flight", rollout, env, control_dt, needed, num_envs)
     title = flight.title if title is None else title
     if view == "above":
-        return save(_draw_from_above(flight, title), path)
+        return canvas.save(_draw_from_above(flight, title), path)
     position = flight.position
     label, log, values, success = flight.progress()
-    figure = make_figure(figsize=(11, 4.6), dpi=130)
-    space = add_space(figure, (0.0, 0.02, 0.46, 0.9))
+    figure = canvas.make_figure(figsize=(11, 4.6), dpi=130)
+    space = canvas.add_space(figure, (0.0, 0.02, 0.46, 0.9))
     over_time = figure.add_axes((0.55, 0.12, 0.43, 0.77))
-    for i, color in enumerate(drone_colors(len(flight))):
+    for i, color in enumerate(canvas.drone_colors(len(flight))):
         flown = slice(int(flight.steps[i]) + 1)
         space.plot(*position[i, flown].T.numpy(), color=color, linewidth=1.2)
         space.scatter(*position[i, 0], color=color, s=14)
         over_time.plot(flight.times[flown], values[i, flown], color=color, linewidth=1.2)
     alike = len(flight) == 1 or not flight.has_own_obstacles
     markers = with_obstacles(flight.markers, flight.solids(0) if alike else None)
-    draw_markers(space, markers)
-    set_box(space, *box(*bounds(position, *markers.points())), zoom=0.9)
+    canvas.draw_markers(space, markers)
+    canvas.set_box(space, *canvas.box(*canvas.bounds(position, *markers.points())), zoom=0.9)
     named = dict(zip(*reversed(space.get_legend_handles_labels()), strict=True))  # a name once
     if named:
         space.legend(named.values(), named.keys(), loc="upper left", frameon=False)
     over_time.set(xlabel="time [s]", ylabel=label)
-    set_scale(over_time, log)
+    canvas.set_scale(over_time, log)
     over_time.grid(alpha=0.3)
     if success is not None:
         near = "" if flight.markers.progress else "below "
         over_time.axhline(success, color=RED, linestyle="--", linewidth=1.0, label=f"success: {near}{success:g}")
         over_time.legend(loc="best", frameon=False)
     figure.suptitle(title, x=0.04, y=0.965, ha="left", fontsize=13)
-    return save(figure, path)
+    return canvas.save(figure, path)
 
 
 @checked
@@ -133,12 +120,12 @@ def plot_episode(
     """
     keys = [*state_keys("position", "velocity"), ("action",), ("next", "reward")]
     flight = Flight("plot_episode", rollout, env, control_dt, keys, env_index=env_index)
-    figure = make_figure(figsize=(_WIDTH, 3.4))  # first: it says so where matplotlib is missing
+    figure = canvas.make_figure(figsize=(_WIDTH, 3.4))  # first: it says so where matplotlib is missing
     from matplotlib import rc_context
     from matplotlib.ticker import MaxNLocator
 
     with rc_context(fname=_PAPER):
-        space = add_space(figure, (0.0, 0.2, 0.44, 0.8), computed_zorder=False)
+        space = canvas.add_space(figure, (0.0, 0.2, 0.44, 0.8), computed_zorder=False)
         _draw_path(space, figure.add_axes((0.09, 0.12, 0.26, 0.02)), flight)
         rotor_speed = flight.state("rotor_speed")
         axes = figure.subplots(2 if rotor_speed is None else 3, 1, sharex=True, gridspec_kw=_BESIDE)
@@ -148,7 +135,7 @@ def plot_episode(
         if flight.target is not None and (near := flight.near_enough) is not None:
             axes[0].axhline(near, color=RED, linestyle="--", linewidth=0.6, label=f"success: below {near:g}")
             axes[0].legend(**_ABOVE)
-        set_scale(axes[0], log)
+        canvas.set_scale(axes[0], log)
         actions = cast("Tensor", flight.entry("action"))[0].T.numpy()
         actions = np.concatenate((actions, actions[:, -1:]), 1)  # each lasts until the next instant
         actions = dict(zip(flight.action_names, actions, strict=True))
@@ -163,7 +150,7 @@ def plot_episode(
         axes[-1].set(xlabel="time [s]", xlim=(0, times[-1]))
         for axis in axes[1:]:
             axis.yaxis.set_major_locator(MaxNLocator(4))
-        return save(figure, path)
+        return canvas.save(figure, path)
 
 
 def _draw_path(space: Axes3D, below: Axes, flight: Flight) -> None:
@@ -181,8 +168,8 @@ def _draw_path(space: Axes3D, below: Axes, flight: Flight) -> None:
         halo = [withStroke(linewidth=2, foreground="white")]
         for i, (x, y, z) in enumerate(markers.gates.tolist(), 1):
             space.text(x, y, z, f"   {i}", color=RED, zorder=11, path_effects=halo)
-    draw_markers(space, markers)
-    set_box(space, *box(*bounds(flight.position, *markers.points())), zoom=0.86)
+    canvas.draw_markers(space, markers)
+    canvas.set_box(space, *canvas.box(*canvas.bounds(flight.position, *markers.points())), zoom=0.86)
     bar = space.figure.colorbar(path, cax=below, orientation="horizontal")
     bar.set_label("speed [m/s]")
     bar.outline.set_linewidth(0.6)
@@ -206,12 +193,12 @@ def _draw_from_above(flight: Flight, title: str) -> Figure:
 
     position, speed, everyone = flight.position, flight.speed, range(len(flight))
     groups = [[i] for i in everyone] if flight.has_own_obstacles else [everyone]
-    low, high = bounds(position)
+    low, high = canvas.bounds(position)
     sides = (high - low)[:2].clamp_min(2.0) + 4.0
     middle, width = 0.5 * (low + high)[:2], 10.0
     left, bottom, right, top = torch.cat((middle - 0.5 * sides, middle + 0.5 * sides)).tolist()
     height = min(0.6 + len(groups) * (0.88 * width * (sides[1] / sides[0]).item() + 0.2), 14.0)
-    figure = make_figure(figsize=(width, height), dpi=130, layout="constrained")
+    figure = canvas.make_figure(figsize=(width, height), dpi=130, layout="constrained")
     axes = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
     fastest, crash = speed.nan_to_num().amax().item(), flight.entry("next", "crash")
     for axis, group in zip(axes, groups, strict=True):
@@ -291,7 +278,7 @@ def plot_learning_curve(
         return np.array([float(row[name] or "nan") for row in rows])  # a cell may be empty
 
     seconds, steps = column("time/seconds"), column("steps")[-1]
-    figure = make_figure(figsize=(3.4 * len(names), 3.2), dpi=130, layout="constrained")
+    figure = canvas.make_figure(figsize=(3.4 * len(names), 3.2), dpi=130, layout="constrained")
     axes = figure.subplots(1, len(names), squeeze=False)
     for axis, name in zip(axes[0], names, strict=True):
         metric = describe_metric(name, metrics)
@@ -302,5 +289,5 @@ def plot_learning_curve(
             ylabel=metric.axis_label + (", median" if metric.median else ""),
         )
         axis.grid(alpha=0.3)
-        set_scale(axis, metric.log)
-    return save(figure, path)
+        canvas.set_scale(axis, metric.log)
+    return canvas.save(figure, path)

@@ -26,17 +26,8 @@ from torchrl_quad.envs.markers import Markers
 from torchrl_quad.errors import MissingPackage, UserValueError, one_line
 from torchrl_quad.files import replacing
 from torchrl_quad.options import Positive, Size, checked
-from torchrl_quad.render.canvas import (
-    INK,
-    RED,
-    add_space,
-    bounds,
-    box,
-    draw_markers,
-    drone_colors,
-    make_figure,
-    set_box,
-)
+from torchrl_quad.render import canvas
+from torchrl_quad.render.canvas import INK, RED
 from torchrl_quad.render.flights import Flight, depth_image, state_keys, with_obstacles
 
 if TYPE_CHECKING:
@@ -65,21 +56,23 @@ class View:
     def __init__(
         self, points: Tensor, num_drones: int, size: int, markers: Markers, image: Sequence[int] | None = None
     ) -> None:
-        low, high = bounds(points, *markers.points())
+        low, high = canvas.bounds(points, *markers.points())
         low[2].clamp_(max=0.0)
-        self.low, self.high = box(low, high)
+        self.low, self.high = canvas.box(low, high)
         self.arms = (0.04 * (self.high - self.low).amax()).float() * _ARMS
 
-        self.figure = make_figure(figsize=(_INCHES, _INCHES), dpi=(size + 0.01) / _INCHES)  # it rounds down to pixels
+        self.figure = canvas.make_figure(
+            figsize=(_INCHES, _INCHES), dpi=(size + 0.01) / _INCHES
+        )  # it rounds down to pixels
         self.canvas: FigureCanvasAgg = self.figure.canvas  # pyrefly: ignore[bad-assignment]  as make_figure sets it
-        space = add_space(self.figure, (0.0, 0.02, 0.96, 0.98))
-        set_box(space, self.low, self.high, zoom=0.82)
-        draw_markers(space, markers, size=8)
+        space = canvas.add_space(self.figure, (0.0, 0.02, 0.96, 0.98))
+        canvas.set_box(space, self.low, self.high, zoom=0.82)
+        canvas.draw_markers(space, markers, size=8)
 
         def line(**style: Any) -> Line3D:  # drawn onto the axes in each frame
             return cast("Line3D", space.plot([], [], [], animated=True, **style)[0])
 
-        colors = drone_colors(num_drones)
+        colors = canvas.drone_colors(num_drones)
         self.drones = [line(color=color, linewidth=2.5) for color in colors]
         self.trails = [line(color=color, linewidth=1, alpha=0.5) for color in colors]
         self.targets = line(color=RED, marker="*", markersize=8, linestyle="none")
@@ -268,10 +261,10 @@ def draw_frame(env: QuadrotorEnv, drones: Sequence[int] | None, size: int) -> np
     kind = len(chosen), size, b"".join(_numpy(x).tobytes() for x in obstacles.values())
     view = views.get(kind)
     if view is None:  # half a metre of room around all drones, their targets and the markers
-        low, high = bounds(*(x for key, x in state.items() if key != "quaternion"), *env.markers().points())
+        low, high = canvas.bounds(*(x for key, x in state.items() if key != "quaternion"), *env.markers().points())
         low, high = low - torch.tensor([0.5, 0.5, 0.0]), high + 0.5
     else:  # a side that has become too near moves out by half of the view, so that it need not at every step
-        low, high = bounds(*(x for key, x in shown.items() if key != "quaternion"), view.low, view.high)
+        low, high = canvas.bounds(*(x for key, x in shown.items() if key != "quaternion"), view.low, view.high)
         room = 0.5 * (view.high - view.low)
         low, high = low - room * (low < view.low), high + room * (high > view.high)
     if view is None or (low < view.low).any() or (high > view.high).any():

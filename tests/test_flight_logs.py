@@ -203,23 +203,10 @@ def test_the_delay_of_the_on_board_clock_is_seen_and_left_to_the_fit(table, read
     np.testing.assert_allclose(shifted.angular_velocity[lag:-lag], plain.angular_velocity[: -2 * lag], atol=1e-9)
 
 
-def test_files_that_are_no_flight_are_refused_by_name(tmp_path, read):
-    cases = {
-        "empty.csv": (b"", "is empty"),
-        "junk.bin": (bytes(range(128, 256)), "not a log of a known kind"),
-        "text.csv": (b"Dear reader,\nthis is a letter.\n", "fewer than two samples"),
-        "ragged.csv": (b"t,x\n1,2\n1,2,3\n", "not a table of numbers"),
-        "cut.csv.gz": (FLIGHT.read_bytes()[:2000], "broken gz"),
-        "cut.ulg": (b"ULog\x01\x12\x35\x01", "not a readable ULog"),
-        "cut.bag": (b"#ROSBAG V2.0\n", "not a readable ROS bag"),
-        "cut.usd": (b"\xbc\x02\x00\x05\x00abc", "header is cut off"),
-        "new.usd": (b"\xbc\x09\x00\x00\x00abcd", "version 9"),
-    }
-    for name, (data, _) in cases.items():
-        (tmp_path / name).write_bytes(data)
-    for name, (_, message) in {**cases, "nowhere.csv": (b"", "does not exist"), ".": (b"", "not a ROS 2 bag")}.items():
+def test_what_holds_no_flight_is_refused_by_name(tmp_path, read):
+    for path, message in ((tmp_path / "nowhere.csv", "does not exist"), (tmp_path, "not a ROS 2 bag")):
         with pytest.raises(UnreadableLog, match=message):
-            read_log(tmp_path / name)
+            read_log(path)
     with pytest.raises(MissingColumns, match="Unknown layout 'betaflight'. Choose from: nanobench"):
         read_log(FLIGHT, "betaflight")
     with pytest.raises(NoFlight, match="share 0.14 s"):

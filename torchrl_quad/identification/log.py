@@ -105,8 +105,7 @@ def read_log(
                        "acceleration": Columns(("ax", "ay", "az"), scale=9.80665)})
         print(log)
 
-    Bags need rosbags: ``pip install '.[logs]'`` in a clone. Time and memory are proportional to the size of the file;
-    ``docs/flight_logs.md`` has the limits.
+    Bags need rosbags: ``pip install '.[logs]'`` in a clone. ``docs/flight_logs.md`` has the limits of size.
 
     Args:
         path: a file, or the folder of a ROS 2 bag. Its first bytes say of what kind it is.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,16 +19,17 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 LARGEST = 1e9  # of a quantity, in SI units; only damage makes larger ones
 MAX_COLUMNS = 100_000  # of a table, and of all messages of a ULog or a uSD log together
-MAX_RECORDS = 20 * 10**6  # messages of a ULog or a bag, events of a uSD log
+MAX_RECORDS = 20 * 10**6  # messages of a ULog, events of a uSD log
 
 
 def open_plain(path: Path) -> io.BufferedReader:
     """A plain file, open for reading. A pipe, a socket or a device is not opened: to read one may never end."""
-    if not path.is_file():
-        raise UnreadableLog(
-            f"{path.name} is not a regular file but a pipe, a socket or a device. Give the path of a log."
-        )
-    return open(path, "rb")
+    if path.is_file():
+        file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb")
+        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):  # which may have become a pipe in between
+            return file
+        file.close()
+    raise UnreadableLog(f"{path.name} is not a regular file but a pipe, a socket or a device. Give the path of a log.")
 
 
 def too_many(name: str, most: int, what: str, remedy: str) -> UnreadableLog:

@@ -113,7 +113,7 @@ REFUSED = {  # what is no log, or what no reader should follow to its end: a fil
     "cut.csv.gz": (gzip.compress(random.Random(0).randbytes(2000))[:1000], "broken gz"),
     "cut.ulg": (ULOG[:8], "not a readable ULog"),
     "cut.bag": (b"#ROSBAG V2.0\n", "not a readable ROS bag"),
-    "cut.usd": (b"\xbc\x02\x00\x05\x00abc", "header is cut off"),
+    "cut.usd": (b"\xbc\x02\x00\x05\x00abc", "header cannot be read: subsection not found"),
     "new.usd": (b"\xbc\x09\x00\x00\x00abcd", "version 9"),
     "nested.ulg": (ulog_of(*(f"a{k}:a{k + 1}[65535] x;" for k in range(9)), "a9:uint8_t[65535] x;"), "no sample"),
     "itself.ulg": (ulog_of("a:uint64_t timestamp;a x;"), "no sample"),

@@ -110,7 +110,7 @@ def test_a_usd_log_is_read_in_both_versions_and_without_its_end(version, tmp_pat
     with pytest.raises(WrongUnit, match=r"gyro.x.*degrees"):
         read_log(write_usd(path, events, version), {"angular_velocity": ("gyro.x", "gyro.y", "gyro.z")})
     path.write_bytes(whole.replace(b"gyro.x(f)", b"gyro.x(e)"))
-    with pytest.raises(UnreadableLog, match=r"a variable of unknown type, 'gyro.x\(e\)'. Export it as CSV"):
+    with pytest.raises(UnreadableLog, match=r"a variable of unknown type, 'gyro.x\(e\)'.*export it as CSV"):
         read_log(path)
 
 

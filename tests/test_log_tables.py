@@ -179,10 +179,15 @@ def test_columns_take_a_scale_and_an_offset_that_are_numbers(value):
             Columns(("a", "b", "c"), offset=value)
 
 
-@pytest.mark.parametrize("field", ["columns", "convention", "onboard", "time", "required"])
-def test_layouts_say_which_of_their_fields_is_wrong(field):
-    for value in (5, "x", [3], {"position": ("x",)}):
-        with pytest.raises(UserError, match=f"Layout: {field} must"):
-            replace(LAYOUTS["nanobench"], **{field: value})
+def test_layouts_say_which_of_their_fields_is_wrong():
+    for changes, message in (
+        ({"columns": {"position": ("x", "y", "z")}}, "position takes 3 column.* got 1: x"),
+        ({"columns": {"position": (5,)}}, "columns: 'position' takes the name of a column"),
+        ({"columns": {"speed": (("v",),)}}, "Unknown quantity 'speed'"),
+        ({"convention": "px4"}, "convention must be one of torchrl_quad.deploy.frames, got 'px4'"),
+        ({"time": Columns(("s", "ns"))}, "time takes 1 column.* got 2: s, ns"),
+    ):
+        with pytest.raises(UserError, match=message):
+            replace(LAYOUTS["nanobench"], **changes)
     with pytest.raises(UserValueError, match="names must be the names of columns, got 5"):
         Columns(5)

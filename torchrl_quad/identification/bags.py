@@ -13,13 +13,13 @@ import numpy as np
 
 from torchrl_quad.errors import UserError, one_line
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
-from torchrl_quad.identification.layouts import BY_IMU, ROS, Columns, Layout, choose, named_alike, shipped
+from torchrl_quad.identification.layouts import BY_IMU, ROS, Asked, Columns, Layout, choose, named_alike, shipped
 from torchrl_quad.identification.signals import Stream, open_plain
 
 MAGIC = (b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0")
 
 
-def read_bag(path: Path, columns: str | Layout | Mapping[str, object] | None) -> tuple[list[Stream], Layout, list[str]]:
+def read_bag(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list[str]]:
     """A stream for each topic that the layout names: columns ``/topic.field.part[0]``.
 
     The time of a message is its header's stamp; without one, when the bag received it. By default topics are found by
@@ -44,15 +44,8 @@ def read_bag(path: Path, columns: str | Layout | Mapping[str, object] | None) ->
         ) from error
 
 
-def _read(
-    bag: Any, name: str, columns: str | Layout | Mapping[str, object] | None
-) -> tuple[list[Stream], Layout, list[str]]:
-    topics: dict[str, str] = {}
-    for connection in bag.connections:
-        if connection.msgcount and topics.setdefault(connection.topic, connection.msgtype) != connection.msgtype:
-            raise UnreadableLog(f"{name}: {connection.topic} has messages of two kinds. Filter one of them out.")
-    if not topics:
-        raise UnreadableLog(f"{name} is not a readable ROS bag: it holds no messages. Record it again.")
+def _read(bag: Any, name: str, columns: Asked) -> tuple[list[Stream], Layout, list[str]]:
+    topics = {connection.topic: connection.msgtype for connection in bag.connections if connection.msgcount}
     layout = _layout(topics, columns, name)
     asked: dict[str, list[str]] = {}
     for column in sorted(layout.names):
@@ -93,7 +86,7 @@ def _number(message: Any, place: str) -> float:
     return float(message)
 
 
-def _layout(topics: Mapping[str, str], columns: str | Layout | Mapping[str, object] | None, name: str) -> Layout:
+def _layout(topics: Mapping[str, str], columns: Asked, name: str) -> Layout:
     if columns is not None and not isinstance(columns, Mapping):
         return choose(columns, None)
     given = columns or {}
@@ -124,5 +117,5 @@ def _layout(topics: Mapping[str, str], columns: str | Layout | Mapping[str, obje
 
 
 def _there(topics: Mapping[str, str]) -> str:
-    listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
+    listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())) or "none"
     return f'Name columns as columns={{"position": ["/topic.field.x", ...]}}. There are: {listed}.'

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -77,21 +77,11 @@ class Layout:
     required: frozenset[str] = frozenset()  #: quantities that a caller named; a file without their columns is refused
 
     def __post_init__(self) -> None:
-        onboard = None if isinstance(self.onboard, str) else self.onboard
-        rules = {
-            "columns must map quantities to tuples of Columns": isinstance(self.columns, Mapping)
-            and all(_are(c, Columns) for c in self.columns.values()),
-            "convention must be one of torchrl_quad.deploy.frames": isinstance(self.convention, frames.Convention),
-            "onboard must be a tuple of fields": _are(onboard, str),
-            "time must be Columns of one name": isinstance(self.time, Columns) and len(self.time.names) == 1,
-            "required must be a set of quantities": isinstance(self.required, Set),
-        }
-        for rule, holds in rules.items():
-            if not holds:
-                raise UserValueError(f"Layout: {rule}, got {shown(getattr(self, rule.split()[0]))}.")
-        for quantity, choices in self.columns.items():
+        if not isinstance(self.convention, frames.Convention):
+            raise UserTypeError(f"convention must be one of torchrl_quad.deploy.frames, got {shown(self.convention)}.")
+        for quantity, choices in (*self.columns.items(), ("time", (self.time,))):
             for choice in choices:
-                _check_quantity(quantity, choice)
+                _as_columns(quantity, choice)
 
     @property
     def names(self) -> set[str]:
@@ -99,20 +89,24 @@ class Layout:
         return {name for choices in self.columns.values() for choice in choices for name in choice.names}
 
 
-def _are(values: object, kind: type) -> bool:
-    return isinstance(values, Sequence) and all(isinstance(value, kind) for value in values)
-
-
-def _check_quantity(quantity: object, columns: Columns) -> None:
+def _as_columns(quantity: object, names: object) -> Columns:
+    if not isinstance(names, Columns):
+        if not isinstance(names, Sequence) or isinstance(names, bytes):
+            raise UserTypeError(
+                f"columns: {shown(quantity)} takes the name of a column, a list of them, or Columns; got "
+                f"{shown(names)}."
+            )
+        names = Columns((names,) if isinstance(names, str) else tuple(names))
     known = [*QUANTITIES, "time"]
     if not (isinstance(quantity, str) and (quantity in known or quantity.startswith("setpoint."))):
         raise MissingColumns(
             f"Unknown quantity {shown(quantity)} in columns. Choose from: {', '.join(known)}, setpoint.NAME."
         )
-    count = len(columns.names)
+    count = len(names.names)
     size = 1 if quantity == "time" else QUANTITIES.get(quantity, (count, None))[0]
     if count != size:
-        raise MissingColumns(f"{quantity} takes {size} column(s), got {count}: {', '.join(columns.names)}. Name each.")
+        raise MissingColumns(f"{quantity} takes {size} column(s), got {count}: {', '.join(names.names)}. Name each.")
+    return names
 
 
 def named_alike(names: str, of: str = "", scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> Columns:
@@ -125,6 +119,7 @@ def shipped(name: str) -> dict[str, Any]:
     return presets.parse(Path(__file__).with_name(name).read_bytes(), name)
 
 
+Asked = str | Layout | Mapping[str, object] | None  # what a caller says of the columns
 LAYOUTS = {
     name: Layout(
         {quantity: tuple(named_alike(**choice) for choice in choices) for quantity, choices in said["columns"].items()},
@@ -136,7 +131,7 @@ LAYOUTS = {
 }
 
 
-def choose(columns: str | Layout | Mapping[str, object], default: Layout | None) -> Layout:
+def choose(columns: Asked, default: Layout | None) -> Layout:
     """The layout for what a caller names: a preset, a layout, or a mapping, which replaces entries of a default."""
     if isinstance(columns, Layout):
         return columns
@@ -156,18 +151,6 @@ def choose(columns: str | Layout | Mapping[str, object], default: Layout | None)
     if "quaternion" in chosen or "euler" in chosen:  # the caller names the attitude: not that of the preset, too
         kept = {quantity: choices for quantity, choices in kept.items() if quantity not in ("quaternion", "euler")}
     return replace(default, columns=kept | chosen, time=time[0] if time else default.time, required=frozenset(chosen))
-
-
-def _as_columns(quantity: str, names: object) -> Columns:
-    if not isinstance(names, Columns):
-        if not isinstance(names, Sequence) or isinstance(names, bytes):
-            raise UserTypeError(
-                f"columns: {shown(quantity)} takes the name of a column, a list of them, or Columns; got "
-                f"{shown(names)}."
-            )
-        names = Columns(tuple(names) if not isinstance(names, str) else (names,))
-    _check_quantity(quantity, names)
-    return names
 
 
 def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Signal]:

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from log_writers import END, OURS, TABLE, G, flight, matrix, ned, own_table, write_csv
+from log_writers import END, OURS, TABLE, G, flight, matrix, own_table, write_csv
 
-from torchrl_quad.deploy import frames
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.identification import (
     LAYOUTS,
@@ -78,9 +77,7 @@ def test_a_real_flight_is_read_in_our_units_frames_and_orders(table):
     assert log.setpoint["position"].shape == log.position.shape
     assert log.onboard == ("angular_velocity", "acceleration", "motor_command", "battery_voltage", "setpoint")
 
-
-def test_the_ground_take_off_and_landing_are_cut_out_and_said(table):
-    log = read_log(FLIGHT)
+    # The ground, take-off and landing are cut out, and said.
     ((start, stop),) = log.segments
     ground = np.median(table["pz"][:50])
     assert log.position[start:stop, 2].min() > ground + 0.0995
@@ -106,6 +103,10 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "z down": (lambda t: scaled(t, ("pz", "vz"), -1), "WrongFrame", "z points down.*frames.px4"),
     "accelerometer down": (lambda t: scaled(t, FORCE[2:], -1), "WrongFrame", "imu_acc_z.*frames.px4"),
     "accelerometer in m/s^2": (lambda t: scaled(t, FORCE, G), "WrongUnit", "imu_acc_x.*median length of 9"),
+    "accelerometer in g": (lambda t: scaled(t, FORCE, 1 / G), "WrongUnit", "in g.*scale=9.80665"),
+    "accelerometer in mg": (lambda t: scaled(t, FORCE, 1e3 / G), "WrongUnit", "scale=9.80665e-3"),
+    "motors in percent": (lambda t: scaled(t, MOTORS, 100.0), "WrongUnit", "scale=1 / 100"),
+    "motors in counts": (lambda t: scaled(t, MOTORS, 65535.0), "WrongUnit", "scale=1 / 65535"),
     "motors beyond full": (lambda t: scaled(t, MOTORS, 2.0), "WrongUnit", "motor_motor_m1.*from 0 to 1"),
     "clock in ms": (lambda t: scaled(t, "t", 1e3), "WrongUnit", "milliseconds"),
     "clock jumps back": (lambda t: {"t": t["t"] - (t["t"] > 5.0)}, "ClockJumpsBack", "from 5 to 4.0.* at sample"),
@@ -305,32 +306,17 @@ def test_euler_angles_and_velocities_of_the_body_become_ours(tmp_path):
     np.testing.assert_allclose(np.abs((log.quaternion * true["quaternion"]).sum(-1)), 1.0, atol=1e-7)
     with pytest.raises(WrongFrame, match='"velocity_body"'):
         read_log(path, TABLE)
-    force, motors = true["acceleration"], true["motor_command"]
-    for error, message, changes in (
-        (WrongFrame, "in the world frame", {"angular_velocity": np.einsum("nij,nj->ni", r, true["angular_velocity"])}),
-        (WrongUnit, "in g.*scale=9.80665", {"acceleration": force / G}),
-        (WrongUnit, "scale=9.80665e-3", {"acceleration": 1e3 * force / G}),
-        (WrongUnit, "scale=1 / 65535", {"motor_command": 65535.0 * motors}),
-        (WrongUnit, "scale=1 / 100", {"motor_command": 100.0 * motors}),
-        (WrongUnit, "offset=1000", {"motor_command": 2000.0 * motors}),
-    ):
-        with pytest.raises(error, match=message):
-            read_log(write_csv(path, own_table(t, **changes)), TABLE)
+    rates = np.einsum("nij,nj->ni", r, true["angular_velocity"])
+    with pytest.raises(WrongFrame, match="in the world frame"):
+        read_log(write_csv(path, own_table(t, angular_velocity=rates)), TABLE)
+    write_csv(path, own_table(t, motor_command=2000.0 * true["motor_command"]))
+    with pytest.raises(WrongUnit, match="offset=1000"):
+        read_log(path, TABLE)
     few = {k: v for k, v in TABLE.items() if k in ("time", "position", "quaternion")}
     log = read_log(path, few | {"motor_command": Columns(OURS["motor_command"], scale=1 / 2000)})
     inside = slice(*log.segments[0])
     np.testing.assert_allclose(log.velocity[inside], true["velocity"][inside], atol=0.02)
     assert log.acceleration is None and log.setpoint is None
-
-
-def test_a_log_in_ned_is_read_by_its_convention(tmp_path):
-    t = np.arange(0.0, END, 0.01)
-    path = write_csv(tmp_path / "ned.csv", own_table(t, **ned(flight(t))))
-    with pytest.raises(WrongFrame, match=r"frames.px4\(\)"):
-        read_log(path, TABLE)
-    log = read_log(path, TABLE, convention=replace(frames.px4(), motors=(0, 1, 2, 3)))
-    np.testing.assert_allclose(log.position, flight(t)["position"], atol=1e-6)
-    np.testing.assert_allclose(log.angular_velocity, flight(t)["angular_velocity"], atol=1e-6)
 
 
 HUGE = 10**400  # more than a float holds

@@ -1,6 +1,5 @@
 """What read_log finds in a real flight and in tables of a known one, and what it says of every fault of a log."""
 
-import gzip
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,10 +33,8 @@ MOTORS = tuple(f"motor_motor_m{k}" for k in (1, 2, 3, 4))
 @pytest.fixture(scope="module")
 def table():
     """The first nine seconds of the flight, by column; copies of it get faults."""
-    with gzip.open(FLIGHT, "rt") as file:
-        names = file.readline().strip().split(",")
-        rows = np.loadtxt(file, delimiter=",", max_rows=900)
-    return dict(zip(names, rows.T, strict=True))
+    rows = np.genfromtxt(FLIGHT, delimiter=",", names=True, max_rows=900)
+    return {name: rows[name] for name in rows.dtype.names}
 
 
 @pytest.fixture
@@ -195,10 +192,6 @@ def test_a_mapping_replaces_entries_of_a_preset_and_nothing_else(table, read):
     log = read(renamed, drop=("pwr_pm_vbat", "sp_ctrltarget_yaw"), columns={"battery_voltage": "volts"})
     np.testing.assert_array_equal(log.battery_voltage, read().battery_voltage)
     assert set(log.setpoint) == {"position"}  # what the preset knows and the file lacks is left out, as ever
-    with pytest.raises(MissingColumns, match="no column vlots, named for battery_voltage.*There are: .*volts"):
-        read(renamed, columns={"battery_voltage": "vlots"})
-    with pytest.raises(MissingColumns, match="no column seconds of the time. There are: t, "):
-        read(columns={"time": "seconds"})
 
 
 def test_the_delay_of_the_on_board_clock_is_seen_and_left_to_the_fit(table, read):
@@ -210,19 +203,20 @@ def test_the_delay_of_the_on_board_clock_is_seen_and_left_to_the_fit(table, read
     np.testing.assert_allclose(shifted.angular_velocity[lag:-lag], plain.angular_velocity[: -2 * lag], atol=1e-9)
 
 
-def test_what_holds_no_flight_is_refused_by_name(tmp_path, read):
-    for path, message in (
-        (tmp_path / "nowhere.csv", "does not exist"),
-        (tmp_path, "Expected metadata file"),
+def test_what_holds_no_flight_or_not_what_was_asked_for_is_refused_by_name(read):
+    for error, message, options in (
+        (NoFlight, "share 0.14 s", {"rows": slice(0, 15)}),
+        (NoFlight, "never for 60 s", {"min_duration": 60.0}),
+        (MissingColumns, "Unknown layout 'betaflight'. Choose from: nanobench", {"columns": "betaflight"}),
+        (
+            MissingColumns,
+            "no column volts, named for battery_voltage",
+            {"columns": {"battery_voltage": "volts"}},
+        ),
+        (MissingColumns, "no column s of the time. There are: t, ", {"columns": {"time": "s"}}),
     ):
-        with pytest.raises(UnreadableLog, match=message):
-            read_log(path)
-    with pytest.raises(MissingColumns, match="Unknown layout 'betaflight'. Choose from: nanobench"):
-        read_log(FLIGHT, "betaflight")
-    with pytest.raises(NoFlight, match="share 0.14 s"):
-        read(rows=slice(0, 15))
-    with pytest.raises(NoFlight, match="never for 60 s"):
-        read(min_duration=60.0)
+        with pytest.raises(error, match=message):
+            read(**options)
 
 
 # -- tables of a flight whose every quantity is known ------------------------------------------------------------------

@@ -376,6 +376,8 @@ def test_a_pipe_a_socket_and_a_device_are_refused_unopened(tmp_path, monkeypatch
     for path in (tmp_path / "pipe.csv", tmp_path / "link.csv", tmp_path / "socket", folder, Path("/dev/zero")):
         assert "is not a regular file but a pipe, a socket or a device" in refused(path)
     monitor.close()
+    (folder / "a.mcap").unlink()
+    assert "bag is not a readable ROS bag" in refused(folder) and "does not exist" in refused(tmp_path / "nowhere.csv")
     monkeypatch.setattr(Path, "is_file", lambda path: True)  # when it was looked at, before it became a pipe
     assert "is not a regular file" in refused(tmp_path / "pipe.csv")
 

@@ -96,9 +96,9 @@ class DroneRandomization(Disturbance):
                     f"{source}: {name!r} belongs to the flight controller, which keeps the nominal drone; a random one "
                     "would change nothing. Give another drone instead."
                 )
-            if name not in plant_fields or name == "rotor_spin":
-                allowed = ", ".join(field for field in plant_fields if field != "rotor_spin")
-                raise UserValueError(f"{source}: unknown field {shown(name)}. Choose from: {allowed}.")
+            allowed = [field for field in plant_fields if field != "rotor_spin"]
+            if name not in allowed:
+                raise UserValueError(f"{source}: unknown field {shown(name)}. Choose from: {', '.join(allowed)}.")
             is_one = isinstance(distribution, Mapping) and len(distribution) == 1
             if not (is_one and set(distribution) <= set(_DISTRIBUTIONS)):
                 choices = "; ".join(f"{key}: {numbers}" for key, numbers in _DISTRIBUTIONS.items())
@@ -123,7 +123,6 @@ class DroneRandomization(Disturbance):
                 raise UserValueError(f"{source}: the drones that may be drawn are not all possible: {error}") from error
 
     def start(self, random: Randomness, state: State) -> State:
-        """Draw a drone for each start."""
         drawn = {}
         for name, nominal in self.nominal.items():
             shape = (len(state["position"]), *nominal.shape[-QuadrotorParams.dim(name) :])
@@ -171,17 +170,14 @@ class Wind(Disturbance):
 
     @property
     def noise_size(self) -> int:
-        """Gusts need one number for each axis."""
         return 3 if self.gust else 0
 
     def start(self, random: Randomness, state: State) -> State:
-        """Draw mean winds, and gusts in their steady state."""
         n = len(state["position"])
         mean = random.tensor(self.mean) + random.tensor(self.spread) * random.uniform(n, 3)
         return {"mean_wind": mean, "wind": mean + self.gust * random.normal(n, 3) if self.gust else mean.clone()}
 
     def advance(self, state: State, noise: Tensor | None, dt: float) -> State:
-        """The wind a time dt [s] later."""
         if noise is None:
             return {}
         decay = math.exp(-dt / self.gust_time)
@@ -213,20 +209,16 @@ class Sensors(Disturbance):
 
     @property
     def noise_size(self) -> int:
-        """Three numbers for each of the four measurements."""
         return 12 if any((self.position, self.attitude, self.velocity, self.angular_velocity)) else 0
 
     def start(self, random: Randomness, state: State) -> State:
-        """A queue full of the first measurement."""
         noise = random.normal(len(state["position"]), 12) if self.noise_size else None
         return {"measurements": self._measure(state, noise).expand(-1, self.delay + 1, -1).clone()}
 
     def advance(self, state: State, noise: Tensor | None, dt: float) -> State:
-        """Measure once more, and forget the oldest measurement."""
         return {"measurements": torch.cat((state["measurements"][:, 1:], self._measure(state, noise)), 1)}
 
     def observe(self, state: State) -> State:
-        """The state with the oldest measurement instead of the truth."""
         position, attitude, velocity, angular_velocity = state["measurements"][:, 0].split((3, 4, 3, 3), -1)
         measured = {"position": position, "quaternion": attitude}
         return {**state, **measured, "velocity": velocity, "angular_velocity": angular_velocity}
@@ -265,7 +257,6 @@ class RandomStart(Disturbance):
     angular_velocity: BodyRate = 0.0
 
     def start(self, random: Randomness, state: State) -> State:
-        """Turn and push the starts of a task."""
         n = len(state["position"])
         heading, tilt = math.pi * random.uniform(n, 1), 0.5 * self.tilt * (random.uniform(n, 1) + 1.0)
         zero = torch.zeros_like(tilt)

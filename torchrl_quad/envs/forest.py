@@ -20,7 +20,7 @@ from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenes import ELSEWHERE, MAX_OBSTACLES, Scene, left_out
 from torchrl_quad.envs.terms import norm, outside
 from torchrl_quad.errors import UserTypeError, UserValueError
-from torchrl_quad.options import Size, between, entries
+from torchrl_quad.options import Size, between, checked, entries
 from torchrl_quad.vision import has_way
 
 #: Trees per square metre, and the least gap between two of them [m].
@@ -229,6 +229,7 @@ class ForestEnv(QuadrotorEnv):
         return Markers(progress="distance", success=self.length)
 
 
+@checked
 class Forest(Scene):
     """A random forest on flat ground: a new one in each episode, whose trees keep a gap between each other.
 
@@ -248,8 +249,6 @@ class Forest(Scene):
     Raises:
         ValueError: there are more than 1000 trees; (in use) the drone is as wide as the gap.
     """
-
-    is_drawn_elsewhere = True
 
     def __init__(
         self,

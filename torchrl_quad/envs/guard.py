@@ -27,15 +27,10 @@ MAX_STEPS = 2**31  # since the start of an episode
 
 
 class Guard:
-    """Replaces meaningless states: what is not finite, or beyond the bounds of the model.
+    """Replaces meaningless states, not finite or beyond the model, by a safe one, which names and shapes are read from.
 
     The task's own entries are replaced only where they are out of bounds. Selecting before the physics keeps
     gradients clean: a gradient of zero never meets an infinite derivative.
-
-    Args:
-        safe_state: takes over where a state is meaningless; names and shapes are read from it, too.
-        dynamics: has the bounds of its own entries.
-        task_entries: the names of the task's own entries.
     """
 
     def __init__(self, safe_state: State, dynamics: Dynamics, task_entries: list[Key]) -> None:
@@ -136,18 +131,24 @@ def is_true(flags: Tensor) -> bool:
     return looks_are_free(flags.device) and not is_traced() and bool(flags.all())
 
 
-# -- checks of states and actions --------------------------------------------------------------------------------------
+def read_state(state: Any, safe_state: State, source: str, convert: bool = False) -> State:
+    """The entries of a state (a tensordict), if all are there with the right shape, precision and device.
 
-
-def read_state(state: Any, safe_state: State, source: str) -> State:
-    """The entries of a state (a tensordict), if all are there with the right shape, precision and device."""
-    given = dict(as_tensordict(state, source).items())  # reading all names at once is quicker than one by one
+    With ``convert`` the kind of their numbers must be right, and they become copies of the right precision and device.
+    """
+    if not isinstance(state, TensorDictBase):
+        got = type(state).__name__
+        raise UserValueError(f'{source}: a state is a tensordict, such as env.reset()["state"]; got {got}.')
+    given: Any = dict(state.items())  # reading all names at once is quicker than one by one
     entries: dict[Any, Any] = {
         key: state.get(key, None) if isinstance(key, tuple) else given.get(key) for key in safe_state
     }
     for key, x in entries.items():
         expected = safe_state[key]
-        if x is None or x.shape != expected.shape or x.dtype != expected.dtype or x.device != expected.device:
+        fits = x is not None and x.shape == expected.shape
+        if convert and fits and kind_of(x) == kind_of(expected):
+            entries[key] = x.to(expected, copy=True)
+        elif convert or not fits or x.dtype != expected.dtype or x.device != expected.device:
             raise entry_error(entries, key, safe_state, source)
     return entries
 
@@ -171,15 +172,8 @@ def check_action(action: Tensor | None, example: Tensor) -> None:
 
 
 def check_finite(action: Tensor) -> None:
-    """Check that actions (n, 4), or (n, time, 4) of a horizon, are finite.
-
-    Raises:
-        ValueError: some are not, with their environments and the first step.
-    """
-    if is_traced():
-        return
-    finite = action.isfinite().all(-1)
-    if finite.all():
+    """Check that actions (n, 4), or (n, time, 4) of a horizon, are finite."""
+    if is_traced() or (finite := action.isfinite().all(-1)).all():
         return
     broken = ~finite if action.dim() == 3 else ~finite.unsqueeze(1)
     at = f", first at step {broken.any(0).nonzero()[0].item()} of the rollout" if action.dim() == 3 else ""
@@ -194,14 +188,6 @@ def first_ten(flags: Tensor) -> str:
     """The indices of the first flags (n) that are set, for a message."""
     who = flags.nonzero().flatten().tolist()
     return ", ".join(map(str, who[:10])) + (", ..." if len(who) > 10 else "")
-
-
-def as_tensordict(state: object, source: str) -> Any:
-    """The state, if it is a tensordict."""
-    if isinstance(state, TensorDictBase):
-        return state
-    got = type(state).__name__
-    raise UserValueError(f'{source}: a state is a tensordict, such as env.reset()["state"]; got {got}.')
 
 
 def kind_of(x: Tensor) -> str:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -19,7 +18,6 @@ from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import Real, Share, accepted, between, checked
 from torchrl_quad.vision.primitives import SIZES
 
-MAX_POINTS = 1_000_000  # of an object; no picture shows more
 Length = Annotated[float, between(1e-6, 1e6)]  # [m]
 _COLOR = "written as #rrggbb, such as #c8452f"
 Color = Annotated[Any, accepted(lambda x: isinstance(x, str) and bool(re.fullmatch("#[0-9a-fA-F]{6}", x)), _COLOR)]
@@ -110,29 +108,20 @@ class Shape:
 def as_points(what: str, points: object) -> Tensor:
     """Points (n, 3) as pictures take them: on the CPU, in single precision, without gradient."""
     found = as_numbers(points)
-    if found is None:
-        raise UserValueError(f"{what} must be points (n, 3) [m], got {shown(points)}.")
-    if found.dim() != 2 or found.shape[1] != 3 or not len(found):
-        raise UserValueError(f"{what} must be points (n, 3) [m], got shape {tuple(found.shape)}.")
+    if found is None or found.dim() != 2 or found.shape[1] != 3 or not len(found):
+        got = shown(points) if found is None else f"shape {tuple(found.shape)}"
+        raise UserValueError(f"{what} must be points (n, 3) [m], got {got}.")
     return found
 
 
 def as_numbers(values: Any) -> Tensor | None:
     """A tensor, an array, or a list of numbers, or of any of these, on the CPU, in single precision; None if none."""
-    parts = values[:MAX_POINTS] if isinstance(values, list | tuple) else ()
-    if not all(map(_is_few, (values, *parts))):
-        return None
     try:
-        if parts:
-            values = torch.stack([torch.as_tensor(x).detach().cpu().float() for x in parts])
+        if isinstance(values, list | tuple) and values:
+            values = torch.stack([torch.as_tensor(x).detach().cpu().float() for x in values])
         return torch.as_tensor(values).detach().cpu().float()
     except (TypeError, ValueError, RuntimeError, OverflowError):
         return None
-
-
-def _is_few(values: Any) -> bool:
-    is_one = isinstance(values, Tensor | np.ndarray) or not hasattr(values, "__len__")
-    return is_one or len(values) <= MAX_POINTS
 
 
 def along_the_course(gates: Tensor) -> Tensor:
@@ -213,7 +202,7 @@ class Markers:
         return [x for x in everything if x is not None]
 
 
-def visible_state(state: Mapping[Any, Any]) -> State:
+def visible_state(state: Any) -> State:
     """The entries of a state, nested or not, that pictures show: ``position``, ``quaternion``, ``target`` if it is a
     position, and the random obstacles of a scene."""
     shown: State = {key: state[key] for key in ("position", "quaternion")}

@@ -1,5 +1,6 @@
 """The environment in TorchRL's own hands: under its transforms, losses and collectors, and in several processes."""
 
+import multiprocessing
 import signal
 from functools import partial
 
@@ -45,8 +46,8 @@ from torchrl_quad.envs import TASKS
 FEATURES = ["observation", ("state", "velocity")]
 
 
-def norm(scale=2.0):
-    return ObservationNorm(loc=0.1, scale=scale, in_keys=["observation"], standard_normal=True)
+def norm():
+    return ObservationNorm(loc=0.1, scale=2.0, in_keys=["observation"], standard_normal=True)
 
 
 def frames(**kwargs):
@@ -57,13 +58,6 @@ def tensors():
     return CatTensors(FEATURES, "observation", del_keys=False)
 
 
-# By name: what leaves the policy's input alone, with the factor on the reward, and what does not.
-BESIDE_THE_POLICY = {
-    "step counter": (lambda: [StepCounter()], 1.0),
-    "reward sum": (lambda: [RewardSum()], 1.0),
-    "reward scaling": (lambda: [RewardScaling(0.5, 2.0)], 2.0),
-    "all": (lambda: [StepCounter(max_steps=50), RewardScaling(0.5, 2.0), RewardSum()], 2.0),
-}
 BEFORE_THE_POLICY = {
     "normalised": lambda: [norm()],
     "frames": lambda: [frames()],
@@ -71,7 +65,6 @@ BEFORE_THE_POLICY = {
     "tensors": lambda: [tensors()],
     "all": lambda: [StepCounter(), norm(), tensors(), frames(), RewardScaling(0.5, 2.0), RewardSum()],
 }
-STACKS = {**{name: make for name, (make, _) in BESIDE_THE_POLICY.items()}, **BEFORE_THE_POLICY}
 PRECISION = {"double to float": lambda: [DoubleToFloat()]}
 
 
@@ -115,38 +108,40 @@ def gradient(env, actor):
 
 
 @pytest.fixture
-def deadline():
-    """Processes that do not answer fail the test."""
+def processes():
+    """Other processes begin as copies of one that has imported everything; those that do not answer fail the test."""
 
     def give_up(*_):
         raise TimeoutError("no answer from the other processes in 100 s")
 
+    multiprocessing.set_forkserver_preload(["torchrl.collectors", "torchrl_quad.envs"])
+    multiprocessing.set_start_method("forkserver", force=True)
     signal.signal(signal.SIGALRM, give_up)
     signal.alarm(100)
     yield
     signal.alarm(0)
+    multiprocessing.set_start_method(None, force=True)
 
 
 # -- transforms --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("task", "name"), [("hovering", x) for x in (*STACKS, *PRECISION)] + [(x, "all") for x in TASKS]
+    ("task", "name"), [("hovering", x) for x in (*BEFORE_THE_POLICY, *PRECISION)] + [(x, "all") for x in TASKS]
 )
 def test_specs_hold_under_transforms(task, name):
-    transforms = {**STACKS, **PRECISION}[name]()
+    transforms = {**BEFORE_THE_POLICY, **PRECISION}[name]()
     env = TransformedEnv(make_env(task, num_envs=2, dtype=torch.float64), Compose(*transforms))
     check_env_specs(env, break_when_any_done="both")
 
 
-@pytest.mark.parametrize("name", BESIDE_THE_POLICY)
-def test_transforms_that_the_policy_does_not_see_leave_its_gradient_as_it_is(name):
-    transforms, factor = BESIDE_THE_POLICY[name]
+def test_transforms_that_the_policy_does_not_see_leave_its_gradient_as_it_is():
     plain = make([], seed=1)
     actor = lively(make_actor(plain))
-    expected = factor * gradient(plain, actor)
+    expected = 2.0 * gradient(plain, actor)
     assert expected.norm() > 1e-3
-    torch.testing.assert_close(gradient(make(transforms(), seed=1), actor), expected, rtol=1e-9, atol=1e-12)
+    beside = make([StepCounter(max_steps=50), RewardScaling(0.5, 2.0), RewardSum()], seed=1)
+    torch.testing.assert_close(gradient(beside, actor), expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", BEFORE_THE_POLICY)
@@ -235,51 +230,43 @@ def test_visited_states_restart_what_transforms_remember():
 # -- losses and collectors ---------------------------------------------------------------------------------------------
 
 
-def test_a_collector_and_the_ppo_loss_of_torchrl_train_on_it():
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_a_collector_and_losses_of_torchrl_train_on_it(name):
     env = TransformedEnv(HoveringEnv(num_envs=4, max_episode_steps=8), Compose(StepCounter(), RewardSum()))
-    actor, value = make_actor(env, return_log_prob=True), make_value(env)
-    before = [p.clone() for p in actor.parameters()]
-    loss = ClipPPOLoss(actor, value, entropy_bonus=False)
+    actor = make_actor(env, return_log_prob=name == "ppo")
+    if name == "ppo":
+        value = make_value(env)
+        loss = ClipPPOLoss(actor, value, entropy_bonus=False)
+        advantage = GAE(gamma=0.99, lmbda=0.95, value_network=value, vectorized=False)
+    else:
+        loss = SACLoss(actor, make_qvalue(env), action_spec=env.action_spec_unbatched)
+        loss.make_value_estimator(gamma=0.99)
+        updater = SoftUpdate(loss, tau=0.05)
+        replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=32)
     optimizer = torch.optim.Adam(loss.parameters(), 1e-3)
-    collector = Collector(env, actor, frames_per_batch=40, total_frames=80, auto_register_policy_transforms=True)
+    before = [p.detach().clone() for p in loss.parameters()]
+    sizes = {"frames_per_batch": 40, "total_frames": 80}
+    collector = Collector(env, actor, **sizes, auto_register_policy_transforms=True)
     for data in collector:
         assert data.batch_size == (4, 10)
         assert not data["next", "reward"].requires_grad
-        GAE(gamma=0.99, lmbda=0.95, value_network=value, vectorized=False)(data)
-        out = loss(data)
-        optimizer.zero_grad()
-        (out["loss_objective"] + out["loss_critic"]).backward()
-        assert out["loss_objective"].isfinite() and out["loss_critic"].isfinite()
-        optimizer.step()
-    collector.shutdown()
-    assert any(not torch.equal(p, q) for p, q in zip(actor.parameters(), before, strict=True))
-
-
-def test_a_collector_and_the_sac_loss_of_torchrl_train_on_it():
-    env = TransformedEnv(HoveringEnv(num_envs=4, max_episode_steps=8), Compose(StepCounter(), RewardSum()))
-    actor = make_actor(env)
-    loss = SACLoss(actor, make_qvalue(env), action_spec=env.action_spec_unbatched)
-    loss.make_value_estimator(gamma=0.99)
-    updater = SoftUpdate(loss, tau=0.05)
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=32)
-    optimizer = torch.optim.Adam(loss.parameters(), 1e-3)
-    before = [p.detach().clone() for p in loss.parameters()]
-    sizes = {"frames_per_batch": 40, "total_frames": 80, "init_random_frames": 40}
-    collector = Collector(env, actor, **sizes, auto_register_policy_transforms=True)
-    for data in collector:
-        replay.extend(data.reshape(-1))
+        if name == "ppo":
+            advantage(data)
+        else:
+            replay.extend(data.reshape(-1))
         for _ in range(3):
-            loss_now = total(loss(replay.sample()))
+            loss_now = total(loss(data if name == "ppo" else replay.sample()))
             optimizer.zero_grad()
             loss_now.backward()
             assert loss_now.isfinite()
             optimizer.step()
-            updater.step()
+            if name == "sac":
+                updater.step()
     collector.shutdown()
     assert all(not torch.equal(p, q) for p, q in zip(loss.parameters(), before, strict=True))
 
 
-def test_a_collector_of_several_processes_flies_it(deadline):
+def test_a_collector_of_several_processes_flies_it(processes):
     makers = [partial(HoveringEnv, num_envs=3, max_episode_steps=6, seed=seed) for seed in (0, 1)]
     sizes = {"frames_per_batch": 24, "total_frames": 48}
     collector = MultiCollector(makers, make_actor(makers[0]()), sync=True, **sizes)
@@ -330,7 +317,7 @@ def test_environments_in_one_process_keep_their_gradients():
         BPTTLoss(actor)(rollout)["loss_actor"].backward()
 
 
-def test_environments_in_several_processes_fly_and_the_loss_says_that_they_cut_the_gradient(deadline):
+def test_environments_in_several_processes_fly_and_the_loss_says_that_they_cut_the_gradient(processes):
     env = ParallelEnv(2, partial(HoveringEnv, num_envs=3, max_episode_steps=6))
     try:
         actor, rollout = check_a_batch_of_environments(env)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -108,18 +107,14 @@ class QuadrotorEnv(Task, EnvBase):
         camera: config.CameraOption = None,
     ) -> None:
         if action_delay == 0 and observe_last_action:
-            raise UserValueError(
-                "observe_last_action shows the commands that are on their way; with action_delay=0 there are none."
-            )
+            raise UserValueError("observe_last_action shows commands on their way; with action_delay=0 there are none.")
         # What is built of these is built again on another device.
-        self._build_dynamics = partial(
-            config.build_dynamics, dynamics, control=control, dt=dt, control_dt=control_dt, integrator=integrator
-        )
-        self._build_disturbances = partial(
-            config.build_disturbances, random_start=random_start, randomize=randomize, wind=wind,
-            observation_noise=observation_noise, observation_delay=observation_delay, scene=scene, camera=camera,
-            disturbances=config.as_disturbances(disturbances),
-        )  # fmt: skip
+        self._options: dict[str, Any] = {
+            "dynamics": dynamics, "control": control, "dt": dt, "control_dt": control_dt, "integrator": integrator,
+            "random_start": random_start, "randomize": randomize, "wind": wind, "observation_noise": observation_noise,
+            "observation_delay": observation_delay, "disturbances": config.as_disturbances(disturbances),
+            "scene": scene, "camera": camera,
+        }  # fmt: skip
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.num_envs, self.dtype, self.control_dt, self.action_delay = num_envs, dtype, control_dt, action_delay
         self.max_episode_steps, self.observe_last_action = max_episode_steps, observe_last_action
@@ -155,8 +150,6 @@ class QuadrotorEnv(Task, EnvBase):
             f"control_dt={self.control_dt:g} s, max_episode_steps={self.max_episode_steps}{more}, "
             f"device={self.device}, dtype={self.dtype}, compiled={self.is_compiled})"
         )
-
-    # -- what its users may set and ask --------------------------------------------------------------------------------
 
     @property
     def params(self) -> QuadrotorParams:
@@ -250,15 +243,12 @@ class QuadrotorEnv(Task, EnvBase):
 
     def _place(self, nominal: QuadrotorParams) -> None:
         """Build what holds tensors on the device and in the precision of the environment."""
-        for name, x in self.weights.items():
-            if isinstance(x, Tensor):
-                self.weights = {**self.weights, name: x.reshape(()).to(self.device, self.dtype)}
-        self.dynamics = self._build_dynamics(nominal)
-        self.disturbances = self._build_disturbances(self.dynamics)
+        self.dynamics = config.build_dynamics(nominal, self._options)
+        self.disturbances = config.build_disturbances(self.dynamics, self._options)
         self.randomness = Randomness(self.device, self.dtype)
 
     def _connect(self, safe_state: State, options: dict[str, Any] | None = None) -> None:
-        """Join what belongs together on one device: the step, what runs it, and its random numbers."""
+        """Join what belongs together on one device."""
         self.control_step = ControlStep(self, safe_state)
         self._run(options)
         sizes = {name: x.noise_size for name, x in self.disturbances.items()}
@@ -275,9 +265,9 @@ class QuadrotorEnv(Task, EnvBase):
 
     def reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool | None = None, **options: Any) -> Any:
         """As TorchRL's; of a mask and a state in one tensordict, ``set_state`` says which of them counts."""
-        is_said = set_state is not None or options.get("select_reset_only") or tensordict is None
+        is_said = set_state is not None or options.get("select_reset_only")
         # Of the two TorchRL 0.14 takes the state, and 0.15 the mask.
-        if not is_said and "_reset" in tensordict and "state" in tensordict:
+        if not is_said and tensordict is not None and {"_reset", "state"} <= set(tensordict.keys()):
             raise UserValueError(
                 'reset: the tensordict has a mask in "_reset" and a state. For fresh starts in the environments of the '
                 "mask write env.reset(tensordict, set_state=False); to set them to this state, set_state=True."

@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import torch
 from pydantic import AfterValidator
-from torch import Tensor
 
 from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams
 from torchrl_quad.envs.disturbances import Disturbance, DroneRandomization, RandomStart, Sensors, Wind
@@ -23,9 +22,6 @@ from torchrl_quad.vision import DepthCamera
 MAX_SUBSTEPS = 200  # physics steps of a control step, which take half a second without compilation
 # A larger weight would leave none of the seven digits of single precision to the others.
 Weight = Annotated[float, between(-1e6, 1e6)]
-
-
-# -- types of options --------------------------------------------------------------------------------------------------
 
 
 def _names(keys: Iterable[object]) -> str:
@@ -46,34 +42,23 @@ def _scene(value: Any) -> object:
 
 
 def _weights(weights: object) -> object:
-    if weights is None:
-        return None
-    if not isinstance(weights, Mapping):
+    if not isinstance(weights, Mapping | None):
         raise UserValueError("be a mapping from terms of the reward to numbers")
-    for name, value in weights.items():
-        x = value.detach() if isinstance(value, Tensor) else value
-        if isinstance(x, Tensor) and x.numel() == 1 and not (x.is_complex() or x.dtype == torch.bool):
-            x = x.item()
+    for name, value in (weights or {}).items():
         try:
-            check_value(str(name), x, Weight)
+            check_value(str(name), value, Weight)
         except UserValueError as error:
             raise Explained(str(error)) from None
     return weights
-
-
-def _is_file_or(*kinds: type) -> Callable[[object], bool]:
-    return lambda value: isinstance(value, (str, Path, Mapping, *kinds)) and value != ""
 
 
 FloatType = Annotated[
     Any, accepted(lambda x: x is torch.float32 or x is torch.float64, "torch.float32 or torch.float64")
 ]
 ControlPeriod = Annotated[float, between(1e-6, 1.0)]
+_DRONE = "the name of a preset, the path of a YAML file, a mapping, or QuadrotorParams"
 DroneOption = Annotated[
-    Any,
-    accepted(
-        _is_file_or(QuadrotorParams), "the name of a preset, the path of a YAML file, a mapping, or QuadrotorParams"
-    ),
+    Any, accepted(lambda x: isinstance(x, str | Path | Mapping | QuadrotorParams) and x != "", _DRONE)
 ]
 DynamicsOption = Annotated[Any, AfterValidator(_dynamics)]
 ControlOption = Annotated[
@@ -82,7 +67,10 @@ ControlOption = Annotated[
 NoiseOption = Annotated[Any, buildable(Sensors, "observation_noise")]
 WindOption = Annotated[Any, buildable(Wind, "wind")]
 StartOption = Annotated[Any, buildable(RandomStart, "random_start")]
-RandomizeOption = Annotated[Any, accepted(_is_file_or(type(None)), "a mapping, or the path of a YAML file")]
+RandomizeOption = Annotated[
+    Any,
+    accepted(lambda x: isinstance(x, str | Path | Mapping | None) and x != "", "a mapping, or the path of a YAML file"),
+]
 DisturbancesOption = Annotated[Any, AfterValidator(lambda value: as_disturbances(value) and value)]
 SceneOption = Annotated[Any, AfterValidator(_scene)]
 CameraOption = Annotated[Any, buildable(DepthCamera, "camera")]
@@ -113,65 +101,46 @@ def as_disturbances(value: Any, setting: str = "disturbances") -> list[Disturban
     return built
 
 
-# -- what is built of them ---------------------------------------------------------------------------------------------
-
-
-def build_dynamics(
-    name: str, nominal: QuadrotorParams, *, control: Any, dt: float, control_dt: float, integrator: str
-) -> Dynamics:
-    """The model of the drone.
-
-    Raises:
-        ValueError: the options do not fit each other.
-    """
-    model: Callable[..., Dynamics] = DYNAMICS[name]
+def build_dynamics(nominal: QuadrotorParams, options: Mapping[str, Any]) -> Dynamics:
+    """The model of the drone; a UserValueError says which options do not fit each other."""
+    dt, control_dt, control = options["dt"], options["control_dt"], options["control"]
+    model: Callable[..., Dynamics] = DYNAMICS[options["dynamics"]]
     takes_control = "control" in inspect.signature(model).parameters
     if not takes_control and control != "rates":
         raise UserValueError(
-            f"dynamics={name!r} takes no control: its actions have a meaning of their own. Leave out "
+            f"dynamics={options['dynamics']!r} takes no control: its actions have a meaning of their own. Leave out "
             f"control={shown(control)}."
         )
     substeps = round(control_dt / dt)
-    fits = math.isclose(substeps * dt, control_dt, rel_tol=1e-6)
-    if not (1 <= substeps <= MAX_SUBSTEPS and fits):
+    if not 1 <= substeps <= MAX_SUBSTEPS or not math.isclose(substeps * dt, control_dt, rel_tol=1e-6):
         raise UserValueError(
             f"control_dt must be a whole multiple of dt, at most {MAX_SUBSTEPS} times as long; got {control_dt} and "
             f"{dt}. Try control_dt={min(max(substeps, 1), MAX_SUBSTEPS) * dt:g}."
         )
-    options = {"control": control} if takes_control else {}
-    return model(nominal, dt=dt, substeps=substeps, integrator=integrator, **options)
+    more = {"control": control} if takes_control else {}
+    return model(nominal, dt=dt, substeps=substeps, integrator=options["integrator"], **more)
 
 
-def build_disturbances(
-    dynamics: Dynamics,
-    *,
-    random_start: Any,
-    randomize: Any,
-    wind: Any,
-    observation_noise: Any,
-    observation_delay: int,
-    disturbances: Sequence[Disturbance],
-    scene: Any,
-    camera: Any,
-) -> dict[str, Disturbance]:
+def build_disturbances(dynamics: Dynamics, options: Mapping[str, Any]) -> dict[str, Disturbance]:
     """The disturbances by name, in the order in which they act."""
     chosen: dict[str, Disturbance] = {}
-    if random_start:
-        chosen["random_start"] = build(RandomStart, "random_start", random_start)
-    if randomize:
-        chosen["randomize"] = DroneRandomization(randomize, dynamics.nominal, dynamics.plant_fields)
-    if wind is not None:
-        chosen["wind"] = build(Wind, "wind", wind)
-    sensors = build(Sensors, "observation_noise", observation_noise or {}, delay=observation_delay)
+    if options["random_start"]:
+        chosen["random_start"] = build(RandomStart, "random_start", options["random_start"])
+    if options["randomize"]:
+        chosen["randomize"] = DroneRandomization(options["randomize"], dynamics.nominal, dynamics.plant_fields)
+    if options["wind"] is not None:
+        chosen["wind"] = build(Wind, "wind", options["wind"])
+    noise, delay = options["observation_noise"] or {}, options["observation_delay"]
+    sensors = build(Sensors, "observation_noise", noise, delay=delay)
     if sensors.noise_size or sensors.delay:
         chosen["sensors"] = sensors
-    for disturbance in disturbances:
+    for disturbance in options["disturbances"]:
         chosen[f"{type(disturbance).__name__}_{len(chosen)}"] = disturbance
+    scene, camera = options["scene"], options["camera"]
     if scene is not None or camera is not None:
-        bound = Scene.of({"ground": True} if scene is None else scene).bound(dynamics.nominal)
-        chosen["scene"] = bound
+        chosen["scene"] = scene = Scene.of({"ground": True} if scene is None else scene).bound(dynamics.nominal)
         if camera is not None:
-            chosen["camera"] = MountedCamera(DepthCamera.of(camera), bound)
+            chosen["camera"] = MountedCamera(DepthCamera.of(camera), scene)
     return chosen
 
 
@@ -187,14 +156,11 @@ def full_signature(cls: type, base: type) -> inspect.Signature:
     return inspect.Signature(sorted([*arguments.values(), option], key=lambda x: x.kind))
 
 
-# -- checks that no type can express -----------------------------------------------------------------------------------
-
-
 def known_weights(usual: Mapping[str, Any], weights: Mapping[str, Any]) -> Mapping[str, Any]:
     """The weights of a task's reward terms, with those that are given; a UserValueError names a term it lacks."""
     if unknown := [str(name) for name in weights if name not in usual]:
         raise UserValueError(f"weights: unknown term {_names(unknown)}. Choose from: {_names(usual)}.")
-    return {**usual, **weights}
+    return {**usual, **{name: float(x) for name, x in weights.items()}}
 
 
 def check_params(params: object, num_envs: int) -> None:

@@ -21,7 +21,6 @@ from torchrl_quad.envs.scenes import ELSEWHERE, MAX_OBSTACLES, Scene, left_out
 from torchrl_quad.envs.terms import norm, outside
 from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.options import Size, between, checked, entries
-from torchrl_quad.vision import has_way
 
 #: Trees per square metre, and the least gap between two of them [m].
 DIFFICULTIES = {"easy": (0.04, 1.5), "middle": (0.08, 1.2), "hard": (0.12, 0.9)}
@@ -80,11 +79,8 @@ class ForestEnv(QuadrotorEnv):
         observe_velocity: whether the policy observes its velocity.
         camera: as for :class:`~torchrl_quad.envs.QuadrotorEnv`; a mapping changes the camera of 16 x 12 pixels, 90
             degrees and 10 m. None flies without one.
-        scene: replaces the random forest, as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
+        scene: replaces the random forest, as for :class:`~torchrl_quad.envs.QuadrotorEnv`; see that it leaves a way.
         **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
-
-    Raises:
-        ValueError: the scene leaves no way through.
     """
 
     length, half_width, ceiling = 30.0, 8.0, 4.0  # [m]
@@ -131,19 +127,6 @@ class ForestEnv(QuadrotorEnv):
     def set_up(self) -> None:
         self.centre = self.tensor([0.5 * (self.length - self.before), 0.0, 0.0])
         self.extent = self.tensor([0.5 * (self.length + self.before) + 1.0, self.half_width])
-        fixed, radius, top = self.scene.touchable, self.scene.radius, self.ceiling
-        if not fixed.total:
-            return
-        start = self.tensor([-self.run_up[0], 0.0, self.cruise_height])
-        goal = self.tensor([self.length, 0.0, self.cruise_height])
-        low = self.tensor([-self.before, -self.half_width, radius])
-        high = self.tensor([self.length + 1.0, self.half_width, top])
-        if not has_way(fixed, start, goal, low, high, radius):
-            raise UserValueError(
-                f"{self.scene.source}: the obstacles leave no way from (x, y, z) = (-1, 0, 1.5) to (30, 0, 1.5) m, "
-                f"within {self.half_width:g} m to both sides and below {top:g} m, for a drone of radius {radius:.3g} m."
-                " Take some away, or open a gap."
-            )
 
     def initial_state(self, n: int) -> State:
         across, along, up = self.uniform(3, n, 1)

@@ -100,30 +100,23 @@ class Containment:
         self, state: State, action: Tensor, params: QuadrotorParams
     ) -> tuple[State, Tensor, QuadrotorParams | RawParams]:
         """The same values, whose gradients come back only from meaningful environments."""
-        keys = [key for key, x in state.items() if x.requires_grad]
-        if not (keys or action.requires_grad or params.requires_grad):
-            return state, action, params
-        action, *values = _Contain.apply(self, action, *(state[key] for key in keys))
-        state = {**state, **dict(zip(keys, values, strict=True))}
+        state = {key: self._contained(x) for key, x in state.items()}
         fields = {name: x for name, x in params.fields().items() if x.requires_grad}
-        if not fields:
-            return state, action, params
-        each = (x if x.dim() > params.dim(name) else x.unsqueeze(0) for name, x in fields.items())
-        each = _Contain.apply(self, *(x.expand(len(action), *x.shape[1:]) for x in each))
-        return state, action, RawParams(**{**params.fields(), **dict(zip(fields, each, strict=True))})
+        for name, x in fields.items():
+            each = x if x.dim() > params.dim(name) else x.unsqueeze(0)
+            fields[name] = self._contained(each.expand(len(action), *each.shape[1:]))
+        flown = RawParams(**{**params.fields(), **fields}) if fields else params
+        return state, self._contained(action), flown
 
+    def _contained(self, x: Tensor) -> Tensor:
+        if not x.requires_grad:
+            return x
+        x = x.view_as(x)
+        x.register_hook(self._kept)
+        return x
 
-class _Contain(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, containment: Containment, *values: Tensor) -> tuple[Tensor, ...]:
-        ctx.containment = containment
-        ctx.set_materialize_grads(False)
-        return tuple(x.view_as(x) for x in values)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        keep = ctx.containment.valid.unsqueeze(1)
-        return None, *(None if g is None else torch.where(like(keep, g), g, 0.0) for g in grads)
+    def _kept(self, grad: Tensor | None) -> Tensor | None:
+        return None if grad is None else torch.where(like(self.valid.unsqueeze(1), grad), grad, 0.0)
 
 
 def is_true(flags: Tensor) -> bool:

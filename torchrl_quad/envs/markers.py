@@ -48,16 +48,11 @@ class Shape:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", as_points("Shape: points", self.points))
-        if self.faces is None:
-            return
-        faces, n = as_numbers(self.faces), len(self.points)
-        is_triangles = faces is not None and faces.dim() == 2 and faces.shape[1] == 3
-        if faces is None or not (is_triangles and ((faces >= 0) & (faces < n) & (faces == faces.floor())).all()):
-            got = type(self.faces).__name__ if faces is None else f"shape {tuple(faces.shape)}"
-            raise UserValueError(
-                f"Shape: faces must be indices (m, 3) of its {n} points, three for each triangle; got {got}."
-            )
-        object.__setattr__(self, "faces", faces.long())
+        if self.faces is not None:
+            faces = as_numbers(self.faces)
+            if faces is None or faces.dim() != 2 or faces.shape[1] != 3 or not 0 <= faces.max() < len(self.points):
+                raise UserValueError(f"Shape: faces must be indices (m, 3) of its {len(self.points)} points.")
+            object.__setattr__(self, "faces", faces.long())
 
     @classmethod
     def line(cls, points: object, **style: Any) -> Shape:

@@ -122,15 +122,10 @@ def _path(cls: type) -> str:
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
-def _set_time_limits() -> None:
-    """Give gymnasium's ids of this package the episode lengths, where there is gymnasium."""
-    try:
-        from gymnasium import registry
-    except ModuleNotFoundError:
-        return
-    for name, cls in TASKS.items():
-        if spec := registry.get(f"torchrl_quad/{name.capitalize()}-v0"):
-            spec.max_episode_steps = inspect.signature(cls).parameters["max_episode_steps"].default
-
-
-_set_time_limits()
+try:  # gymnasium's ids of this package get the episode lengths, where there is gymnasium
+    from gymnasium import registry as _ids
+except ModuleNotFoundError:
+    _ids = {}
+for _name, _cls in TASKS.items():
+    if _spec := _ids.get(f"torchrl_quad/{_name.capitalize()}-v0"):
+        _spec.max_episode_steps = inspect.signature(_cls).parameters["max_episode_steps"].default

@@ -124,7 +124,10 @@ class Scene(Disturbance):
         fixed = {kind: like.new_tensor(self.fixed[kind]).reshape(1, -1, size) for kind, size in SIZES.items()}
         own.constants = Primitives(**fixed)
         own.touchable = own.constants._replace(planes=own.constants.planes[:, int(self.ground) :])
-        own.radius = drone_radius(nominal) if self.drone_radius is None else self.drone_radius
+        # As large as propellers can be without touching each other.
+        rotors = nominal.rotor_positions.detach().reshape(-1, 4, 2)[0]
+        reach = (rotors.norm(dim=-1).max() + 0.5 * torch.pdist(rotors).min()).item()
+        own.radius = reach if self.drone_radius is None else self.drone_radius
         return own
 
     def draw(self, random: Randomness, state: State) -> dict[str, Tensor]:
@@ -220,12 +223,6 @@ def left_out(solids: Tensor, who: Tensor) -> Tensor:
     """Solids (n, m, k) that are not planes, those of a mask (n, m) moved out of the way."""
     elsewhere = torch.cat((solids[..., :2], torch.full_like(solids[..., :1], ELSEWHERE), solids[..., 3:]), -1)
     return torch.where(who.unsqueeze(-1), elsewhere, solids)
-
-
-def drone_radius(params: QuadrotorParams) -> float:
-    """The radius of a sphere around a drone and its propellers, as large as they can be without touching [m]."""
-    rotors = params.rotor_positions.detach().reshape(-1, 4, 2)[0]
-    return (rotors.norm(dim=-1).max() + 0.5 * torch.pdist(rotors).min()).item()
 
 
 def _range(kind: str, name: str, value: object, size: int, may_vary: bool) -> tuple[list[float], list[float]]:

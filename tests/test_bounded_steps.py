@@ -6,17 +6,8 @@ from tensordict.nn import TensorDictSequential
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import (
-    ABPTLoss,
-    BPTTLoss,
-    HoveringEnv,
-    SHACLoss,
-    TrustRegion,
-    differentiable_rollout,
-    make_actor,
-    make_qvalue,
-    make_value,
-)
+from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_qvalue, make_value
+from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss, TrustRegion
 from torchrl_quad.objectives.action_gradients import MedianClip, action_gradient, sources_of_steps
 
 LOSSES = {
@@ -160,8 +151,7 @@ def test_what_cannot_be_clipped_is_refused(env):
             BPTTLoss(actor, clip_action_gradient=bad)
     rollout = flight(env, actor)
     loss = BPTTLoss(actor, clip_action_gradient=5.0)
-    square = torch.stack([flight(env, actor, steps=4) for _ in range(4)])
-    for changed in (rollout[:2], square):
+    for changed in (rollout[:2], torch.stack([flight(env, actor, steps=4) for _ in range(4)])):
         with pytest.raises(ValueError, match="needs one rollout as differentiable_rollout returned it, whole"):
             loss.loss_actor(changed)
     with pytest.raises(ValueError, match="BPTTLoss needs a policy as make_actor builds it, .*no 'loc'"):

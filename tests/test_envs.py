@@ -6,7 +6,6 @@ import pickle
 import pytest
 import torch
 from flying import fly, hold, start
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
 
@@ -112,15 +111,6 @@ def test_a_partial_reset_leaves_the_others_alone(env):
     assert all(torch.equal(value, before[key]) for key, value in nobody.items())
 
 
-def test_a_state_that_is_set_goes_on_as_if_it_had_never_stopped(env64):
-    actions = [torch.rand(4, 4, dtype=torch.float64) * 0.4 - 0.5 for _ in range(8)]
-    whole = fly(env64, env64.reset(), actions)
-    middle = TensorDict({"state": whole["next", "state"][:, 3].clone()}, [4])
-    rest = fly(env64, env64.reset(middle, set_state=True), actions[4:])
-    for key, value in rest["next"].items(include_nested=True, leaves_only=True):
-        assert torch.equal(value, whole["next", key][:, 4:]), key
-
-
 @pytest.mark.parametrize("wrap", [False, True])
 def test_resets_draw_from_the_initial_state_source(wrap):
     base = HoveringEnv(num_envs=2, max_episode_steps=3)
@@ -140,13 +130,6 @@ def test_resets_draw_from_the_initial_state_source(wrap):
         assert torch.equal(flight["state", "velocity"][:, t], state["velocity"])
     env.set_initial_state_source(None)
     assert (env.reset()["state", "velocity"] == 0).all()
-
-
-def test_a_drone_may_be_given_by_name_mapping_or_parameters():
-    params = load_drone("crazyflie")
-    mapping = {name: value.squeeze().tolist() for name, value in params.fields().items()}
-    for drone in ("crazyflie", params, mapping):
-        assert HoveringEnv(num_envs=1, drone=drone).params.mass == params.mass
 
 
 @pytest.mark.parametrize("num_envs", [2, 3])

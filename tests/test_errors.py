@@ -7,7 +7,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import StepCounter, TransformedEnv
 
-from torchrl_quad import HoveringEnv, available_tasks, differentiable_rollout, load_drone, make_actor, make_env
+from torchrl_quad import HoveringEnv, differentiable_rollout, load_drone, make_actor, make_env
 from torchrl_quad.envs import Event
 
 nan = float("nan")
@@ -27,22 +27,14 @@ def adding(**entries):
     return lambda self, n: {**HoveringEnv.initial_state(self, n), **entries}
 
 
-# -- options -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("task", "kwargs", "message"),
-    [
+def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them():
+    for task, kwargs, message in (
         ("hovering", {"num_env": 3}, r"HoveringEnv got .* 'num_env'. Did you mean 'num_envs'\? Choose from: "),
-        ("landing", {"max_episode_step": 3}, r"LandingEnv .* Did you mean 'max_episode_steps'\?"),
         ("racing", {"gate_bonsu": "log"}, r"RacingEnv got an unexpected .* 'gate_bonsu'. Did you mean 'gate_bonus'\?"),
-        ("tracking", {"curves": 1}, r"Did you mean 'curve'\? Choose from: action_delay, camera, compile, control,"),
-        ("hovering", {"xyz": 1}, r"argument 'xyz'. Choose from: action_delay, camera, .* seed, weights, wind.$"),
-    ],
-)
-def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them(task, kwargs, message):
-    with pytest.raises(TypeError, match=message):
-        make_env(task, **kwargs)
+        ("tracking", {"xyz": 1}, r"argument 'xyz'. Choose from: action_delay, camera, .*curve.* weights, wind.$"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            make_env(task, **kwargs)
 
 
 @pytest.mark.parametrize(
@@ -65,24 +57,15 @@ def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them(task,
             "the four rotors cannot make thrust and torque about each axis on their own",
         ),
         ({"drone": None}, "drone must be the name of a preset, .* or QuadrotorParams, got None"),
-        ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
         ({"seed": -1}, "seed must be at least 0, got -1"),
         ({"dtype": torch.int32}, "dtype must be torch.float32 or torch.float64"),
         ({"dynamics": "plane"}, r"dynamics must be one of quadrotor, point_mass(, \w+)*, got 'plane'"),
-        ({"action_delay": -1}, "action_delay must be at least 0, got -1. Control steps from a command to its effect"),
         ({"action_delay": 0, "observe_last_action": True}, "with action_delay=0 there are none"),
-        ({"drone": "dji"}, "Unknown drone 'dji'. Choose from"),
     ],
 )
 def test_a_bad_value_is_refused_by_name(kwargs, message):
     with pytest.raises(ValueError, match=message):
         HoveringEnv(**kwargs)
-
-
-def test_an_unknown_task_is_refused_with_the_known_ones():
-    for task in ("hover", None, ["hovering"]):
-        with pytest.raises(ValueError, match=f"Unknown task .*. Choose from: {', '.join(available_tasks())}."):
-            make_env(task)
 
 
 @pytest.mark.parametrize(
@@ -128,11 +111,6 @@ def test_an_event_whose_term_has_a_name_that_is_taken_is_refused():
 def test_parameters_that_do_not_fit_are_refused(env):
     with pytest.raises(TypeError, match="params must be QuadrotorParams, such as env.params.replace.*; got str"):
         env.params = "visfly"
-    with pytest.raises(ValueError, match="field 'mass' is for 3 environments, and num_envs=4"):
-        env.params = visfly.replace(mass=[[0.4]] * 3)
-
-
-# -- actions -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -159,11 +137,8 @@ def test_an_action_of_another_shape_or_kind_is_refused_and_not_broadcast(env, ac
 
 
 def test_a_policy_that_writes_no_action_learns_where_to(env):
-    message = 'The action must have shape .* there is none. A policy writes it under "action", as make_actor'
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match='there is none. A policy writes it under "action", as make_actor.env. does'):
         differentiable_rollout(env, linear(13, 4, out_key="acton"), None, 2)
-    with pytest.raises(ValueError, match=message):
-        env.step(env.reset())
 
 
 def test_an_action_on_another_device_is_refused(env):
@@ -200,9 +175,6 @@ def test_an_action_is_not_looked_at_where_nobody_can(env64, transform):
         assert getattr(torch.func, transform)(reward)(action).isfinite().all()
 
 
-# -- rollouts ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("horizon", [0, 2.5, "long"])
 def test_a_horizon_is_a_number_of_steps(env, horizon):
     with pytest.raises(ValueError, match="horizon must be (at least 1|a whole number), got"):
@@ -219,14 +191,6 @@ def test_an_actor_that_reads_what_nobody_writes_is_refused_with_what_there_is(en
             differentiable_rollout(some, linear(13, 4, in_key=key), None, 2)
     with pytest.raises(ValueError, match="The actor reads 'observation', which is not in the tensordict"):
         differentiable_rollout(env, make_actor(env), env.reset().select("state"), 2)
-
-
-def test_an_error_inside_the_actor_stays_what_it_is(env):
-    def fail(_):
-        raise KeyError("mine")
-
-    with pytest.raises(KeyError, match="mine"):
-        differentiable_rollout(env, TensorDictModule(fail, in_keys=["observation"], out_keys=["action"]), None, 2)
 
 
 def test_a_carry_is_a_tensordict_of_the_environment(env):

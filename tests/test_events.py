@@ -193,9 +193,6 @@ def test_tumbling_and_standing_drones_have_finite_gradients_and_specs_hold(task,
     assert all(x.any() and x.isfinite().all() for x in grads)
 
 
-# -- times -------------------------------------------------------------------------------------------------------------
-
-
 def test_times_have_the_derivatives_of_finite_differences():
     start, end = torch.randn(2, 50, 3, dtype=torch.float64)
     centre = start + 0.7 * (end - start) + 0.02 * torch.randn(50, 3, dtype=torch.float64)
@@ -228,9 +225,6 @@ def test_the_derivative_of_a_grazing_pass_is_bounded_and_those_who_are_inside_or
         inside = start[:, 0] <= 1.0
         assert not time[inside].any() and not any(x[inside].any() for x in grads)
         assert ((time >= 0.0) & (time <= 1.0)).all() and all((x.norm(dim=1) <= 1e4).all() for x in grads)
-
-
-# -- what a later event changes ----------------------------------------------------------------------------------------
 
 
 def test_a_later_event_costs_discount_and_changes_when_the_dense_terms_jump():

@@ -17,7 +17,6 @@ from torchrl_quad.render import animate_flight, canvas, figures, plot_episode, p
         (Metric("episodes solved", "%", 100.0), 1.0, "100 %"),
         (Metric("return"), -23.456, "-23.5"),
         (Metric("return"), 12345.6, "12346"),
-        (Metric("lap time", "s"), torch.nan, "none"),
         (Metric("lap time", "s"), torch.inf, "inf s"),
     ],
 )
@@ -54,9 +53,6 @@ def test_the_markers_of_racing_and_tracking_are_where_their_targets_are():
     assert (torch.cdist(target, tracking.markers().curve).amin(-1) < 0.06).all()  # half of the step between points
     hovering = HoveringEnv(num_envs=2).markers()  # shown where the flight had them
     assert hovering.places is hovering.curve is hovering.gates is None
-
-
-# -- objects -----------------------------------------------------------------------------------------------------------
 
 
 def test_bodies_are_closed_and_have_the_volume_and_the_corners_that_they_should_have():

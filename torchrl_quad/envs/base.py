@@ -226,20 +226,13 @@ class QuadrotorEnv(Task, EnvBase):
         return self
 
     def render(self, drones: Sequence[int] | None = None, *, size: int = 336) -> Any:
-        """Draw the drones as the last reset, step or rollout left them; TorchRL's ``PixelRenderTransform`` calls it.
+        """Draw drones as the last reset, step or rollout left them; TorchRL's ``PixelRenderTransform`` calls it.
 
-        Args:
-            drones: indices of those to draw; by default the first six.
-            size: width and height [pixels] of the picture, a numpy array (size, size, 3) of uint8.
-
-        Raises:
-            ValueError: there is no state yet, as before the first reset; or an argument is out of its range.
+        The indices are by default the first six. The picture is a numpy array (size, size, 3) of uint8.
         """
         from torchrl_quad.render.video import draw_frame  # matplotlib is needed only here
 
         return draw_frame(self, drones, size)
-
-    # -- TorchRL's side ------------------------------------------------------------------------------------------------
 
     def _place(self, nominal: QuadrotorParams) -> None:
         """Build what holds tensors on the device and in the precision of the environment."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,13 +24,9 @@ MAX_SUBSTEPS = 200  # physics steps of a control step, which take half a second 
 Weight = Annotated[float, between(-1e6, 1e6)]
 
 
-def _names(keys: Iterable[object]) -> str:
-    return ", ".join(map(str, keys))
-
-
 def _dynamics(value: object) -> object:
     if not (isinstance(value, str) and value in DYNAMICS):  # users add to DYNAMICS
-        raise UserValueError(f"be one of {_names(DYNAMICS)}")
+        raise UserValueError(f"be one of {', '.join(DYNAMICS)}")
     return value
 
 
@@ -159,7 +155,7 @@ def full_signature(cls: type, base: type) -> inspect.Signature:
 def known_weights(usual: Mapping[str, Any], weights: Mapping[str, Any]) -> Mapping[str, Any]:
     """The weights of a task's reward terms, with those that are given; a UserValueError names a term it lacks."""
     if unknown := [str(name) for name in weights if name not in usual]:
-        raise UserValueError(f"weights: unknown term {_names(unknown)}. Choose from: {_names(usual)}.")
+        raise UserValueError(f"weights: unknown term {', '.join(unknown)}. Choose from: {', '.join(usual)}.")
     return {**usual, **{name: float(x) for name, x in weights.items()}}
 
 

@@ -29,12 +29,7 @@ MAX_WIND = 100.0  # [m/s]
 Speed = Annotated[float, between(0.0, MAX_SPEED)]
 BodyRate = Annotated[float, between(0.0, MAX_ANGULAR_VELOCITY)]
 Angle = Annotated[float, between(0.0, math.pi)]
-PositionNoise = Annotated[float, between(0.0, 100.0)]
-Speeds = Annotated[Sequence[Annotated[float, between(-MAX_WIND, MAX_WIND)]], entries(3, 3)]
-Spreads = Annotated[Sequence[Annotated[float, between(0.0, MAX_WIND)]], entries(3, 3)]
 _PAIR = Annotated[Sequence[Annotated[float, between(-1e6, 1e6)]], entries(2, 2)]
-Gust = Annotated[float, between(0.0, 0.2 * MAX_WIND)]
-GustTime = Annotated[float, between(1e-3, 1e6)]
 
 
 class Disturbance:
@@ -155,10 +150,10 @@ class Wind(Disturbance):
         gust_time: the time after which a gust has decayed to 1/e, 0.001 to 1e6 s.
     """
 
-    mean: Speeds = (0.0, 0.0, 0.0)
-    spread: Spreads = (0.0, 0.0, 0.0)
-    gust: Gust = 0.0
-    gust_time: GustTime = 1.0
+    mean: Annotated[Sequence[Annotated[float, between(-MAX_WIND, MAX_WIND)]], entries(3, 3)] = (0.0, 0.0, 0.0)
+    spread: Annotated[Sequence[Annotated[float, between(0.0, MAX_WIND)]], entries(3, 3)] = (0.0, 0.0, 0.0)
+    gust: Annotated[float, between(0.0, 0.2 * MAX_WIND)] = 0.0
+    gust_time: Annotated[float, between(1e-3, 1e6)] = 1.0
 
     def __post_init__(self) -> None:
         strongest = max(abs(m) + s for m, s in zip(self.mean, self.spread, strict=True)) + 5.0 * self.gust
@@ -201,7 +196,7 @@ class Sensors(Disturbance):
         delay: control steps by which the readings lag behind, 0 to 1000.
     """
 
-    position: PositionNoise = 0.0
+    position: Annotated[float, between(0.0, 100.0)] = 0.0
     attitude: Angle = 0.0
     velocity: Speed = 0.0
     angular_velocity: BodyRate = 0.0

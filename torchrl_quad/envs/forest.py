@@ -29,8 +29,6 @@ PLACES = 12  # that are tried for a tree before it is left out
 Density = Annotated[float, between(0.0, 2.0)]
 Gap = Annotated[float, between(0.1, 10.0)]
 Length = Annotated[float, between(1.0, 1_000.0)]
-Radii = Annotated[Sequence[Annotated[float, between(0.01, 10.0)]], entries(2, 2)]
-Height = Annotated[float, between(0.1, 100.0)]
 Speed = Annotated[float, between(0.1, 30.0)]
 Speeds = Annotated[Sequence[Speed], entries(2, 2)]
 
@@ -221,16 +219,12 @@ class Forest(Scene):
     so enclose nothing: there is a way through.
 
     Args:
-        density: trees per square metre, 0 to 2.
-        gap: the least distance between the surfaces of two trees, 0.1 to 10 m.
-        length: of the forest, along x from 0, 1 to 1000 m.
-        half_width: to both sides of y = 0, 1 to 1000 m.
+        density: trees per square metre, 0 to 2; at most 1000 in all.
+        gap: the least distance between the surfaces of two trees, 0.1 to 10 m, more than the drone's diameter.
+        length, half_width: of the forest, along x from 0, and to both sides of y = 0, 1 to 1000 m.
         radius: the least and the greatest radius of a tree, 0.01 to 10 m.
         height: of all trees, 0.1 to 100 m.
         **options: as for :class:`~torchrl_quad.Scene`, but for ground and source.
-
-    Raises:
-        ValueError: there are more than 1000 trees; (in use) the drone is as wide as the gap.
     """
 
     def __init__(
@@ -240,8 +234,8 @@ class Forest(Scene):
         length: Length = 30.0,
         half_width: Length = 8.0,
         *,
-        radius: Radii = (0.1, 0.4),
-        height: Height = 6.0,
+        radius: Annotated[Sequence[Annotated[float, between(0.01, 10.0)]], entries(2, 2)] = (0.1, 0.4),
+        height: Annotated[float, between(0.1, 100.0)] = 6.0,
         **options: Any,
     ) -> None:
         if radius[0] > radius[1]:

@@ -148,15 +148,15 @@ def read_state(state: Any, safe_state: State, source: str, convert: bool = False
 
 def check_action(action: Tensor | None, example: Tensor) -> None:
     """Check that an action is (n, 4), of the precision and on the device of an example (n, ...)."""
-    n, dtype, device = len(example), example.dtype, example.device
+    n, dtype = len(example), example.dtype
     if action is None or action.shape != (n, 4):
         got = "there is none" if action is None else f"got {tuple(action.shape)}"
         raise UserValueError(
-            f"The action must have shape ({n}, 4), named in env.action_units, for each environment; {got}. A "
-            'policy writes it under "action", as make_actor(env) does.'
+            f"The action must have shape ({n}, 4), named in env.action_units, for each environment; {got}. A policy "
+            'writes it under "action", as make_actor(env) does.'
         )
-    if action.device != device:
-        raise UserValueError(f"The action is on {action.device}, and the environment on {device}.")
+    if action.device != example.device:
+        raise UserValueError(f"The action is on {action.device}, and the environment on {example.device}.")
     if action.dtype != dtype:
         raise UserValueError(
             f"The action is {action.dtype}, and the environment flies in {dtype}. Convert the policy, "

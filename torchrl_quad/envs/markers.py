@@ -31,20 +31,13 @@ class Shape:
 
     The class methods make the usual ones. ``Shape(points, faces)`` takes any mesh, such as
     ``Shape(mesh.vertices, mesh.faces)`` of trimesh.
-
-    Args:
-        points: (n, 3) [m], world frame; a line has a gap where a point is NaN.
-        faces: the corners of triangles, as indices of points (m, 3); None for a line.
-        name: of the object in the legend.
-        color: of lines and surfaces.
-        opacity: of a surface, above 0, at most 1.
     """
 
-    points: Any  # a tensor, once it is built
-    faces: Any = None
-    name: str = ""
-    color: Color = "#6b7a90"
-    opacity: Share = 0.35
+    points: Any  #: (n, 3) [m], world frame; a line has a gap where a point is NaN
+    faces: Any = None  #: the corners of triangles, as indices of points (m, 3); None for a line
+    name: str = ""  #: in the legend
+    color: Color = "#6b7a90"  #: of lines and surfaces
+    opacity: Share = 0.35  #: of a surface, above 0, at most 1
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", as_points("Shape: points", self.points))
@@ -146,28 +139,17 @@ class Markers:
 
     Without places, a curve, or gates that are the targets, pictures also show where the entry ``target`` (num_envs, 3)
     of the state has been in the flight.
-
-    Args:
-        target: the name of the target, as in "distance to the target".
-        places: targets that do not move (k, 3).
-        curve: a line (m, 3) along which the target moves.
-        gates: centres of gates (k, 3), in the order of flight.
-        gate_radius: of all gates, or of each (k) [m].
-        gate_axes: the direction (k, 3) in which each gate is flown; by default along the course.
-        shapes: other objects.
-        progress: the metric that best shows how a flight goes; by default the distance to the target.
-        success: the value of the progress, in SI units, from which a state fulfils the task.
     """
 
-    target: str = "target"
-    places: Tensor | None = None
-    curve: Tensor | None = None
-    gates: Tensor | None = None
-    gate_radius: float | Tensor = 0.3
-    gate_axes: Tensor | None = None
-    shapes: Sequence[Shape] = ()
-    progress: str | None = None
-    success: Real | None = None
+    target: str = "target"  #: the name of the target, as in "distance to the target"
+    places: Tensor | None = None  #: targets that do not move (k, 3)
+    curve: Tensor | None = None  #: a line (m, 3) along which the target moves
+    gates: Tensor | None = None  #: centres of gates (k, 3), in the order of flight
+    gate_radius: float | Tensor = 0.3  #: of all gates, or of each (k) [m]
+    gate_axes: Tensor | None = None  #: the direction (k, 3) in which each gate is flown; by default along the course
+    shapes: Sequence[Shape] = ()  #: other objects
+    progress: str | None = None  #: the metric that best shows how a flight goes; None for the distance to the target
+    success: Real | None = None  #: the value of the progress, in SI units, from which a state fulfils the task
 
     def __post_init__(self) -> None:
         for name in ("places", "curve", "gates", "gate_axes"):

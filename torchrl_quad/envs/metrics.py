@@ -19,22 +19,14 @@ class Metric:
     """How a metric is averaged over episodes, printed, and drawn.
 
     Values themselves are in SI units everywhere; only print and pictures use ``scale`` and ``unit``.
-
-    Args:
-        label: its name in prose, such as "position error".
-        unit: in print, such as "cm".
-        scale: how many of these units make one SI unit, 100 for cm.
-        median: whether its average is the median instead of the mean, which a few crashes would dominate.
-        log: whether it is drawn on a logarithmic axis.
-        goal: "max" if more is better, "min" if less is; wandb keeps the best value of such a metric.
     """
 
-    label: str
-    unit: str = ""
-    scale: Scale = 1.0
-    median: bool = False
-    log: bool = False
-    goal: Literal["max", "min"] | None = None
+    label: str  #: its name in prose, such as "position error"
+    unit: str = ""  #: in print, such as "cm"
+    scale: Scale = 1.0  #: how many of these units make one SI unit, 100 for cm
+    median: bool = False  #: whether its average is the median instead of the mean, which a few crashes would dominate
+    log: bool = False  #: whether it is drawn on a logarithmic axis
+    goal: Literal["max", "min"] | None = None  #: whether more or less is better; wandb keeps the best value
 
     @property
     def is_length(self) -> bool:

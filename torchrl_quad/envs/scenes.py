@@ -30,8 +30,6 @@ SMALLEST = 1e-3  # [m], of an obstacle: what single precision resolves at a dist
 TOLERANCE = 1e-3  # [m], by which a state may lie nearer to an obstacle than a flight would have left it
 Obstacles = Sequence[Mapping[str, Any]]
 Count = Annotated[int, between(1, MAX_OBSTACLES)]
-Clearance = Annotated[float, between(0.0, 100.0)]
-Radius = Annotated[float, between(1e-3, 10.0)]
 
 # The fields of an obstacle by kind, with the number of their entries; the first is where it stands.
 _FIELDS = {
@@ -92,8 +90,8 @@ class Scene(Disturbance):
         cylinders: Obstacles = (),
         boxes: Obstacles = (),
         walls: Obstacles = (),
-        clearance: Clearance = 0.3,
-        drone_radius: Radius | None = None,
+        clearance: Annotated[float, between(0.0, 100.0)] = 0.3,
+        drone_radius: Annotated[float, between(1e-3, 10.0)] | None = None,
         source: str = "scene",
     ) -> None:
         self.source, self.ground, self.clearance, self.drone_radius = source, ground, clearance, drone_radius

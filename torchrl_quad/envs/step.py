@@ -149,10 +149,7 @@ class ControlStep:
     def restore(self, state: object, source: str, mask: Tensor | None = None) -> State:
         """A copy of a state to fly from, in the precision and on the device of the environment, if it can fly.
 
-        Args:
-            state: a tensordict with all entries of the state.
-            source: where the state comes from, for messages.
-            mask: which environments it is for, bool (n) or (n, 1); all for None. The others may hold anything.
+        The mask, bool (n) or (n, 1), says which environments it is for: the others may hold anything.
         """
         entries = guard.read_state(state, self.safe_state, source, convert=True)
         if is_traced():

@@ -41,7 +41,6 @@ CURVES: dict[str, tuple[Curve, float]] = {  # by name: the curve, and its period
 }
 _CURVE = f"one of {', '.join(CURVES)}, or a function from phases (*) [rad] to positions (*, 3) [m]"
 CurveOption = Annotated[Any, accepted(lambda x: callable(x) or (isinstance(x, str) and x in CURVES), _CURVE)]
-Period = Annotated[float, between(0.1, 10_000.0)]
 
 
 class TrackingEnv(QuadrotorEnv):
@@ -101,7 +100,7 @@ class TrackingEnv(QuadrotorEnv):
         num_envs: Size = 64,
         *,
         curve: CurveOption = "slow_circle",
-        period: Period | None = None,
+        period: Annotated[float, between(0.1, 10_000.0)] | None = None,
         max_episode_steps: Size = 512,
         **kwargs: Any,
     ) -> None:

@@ -30,14 +30,14 @@ class Shape:
     """An object that does not move: an obstacle, a wall, a path. Figures, films and replays draw it.
 
     The class methods make the usual ones. ``Shape(points, faces)`` takes any mesh, such as
-    ``Shape(mesh.vertices, mesh.faces)`` of trimesh.
+    ``Shape(mesh.vertices, mesh.faces)`` of trimesh. The opacity is that of a surface, above 0, at most 1.
     """
 
     points: Any  #: (n, 3) [m], world frame; a line has a gap where a point is NaN
     faces: Any = None  #: the corners of triangles, as indices of points (m, 3); None for a line
     name: str = ""  #: in the legend
-    color: Color = "#6b7a90"  #: of lines and surfaces
-    opacity: Share = 0.35  #: of a surface, above 0, at most 1
+    color: Color = "#6b7a90"  # of lines and surfaces
+    opacity: Share = 0.35  # of a surface, above 0, at most 1
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", as_points("Shape: points", self.points))
@@ -138,7 +138,8 @@ class Markers:
     """What pictures show in addition to the drones; positions are in m, in the world frame.
 
     Without places, a curve, or gates that are the targets, pictures also show where the entry ``target`` (num_envs, 3)
-    of the state has been in the flight.
+    of the state has been in the flight. ``success`` is the value of the progress, in SI units, from which a state
+    fulfils the task.
     """
 
     target: str = "target"  #: the name of the target, as in "distance to the target"
@@ -149,7 +150,7 @@ class Markers:
     gate_axes: Tensor | None = None  #: the direction (k, 3) in which each gate is flown; by default along the course
     shapes: Sequence[Shape] = ()  #: other objects
     progress: str | None = None  #: the metric that best shows how a flight goes; None for the distance to the target
-    success: Real | None = None  #: the value of the progress, in SI units, from which a state fulfils the task
+    success: Real | None = None  # the value of the progress, in SI units, from which a state fulfils the task
 
     def __post_init__(self) -> None:
         for name in ("places", "curve", "gates", "gate_axes"):

@@ -18,12 +18,13 @@ from torchrl_quad.options import Scale, checked
 class Metric:
     """How a metric is averaged over episodes, printed, and drawn.
 
-    Values themselves are in SI units everywhere; only print and pictures use ``scale`` and ``unit``.
+    Values themselves are in SI units everywhere; only print and pictures use ``unit``, and ``scale``, how many
+    of these units make one SI unit.
     """
 
     label: str  #: its name in prose, such as "position error"
     unit: str = ""  #: in print, such as "cm"
-    scale: Scale = 1.0  #: how many of these units make one SI unit, 100 for cm
+    scale: Scale = 1.0  # how many of these units make one SI unit, 100 for cm
     median: bool = False  #: whether its average is the median instead of the mean, which a few crashes would dominate
     log: bool = False  #: whether it is drawn on a logarithmic axis
     goal: Literal["max", "min"] | None = None  #: whether more or less is better; wandb keeps the best value

@@ -181,15 +181,11 @@ def test_a_fixed_scene_comes_from_a_file_and_stands_in_no_state(tmp_path):
     assert nearest(solids, torch.tensor([[7.0, 5.0, 4.0]]))[0].item() == pytest.approx(1.0)
 
 
-BLOCK = {"boxes": [{"centre": [10.0, 0.0, 2.0], "size": [1.0, 16.0, 4.0]}]}
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: HoveringEnv(scene={"spheres": [{"centre": [1, 0, 1.5], "radius": 1.0}]}), "drones would start there"),
         (lambda: HoveringEnv(camera={"position": (0.5, 0, 0)}), "the camera could be inside an obstacle"),
-        (lambda: ForestEnv(scene=BLOCK), "the obstacles leave no way from"),
         (lambda: ForestEnv(gap=0.2), "does not fit through gaps of 0.2 m"),
         (lambda: ForestEnv(density=10.0), "density must be at most 2, got 10.0"),
         (lambda: ForestEnv(speed=(5.0, 2.0)), "speed must be one speed"),

@@ -5,7 +5,6 @@ import json
 import math
 import re
 import sys
-from importlib.metadata import EntryPoint
 
 import gymnasium
 import pytest
@@ -29,9 +28,6 @@ def forget(monkeypatch):
     monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
     monkeypatch.setattr(gymnasium, "registry", gymnasium.envs.registration.registry)
     monkeypatch.setattr(ConfigStore.instance(), "repo", dict(ConfigStore.instance().repo))
-    registry._offered.cache_clear()
-    yield
-    registry._offered.cache_clear()
 
 
 def test_one_line_makes_a_task_known_to_make_env_and_to_gymnasium():
@@ -42,17 +38,6 @@ def test_one_line_makes_a_task_known_to_make_env_and_to_gymnasium():
     drones = gymnasium.make_vec("torchrl_quad/FlyToCorner-v0", num_envs=2, reach=0.1)
     assert drones.reset(seed=0)[0].shape == (2, 13)
     assert type(make_env("own_task.CornerEnv", num_envs=2)) is CornerEnv  # without any name
-
-
-def test_packages_offer_tasks_by_entry_points(monkeypatch):
-    offers = [("corner", "own_task:CornerEnv"), ("norm", "own_task:norm"), ("two", "a:b"), ("two", "c:d")]
-    points = [EntryPoint(name, value, "torchrl_quad.tasks") for name, value in offers]
-    monkeypatch.setattr(registry, "entry_points", lambda group: points if group == "torchrl_quad.tasks" else [])
-    assert type(make_env("corner", num_envs=2)) is CornerEnv and "corner" in available_tasks()
-    with pytest.raises(TypeError, match="The entry point norm = 'own_task:norm': a task is a subclass of QuadrotorEnv"):
-        make_env("norm")
-    with pytest.raises(ValueError, match="Several packages offer a task 'two': a:b, c:d. Remove all but one."):
-        make_env("two")
 
 
 class UnfinishedEnv(QuadrotorEnv):

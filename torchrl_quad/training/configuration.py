@@ -21,11 +21,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_quad import BPTTLoss, QuadrotorEnv, available_tasks
 from torchrl_quad.envs import TASKS, task_class
+from torchrl_quad.envs.config import as_disturbances
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.registry import imported
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.objectives import PathwiseLoss
-from torchrl_quad.options import build
 
 CONFIG = Path(__file__).parent / "config"  # in the repository a link to recipes/config
 SET_BY_RECIPES = ("num_envs", "device", "seed", "compile")  # settings outside ``env``
@@ -99,13 +99,7 @@ def own_loss(path: Any, kind: type) -> type:
 
 def own_disturbances(specs: Sequence[str | Mapping[str, Any]] | None) -> list[Disturbance] | None:
     """The disturbances that ``env.disturbances`` names: paths, or mappings with ``_target_`` and arguments."""
-    if specs is None:
-        return None
-    found, setting = [], "env.disturbances"
-    for spec in specs:
-        options: dict[str, Any] = {"_target_": spec} if isinstance(spec, str) else dict(spec)
-        found.append(build(own_class(options.pop("_target_", None), Disturbance, setting), setting, options))
-    return found
+    return None if specs is None else as_disturbances(specs, "env.disturbances")
 
 
 def named_code(values: Any) -> list[str]:

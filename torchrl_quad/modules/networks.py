@@ -26,15 +26,14 @@ MOST_WEIGHTS = 100_000_000  # of a network
 
 
 def _pointwise(activation: Any) -> Any:
-    if isinstance(activation, type) and issubclass(activation, nn.Module):
-        x = torch.zeros(2, 3)
-        try:
-            with torch.random.fork_rng(devices=[]):
-                if activation()(x).shape == x.shape:
-                    return activation
-        except Exception:  # classes that are no activations raise anything
-            pass
-    raise UserValueError("be a class of activations of torch.nn without arguments, such as torch.nn.ELU")
+    try:
+        with torch.random.fork_rng(devices=[]):
+            fits = issubclass(activation, nn.Module) and activation()(torch.zeros(2, 3)).shape == (2, 3)
+    except Exception:  # what is no activation raises anything
+        fits = False
+    if not fits:
+        raise UserValueError("be a class of activations of torch.nn without arguments, such as torch.nn.ELU")
+    return activation
 
 
 Actor = TypeVar("Actor", bound=TanhGaussianActor)
@@ -69,16 +68,15 @@ def make_actor(
         activation: of the hidden layers; smooth ones give smooth policy gradients.
         input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``. What the tasks observe
             is of one to ten; entries of the state may be far larger.
-        action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``,
-            averaged over environments, if there is one (see :mod:`torchrl_quad.data`; a drone's is to hover), and the
-            middle of the range otherwise.
+        action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``
+            (see :mod:`torchrl_quad.data`; a drone's is to hover), or the middle of the range.
         scale_init: the standard deviation of the policy's noise at the start, before the tanh, in units of half the
             range. Training brings it down to 0.01 at least, or to a tenth of this.
         learn_scale: whether this noise changes with the state and in training. Otherwise neither a gradient through the
             simulator nor a KL bound takes the exploration away.
-        noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise. Correlated noise moves a
-            drone where independent noise averages out; try 0.9 at 50 Hz. Then loc, scale and the log-probability are
-            those of the action given the noise of the step before, ``noise_before``; ``noise`` is that of the step.
+        noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise, which averages out; try 0.9
+            at 50 Hz. Then loc, scale and the log-probability are those of the action given ``noise_before``, that of
+            the step before; ``noise`` is that of the step.
         return_log_prob: whether it also writes the log-probability of the action, which an entropy bonus and PPO need.
             mu then stays between -5 and 5: further out, rounding of the action determines the log-probability.
 
@@ -148,9 +146,8 @@ def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[B
         raise UserValueError(f"{name} needs an action with bounds, a Bounded spec; got {type(spec).__name__}.")
     if len(spec.shape) != 1:
         raise UserValueError(
-            f"{name} writes one action (k) for each environment, and here it has shape {tuple(spec.shape)}: a "
-            "transform such as MultiAction asks for several actions at once. Leave it out. To hold each action longer, "
-            "give the environment a longer control step, control_dt=0.04."
+            f"{name} writes one action (k) for each environment, and here it has shape {tuple(spec.shape)}: leave out "
+            "transforms such as MultiAction. To hold each action longer, give the environment control_dt=0.04."
         )
     low, high = spec.low, spec.high
     middle = 0.5 * (low + high)

@@ -148,10 +148,9 @@ class VisualActor(TanhGaussianActor):
         """Write loc, scale and action, the memory, correlated noise, and the log-probability if wanted."""
         if "is_init" in self.in_keys and "is_init" not in tensordict:
             raise UserValueError(
-                "A policy with memory reads 'is_init', which says where episodes begin. Fly it by "
-                "differentiable_rollout, or by env.rollout(..., break_when_any_done=False), on an environment without "
-                "transforms; or give the environment TorchRL's: TransformedEnv(env, Compose(InitTracker(), "
-                "actor.make_tensordict_primer()))."
+                "A policy with memory reads 'is_init', which says where episodes begin. Fly an environment without "
+                "transforms by differentiable_rollout, or give it TorchRL's: "
+                "TransformedEnv(env, Compose(InitTracker(), actor.make_tensordict_primer()))."
             )
         return super().forward(tensordict, **kwargs)
 

@@ -74,11 +74,6 @@ class AHACLoss(SHACLoss):
             raise UserValueError(f"horizon={horizon} must lie between min_horizon={low} and max_horizon={high}.")
         options = with_fixed(self, kwargs, target_bootstrap=False, delay_value=False)
         super().__init__(actor_network, value_network, num_value_nets=num_value_nets, **options)
-        if not {"loc", "scale"} <= set(self.actor_network.out_keys):
-            raise UserValueError(
-                "AHACLoss needs a policy as make_actor builds it, which writes loc and scale; this one writes "
-                f"{', '.join(map(str, self.actor_network.out_keys))}."
-            )
         self.min_horizon, self.max_horizon = low, high
         self.max_stiffness, self.horizon_lr = max_stiffness, horizon_lr
         number = {"device": self._default_device, "dtype": torch.float64}

@@ -70,10 +70,7 @@ class HybridLoss(SHACLoss):
 
     @dataclass
     class _AcceptedKeys(SHACLoss._AcceptedKeys):
-        """As for SHAC, and the keys of what :meth:`HybridLoss.write_targets` writes.
-
-        ``advantage`` is A' and ``location_gradient`` b p, both divided by the standard deviation of A; ``latent`` is u.
-        """
+        """``advantage`` is A' and ``location_gradient`` b p, both divided by the deviation of A; ``latent`` is u."""
 
         advantage: NestedKey = "advantage"
         location_gradient: NestedKey = "location_gradient"
@@ -188,7 +185,6 @@ class HybridLoss(SHACLoss):
         return grad if self.clip is None else self.clip(grad)[0]
 
     def _in_location(self, data: TensorDictBase, grad: Tensor) -> tuple[Tensor, Tensor]:
-        """The gradient in the mean before the tanh, from that in the action, and the action before the tanh."""
         with self.actor_network_params.to_module(self.actor_network):
             plain = plain_of(self.actor_network)
             xi = plain.drawn_again(data)[:, : plain.size].view_as(grad)

@@ -43,14 +43,14 @@ class AHACLoss(SHACLoss):
         loss.adapt_horizon(losses["stiffness"])
 
     Args:
-        actor_network, value_network: as for :class:`SHACLoss`; the policy is one of :func:`~torchrl_quad.make_actor`.
+        actor_network: the policy that flew the rollout, as :func:`~torchrl_quad.make_actor` builds it.
         horizon: control steps of the first rollout.
         min_horizon: the shortest horizon; null for a quarter of the first.
         max_horizon: the longest horizon; null for twice the first.
         max_stiffness: the bound on the growth of action gradients along a horizon, beyond which it gets shorter; 1.5 to
             5 are usual.
         horizon_lr: the share by which the horizon may change in an iteration.
-        num_value_nets, **kwargs: as for :class:`SHACLoss`.
+        **kwargs: as for :class:`SHACLoss`.
     """
 
     measured_of_actions = ["stiffness"]

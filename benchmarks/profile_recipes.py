@@ -82,7 +82,7 @@ def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) ->
     clocks.around(objectives.PathwiseLoss, "loss_actor", "loss")
     for loss, name in ((objectives.ABPTLoss, "loss_qvalue"), (objectives.SHACLoss, "loss_value")):
         clocks.around(loss, name, "critic")
-    clocks.around(objectives.critic.PathwiseCriticLoss, "write_value_target", "critic")
+    clocks.around(objectives.PathwiseCriticLoss, "write_value_target", "critic")
     clocks.around(torch.optim.Adam, "step", "optimiser")
     clocks.around(torch.nn.utils, "clip_grad_norm_", "optimiser")
     clocks.around(building, "update_normalizer", "bookkeeping")

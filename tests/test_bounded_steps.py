@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_qvalue, make_value
 from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss, TrustRegion
-from torchrl_quad.objectives.action_gradients import MedianClip, action_gradient, sources_of_steps
+from torchrl_quad.objectives.calls import MedianClip, action_gradient, sources_of_steps
 
 LOSSES = {
     "bptt": lambda env, actor, **options: BPTTLoss(actor, **options),

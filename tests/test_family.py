@@ -118,13 +118,9 @@ def test_the_horizon_gets_shorter_where_the_dynamics_are_stiff_and_longer_where_
     again = make_ahac(horizon=32)
     again.load_state_dict(loss.state_dict())
     assert again.horizon == 64 and again.multiplier == loss.multiplier
-
-
-def test_the_adapted_horizon_settles_where_the_stiffness_meets_its_bound():
-    loss = make_ahac(horizon=16, max_horizon=256)
     for _ in range(200):
-        loss.adapt_horizon((0.02 * loss.length).float())  # a stiffness of 2 at 100 steps
-    assert loss.length.item() == pytest.approx(100, rel=1e-3)
+        again.adapt_horizon((0.04 * again.length).float())  # a stiffness of 2 at 50 steps
+    assert again.length.item() == pytest.approx(50, rel=1e-3)
 
 
 def test_the_stiffness_is_the_root_mean_square_of_the_action_gradients_in_medians():
@@ -149,11 +145,6 @@ def test_ahac_learns_what_shac_does_from_the_least_of_its_critics(env64):
     torch.testing.assert_close(*grads)
     with torch.no_grad():
         assert ahac.loss_actor(rollout)[1]["stiffness"].isnan()
-
-
-def test_ahac_needs_a_policy_of_make_actor():
-    with pytest.raises(ValueError, match="as make_actor builds it, which writes loc and scale; this one writes action"):
-        AHACLoss(*make_networks()[:2])
 
 
 # -- ABPT --------------------------------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 import copy
 import inspect
 import pickle
-import warnings
 
 import numpy as np
 import pytest
@@ -36,7 +35,7 @@ from torchrl_quad import (
 )
 from torchrl_quad.engine import ActionSequence
 from torchrl_quad.envs import ForestEnv
-from torchrl_quad.errors import UserError, UserTypeError, UserValueError, WrongState
+from torchrl_quad.errors import UserError, UserTypeError, UserValueError
 from torchrl_quad.options import declared
 
 HOSTILE = [
@@ -99,30 +98,20 @@ def calls():
     }
 
 
-NAMES = (
-    *("bptt", "shac", "sapo", "ahac", "hybrid", "abpt", "estimator", "returns", "keys", "loss", "critic's loss"),
-    *("targets", "trust region", "actor", "value", "qvalue", "visual actor", "buffer", "start", "source", "extend"),
-    *("load", "rollout", "restart", "normalizer", "statistics", "collector", "audit", "comparison", "variance"),
-    *("by horizon", "actions"),
-)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_every_argument_is_taken_or_refused_in_one_line(calls, name):
-    function, given, more = calls[name]
-    signature = inspect.signature(function.__init__ if isinstance(function, type) else function)
-    own = [x for x, p in signature.parameters.items() if x != "self" and p.kind is not p.VAR_KEYWORD]
-    accepted, refused = 0, []
-    for argument in dict.fromkeys([*own, *more]):
-        for value in HOSTILE:
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
+@pytest.mark.filterwarnings("ignore")
+def test_every_argument_is_taken_or_refused_in_one_line(calls):
+    for name, (function, given, more) in calls.items():
+        signature = inspect.signature(function.__init__ if isinstance(function, type) else function)
+        own = [x for x, p in signature.parameters.items() if x != "self" and p.kind is not p.VAR_KEYWORD]
+        accepted, refused = 0, []
+        for argument in dict.fromkeys([*own, *more]):
+            for value in HOSTILE:
+                try:
                     function(**{**given, argument: value})
-                accepted += 1
-            except UserError as error:
-                refused.append(str(error))
-    assert len(refused) > accepted and "\n" not in "".join(refused)
+                    accepted += 1
+                except UserError as error:
+                    refused.append(str(error))
+        assert len(refused) > accepted and "\n" not in "".join(refused), name
 
 
 def test_what_is_taken_has_finite_losses(calls):
@@ -164,8 +153,6 @@ def test_a_loss_of_ones_own_is_checked_too(env):
         Weighted(actor, alpha=-1)
     with pytest.raises(UserTypeError, match="Weighted got an unexpected .* 'weigth'. Did you mean 'weight'"):
         Weighted(actor, weigth=2)
-    with pytest.raises(UserTypeError, match="SAPOLoss sets delay_value itself: leave it out"):
-        SAPOLoss(actor, make_value(env), delay_value=True)
 
 
 @pytest.mark.parametrize("way", [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))], ids=["copy", "pickle"])
@@ -176,29 +163,14 @@ def test_a_copy_of_a_loss_computes_the_same(env, way):
     assert list(inspect.signature(Weighted).parameters) == ["actor_network", "weight", "kwargs"]
 
 
-def test_networks_and_horizons_that_fit_into_no_memory_are_refused_before_they_are_made(env, monkeypatch):
-    actor, value = make_actor(env), make_value(env, [1300, 1300])
-    with pytest.raises(UserValueError, match="64 copies of this value_network have 109,824,064 weights, more than 1"):
-        SHACLoss(actor, value, num_value_nets=64)
-    with pytest.raises(UserValueError, match="horizon must be at most 100000, got 1000000000"):
-        differentiable_rollout(env, actor, None, 10**9)
-    many = HoveringEnv(num_envs=100_000)
-    monkeypatch.setattr("os.sysconf", lambda name: 10**5 if name == "SC_PHYS_PAGES" else 10**4)
-    with pytest.raises(UserValueError, match="of 50 steps of 100,000 environments .* more than 2 GB, and there are 1"):
-        differentiable_rollout(many, actor, None, 50)
-
-
 # -- what does not fit -------------------------------------------------------------------------------------------------
 
 
 def test_an_actor_or_a_carry_of_another_environment_is_refused(env, env64):
     actor = make_actor(env)
+    forest = ForestEnv(num_envs=2, density=0.02)
     for other, carry, message in (
-        (
-            ForestEnv(num_envs=2, density=0.02),
-            None,
-            "was built for entries of 13 numbers, and reads some of 9: those",
-        ),
+        (forest, None, "was built for entries of 13 numbers, and reads some of 9: those"),
         (env, HoveringEnv(num_envs=2).reset(), r"carry has batch size \(2,\), and the environment \(4,\)"),
         (env, env64.reset(), "'observation' of the carry is torch.float64 on cpu, and that of the env"),
     ):
@@ -207,12 +179,3 @@ def test_an_actor_or_a_carry_of_another_environment_is_refused(env, env64):
     rollout, _ = differentiable_rollout(env64, make_actor(env64), None, 2)
     with pytest.raises(UserValueError, match="Critic computes in torch.float32 on cpu, and 'observation' is .*64"):
         SHACLoss(actor, make_value(env)).loss_value(rollout.detach())
-
-
-def test_a_rollout_without_its_graph_is_a_mistake_of_the_user(env):
-    actor = make_actor(env)
-    rollout, _ = differentiable_rollout(env, actor, None, 2)
-    with pytest.raises(WrongState, match="carries no gradient"):
-        BPTTLoss(actor).loss_actor(rollout.detach())
-    with pytest.raises(WrongState, match="The visited-state buffer is empty"):
-        VisitedStateBuffer().initial_state(env)

@@ -1,5 +1,7 @@
 """Observations normalised by running statistics, with gradients."""
 
+import contextlib
+
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
@@ -99,14 +101,12 @@ def test_a_normalized_policy_on_plain_tensors_is_the_policy():
 
 @pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers with non-empty batch-size:UserWarning")
 def test_where_a_live_vecnorm_breaks_backward_the_normalizer_does_not():
-    def train(transform):
-        env = TransformedEnv(HoveringEnv(num_envs=4), transform)
+    for transform, breaks in ((VecNormV2(in_keys=["observation"]), True), (None, False)):
+        env = HoveringEnv(num_envs=4)
+        env = TransformedEnv(env, transform or ObservationNormalizer(env))
         rollout, _ = differentiable_rollout(env, make_actor(env), None, 5)
-        rollout["next", "reward"].sum().backward()
-
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        train(VecNormV2(in_keys=["observation"]))
-    train(ObservationNormalizer(HoveringEnv(num_envs=4)))
+        with pytest.raises(RuntimeError, match="modified by an inplace") if breaks else contextlib.nullcontext():
+            rollout["next", "reward"].sum().backward()
 
 
 def test_the_normalizer_is_saved_and_leaves_out_what_is_not_finite():

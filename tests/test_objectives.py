@@ -123,17 +123,6 @@ def test_the_bootstrap_of_abpt_has_its_gradient_through_state_and_action_and_non
     assert all(p.grad is None for p in loss.qvalue_network_params.values(True, True))
 
 
-def test_the_terminal_value_of_shac_has_its_gradient_in_the_state_and_none_in_the_critic():
-    actor, value, _ = make_networks()
-    loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA)
-    rollout = make_rollout(actor)
-    shift = torch.zeros(2, 4, 1, requires_grad=True)
-    rollout["next", "observation"] = rollout["next", "observation"] + shift
-    loss.loss_actor(rollout)[0].backward()
-    assert (-shift.grad[..., 0] * 2).tolist() == [[0, 10 / 4, 0, 10 / 4], [0, 0, 0, 10 / 2]]
-    assert value.module.weight.grad is None
-
-
 def test_without_its_terminal_gradient_shac_has_the_value_of_shac_and_the_gradient_of_bptt():
     actor, value, _ = make_networks()
 
@@ -249,8 +238,7 @@ def test_td_lambda_targets_come_from_the_target_network_and_respect_the_ends():
 
 def test_td_lambda_targets_of_abpt_take_the_least_critic_with_a_new_action():
     actor, *_ = make_networks()
-    loss = make_abpt(actor, 10.0, 20.0)
-    target = loss.write_value_target(make_rollout(actor).detach())["value_target"]
+    target = make_abpt(actor, 10.0, 20.0).write_value_target(make_rollout(actor).detach())["value_target"]
     expected = td_lambda([2.0, 4.0, 6.0, 8.0], [24, 108, 48, 60], [False, True, False, True], [False] * 4)
     torch.testing.assert_close(target[0, :, 0], torch.tensor(expected))
 
@@ -270,22 +258,16 @@ def test_the_critic_s_loss_is_the_squared_error_and_reaches_the_critic_alone():
     assert loss_qvalue.item() == pytest.approx(2 * 144 * (1 + 4 + 9 + 16) / 4)
 
 
-def test_the_critic_s_loss_computes_its_targets_when_they_are_missing():
-    actor, value, _ = make_networks()
-    loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA)
-    rollout = make_rollout(actor)
-    without = loss.loss_value(rollout)[0]
-    assert "value_target" not in rollout
-    assert without == loss.loss_value(loss.write_value_target(rollout.detach()))[0]
-
-
-def test_a_terminated_last_state_that_is_not_finite_leaves_the_targets_alone():
+def test_missing_targets_are_computed_also_where_a_terminated_last_state_is_not_finite():
     actor, value, _ = make_networks()
     loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
     rollout = make_rollout(actor).detach()
-    clean = loss.write_value_target(rollout.copy())["value_target"]
+    without = loss.loss_value(rollout)[0]
+    assert "value_target" not in rollout
+    clean = loss.write_value_target(rollout.copy())
+    assert without == loss.loss_value(clean)[0]
     rollout["next", "observation"][1, 2] = float("nan")
-    assert torch.equal(loss.write_value_target(rollout)["value_target"], clean)
+    assert torch.equal(loss.write_value_target(rollout)["value_target"], clean["value_target"])
 
 
 def test_td0_is_offered_and_gae_is_not():

@@ -17,8 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl_quad.data import differentiable_rollout
 from torchrl_quad.data.unwrap import check_env, check_tensordict, group, leaf
 from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
-from torchrl_quad.objectives.action_gradients import sources_of_steps
-from torchrl_quad.objectives.calls import discounts, total
+from torchrl_quad.objectives.calls import discounts, sources_of_steps, total
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, checked, entries
 

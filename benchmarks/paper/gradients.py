@@ -32,8 +32,7 @@ from benchmarks.paper.running import QUICK, kept, run, side_by_side
 from torchrl_quad import audit_reward, differentiable_rollout, make_actor, make_env, make_qvalue, make_value, objectives
 from torchrl_quad.envs.metrics import first_episode
 from torchrl_quad.files import add_rows, replacing
-from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again
-from torchrl_quad.objectives.calls import discounts
+from torchrl_quad.objectives.calls import action_gradient, discounts, distribution_again
 from torchrl_quad.training.building import build_env, make_policy, network
 from torchrl_quad.training.checkpoints import read_checkpoint
 

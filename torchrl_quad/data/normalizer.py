@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ObservationNorm
 
 from torchrl_quad.data.unwrap import check_env, leaf, observed, state_keys
-from torchrl_quad.errors import UserTypeError, UserValueError, shown
+from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.options import Entry, Positive, checked
 
 
@@ -20,8 +20,7 @@ class ObservationNormalizer(ObservationNorm):
     """Subtracts the mean and divides by the standard deviation of all observations seen, fixed within a horizon.
 
     TorchRL's VecNorm changes its statistics in place at every step, which breaks backward through a rollout. Here
-    :meth:`update` changes them between horizons, and a graph that is not differentiated yet keeps its values. The
-    statistics are buffers and therefore part of ``state_dict``.
+    :meth:`update` changes them between horizons, and a graph that is not differentiated yet keeps its values.
 
     .. code-block:: python
 
@@ -36,19 +35,14 @@ class ObservationNormalizer(ObservationNorm):
         env: the environment to wrap, for size, device and floating-point type of the observation.
         key: the entry (*, k) to normalise, which is overwritten.
         min_scale: the least standard deviation to divide by, in the observation's unit.
-
-    Raises:
-        ValueError: the environment does not observe the key, its state holds the key, or its entry is no vector of
-            floating-point numbers.
     """
 
     def __init__(self, env: EnvBase, key: Entry = "observation", *, min_scale: Positive = 0.01) -> None:
         check_env(env)
-        specs = observed(env)
-        known = [*specs.keys(True, True)]
-        if key not in known:
+        specs = dict(observed(env).items(True, True))
+        if key not in specs:
             raise UserValueError(
-                f"The environment does not observe {key!r}. Choose from: {', '.join(map(str, known))}."
+                f"The environment does not observe {key!r}. Choose from: {', '.join(map(str, specs))}."
             )
         if key in state_keys(env):
             raise UserValueError(
@@ -56,11 +50,6 @@ class ObservationNormalizer(ObservationNorm):
                 f'CatTensors([{key!r}], "features", del_keys=False), and normalise "features".'
             )
         spec = specs[key]
-        if not spec.shape or not spec.dtype.is_floating_point:
-            raise UserValueError(
-                f"{shown(key)} is {tuple(spec.shape)}, {spec.dtype}, and the normalizer takes floating-point vectors "
-                "(*, k). Choose another key."
-            )
         loc = torch.zeros(spec.shape[-1], device=spec.device, dtype=spec.dtype)
         super().__init__(loc, torch.ones_like(loc), in_keys=[key], standard_normal=True)
         self.min_scale = min_scale
@@ -121,9 +110,8 @@ class NormalizedPolicy(TensorDictModuleBase):
         """The same on plain tensors, if the policy has such a form that can normalise; None otherwise."""
         plain = cast(Any, self.policy).plain() if hasattr(self.policy, "plain") else None
         (key,) = self.normalizer.in_keys
-        if plain is None or key not in plain.in_keys:
-            return plain
-        if not hasattr(plain, "normalize"):
-            return None
-        plain.normalize(key, self.normalizer.loc, self.normalizer.scale)
+        if plain is not None and key in plain.in_keys:
+            if not hasattr(plain, "normalize"):
+                return None
+            plain.normalize(key, self.normalizer.loc, self.normalizer.scale)
         return plain

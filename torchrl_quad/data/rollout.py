@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
-import os
+import functools
+import types
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Annotated, Any, cast
 
@@ -18,15 +18,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.normalizer import NormalizedPolicy, ObservationNormalizer
-from torchrl_quad.data.unwrap import (
-    base_env,
-    check_actor,
-    check_env,
-    check_whole_state,
-    leaf,
-    memory_keys,
-    observed,
-)
+from torchrl_quad.data.unwrap import base_env, check_actor, check_env, check_whole_state, leaf, memory_keys, observed
 from torchrl_quad.data.visited_states import restart
 from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.options import Field, Fraction, Horizon, accepted, checked
@@ -51,10 +43,9 @@ def differentiable_rollout(
 ) -> tuple[TensorDictBase, TensorDictBase]:
     """Fly a horizon, and keep the graph from every reward back to every action.
 
-    Environments that finish are reset on the way: the gradient is cut exactly there, and ``"next"`` keeps the true last
-    state. The rollout is the environment's own ``rollout``, so this works for any differentiable TorchRL environment
-    and any stack of transforms. The gradient also goes through the memory of a recurrent actor, which is cleared, and
-    the gradient cut, at the start of an episode.
+    Environments that finish are reset on the way: the gradient is cut exactly there, also in the memory of a recurrent
+    actor, which is cleared, and ``"next"`` keeps the true last state. The rollout is the environment's own ``rollout``,
+    so this works for any differentiable TorchRL environment and any stack of transforms.
 
     Args:
         env: the environment.
@@ -65,12 +56,11 @@ def differentiable_rollout(
         exploration_type: RANDOM samples the policy, DETERMINISTIC takes its mode.
 
     Returns:
-        the rollout, of batch size (*env.batch_size, horizon), and the carry to continue from: detached, and reset in
-        the environments whose last step was done.
+        the rollout (*env.batch_size, horizon), and the carry to continue from: detached, and reset where the last step
+        was done.
 
     Raises:
-        ValueError: the rollout is larger than the memory; the actor reads an entry that is missing, or a transform
-            overwrites or leaves out a part of the state.
+        ValueError: the actor reads an entry that is missing, or a transform changes a part of the state.
     """
     check_env(env)
     check_actor(actor, "actor")
@@ -82,16 +72,9 @@ def differentiable_rollout(
         check_whole_state(env)
         carry = env.reset() if carry is None else carry.copy()
         _check_start(env, actor, carry)
-        if carry.numel() * horizon > 1_000_000:
-            _check_memory(carry, horizon)
         with set_exploration_type(exploration_type):
             rollout = _rollout(env, actor, carry, horizon)
     except KeyError as error:
-        if "not found in the environment outputs" in str(error):
-            raise UserValueError(
-                f"ExcludeTransform: {error.args[0]} TorchRL's transform leaves out single entries, and no groups: name "
-                'each, such as ("reward_terms", "velocity"). Keep the state, from which the next step starts.'
-            ) from error
         missing = [key for key in actor.in_keys if carry is not None and key not in carry]
         if not missing:
             raise
@@ -134,44 +117,21 @@ def _check_start(env: EnvBase, actor: TensorDictModuleBase, carry: TensorDictBas
             f"carry has batch size {tuple(carry.batch_size)}, and the environment {tuple(size)}. Start from "
             "the tensordict of its own reset(), or of its last rollout."
         )
-    for key in actor.in_keys:
-        if key not in carry or key not in observed(env).keys(True, True):
-            continue
+    for key in (key for key in actor.in_keys if key in carry and key in observed(env).keys(True, True)):
         x, spec = leaf(carry, key), observed(env)[key]
-        if x.dtype == spec.dtype and (env.device is None or x.device == env.device):
-            continue
-        raise UserValueError(
-            f"{key!r} of the carry is {x.dtype} on {x.device}, and that of the environment {spec.dtype} on "
-            f"{env.device}. Start from the tensordict of its own reset(), or of its last rollout."
-        )
-
-
-def _check_memory(carry: TensorDictBase, horizon: int) -> None:
-    """Raise a UserValueError for a rollout whose entries, without their graph, are larger than the memory."""
-    needed = 2 * horizon * sum(x.numel() * x.dtype.itemsize for x in cast(Iterable[Tensor], carry.values(True, True)))
-    if carry.device is not None and carry.device.type == "cuda":
-        has = torch.cuda.get_device_properties(carry.device).total_memory
-    elif hasattr(os, "sysconf"):
-        has = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    else:
-        return
-    if needed > has:
-        raise UserValueError(
-            f"A rollout of {horizon:,} steps of {carry.numel():,} environments takes more than {needed / 1e9:,.0f} GB, "
-            f"and there are {has / 1e9:,.0f}. Fly far fewer than {horizon * has // needed:,} steps at a time, or fewer "
-            "environments."
-        )
+        if x.dtype != spec.dtype or (env.device is not None and x.device != env.device):
+            raise UserValueError(
+                f"{key!r} of the carry is {x.dtype} on {x.device}, and that of the environment {spec.dtype} on "
+                f"{env.device}. Start from the tensordict of its own reset(), or of its last rollout."
+            )
 
 
 def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> TensorDictBase:
-    """The environment's own rollout.
-
-    If its only transform is our normaliser, the environment inside flies, compiled if it can, and what it observed is
-    normalised afterwards.
-    """
+    """The environment's own rollout."""
     options = {"auto_reset": False, "break_when_any_done": False}
     if not (isinstance(env, TransformedEnv) and type(env.transform) is ObservationNormalizer):
         return env.rollout(horizon, actor, tensordict=start, **options)
+    # The environment inside flies, compiled if it can, and what it observed is normalised afterwards.
     normalizer = env.transform
     (key,) = normalizer.in_keys
     if key in start:  # otherwise the environment complains
@@ -186,10 +146,9 @@ def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, h
 class DifferentiableCollector(BaseCollector):
     """Horizons with their graph, for ``torchrl.trainers.Trainer`` and for loops written around collectors.
 
-    Each batch is what :func:`differentiable_rollout` returns, (*env.batch_size, horizon), and begins where the one
-    before it has ended, or at a fresh start. TorchRL's own collectors cut the graph. Take one step of the optimizer for
-    each batch (``optim_steps_per_batch=1``): ``backward`` frees its graph. The policy is not copied: a step of the
-    optimizer affects the next batch.
+    Each batch is a :func:`differentiable_rollout` that begins where the one before has ended, or at a fresh start. Take
+    one step of the optimizer for each (``optim_steps_per_batch=1``): ``backward`` frees its graph. The policy is not
+    copied: a step of the optimizer affects the next batch.
 
     Args:
         env: any differentiable environment, also under transforms; or a function that builds it.
@@ -217,7 +176,7 @@ class DifferentiableCollector(BaseCollector):
         exploration_type: ExplorationType = ExplorationType.RANDOM,
     ) -> None:
         super().__init__()
-        self.env = cast(EnvBase, env if isinstance(env, EnvBase) or not _needs_nothing(env) else env())
+        self.env = cast(EnvBase, env() if isinstance(env, types.FunctionType | functools.partial) else env)
         check_env(self.env)
         check_actor(policy, "policy")
         self.policy, self.exploration_type, self.restart_fraction = policy, exploration_type, restart_fraction
@@ -246,26 +205,15 @@ class DifferentiableCollector(BaseCollector):
             yield batch
 
     def __len__(self) -> int:
-        if self.total_frames == float("inf"):
-            raise UserTypeError("A collector without total_frames never ends, and has no length.")
         return -(self.total_frames // -self.frames_per_batch)
 
-    def update_policy_weights_(
-        self,
-        policy_or_weights: TensorDictBase | nn.Module | Mapping[str, Any] | None = None,
-        *,
-        weights: TensorDictBase | Mapping[str, Any] | None = None,
-        policy: nn.Module | None = None,
-        weights_dict: Mapping[str, Any] | None = None,
-        **_: Any,
-    ) -> None:
+    def update_policy_weights_(self, policy_or_weights: Any = None, **given: Any) -> None:
         """Copy weights into the policy: those of a module, or a tensordict of them; without any it is up to date."""
-        several = (policy_or_weights, weights, policy, (weights_dict or {}).get("policy"))
-        given = next((x for x in several if x is not None), None)
-        if given is not None and given is not self.policy:
-            is_module = isinstance(given, nn.Module)
-            given = TensorDict.from_module(given) if is_module else TensorDict(cast(dict, given)).unflatten_keys(".")
-            TensorDict.from_module(self.policy).data.update_(given.data)
+        given |= given.get("weights_dict") or {}
+        for weights in (policy_or_weights, given.get("weights"), given.get("policy")):
+            if weights is not None:
+                own = TensorDict.from_module(weights) if isinstance(weights, nn.Module) else TensorDict(weights)
+                TensorDict.from_module(self.policy).data.update_(own.unflatten_keys(".").data)
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed the environment; the next batch begins with a reset. Returns the seed for another environment."""
@@ -298,17 +246,3 @@ class DifferentiableCollector(BaseCollector):
         """Close the environment."""
         if close_env and not self.env.is_closed:
             self.env.close(raise_if_closed=raise_on_error)
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}(env={self.env}, horizon={self.horizon}, total_frames={self.total_frames})"
-
-
-def _needs_nothing(function: Any) -> bool:
-    """Whether something that is no network can be called without arguments."""
-    if isinstance(function, nn.Module):
-        return False
-    try:
-        inspect.signature(function).bind()
-    except (TypeError, ValueError):
-        return False
-    return True

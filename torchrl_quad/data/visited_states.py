@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import torch
-from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
@@ -28,24 +29,22 @@ from torchrl_quad.data.unwrap import (
 from torchrl_quad.errors import UserTypeError, UserValueError, WrongState, one_line
 from torchrl_quad.options import Device, Entries, Fraction, Seed, Size, checked
 
-Kinds = dict[NestedKey, tuple[torch.Size, torch.dtype]]  # of the entries of one state
+Kinds = dict[NestedKey, tuple[torch.Size, bool]]  # of the entries of one state: shape, and whether these are floats
 
 
 @checked
 class VisitedStateBuffer(TensorDictReplayBuffer):
     """States that the policy has visited, from which horizons and episodes can start.
 
-    The buffer keeps states and no transitions, so it is no replay for off-policy learning. A state is the complete
-    Markov state, including commands on their way and whatever the task keeps, detached from any graph. ``state_dict``
-    and ``dumps(path)`` save the states and the buffer's random generator, which draws them and decides which
-    environments get one.
+    A state is the complete Markov state, including commands on their way and whatever the task keeps, detached from any
+    graph. ``state_dict`` and ``dumps(path)`` save the states and the random generator, which draws them and decides
+    which environments get one.
 
     Args:
         capacity: visited states kept; the oldest go first.
         env: the environment whose Markov state is kept; see :mod:`torchrl_quad.data`.
         state_keys: the entries that make up the Markov state. By default those of ``env``, and "state" without one.
-        actor: a recurrent policy, whose memory is kept with the state. Without it, and in :meth:`source`, a visited
-            state has an empty memory.
+        actor: a recurrent policy, whose memory is kept with the state, but for :meth:`source`.
         device: where the states are stored.
         seed: of the buffer's own random generator.
     """
@@ -65,22 +64,18 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         if actor is not None:
             check_actor(actor, "actor")
         generator = torch.Generator(device=device).manual_seed(seed)
-        # Of each part of a state, as far as it is known.
-        self.kinds: dict[NestedKey, Kinds] = {} if env is None else _kinds_of(env)
-        if state_keys is None:
-            state_keys = ("state",) if env is None else _state_keys(env)
-        self.state_keys = tuple(state_keys)
+        self.state_keys = tuple(state_keys or (("state",) if env is None else _state_keys(env)))
         self.memory_keys = () if actor is None else memory_keys(actor)
         self.names = (*self.state_keys, *self.memory_keys)
+        known: Any = TensorDict() if env is None else observed(env).zero().reshape(-1)
+        # Of each part of a state, as far as it is known.
+        self.kinds: dict[NestedKey, Kinds] = {name: _kinds(known, name) for name in self.names if name in known}
         super().__init__(storage=LazyTensorStorage(capacity, device=device), generator=generator)
 
     def extend(self, tensordicts: TensorDictBase) -> Tensor:
         """Add the states in which the steps of a rollout (any batch size) started, and return the indices written.
 
         Terminated states and states that are not finite are left out.
-
-        Raises:
-            ValueError: the rollout lacks an entry of the state, or its states differ in kind from the buffer's.
         """
         check_tensordict("The visited-state buffer", tensordicts)
         missing = [key for key in self.names if key not in tensordicts]
@@ -110,9 +105,6 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         Args:
             env: an environment that can be set to a state, also under transforms.
             fraction: the share of horizons that start in visited states, a probability for each member of the batch.
-
-        Raises:
-            RuntimeError: the buffer is empty.
         """
         check_env(env)
         mixed, visited, pick = self._mixed(_fresh(env, self.state_keys), fraction)
@@ -133,10 +125,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
 
         Returns:
             a function from n to n states: the tensordict (n) that ``env`` keeps under its one state key, or a
-            tensordict (n) with all of several keys. It raises what :meth:`initial_state` does.
-
-        Raises:
-            TypeError: the environment has no ``sample_start``.
+            tensordict (n) with all of several keys.
         """
         check_env(env)
         base: Any = base_env(env)
@@ -159,32 +148,23 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
                 "The visited-state buffer is empty. Fly a first horizon from env.reset() and extend the buffer with it."
             )
         visited = cast(TensorDictBase, self.sample(fresh.numel())).select(*self.names).to(fresh.device)
-        # A transform may have changed the precision of a rollout.
-        self._check_same(cast(TensorDictBase, fresh.reshape(-1)), exact=False)
+        self._check_same(cast(TensorDictBase, fresh.reshape(-1)))
         pick = torch.rand(fresh.shape, generator=self._rng, device=self._rng.device) < fraction
         pick = pick.to(fresh.device)
         visited = cast(TensorDictBase, visited.reshape(fresh.shape))
         return visited.select(*self.state_keys).where(pick, fresh), visited, pick
 
-    def _check_same(self, states: TensorDictBase, exact: bool = True) -> None:
+    def _check_same(self, states: TensorDictBase) -> None:
         """Raise a UserValueError for states (n) of another kind than the kept ones, which would broadcast silently."""
         different: set[str] = set()
         for name in filter(states.__contains__, self.names):
             theirs = _kinds(states, name)
-            ours = self.kinds.get(name, theirs)
-            if not exact:
-                theirs, ours = (
-                    {key: (shape, kind.is_floating_point) for key, (shape, kind) in kinds.items()}
-                    for kinds in (theirs, ours)
-                )
-            different |= {str(key) for key, _ in ours.items() ^ theirs.items()}
+            different |= {str(key) for key, _ in self.kinds.get(name, theirs).items() ^ theirs.items()}
         if different:
             raise UserValueError(
                 f"These are other states than those in the visited-state buffer: {', '.join(sorted(different))} differ "
                 "in name, shape or type. Keep a buffer for each task and its options, such as action_delay."
             )
-
-    # -- saving and loading --------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
         """The states (n), in their places, the place of the next one, and the random generator."""
@@ -196,20 +176,31 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Hold what :meth:`state_dict` has returned, also that of a smaller buffer.
-
-        Raises:
-            ValueError: the content does not fit the buffer, which stays as it is.
-        """
-        states, cursor, generator = self._read(state_dict)
+        """Hold what :meth:`state_dict` has returned, also that of a smaller buffer; what does not fit is refused."""
+        generator, most = torch.Generator(device=self._rng.device), self._storage.max_size
+        try:
+            entries, cursor = state_dict["states"], operator.index(state_dict["cursor"])
+            n = len(next(iter(entries.values()), ()))
+            if not (0 <= cursor <= n <= most):
+                raise UserValueError(f"it has {n:,} states, and its cursor is {cursor}")
+            states = TensorDict(entries, [n]).detach().unflatten_keys(".").select(*self.names if n else ())
+            generator.set_state(state_dict["random"])
+        except Exception as error:  # of tensordict and torch: one for each thing that may be wrong
+            raise UserValueError(
+                f"The content does not fit this visited-state buffer of {most:,} states: {one_line(error)}. Take what "
+                "a buffer of the same task and options has saved."
+            ) from None
+        self._check_same(states)
+        if cursor < n < most:  # of a smaller buffer that was full: its oldest state is at the cursor
+            states, cursor = states[torch.arange(n).roll(-cursor)], n
         storage = cast(LazyTensorStorage, self._storage)
         storage._empty()
-        if len(states):
+        if n:
             states = states.to(storage.device)
             self.kinds = {name: _kinds(states, name) for name in self.names}
-            index = torch.arange(len(states), device=states.device)
+            index = torch.arange(n, device=states.device)
             cast(Any, storage).set(index, states.set("index", index))
-        self._writer.load_state_dict({"_cursor": cursor, "_write_count": len(states)})
+        self._writer.load_state_dict({"_cursor": cursor % most, "_write_count": n})
         self.set_rng(generator)
 
     def dumps(self, path: str | Path) -> None:
@@ -218,80 +209,22 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         torch.save(self.state_dict(), Path(path) / "buffer.pt")
 
     def loads(self, path: str | Path) -> None:
-        """Read from a folder what :meth:`dumps` has written.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file is damaged, or its content does not fit.
-        """
-        file = Path(path) / "buffer.pt"
-        with file.open("rb") as opened:
-            try:
-                content = torch.load(opened, map_location="cpu", weights_only=True)
-            except Exception as error:
-                said = one_line(error) or type(error).__name__
-                raise UserValueError(f"{file} is damaged, or no buffer that dumps wrote: {said}") from None
-        self.load_state_dict(content)
-
-    def _read(self, content: Mapping[str, Any]) -> tuple[TensorDict, int, torch.Generator]:
-        """The states, the place of the next one and the generator of a content that fits."""
-        most = self._storage.max_size
-
-        def refuse(what: str) -> NoReturn:
-            raise UserValueError(
-                f"The content does not fit this visited-state buffer of {most:,} states: {what}. Take what a buffer of "
-                "the same task and options has saved."
-            )
-
-        try:
-            entries, cursor, random = content["states"], content["cursor"], content["random"]
-        except (TypeError, KeyError, ValueError, IndexError):
-            refuse("it lacks the states, the cursor or the random generator")
-        if not isinstance(entries, Mapping) or not all(isinstance(x, Tensor) for x in entries.values()):
-            refuse("its states are no tensors by name")
-        n = max((len(x) for x in entries.values() if x.ndim), default=0)
-        if n > most:
-            refuse(f"it has {n:,} states")
-        if type(cursor) is not int or not 0 <= cursor <= n:
-            refuse(f"its cursor is {cursor!r}, with {n} states")
-        for name, x in entries.items():
-            if x.layout is not torch.strided or x.is_meta or x.ndim == 0 or len(x) != n:
-                refuse(f"{name} has shape {tuple(x.shape)}")
-            if not x.isfinite().all():
-                refuse(f"{name} is not finite")
-        states = TensorDict({str(name): x.detach() for name, x in entries.items()}, [n]).unflatten_keys(".")
-        if n:
-            lost = [name for name in self.names if name not in states]
-            more = set(states.keys(True, True)) - set(states.select(*self.names, strict=False).keys(True, True))
-            if lost or more:
-                refuse(f"it lacks or adds {(*lost, *more)[:1]}")
-            self._check_same(states)
-        if cursor < n < most:  # of a smaller buffer that was full: its oldest state is at the cursor
-            states, cursor = states[torch.arange(n).roll(-cursor)], n
-        generator = torch.Generator(device=self._rng.device)
-        try:
-            generator.set_state(random)
-        except (RuntimeError, TypeError) as error:
-            refuse(f"its random generator is none ({one_line(error)})")
-        return states, cursor % most, generator
+        """Read from a folder what :meth:`dumps` has written."""
+        self.load_state_dict(torch.load(Path(path) / "buffer.pt", map_location="cpu", weights_only=True))
 
 
 @checked
 def restart(env: EnvBase, carry: TensorDictBase, fraction: Fraction) -> TensorDictBase:
     """Give a random fraction of the environments fresh starts, and let the others continue; the carry for a rollout.
 
-    Most flights then last for many horizons. The choice draws from torch's global generator, the fresh starts from the
-    environment's own. The flights that continue keep the memory of a recurrent policy. Transforms with a memory, such
-    as StepCounter or a primer, begin again in all environments, and so does the correlated noise of a policy without
-    memory.
+    The choice draws from torch's global generator, the fresh starts from the environment's own. The flights that
+    continue keep the memory of a recurrent policy. Transforms with a memory, such as StepCounter or a primer, begin
+    again in all environments, and so does the correlated noise of a policy without memory.
 
     Args:
         env: an environment that can be set to a state, also under transforms.
         carry: where the environments are, as ``differentiable_rollout`` returns it.
         fraction: the share of flights that are given up for a fresh start, a probability for each.
-
-    Raises:
-        ValueError: the carry lacks an entry of the state or has another batch size.
     """
     check_env(env)
     if not isinstance(carry, TensorDictBase):
@@ -332,15 +265,6 @@ def _draws_starts(base: EnvBase) -> bool:
 
 
 def _kinds(states: TensorDictBase, name: NestedKey) -> Kinds:
-    """Shape and type of each entry of states (n) under a name."""
-    return {key: (x.shape[1:], x.dtype) for key, x in states.select(name).items(True, True)}
-
-
-def _kinds_of(env: EnvBase) -> dict[NestedKey, Kinds]:
-    """The same for each part of an environment's state that its rollouts hold."""
-    kinds: dict[NestedKey, Kinds] = {}
-    for key, spec in observed(env).items(True, True):
-        if key in state_keys(env):
-            name = key if isinstance(key, str) else key[0]
-            kinds.setdefault(name, {})[unravel_key(key)] = (spec.shape[env.ndim :], spec.dtype)
-    return kinds
+    """The kind of each entry of states (n) under a name."""
+    entries = cast(TensorDictBase, states.select(name)).items(True, True)
+    return {key: (x.shape[1:], x.is_floating_point()) for key, x in entries}

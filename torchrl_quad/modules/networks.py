@@ -8,18 +8,17 @@ from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar, cast
 
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
-from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_quad.data.unwrap import base_env, check_env, observed
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.modules.plain import Critic, GaussianHead, Network, TanhGaussianActor
+from torchrl_quad.modules.plain import Critic, GaussianHead, Network, TanhGaussianActor, layout
 from torchrl_quad.options import AfterValidator, Below1, Entries, Field, Scale, Width, checked
 
 OBSERVATION = ("observation",)
@@ -27,15 +26,14 @@ MOST_WEIGHTS = 100_000_000  # of a network
 
 
 def _pointwise(activation: Any) -> Any:
-    if isinstance(activation, type) and issubclass(activation, nn.Module):
-        x = torch.zeros(2, 3)
-        try:
-            with torch.random.fork_rng(devices=[]):
-                if activation()(x).shape == x.shape:
-                    return activation
-        except Exception:  # classes that are no activations raise anything
-            pass
-    raise UserValueError("be a class of activations of torch.nn without arguments, such as torch.nn.ELU")
+    try:
+        with torch.random.fork_rng(devices=[]):
+            fits = issubclass(activation, nn.Module) and activation()(torch.zeros(2, 3)).shape == (2, 3)
+    except Exception:  # what is no activation raises anything
+        fits = False
+    if not fits:
+        raise UserValueError("be a class of activations of torch.nn without arguments, such as torch.nn.ELU")
+    return activation
 
 
 Actor = TypeVar("Actor", bound=TanhGaussianActor)
@@ -60,8 +58,8 @@ def make_actor(
 ) -> ProbabilisticActor:
     """A tanh-Gaussian policy a = tanh(mu(s) + sigma(s) noise), stretched to the bounds of the action.
 
-    The weights of its last layer start near zero: the first actions are close to ``action_init``, with noise of about
-    ``scale_init`` (before the tanh, in units of half the range). It writes ``loc``, ``scale`` and ``action``.
+    The weights of its last layer start near zero: the first actions are close to ``action_init``. It writes ``loc``,
+    ``scale`` and ``action``.
 
     Args:
         env: any TorchRL environment, for the sizes of its entries, the action's bounds, device and floating-point type.
@@ -69,31 +67,28 @@ def make_actor(
         in_keys: the entries that are concatenated into the network's input, each (*, k), in a list: ["observation"].
         activation: of the hidden layers; smooth ones give smooth policy gradients.
         input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``. What the tasks observe
-            is of one to ten [m, m/s, rad/s, ten times the quaternion]; entries of the state may be far larger.
-        action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``,
-            averaged over environments, if there is one (see :mod:`torchrl_quad.data`; a drone's is to hover), and the
-            middle of the range otherwise.
-        scale_init: the standard deviation of the policy's noise at the start, before the tanh. Training brings it down
-            to 0.01 at least, or to a tenth of this.
+            is of one to ten; entries of the state may be far larger.
+        action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``
+            (see :mod:`torchrl_quad.data`; a drone's is to hover), or the middle of the range.
+        scale_init: the standard deviation of the policy's noise at the start, before the tanh, in units of half the
+            range. Training brings it down to 0.01 at least, or to a tenth of this.
         learn_scale: whether this noise changes with the state and in training. Otherwise neither a gradient through the
             simulator nor a KL bound takes the exploration away.
-        noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise. Correlated noise moves a
-            drone where independent noise averages out; try 0.9 at 50 Hz. Then loc, scale and the log-probability are
-            those of the action given the noise of the step before, ``noise_before``; ``noise`` is that of the step.
+        noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise, which averages out; try 0.9
+            at 50 Hz. Then loc, scale and the log-probability are those of the action given ``noise_before``, that of
+            the step before; ``noise`` is that of the step.
         return_log_prob: whether it also writes the log-probability of the action, which an entropy bonus and PPO need.
             mu then stays between -5 and 5: further out, rounding of the action determines the log-probability.
 
     Raises:
-        ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one; the
-            number of scales is not that of the entries; the first action is not strictly inside the bounds; or the
-            network has more than 100 million weights.
+        ValueError: the action has no bounds, or more than one dimension; an entry is unknown, or has more than one; or
+            the first action is not strictly inside the bounds.
     """
     spec, first = first_action(env, action_init, "make_actor")
-    size = spec.shape[-1]
-    net = network_of(env, in_keys, 2 * size if learn_scale else size, num_cells, activation, input_scale)
-    start_near(net.mlp, first)
-    params = with_head(net, size, scale_init, noise_correlation, in_keys, return_log_prob)
-    return sampled(TanhGaussianActor, params, spec, return_log_prob)
+    size = 2 * len(first) if learn_scale else len(first)
+    net = network_of(env, in_keys, size, num_cells, activation, input_scale)
+    options = scale_init, noise_correlation, return_log_prob
+    return policy_of(TanhGaussianActor, [], net, in_keys, spec, first, *options)
 
 
 @checked
@@ -108,19 +103,16 @@ def make_value(
     """A state value V(s), written to ``state_value``, (*, 1).
 
     LayerNorm normalises its hidden layers: without it the gradient of the critic, which the policy follows, is far off.
-
     A critic may read more than the actor does, such as ``in_keys=("observation", ("state", "rotor_speed"))``. Rotors
     turn at some 1000 rad/s, and ``input_scale=(1.0, 1e-3)`` brings both entries to about one. Among obstacles,
-    ``"obstacle"`` (*, 4) is the distance from the drone's surface to the nearest [m], and the direction away from it in
-    the body frame.
+    ``"obstacle"`` (*, 4) is the distance to the nearest [m], and the direction away from it in the body frame.
 
     Args:
-        env, activation, input_scale: as for :func:`make_actor`, and so are the errors.
+        env, activation, input_scale, in_keys: as for :func:`make_actor`, and so are the errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
-        in_keys: the entries that it reads, each (*, k), in a list: ["observation"].
     """
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, layer_norm=True)
-    return Critic(net, in_keys=list(in_keys))
+    return Critic(net, in_keys)
 
 
 @checked
@@ -135,18 +127,15 @@ def make_qvalue(
 ) -> ValueOperator:
     """A state-action value Q(s, a), written to ``state_action_value``, (*, 1); otherwise as :func:`make_value`.
 
-    A policy's action reveals the state. A critic that reads the state off the action gets its gradient in the action
-    wrong; an ``action_scale`` below one makes it rely on the state first.
-
     Args:
-        env, activation, input_scale: as for :func:`make_actor`, and so are the errors.
+        env, activation, input_scale, in_keys: as for :func:`make_actor`, and so are the errors.
         num_cells: the width of every hidden layer, in a list: [64, 64], or [64] for a single layer.
-        in_keys: the entries that it reads, each (*, k), in a list: ["observation"].
-        action_scale: the action is multiplied by this.
+        action_scale: the action is multiplied by this. It reveals the state, and a critic that reads the state off it
+            gets its gradient in the action wrong: below one it relies on the state first.
     """
     in_keys = [*in_keys, "action"]
     net = network_of(env, in_keys, 1, num_cells, activation, input_scale, action_scale, layer_norm=True)
-    return Critic(net, in_keys=in_keys)
+    return Critic(net, in_keys)
 
 
 def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[Bounded, Tensor]:
@@ -157,71 +146,65 @@ def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[B
         raise UserValueError(f"{name} needs an action with bounds, a Bounded spec; got {type(spec).__name__}.")
     if len(spec.shape) != 1:
         raise UserValueError(
-            f"{name} writes one action (k) for each environment, and here it has shape {tuple(spec.shape)}: a "
-            "transform such as MultiAction asks for several actions at once. Leave it out. To hold each action longer, "
-            "give the environment a longer control step, control_dt=0.04."
+            f"{name} writes one action (k) for each environment, and here it has shape {tuple(spec.shape)}: leave out "
+            "transforms such as MultiAction. To hold each action longer, give the environment control_dt=0.04."
         )
-    low, high = bounds_of(spec)
+    low, high = spec.low, spec.high
     middle = 0.5 * (low + high)
     if action_init is None:
         action_init = getattr(_single(env), "neutral_action", middle)
         action_init = action_init.mean(0) if action_init.dim() > middle.dim() else action_init
     first = middle
     try:
-        first = torch.as_tensor(action_init)
-        fits = not first.is_complex() and first.shape == spec.shape
-        fits = fits and bool(((low < first.to(middle)) & (first.to(middle) < high)).all())
+        first = torch.as_tensor(action_init).to(middle)
+        fits = first.shape == spec.shape and bool(((low < first) & (first < high)).all())
     except (TypeError, ValueError, RuntimeError, OverflowError):  # raised for what cannot become a tensor
         fits = False
     if not fits:
-        is_tensor = isinstance(action_init, Tensor) and not action_init.is_meta
-        given = action_init.tolist() if is_tensor else action_init
         raise UserValueError(
             f"action_init must be {spec.shape[-1]} numbers strictly between {low.tolist()} and {high.tolist()}, got "
-            f"{shown(given)}."
+            f"{shown(action_init)}."
         )
-    return spec, torch.atanh((first.to(middle) - middle) / (0.5 * (high - low)))
+    return spec, torch.atanh((first - middle) / (0.5 * (high - low)))
 
 
-def start_near(mlp: MLP, first: Tensor) -> None:
-    """Let the last layer of a policy begin with actions of mean ``first`` (k), before the tanh, whatever it reads."""
-    layer = cast(nn.Linear, mlp[-1])
+def policy_of(
+    cls: type[Actor],
+    parts: Sequence[Any],
+    network: Network,
+    in_keys: Sequence[NestedKey],
+    spec: Bounded,
+    first: Tensor,
+    scale_init: float,
+    rho: float,
+    return_log_prob: bool,
+) -> Actor:
+    """A tanh-Gaussian policy of some parts and a last network, which reads ``in_keys``.
+
+    It begins with actions of mean ``first`` (k), before the tanh, whatever it reads.
+    """
+    layer = cast(nn.Linear, network.mlp[-1])
     with torch.no_grad():
         layer.weight.mul_(0.01)
         layer.bias.zero_()
         layer.bias[: len(first)] = first
-
-
-def with_head(
-    network: Network, size: int, scale_init: float, rho: float, in_keys: Sequence[NestedKey], return_log_prob: bool
-) -> TensorDictModule:
-    """Give the last network of a policy, which reads ``in_keys``, a normal distribution of an action of ``size``."""
     least = min(0.01, 0.1 * scale_init)  # to which training can bring the scale down
     max_loc = 5.0 if return_log_prob else math.inf  # as far as TorchRL's TanhNormal goes with tanh_loc=True
-    network.head = GaussianHead(size, f"biased_softplus_{scale_init}_{least}", max_loc, rho)
+    network.head = GaussianHead(len(first), f"biased_softplus_{scale_init}_{least}", max_loc, rho)
     read = [*in_keys, "noise_before"] if rho else list(in_keys)
-    return TensorDictModule(network, in_keys=read, out_keys=["loc", "scale"])
-
-
-def bounds_of(spec: Bounded) -> tuple[Tensor, Tensor]:
-    """The least and the greatest action."""
-    space = cast(ContinuousBox, spec.space)
-    return space.low, space.high
-
-
-def sampled(cls: type[Actor], params: TensorDictModule, spec: Bounded, return_log_prob: bool) -> Actor:
-    """A policy that samples a tanh-Gaussian action within the bounds of its spec."""
-    low, high = bounds_of(spec)
+    last = TensorDictModule(network, in_keys=read, out_keys=["loc", "scale"])
+    low, high = spec.low, spec.high
     actor = cls(
-        params,
+        TensorDictSequential([*parts, last]) if parts else last,
         in_keys=["loc", "scale"],
         spec=spec,
         distribution_class=TanhNormal,
         distribution_kwargs={} if (low == -1).all() and (high == 1).all() else {"low": low, "high": high},
         return_log_prob=return_log_prob,
     )
-    if "noise_before" in actor.in_keys:
+    if rho:
         actor.out_keys = [*actor.out_keys, "noise_before", "noise"]
+    actor.built = layout(actor)
     return actor
 
 
@@ -247,30 +230,26 @@ def network_of(
         )
     if action_scale is not None:
         scales.append(action_scale)
-    sizes = [more + sum(spec.shape[-1] for spec in specs), *num_cells, out_features]
-    check_memory([a * b for a, b in itertools.pairwise(sizes)])
-    norm_kwargs = [{"normalized_shape": cells} for cells in num_cells] if layer_norm else None
+    widths = [spec.shape[-1] for spec in specs]
+    if more:
+        scales, widths = [1.0, *scales], [more, *widths]
+    weights = sum(a * b for a, b in itertools.pairwise([sum(widths), *num_cells, out_features]))
+    if weights > MOST_WEIGHTS:
+        raise UserValueError(
+            f"A network of this many cells has {weights:,} weights, more than {MOST_WEIGHTS:,}: write smaller widths, "
+            "such as num_cells=[256, 256]."
+        )
     mlp = MLP(
-        in_features=sizes[0],
+        in_features=sum(widths),
         out_features=out_features,
         num_cells=list(num_cells),
         activation_class=activation,
         norm_class=nn.LayerNorm if layer_norm else None,
-        norm_kwargs=norm_kwargs,
+        norm_kwargs=[{"normalized_shape": cells} for cells in num_cells] if layer_norm else None,
         device=env.device,
     )
     dtype = next((spec.dtype for spec in specs if spec.dtype.is_floating_point), None)
-    widths = [spec.shape[-1] for spec in specs]
-    return Network(mlp.to(dtype), [1.0, *scales] if more else scales, [more, *widths] if more else widths)
-
-
-def check_memory(weights: Sequence[int]) -> None:
-    """Raise a UserValueError for layers of more than 100 million weights, before they are made."""
-    if sum(weights) > MOST_WEIGHTS:
-        raise UserValueError(
-            f"A network of this many cells has {sum(weights):,} weights, more than {MOST_WEIGHTS:,}: write smaller "
-            "widths, such as num_cells=[256, 256]."
-        )
+    return Network(mlp.to(dtype), scales, widths)
 
 
 def _single(env: EnvBase) -> EnvBase:

@@ -8,13 +8,13 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import NormalParamExtractor, ProbabilisticTensorDictModule, dispatch
+from tensordict.nn import NormalParamExtractor, TensorDictSequential, dispatch
 from tensordict.nn.utils import biased_softplus
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.func import vjp
 from torchrl.envs.utils import ExplorationType, exploration_type
-from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 
 from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.errors import UserValueError
@@ -23,15 +23,10 @@ from torchrl_quad.errors import UserValueError
 class GaussianHead(NormalParamExtractor):
     """The normal distribution of an action, from what a network returns and, if rho > 0, the noise of the step before.
 
-    With noise e_t = rho e_(t-1) + sqrt(1 - rho^2) xi_t the action mu + sigma e_t has mean mu + rho sigma e_(t-1) and
-    standard deviation sigma sqrt(1 - rho^2). Each e_t is standard normal: the noise is as large as without correlation.
-
-    Args:
-        size: of the action, k.
-        scale_mapping: as for NormalParamExtractor.
-        max_loc: the largest absolute value of mu. Beyond 7.25 tanh is clipped, and an action no longer determines what
-            was drawn: its log-probability falls without bound.
-        rho: the correlation of the noise of two consecutive steps.
+    With noise e_t = rho e_(t-1) + sqrt(1 - rho^2) xi_t the action mu + sigma e_t, of ``size`` k, has mean
+    mu + rho sigma e_(t-1) and standard deviation sigma sqrt(1 - rho^2). Each e_t is standard normal: the noise is as
+    large as without correlation. ``max_loc`` bounds mu: beyond 7.25 tanh is clipped, and an action no longer determines
+    what was drawn, so that its log-probability falls without bound.
     """
 
     def __init__(self, size: int, scale_mapping: str, max_loc: float = math.inf, rho: float = 0.0) -> None:
@@ -85,45 +80,48 @@ class Network(nn.Module):
         super().__init__()
         self.mlp, self.scales, self.widths = mlp, tuple(scales), tuple(widths)
         self.head: nn.Module = nn.Identity()
+        self.is_plain = all(isinstance(x, nn.Linear | nn.LayerNorm) or is_pointwise(x) for x in mlp)
 
     def forward(self, *inputs: Tensor) -> Any:
         """The head's output for inputs (*, k_i); the head receives (*, out_features), and the further inputs."""
         own = len(self.scales)
-        check_widths(inputs[:own], self.widths)
-        return self.head(self.mlp(_concatenated(inputs[:own], self.scales)), *inputs[own:])
+        return self.head(self.mlp(self.joined(inputs[:own])), *inputs[own:])
+
+    def joined(self, inputs: Sequence[Tensor]) -> Tensor:
+        """What the first layer reads; a UserValueError for inputs that the network was not built for."""
+        found = tuple(x.shape[-1] for x in inputs)
+        if found != self.widths:
+            raise UserValueError(
+                f"This network was built for entries of {', '.join(map(str, self.widths))} numbers, and reads some of "
+                f"{', '.join(map(str, found))}: those of another environment, or of other options. Build one for this."
+            )
+        return _concatenated(inputs, self.scales)
 
 
 class Critic(ValueOperator):
     """What :func:`~torchrl_quad.make_value` and :func:`~torchrl_quad.make_qvalue` build."""
+
+    def __init__(self, network: Network, in_keys: Sequence[NestedKey]) -> None:
+        super().__init__(network, in_keys=list(in_keys))
+        self.built = layout(self)
 
     def plain(self) -> Callable[[Mapping[str, Tensor], Sequence[Tensor]], Tensor] | None:
         """The prediction (*, 1) as a pure function of the parameters, by name, and the inputs, each (*, k).
 
         None if its parts were changed or hooked.
         """
-        network = self.module
-        if type(self) is not Critic or type(network) is not Network or type(network.mlp) is not MLP:
-            return None
-        if type(network.head) is not nn.Identity or is_hooked(self):
-            return None
-        layers = {f"module.mlp.{name}": layer for name, layer in network.mlp.named_children()}
-        known = (nn.Linear, nn.LayerNorm)
-        are_known = all(type(layer) in known or is_pointwise(layer) for layer in layers.values())
-        # A layer that stands in two places has one name.
-        if len(layers) < len(network.mlp) or not are_known:
+        network = cast(Network, self.module)
+        if layout(self) != self.built or not network.is_plain:
             return None
 
         def predict(params: Mapping[str, Tensor], inputs: Sequence[Tensor]) -> Tensor:
-            check_widths(inputs, network.widths)
-            x = _concatenated(inputs, network.scales)
-            for name, layer in layers.items():
-                weight, bias = params.get(f"{name}.weight"), params.get(f"{name}.bias")
-                if type(layer) is nn.Linear:
-                    x = nn.functional.linear(x, cast(Tensor, weight), bias)
-                elif type(layer) is nn.LayerNorm:
+            x = network.joined(inputs)
+            for name, layer in network.mlp.named_children():
+                weight, bias = (params.get(f"module.mlp.{name}.{kind}") for kind in ("weight", "bias"))
+                if isinstance(layer, nn.LayerNorm):
                     x = nn.functional.layer_norm(x, layer.normalized_shape, weight, bias, layer.eps)
                 else:
-                    x = layer(x)
+                    x = layer(x) if weight is None else nn.functional.linear(x, weight, bias)
             return x
 
         return predict
@@ -132,20 +130,22 @@ class Critic(ValueOperator):
 class TanhGaussianActor(ProbabilisticActor):
     """What :func:`~torchrl_quad.make_actor` builds: a tanh-Gaussian policy that environments can fly as pure functions.
 
-    With noise that is correlated in time it writes ``noise``, that of the step, and ``noise_before``, that of the step
-    before. A flight hands ``noise`` on from step to step. If there is none yet it is drawn. A deterministic flight has
-    none.
+    With noise that is correlated in time it writes ``noise``, which a flight hands on, and ``noise_before``, that of
+    the step before. If there is none yet it is drawn. A deterministic flight has none.
     """
+
+    built: list[Any]  # its layout
 
     @property
     def last(self) -> Network:
         """The network that ends in the head."""
-        return cast(Network, self[0].module)
+        parts: Any = self[0]
+        return cast(Network, (parts[-1] if isinstance(parts, TensorDictSequential) else parts).module)
 
     @property
-    def sampler(self) -> ProbabilisticTensorDictModule:
+    def sampler(self) -> Any:
         """The part that samples."""
-        return cast(ProbabilisticTensorDictModule, self[1])
+        return self[1]
 
     @property
     def is_random(self) -> bool | None:
@@ -185,34 +185,20 @@ class TanhGaussianActor(ProbabilisticActor):
 
     def plain(self) -> PlainTanhGaussian | None:
         """The policy as pure functions of its present weights; None if its parts were changed or hooked."""
-        is_random, network = self.is_random, getattr(self[0], "module", None)
-        if is_random is None or type(self) is not TanhGaussianActor or len(self.module) != 2:
+        if type(self) is not TanhGaussianActor or self.is_random is None or layout(self) != self.built:
             return None
-        if type(network) is not Network or is_hooked(self) or self.sampler.distribution_class is not TanhNormal:
-            return None
-        if len(set(map(str, self[0].in_keys))) < len(self[0].in_keys):
-            return None
-        head, mlp = network.head, network.mlp
-        if type(head) is not GaussianHead or type(head.scale_mapping) is not biased_softplus or type(mlp) is not MLP:
-            return None
-        layers, activations = list(mlp)[::2], list(mlp)[1::2]
-        if any(type(layer) is not nn.Linear or layer.bias is None for layer in layers):
-            return None
-        if len(activations) != len(layers) - 1 or not all(map(is_pointwise, activations)):
-            return None
-        return PlainTanhGaussian(self, cast(list[nn.Linear], layers), activations, is_random)
+        reads_twice = len(set(map(str, self[0].in_keys))) < len(self[0].in_keys)
+        return None if reads_twice or not self.last.is_plain else PlainTanhGaussian(self)
 
 
 class PlainTanhGaussian:
     """A tanh-Gaussian policy on plain tensors; see the engine's ``PlainPolicy``."""
 
-    def __init__(
-        self, actor: TanhGaussianActor, layers: list[nn.Linear], activations: list[nn.Module], is_random: bool
-    ) -> None:
-        network = actor.last
+    def __init__(self, actor: TanhGaussianActor) -> None:
+        network, self.is_random = actor.last, actor.is_random
         self.scales, self.widths = network.scales, network.widths
         self.in_keys, self.out_keys = list(actor[0].in_keys)[: len(self.scales)], list(actor.out_keys)
-        self.activations, self.is_random = activations, is_random
+        self.activations, layers = list(network.mlp)[1::2], cast(list[nn.Linear], list(network.mlp)[::2])
         self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
         self._take_head(actor)
         mapping = cast(biased_softplus, self.head.scale_mapping)
@@ -245,8 +231,7 @@ class PlainTanhGaussian:
 
         Noise that is correlated in time comes with that of the step before, (steps, n, 2 size).
         """
-        like = self.weights[0]
-        noise = like.new_zeros((steps, n, self.size))
+        noise = self.weights[0].new_zeros((steps, n, self.size))
         if not self.rho:
             for x in noise if self.is_random else ():
                 x.normal_()
@@ -295,8 +280,7 @@ class PlainTanhGaussian:
         grads: dict[NestedKey, Tensor],
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """What each layer read, and the gradient of what it returned; the gradients of inputs and noise."""
-        pull = vjp(self._sample, kept[-1], drawn)[1]
-        grad, grad_drawn = pull(grads)
+        grad, grad_drawn = vjp(self._sample, kept[-1], drawn)[1](grads)
         read, grads_kept = [], [grad]
         for weight, activation, x in zip(weights[-2:0:-2], self.activations[::-1], kept[-2::-1], strict=True):
             activated, pull = vjp(activation, x)[:2]
@@ -314,10 +298,6 @@ class PlainTanhGaussian:
         pairs = zip(traces[:count], traces[count:], strict=True)
         return [g for x, grad in pairs for g in (grad.t() @ x, grad.sum(0))]
 
-    def action(self, loc: Tensor, scale: Tensor, xi: Tensor) -> Tensor:
-        """The action (*, k) of a normal distribution and the noise in it, each (*, k)."""
-        return self._squash(loc, scale, xi, None)["action"]
-
     def _layers(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
         """What each layer returns before its activation, for inputs (n, k_i)."""
         x, kept = _concatenated(inputs, self.scales), []
@@ -326,16 +306,17 @@ class PlainTanhGaussian:
             x = kept[-1] if activation is None else activation(kept[-1])
         return kept
 
-    def _squash(
-        self, loc: Tensor, scale: Tensor, xi: Tensor, log_prob_key: NestedKey | None
+    def squash(
+        self, loc: Tensor, scale: Tensor, xi: Tensor, log_prob_key: NestedKey | None = None
     ) -> dict[NestedKey, Tensor]:
+        """What :func:`tanh_gaussian` writes, within the bounds of the action."""
         bounds = None if self.low is None else (loc.new_tensor(self.low), loc.new_tensor(self.high))
         return tanh_gaussian(loc, scale, xi, bounds, log_prob_key)
 
     def _sample(self, raw: Tensor, drawn: Tensor) -> dict[NestedKey, Tensor]:
         xi, *before = drawn.split(self.size, -1)
         loc, scale = self.head(raw, *before)
-        written = self._squash(loc, scale, xi, self.log_prob_key)
+        written = self.squash(loc, scale, xi, self.log_prob_key)
         if before:
             written |= {"noise_before": before[0], "noise": self.head.next(before[0], xi)}
         return {key: written[key] for key in self.out_keys}
@@ -346,27 +327,24 @@ def _first_noise(x: Tensor, is_random: bool | None) -> Tensor:
     return x.normal_() if is_random else x
 
 
-def check_widths(inputs: Sequence[Tensor], widths: Sequence[int]) -> None:
-    """Raise a UserValueError for inputs that a network was not built for."""
-    found = tuple(x.shape[-1] for x in inputs)
-    if found != tuple(widths):
-        raise UserValueError(
-            f"This network was built for entries of {', '.join(map(str, widths))} numbers, and reads some of "
-            f"{', '.join(map(str, found))}: those of another environment, or of other options. Build one for this."
-        )
-
-
 def _concatenated(inputs: Sequence[Tensor], scales: Sequence[float]) -> Tensor:
     return torch.cat([x if scale == 1.0 else x * scale for x, scale in zip(inputs, scales, strict=True)], -1)
 
 
-def is_hooked(module: nn.Module) -> bool:
-    """Whether a module or one of its parts has hooks."""
-    hooks = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
-    return any(getattr(part, name) for part in module.modules() for name in hooks)
+def layout(network: nn.Module) -> list[Any]:
+    """The types of a network's parts, their weights and hooks: what differs once somebody has changed a part.
+
+    An activation may be replaced by another one.
+    """
+    found: list[Any] = []
+    for part in network.modules():
+        hooks = part._forward_hooks or part._forward_pre_hooks or part._backward_hooks or part._backward_pre_hooks
+        found += [is_pointwise(part) or type(part), bool(hooks), *(x is None for x in part._parameters.values())]
+    return found
 
 
-def is_pointwise(activation: nn.Module) -> bool:
-    """Whether an activation is a function of its input alone: one of torch's without parameters or random numbers."""
-    known = type(activation).__module__ == "torch.nn.modules.activation" and not isinstance(activation, nn.RReLU)
-    return known and not getattr(activation, "inplace", False) and not list(activation.parameters())
+def is_pointwise(part: nn.Module) -> bool:
+    """Whether a part is a function of its input alone: an activation of torch without parameters or random numbers."""
+    if type(part).__module__ != "torch.nn.modules.activation" or isinstance(part, nn.RReLU):
+        return False
+    return not getattr(part, "inplace", False) and not part._parameters

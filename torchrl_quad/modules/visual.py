@@ -2,43 +2,23 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
+from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase, TensorDictPrimer
-from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, TanhNormal, set_recurrent_mode
-from torchrl.modules.models.utils import SquashDims
+from torchrl.modules import MLP, ConvNet, GRUModule, ProbabilisticActor, set_recurrent_mode
 from torchrl.modules.tensordict_module.rnn import GRU
 
 from torchrl_quad.data.unwrap import check_env, leaf, observed
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.modules.networks import (
-    OBSERVATION,
-    Activation,
-    Cells,
-    ScaleInit,
-    check_memory,
-    first_action,
-    network_of,
-    sampled,
-    start_near,
-    with_head,
-)
-from torchrl_quad.modules.plain import (
-    GaussianHead,
-    Network,
-    PlainTanhGaussian,
-    TanhGaussianActor,
-    is_hooked,
-    is_pointwise,
-)
+from torchrl_quad.modules.networks import OBSERVATION, Activation, Cells, ScaleInit, first_action, network_of, policy_of
+from torchrl_quad.modules.plain import Network, PlainTanhGaussian, TanhGaussianActor, is_pointwise, layout
 from torchrl_quad.options import Below1, Entries, Entry, Field, Scale, Width, checked
 
 MEMORY = "recurrent_state"
@@ -67,7 +47,7 @@ def make_visual_actor(
 
     TorchRL's ConvNet reads the inverse of the depth, 1 / max(depth, 0.3 m), which weights near depths most. A
     multi-layer perceptron reads its features and the vectors; its output goes to TorchRL's GRUModule, and both outputs
-    to the head, as in :func:`~torchrl_quad.make_actor`.
+    to the head.
 
     The policy of a recurrent network also reads ``recurrent_state`` (*, 1, hidden_size) and ``is_init`` (*, 1), and
     writes ``("next", "recurrent_state")``. Environments of this package that fly without transforms hand the memory on,
@@ -101,12 +81,7 @@ def make_visual_actor(
             f"{', '.join(map(str, known))}."
         )
     spec, first = first_action(env, action_init, "make_visual_actor")
-    image, size = known[image_key], len(first)
-    filters = [9 * a * b for a, b in itertools.pairwise((image.shape[-3], *channels))]
-    check_memory([*filters, 3 * hidden_size * (num_cells[-1] + hidden_size) if recurrent else 0])
-    height, width = image.shape[-2:]
-    for _ in channels:
-        height, width = (height + 1) // 2, (width + 1) // 2
+    image = known[image_key]
     convolutions = ConvNet(
         in_features=image.shape[-3],
         num_cells=list(channels),
@@ -117,9 +92,8 @@ def make_visual_actor(
         activation_class=activation,
         device=env.device,
     ).to(image.dtype)
-    trunk = network_of(
-        env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale, more=channels[-1] * height * width
-    )
+    seen = convolutions(image.zero()).shape[-1]
+    trunk = network_of(env, in_keys, num_cells[-1], num_cells[:-1], activation, input_scale, more=seen)
     features = VisualFeatures(convolutions, trunk, activation())
     parts: list[Any] = [TensorDictModule(features, in_keys=[image_key, *in_keys], out_keys=["features"])]
     widths = [num_cells[-1]]
@@ -134,13 +108,10 @@ def make_visual_actor(
         ).to(image.dtype)
         parts.append(memory)
         widths.append(hidden_size)
-    outputs = 2 * size if learn_scale else size
-    last = MLP(sum(widths), outputs, num_cells=[], device=env.device).to(image.dtype)
-    start_near(last, first)
-    head = Network(last, [1.0] * len(widths), widths)
-    read = ["features", "recalled"][: len(widths)]
-    parts.append(with_head(head, size, scale_init, noise_correlation, read, return_log_prob))
-    return sampled(VisualActor, TensorDictSequential(*parts), spec, return_log_prob)
+    size = 2 * len(first) if learn_scale else len(first)
+    last = Network(MLP(sum(widths), size, num_cells=[], device=env.device).to(image.dtype), [1.0] * len(widths), widths)
+    read, options = ["features", "recalled"][: len(widths)], (scale_init, noise_correlation, return_log_prob)
+    return policy_of(VisualActor, parts, last, read, spec, first, *options)
 
 
 class VisualFeatures(nn.Module):
@@ -172,24 +143,14 @@ class Parts(NamedTuple):
 class VisualActor(TanhGaussianActor):
     """What :func:`~torchrl_quad.make_visual_actor` builds."""
 
-    @property
-    def last(self) -> Network:
-        """The network that ends in the head."""
-        return cast(Any, self[0])[-1].module
-
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
-        """Write loc, scale and action, the memory, correlated noise, and the log-probability if wanted.
-
-        Raises:
-            ValueError: "is_init", which marks the first steps of episodes, is missing.
-        """
+        """Write loc, scale and action, the memory, correlated noise, and the log-probability if wanted."""
         if "is_init" in self.in_keys and "is_init" not in tensordict:
             raise UserValueError(
-                "A policy with memory reads 'is_init', which says where episodes begin. Fly it by "
-                "differentiable_rollout, or by env.rollout(..., break_when_any_done=False), on an environment without "
-                "transforms; or give the environment TorchRL's: TransformedEnv(env, Compose(InitTracker(), "
-                "actor.make_tensordict_primer()))."
+                "A policy with memory reads 'is_init', which says where episodes begin. Fly an environment without "
+                "transforms by differentiable_rollout, or give it TorchRL's: "
+                "TransformedEnv(env, Compose(InitTracker(), actor.make_tensordict_primer()))."
             )
         return super().forward(tensordict, **kwargs)
 
@@ -199,50 +160,26 @@ class VisualActor(TanhGaussianActor):
 
     def parts(self) -> Parts | None:
         """The parts as :func:`~torchrl_quad.make_visual_actor` builds them; None if they were changed or hooked."""
-        if type(self) is not VisualActor or len(self.module) != 2 or is_hooked(self) or self.is_random is None:
-            return None
-        if self.sampler.distribution_class is not TanhNormal or type(self[0]) is not TensorDictSequential:
-            return None
-        if len(self[0].module) not in (2, 3):
+        if layout(self) != self.built or self.is_random is None:
             return None
         first, *memory, last = cast(Any, self[0].module)
-        features: Any = getattr(first, "module", None)
-        network: Any = getattr(last, "module", None)
-        if type(features) is not VisualFeatures or not _is_network(features.trunk, nn.Identity):
-            return None
-        if not _is_network(network, GaussianHead) or len(network.mlp) != 1 or not _is_linear(network.mlp[0]):
-            return None
-        convolutions, trunk = list(features.convolutions), [*features.trunk.mlp, features.activation]
-        if type(features.convolutions) is not ConvNet or type(convolutions.pop()) is not SquashDims:
-            return None
-        if features.convolutions[-1].ndims_in != 3 or any(scale != 1.0 for scale in network.scales):
-            return None
-        if not _alternates(convolutions, _halves) or not _alternates(trunk, _is_linear):
-            return None
-        if memory and not _is_memory(memory[0]):
-            return None
-        head, reads = network.head, ["features", "recalled"][: len(memory) + 1]
-        wanted = [reads + ["noise_before"] * bool(head.rho), *([["features", MEMORY, "is_init"]] if memory else [])]
-        if [list(part.in_keys) for part in (last, *memory)] != wanted or len(network.scales) != len(reads):
+        features, head = first.module, last.module.head
+        if not features.trunk.is_plain or not is_pointwise(features.activation):
             return None
         return Parts(
-            convolutions,
+            list(features.convolutions)[:-1],
             NEAREST,
-            trunk,
+            [*features.trunk.mlp, features.activation],
             features.trunk.widths,
             features.trunk.scales,
             memory[0].gru if memory else None,
-            network.mlp[0],
+            last.module.mlp[0],
             head.size,
             head.max_loc,
         )
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """TorchRL's transform that gives an environment the memory of this policy, in its precision.
-
-        Raises:
-            ValueError: the policy has no memory.
-        """
+        """TorchRL's transform that gives an environment the memory of this policy, in its precision."""
         for part in self.modules():
             if isinstance(part, GRUModule):
                 weight = cast(Tensor, part.gru.weight_hh_l0)
@@ -271,33 +208,4 @@ class Replay(PlainTanhGaussian):
     def replay(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
         """What it writes in the states of a rollout (*, horizon), with the noise of the rollout."""
         noise = self.drawn_again(tensordict)[:, : self.size].view_as(leaf(tensordict, "action"))
-        return self._squash(*self.distribution(tensordict), noise, self.log_prob_key)
-
-
-def _is_network(module: Any, head: type[nn.Module]) -> bool:
-    return type(module) is Network and type(module.mlp) is MLP and type(module.head) is head
-
-
-def _alternates(layers: list[nn.Module], is_known: Callable[[nn.Module], bool]) -> bool:
-    """Whether these are layers of a known kind, each followed by its activation."""
-    return len(layers) % 2 == 0 and all(map(is_known, layers[::2])) and all(map(is_pointwise, layers[1::2]))
-
-
-def _is_linear(layer: nn.Module) -> bool:
-    return type(layer) is nn.Linear and layer.bias is not None
-
-
-def _halves(layer: nn.Module) -> bool:
-    """Whether it is a convolution, 3 x 3, that halves height and width."""
-    if type(layer) is not nn.Conv2d or layer.bias is None or (layer.groups, layer.padding_mode) != (1, "zeros"):
-        return False
-    found = layer.kernel_size, layer.stride, layer.padding, layer.dilation
-    return found == ((3, 3), (2, 2), (1, 1), (1, 1))
-
-
-def _is_memory(module: nn.Module) -> bool:
-    """Whether it is a GRU of one layer that goes forwards."""
-    gru: Any = getattr(module, "gru", None)
-    if type(module) is not GRUModule or type(gru) not in (GRU, nn.GRU):
-        return False
-    return (gru.num_layers, gru.bias, gru.bidirectional) == (1, True, False)
+        return self.squash(*self.distribution(tensordict), noise, self.log_prob_key)

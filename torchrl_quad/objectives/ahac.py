@@ -10,8 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.objectives.action_gradients import median_length
-from torchrl_quad.objectives.calls import with_fixed
+from torchrl_quad.objectives.calls import median_length, with_fixed
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Copies, Field, Horizon
 
@@ -45,19 +44,13 @@ class AHACLoss(SHACLoss):
 
     Args:
         actor_network: the policy that flew the rollout, as :func:`~torchrl_quad.make_actor` builds it.
-        value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
         horizon: control steps of the first rollout.
         min_horizon: the shortest horizon; null for a quarter of the first.
         max_horizon: the longest horizon; null for twice the first.
         max_stiffness: the bound on the growth of action gradients along a horizon, beyond which it gets shorter; 1.5 to
             5 are usual.
         horizon_lr: the share by which the horizon may change in an iteration.
-        num_value_nets: the critics made from ``value_network``, each initialised independently.
-        **kwargs: ``terminal_gradient`` and ``average_over_horizon`` of :class:`SHACLoss`, and those of
-            :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
-
-    Raises:
-        ValueError: the horizon is not between its bounds, or the policy writes no ``loc`` and ``scale``.
+        **kwargs: as for :class:`SHACLoss`.
     """
 
     measured_of_actions = ["stiffness"]
@@ -81,11 +74,6 @@ class AHACLoss(SHACLoss):
             raise UserValueError(f"horizon={horizon} must lie between min_horizon={low} and max_horizon={high}.")
         options = with_fixed(self, kwargs, target_bootstrap=False, delay_value=False)
         super().__init__(actor_network, value_network, num_value_nets=num_value_nets, **options)
-        if not {"loc", "scale"} <= set(self.actor_network.out_keys):
-            raise UserValueError(
-                "AHACLoss needs a policy as make_actor builds it, which writes loc and scale; this one writes "
-                f"{', '.join(map(str, self.actor_network.out_keys))}."
-            )
         self.min_horizon, self.max_horizon = low, high
         self.max_stiffness, self.horizon_lr = max_stiffness, horizon_lr
         number = {"device": self._default_device, "dtype": torch.float64}
@@ -101,9 +89,8 @@ class AHACLoss(SHACLoss):
     def adapt_horizon(self, stiffness: Tensor) -> None:
         """Shorten the horizon if the stiffness is above its bound, and lengthen it if it is below.
 
-        Args:
-            stiffness: as ``loss_actor`` measured it, a scalar; of several processes their mean. Infinity, which stands
-                for a gradient that is not finite, shortens the horizon; NaN, for no gradient at all, changes nothing.
+        The stiffness is a scalar, as ``loss_actor`` measured it, of several processes their mean. Infinity, for a
+        gradient that is not finite, shortens the horizon; NaN, for no gradient at all, changes nothing.
         """
         if stiffness.isnan():
             return

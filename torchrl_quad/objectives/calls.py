@@ -1,4 +1,4 @@
-"""What losses share: calls of networks, on plain tensors if these allow it, checks, and the segments of a horizon."""
+"""What losses share: calls of networks, gradients in single actions, and the segments of a horizon."""
 
 from __future__ import annotations
 
@@ -10,18 +10,16 @@ import torch
 from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
+from torch.autograd.graph import GradientEdge
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.unwrap import check_tensordict, leaf
-from torchrl_quad.errors import UserTypeError, UserValueError
+from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError
 
 
 def sample_action(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> TensorDictBase:
-    """The states (*) with what a policy writes in them, sampled, with gradients in its parameters and in the states.
-
-    Its method ``plain()``, if it has one, gives the policy as pure functions of tensors.
-    """
+    """The states (*) with what a policy writes in them, sampled, with gradients in its parameters and in the states."""
     tensordict = tensordict.copy()
     with set_exploration_type(ExplorationType.RANDOM), params.to_module(actor):
         plain = actor.plain() if hasattr(actor, "plain") else None
@@ -37,12 +35,8 @@ def predict(
 ) -> Tensor:
     """What critics predict under ``key`` that share a module and have parameters of their own: (critics, *, k).
 
-    Args:
-        critic: the module; its method ``plain()``, if it has one, gives it as a function of tensors.
-        params: the parameters of one critic, or of several, stacked: (critics).
-        tensordict: what they read, (*); it is not modified.
-        key: under which they write.
-        learning: keep the gradient in the parameters and cut that in the inputs; otherwise the other way round.
+    The parameters are those of one critic, or of several, stacked. ``learning`` keeps the gradient in them, and cuts
+    that in the inputs (*); otherwise it is the other way round.
     """
     plain = critic.plain() if hasattr(critic, "plain") else None
     if plain is None:
@@ -55,13 +49,11 @@ def predict(
         return torch.stack(predictions)
     tensors = [leaf(tensordict, name) for name in critic.in_keys]
     _check_precision(critic, critic.in_keys, tensors, params)
-    weights = {".".join(cast(tuple[str, ...], name)): x for name, x in params.items(True, True)}
-    if learning:
-        tensors = [x.detach() for x in tensors]
-    else:
-        weights = {name: x.detach() for name, x in weights.items()}
-    copies = zip(*(x.unbind(0) for x in weights.values()), strict=True) if params.batch_dims else [weights.values()]
-    return torch.stack([plain(dict(zip(weights, own, strict=True)), tensors) for own in copies])
+    tensors = [x.detach() for x in tensors] if learning else tensors
+    names = [".".join(cast(tuple[str, ...], name)) for name in params.keys(True, True)]
+    weights = [x if learning else x.detach() for x in params.values(True, True)]
+    copies = zip(*(x.unbind(0) for x in weights), strict=True) if params.batch_dims else [weights]
+    return torch.stack([plain(dict(zip(names, own, strict=True)), tensors) for own in copies])
 
 
 def _check_precision(
@@ -98,12 +90,6 @@ def with_fixed(loss: Any, given: Mapping[str, Any], **fixed: Any) -> dict[str, A
     return {**given, **fixed}
 
 
-def check_function(name: str, value: Any) -> None:
-    """Raise a UserTypeError for what is neither None nor can be called."""
-    if not (value is None or callable(value)):
-        raise UserTypeError(f"{name} must be a function, or None; got {type(value).__name__}.")
-
-
 def total(parts: Iterable[Tensor]) -> Tensor:
     """The sum of some tensors, at least one."""
     return cast(Tensor, sum(parts))
@@ -117,10 +103,7 @@ def act(plain: Any, tensordict: TensorDictBase, drawn: Tensor) -> dict[NestedKey
 
 
 def segments(done: Tensor) -> tuple[Tensor, Tensor]:
-    """Mark the first and the last step of each segment, between ends of episodes and of the horizon.
-
-    ``done`` is bool (*, horizon, 1), and so are the results.
-    """
+    """The first and the last step of each segment, between ends of episodes and of the horizon: bool, as ``done``."""
     end = done.clone()
     end[..., -1, :] = True
     return end.roll(1, -2), end
@@ -136,3 +119,104 @@ def step_in_segment(done: Tensor) -> Tensor:
 def discounts(done: Tensor, gamma: Tensor) -> Tensor:
     """gamma^t, for a scalar gamma, where t counts the steps of each segment from 0."""
     return gamma ** step_in_segment(done)
+
+
+# -- gradients in single actions, and how a policy learns from them ----------------------------------------------------
+
+
+def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
+    """The gradient of a scalar in each action of a rollout, by all that follows from it, the policy included.
+
+    ``action`` is ``rollout["action"]`` (*, horizon, k) as it was flown, no copy or part, with its graph, which is kept.
+    """
+    node: Any = action.grad_fn
+    steps = sources_of_steps(action)
+    if isinstance(steps, Tensor):
+        node.learns = False  # the weights of a policy inside the compiled horizon get no gradient here
+        try:
+            (grad,) = torch.autograd.grad(objective, steps, retain_graph=True)
+        finally:
+            node.learns = True
+        return grad.movedim(0, -2)
+    dim = None if steps is None else node._saved_dim  # of the stack; -2 is kept without its sign
+    if steps is None or len(steps) != action.shape[-2] or dim not in (action.ndim - 2, 2**64 - 2):
+        raise UserValueError(
+            "The gradient of each action needs one rollout as differentiable_rollout returned it, whole and with its "
+            "graph; this one was copied, reshaped or cut. Give the rollout itself to the loss."
+        )
+    grads = torch.autograd.grad(objective, steps, retain_graph=True, allow_unused=True)
+    return torch.stack([torch.zeros_like(action[..., 0, :]) if g is None else g for g in grads], -2)
+
+
+def sources_of_steps(entry: Tensor) -> Tensor | list[GradientEdge] | None:
+    """What the rewards of a rollout depend on instead of one of its entries, if that was stacked afterwards."""
+    node: Any = entry.grad_fn
+    if hasattr(node, "actions"):  # of a compiled horizon, a node of its own: (horizon, num_envs, k)
+        return node.actions
+    if node is None or node.name() != "StackBackward0":
+        return None
+    return [GradientEdge(step, index) for step, index in node.next_functions if step is not None]
+
+
+def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
+    """What a policy writes in a rollout's states, with the rollout's noise.
+
+    The gradients reach the policy's parameters alone, neither earlier states nor the noise. A memory is built up again
+    from that at the start. Actions within 1e-6 of a bound count as if they were that far from it.
+    """
+    with params.to_module(actor):
+        plain = plain_of(actor)
+        if hasattr(plain, "replay"):
+            return plain.replay(tensordict)
+        return act(plain, tensordict.select(*plain.in_keys).detach(), plain.drawn_again(tensordict))
+
+
+def distribution_again(
+    actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase
+) -> tuple[Tensor, Tensor]:
+    """loc and scale, before the tanh, in a rollout's states, (*, k); otherwise as :func:`act_again`."""
+    with params.to_module(actor):
+        return plain_of(actor).distribution(tensordict)
+
+
+def plain_of(actor: TensorDictModule) -> Any:
+    """A policy whose noise follows from its actions, as functions of tensors: a ``PlainTanhGaussian``."""
+    make = getattr(actor, "replayed", None) or getattr(actor, "plain", lambda: None)
+    plain = make()
+    if not hasattr(plain, "drawn_again"):
+        raise Unsupported(
+            "Gradients of single actions need a policy of make_actor or make_visual_actor, whose noise follows from "
+            "its actions, and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed parts, or "
+            "leave clip_action_gradient=None with a loss other than AHACLoss and HybridLoss."
+        )
+    return plain
+
+
+def median_length(length: Tensor) -> Tensor:
+    """The median of the lengths that are not zero: a scalar, NaN if all are."""
+    return torch.where(length > 0, length, torch.nan).nanmedian()
+
+
+class MedianClip(nn.Module):
+    """Shortens gradients (*, k) that are longer than ``factor`` times the running median of their lengths.
+
+    One that is not finite becomes zero, and counts as shortened. ``decay`` is that of the running median in each call.
+    """
+
+    def __init__(self, factor: float, decay: float = 0.9) -> None:
+        super().__init__()
+        self.factor, self.decay = factor, decay
+        self.register_buffer("median", torch.zeros(()))
+        self.median: Tensor
+
+    @torch.no_grad()
+    def forward(self, grad: Tensor) -> tuple[Tensor, Tensor]:
+        """The gradients, and the fraction that was shortened of those that are not zero."""
+        length = grad.norm(dim=-1, keepdim=True)
+        finite, counts = length.isfinite(), length != 0
+        median = median_length(torch.where(finite, length, 0.0))
+        running = torch.where(self.median > 0, torch.lerp(median, self.median.to(median), self.decay), median)
+        self.median = torch.where(median.isnan(), self.median.to(median), running)
+        factor = torch.where(finite, self.factor * self.median / length.clamp_min(1e-30), 0.0).clamp_max(1.0)
+        clipped = (counts & (factor < 1)).sum() / counts.sum().clamp_min(1)
+        return torch.where(finite, grad, 0.0) * factor, clipped

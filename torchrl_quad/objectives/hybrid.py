@@ -18,8 +18,14 @@ from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_quad.data.unwrap import check_tensordict, group, leaf
 from torchrl_quad.errors import UserValueError, WrongState
-from torchrl_quad.objectives.action_gradients import action_gradient, distribution_again, plain_of
-from torchrl_quad.objectives.calls import check_function, discounts, segments, takes_rollout
+from torchrl_quad.objectives.calls import (
+    action_gradient,
+    discounts,
+    distribution_again,
+    plain_of,
+    segments,
+    takes_rollout,
+)
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Coefficient, Field, Positive, Share
 
@@ -58,22 +64,15 @@ class HybridLoss(SHACLoss):
             advantage and of the critic's targets is ``make_value_estimator(lmbda=...)``.
         clip_epsilon: how far the ratio of probabilities may move from 1; 0.2 is usual.
         entropy_coeff: the weight of the entropy bonus, next to advantages of standard deviation 1; 0 for none.
-        clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for no
-            bound.
+        clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for none.
+        reduction: mean, sum or none, over samples.
         decay: the share of the running weight that a rollout leaves as it is.
         average: of a scalar over the processes that train together, if there are several.
-        reduction: mean, sum or none, over samples.
-
-    Raises:
-        NotImplementedError: (in use) the policy is another one than ``make_actor`` builds.
     """
 
     @dataclass
     class _AcceptedKeys(SHACLoss._AcceptedKeys):
-        """As for SHAC, and the keys of what :meth:`HybridLoss.write_targets` writes.
-
-        ``advantage`` is A' and ``location_gradient`` b p, both divided by the standard deviation of A; ``latent`` is u.
-        """
+        """``advantage`` is A' and ``location_gradient`` b p, both divided by the deviation of A; ``latent`` is u."""
 
         advantage: NestedKey = "advantage"
         location_gradient: NestedKey = "location_gradient"
@@ -97,14 +96,8 @@ class HybridLoss(SHACLoss):
         average: Callable[[Tensor], Tensor] | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
-        check_function("average", average)
-        super().__init__(
-            actor_network,
-            value_network,
-            delay_value=False,
-            clip_action_gradient=clip_action_gradient,
-            reduction=reduction,
-        )
+        own = {"clip_action_gradient": clip_action_gradient, "reduction": reduction}
+        super().__init__(actor_network, value_network, delay_value=False, **own)
         self.gradient_lmbda, self.clip_epsilon, self.entropy_coeff = gradient_lmbda, clip_epsilon, entropy_coeff
         self.decay, self.average = decay, average
         self.out_keys = [name for name in self.out_keys if name != "clipped"]  # minibatches clip no gradient
@@ -122,11 +115,10 @@ class HybridLoss(SHACLoss):
         return super().forward(self._with_targets(tensordict))
 
     def write_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Differentiate a rollout (*, horizon), update the weight, and write what the minibatches read.
+        """Differentiate a rollout (*, horizon), update the weight, and return what the minibatches read.
 
-        Returns:
-            the rollout without its graph, with ``advantage``, ``location_gradient``, ``latent`` and ``value_target``
-            under their tensor keys.
+        This is the rollout without its graph, with ``advantage``, ``location_gradient``, ``latent`` and
+        ``value_target`` under their tensor keys.
         """
         self._check_rollout(tensordict)
         if not torch.is_grad_enabled():
@@ -141,9 +133,7 @@ class HybridLoss(SHACLoss):
             predicted = (grad * (latent - leaf(data, "loc"))).sum(-1, keepdim=True)
             weight = self._regress(advantage, predicted)
         data.set(keys.advantage, advantage - weight * (predicted - predicted.mean()))
-        data.set(keys.location_gradient, weight * grad)
-        data.set(keys.latent, latent)
-        return data
+        return data.set(keys.location_gradient, weight * grad).set(keys.latent, latent)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss of what :meth:`forward` takes, and the weight, KL(policy that flew || policy), entropy."""
@@ -166,7 +156,7 @@ class HybridLoss(SHACLoss):
         return self._reduce_loss(-objective), metadata
 
     def _with_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
-        check_tensordict(self._name, tensordict)
+        check_tensordict("HybridLoss", tensordict)
         keys = self.tensor_keys
         lost = [key for key in (keys.advantage, keys.location_gradient, keys.latent) if key not in tensordict]
         # An advantage without the other two comes from another estimator.
@@ -181,27 +171,29 @@ class HybridLoss(SHACLoss):
         """The gradient of each action's own lambda-return in that action: (*, horizon, k)."""
         reward, terminated = self._reward(tensordict), self._next(tensordict, "terminated")
         gamma = self._gamma.to(reward.dtype)
-        self._check_horizon(gamma.item() * self.gradient_lmbda, reward)
         goes_on = group(tensordict, "next").select(*self._critic_inputs())[~terminated.squeeze(-1)]
         value = self._value(cast(TensorDictBase, goes_on), target=False).to(reward.dtype)
         done = self._next(tensordict, "done")
-        _, end = segments(done)
-        bootstrap = torch.where(end, 1.0, 1.0 - self.gradient_lmbda).to(reward.dtype)
+        bootstrap = torch.where(segments(done)[1], 1.0, 1.0 - self.gradient_lmbda).to(reward.dtype)
         bootstrap = bootstrap * torch.zeros_like(reward).masked_scatter(~terminated, value)
         discount = discounts(done, gamma * self.gradient_lmbda)
+        if discount.min() < 1e6 * torch.finfo(reward.dtype).tiny:
+            raise UserValueError(
+                f"gamma * gradient_lmbda = {float(gamma * self.gradient_lmbda):.3g} is too small for a horizon of "
+                f"{reward.shape[-2]} steps: {reward.dtype} cannot divide by its power. Fly fewer, or raise the lmbda."
+            )
         objective = (discount * (reward + gamma * bootstrap)).sum()
         grad = action_gradient(objective, leaf(tensordict, self.tensor_keys.action)) / discount
         return grad if self.clip is None else self.clip(grad)[0]
 
     def _in_location(self, data: TensorDictBase, grad: Tensor) -> tuple[Tensor, Tensor]:
-        """The gradient in the mean before the tanh, from that in the action, and the action before the tanh."""
         with self.actor_network_params.to_module(self.actor_network):
             plain = plain_of(self.actor_network)
             xi = plain.drawn_again(data)[:, : plain.size].view_as(grad)
             scale = leaf(data, "scale").detach()
             loc = leaf(data, "loc").detach().requires_grad_()
             with torch.enable_grad():
-                (grad,) = torch.autograd.grad((plain.action(loc, scale, xi) * grad).sum(), loc)
+                (grad,) = torch.autograd.grad((plain.squash(loc, scale, xi)["action"] * grad).sum(), loc)
         if plain.rho:
             # Noise lasts into later actions of the episode: the gradient is that in its new part, divided by the scale.
             decay = plain.rho * (self._gamma * cast(Tensor, self.value_estimator.lmbda))
@@ -212,22 +204,10 @@ class HybridLoss(SHACLoss):
             grad = torch.stack(steps[::-1], -2)
         return grad, (loc + scale * xi).detach()
 
-    def _check_horizon(self, discount: float, reward: Tensor) -> None:
-        """Raise a UserValueError for a horizon at whose end the discount is too small to divide by."""
-        least = 1e6 * torch.finfo(reward.dtype).tiny
-        longest = 1 + int(math.log(least) / math.log(discount)) if 0 < discount < 1 else 1
-        if discount < 1 and reward.shape[-2] > longest:
-            raise UserValueError(
-                f"gamma * gradient_lmbda = {discount:.3g} is too small for a horizon of {reward.shape[-2]} steps: "
-                f"{reward.dtype} cannot divide by its power. Fly at most {longest} steps, or raise gradient_lmbda."
-            )
-
     def _regress(self, advantage: Tensor, predicted: Tensor) -> Tensor:
-        """Update the weight with the slope of the advantages over what was predicted, each (*, horizon, 1).
-
-        Both are centred in each step of the horizon, since an advantage depends on the steps that are left as long as
-        the critic knows little; those of a single flight over its steps.
-        """
+        """Update the weight with the slope of the advantages over what was predicted, each (*, horizon, 1)."""
+        # Centred in each step of the horizon, since an advantage depends on the steps that are left as long as the
+        # critic knows little; those of a single flight over its steps.
         batch = tuple(i for i, size in enumerate(advantage.shape[:-2]) if size > 1) or (-2,)
         advantage, predicted = (x - x.mean(batch, keepdim=True) for x in (advantage, predicted))
         covariance, variance = (predicted * advantage).mean(), predicted.square().mean()

@@ -1,4 +1,4 @@
-"""What all first-order losses share: the discounted rewards of a horizon's segments, and the entropy bonus."""
+"""What all first-order losses share: the rewards of a horizon's segments, the entropy bonus, and the critic, if any."""
 
 from __future__ import annotations
 
@@ -13,15 +13,20 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import ValueEstimators, default_value_kwargs, dispatch_value_estimator
-from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_quad.data.unwrap import check_tensordict, leaf
+from torchrl_quad.data.unwrap import check_tensordict, group, leaf
 from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, WrongState, shown
-from torchrl_quad.objectives.action_gradients import MedianClip, act_again, action_gradient
-from torchrl_quad.objectives.calls import discounts, takes_rollout, total
-from torchrl_quad.options import Coefficient, Device, Entry, Fraction, Positive, Scale, between, check_value, checked
-
-MOST_WEIGHTS = 100_000_000  # of all copies of a critic; more fit into no memory that trains on a horizon
+from torchrl_quad.objectives.calls import (
+    MedianClip,
+    act_again,
+    action_gradient,
+    discounts,
+    predict,
+    segments,
+    takes_rollout,
+    total,
+)
+from torchrl_quad.options import Coefficient, Entry, Fraction, Positive, Scale, between, check_value, checked
 
 
 @checked
@@ -35,9 +40,8 @@ class PathwiseLoss(LossModule):
     Args:
         actor_network: the policy that flew the rollout.
         alpha: the coefficient of the entropy bonus: a number, 0 for none, or auto to hold the entropy at its target.
-            The bonus is alpha * mean over the steps of -log pi(a|s), from the log-probability in the rollout (an actor
-            built with ``return_log_prob=True``). "auto" suits learned noise: with a fixed one the entropy may never
-            reach its target, and alpha keeps growing.
+            The bonus is alpha * mean over the steps of -log pi(a|s), from an actor with ``return_log_prob=True``. With
+            a fixed noise the entropy may never reach its target, and "auto" keeps growing.
         target_entropy: where alpha=auto holds the entropy: a number, or auto for minus the number of action entries.
         alpha_init: what alpha=auto starts from.
         clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for no
@@ -46,7 +50,6 @@ class PathwiseLoss(LossModule):
         reduction: mean or sum over environments (over samples for a critic), or none.
 
     Raises:
-        TypeError: a network is not a TensorDictModule.
         ValueError: (in use) the rollout has no time dimension, lacks an entry, or is on another device.
         RuntimeError: (in use) the rollout has lost its graph, or lacks the log-probability that the bonus needs.
     """
@@ -112,22 +115,13 @@ class PathwiseLoss(LossModule):
         self.out_keys = [*self.out_keys, *self.measured_of_actions, *of_entropy]
 
     def convert_to_functional(self, module: TensorDictModule, module_name: str, *args: Any, **kwargs: Any) -> None:
-        """As TorchRL's, for a TensorDictModule alone, and no more copies than fit into memory."""
+        """As TorchRL's, for a TensorDictModule alone."""
         if not isinstance(module, TensorDictModuleBase):
             raise UserTypeError(
                 f"{module_name} must be a TensorDictModule, got {type(module).__name__}. Wrap a plain module: "
                 'TensorDictModule(module, in_keys=["observation"], out_keys=[...]).'
             )
-        copies = kwargs.get("expand_dim") or 1
-        weights = copies * sum(p.numel() for p in module.parameters() if not torch.nn.parameter.is_lazy(p))
-        if weights > MOST_WEIGHTS:
-            raise UserValueError(
-                f"{copies} copies of this {module_name} have {weights:,} weights, more than {MOST_WEIGHTS:,}. Take "
-                "fewer copies, or a smaller network."
-            )
         super().convert_to_functional(module, module_name, *args, **kwargs)
-
-    # -- keys and parameters -------------------------------------------------------------------------------------------
 
     @property
     def in_keys(self) -> list[NestedKey]:  # pyrefly: ignore[bad-override]  # without its setter
@@ -159,10 +153,6 @@ class PathwiseLoss(LossModule):
         *,
         gamma: Fraction | None = None,
         lmbda: Fraction | None = None,
-        average_rewards: bool | None = None,
-        differentiable: bool | None = None,
-        vectorized: bool | None = None,
-        device: Device | None = None,
         **more: Any,
     ) -> Self:
         """Choose the return estimator and its parameters.
@@ -171,23 +161,12 @@ class PathwiseLoss(LossModule):
         environments (torchrl 0.14).
 
         Args:
-            value_type: one of ``supported_value_estimators``, or an estimator of TorchRL; by default that of the loss.
+            value_type: one of ``supported_value_estimators``; by default that of the loss.
             gamma: the discount of future rewards per control step; 0.99 is usual.
-            lmbda: the lambda of the TD(lambda) targets; 0.95 is usual.
-            average_rewards, differentiable, vectorized, device: as for TorchRL's estimator.
-            **more: of an estimator that is given as a class.
-
-        Raises:
-            NotImplementedError: the loss does not support the estimator.
-            TypeError: the estimator takes no such argument; only TD(lambda) takes a lambda.
+            lmbda: the lambda of the TD(lambda) targets, which no other estimator takes; 0.95 is usual.
+            **more: as for TorchRL's estimator.
         """
         value_type = self.default_value_estimator if value_type is None else value_type
-        options = {"gamma": gamma, "lmbda": lmbda, "average_rewards": average_rewards, "device": device}
-        options |= {"differentiable": differentiable, "vectorized": vectorized}
-        given: dict[str, Any] = {name: x for name, x in options.items() if x is not None}
-        is_class = isinstance(value_type, type) and issubclass(value_type, ValueEstimatorBase)
-        if is_class or isinstance(value_type, ValueEstimatorBase):
-            return super().make_value_estimator(cast(Any, value_type), **given, **more)
         supported = {x.name.lower(): x for x in self.supported_value_estimators}
         chosen = supported.get(value_type.lower()) if isinstance(value_type, str) else value_type
         if not isinstance(chosen, ValueEstimators) or chosen not in self.supported_value_estimators:
@@ -195,22 +174,16 @@ class PathwiseLoss(LossModule):
                 f"{shown(value_type)} is not implemented for loss {type(self).__name__}. Choose from: "
                 f"{', '.join(supported)}."
             )
-        of_lambda = {"lmbda", "vectorized"}
-        known = set(options) if chosen is ValueEstimators.TDLambda else set(options) - of_lambda
-        if unknown := {*more, *given} - known:
-            raise UserTypeError(
-                f"{type(self).__name__} estimates its returns by {chosen.name}, which takes no {min(unknown)!r}. "
-                f"Choose from: {', '.join(sorted(known))}."
-            )
-        if chosen is ValueEstimators.TDLambda:
-            given = {"vectorized": False, **given}
-        estimator = dispatch_value_estimator(
-            self, chosen, supported=self.supported_value_estimators, value_network=None, **given
-        )
+        given: dict[str, Any] = {name: x for name, x in (("gamma", gamma), ("lmbda", lmbda)) if x is not None}
+        more = {"vectorized": False, **more} if chosen is ValueEstimators.TDLambda else more
+        try:
+            estimator = dispatch_value_estimator(self, chosen, supported=[chosen], value_network=None, **given, **more)
+        except TypeError as error:
+            raise UserTypeError(f"{type(self).__name__} estimates its returns by {chosen.name}: {error}.") from None
         given = {**default_value_kwargs(self.value_type), **given}
         for name in {"gamma", "lmbda"} & given.keys():  # TorchRL makes them float32 whatever the rollout is
-            buffer = getattr(estimator, name)
-            setattr(estimator, name, torch.as_tensor(given[name], device=buffer.device, dtype=self._precision))
+            device = getattr(estimator, name).device
+            setattr(estimator, name, torch.as_tensor(given[name], device=device, dtype=self._precision))
         self._forward_value_estimator_keys()
         return self
 
@@ -225,11 +198,10 @@ class PathwiseLoss(LossModule):
     def set_keys(self, **keys: NestedKey | None) -> None:
         """Read entries of a rollout under other names; None means the name that TorchRL uses."""
         known = vars(self.tensor_keys)
-        for name, key in keys.items():
+        for name in keys:
             if name not in known:
                 raise UserValueError(f"{type(self).__name__} reads no {name!r}. Choose from: {', '.join(known)}.")
-            keys[name] = check_value(name, key, Entry | None)
-        super().set_keys(**keys)
+        super().set_keys(**{name: check_value(name, key, Entry | None) for name, key in keys.items()})
 
     def _forward_value_estimator_keys(self, **_: Any) -> None:
         if self._value_estimator is not None:
@@ -238,8 +210,6 @@ class PathwiseLoss(LossModule):
 
     def _network_in_keys(self) -> set[NestedKey]:
         return set(self.actor_network.in_keys)
-
-    # -- the loss ------------------------------------------------------------------------------------------------------
 
     @takes_rollout
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -261,7 +231,7 @@ class PathwiseLoss(LossModule):
             objective = objective.detach() + learned - learned.detach()
             tensordict, metadata = tensordict.copy().update(written), metadata | measured
         if self.has_entropy_bonus:
-            entropy = self._entropy(tensordict)
+            entropy = self._surprise(tensordict).mean((-2, -1))
             objective = objective + self._entropy_bonus(tensordict)
             metadata |= {"entropy": entropy.detach().mean(), "alpha": self.alpha.clone()}
             if self.automatic_alpha:
@@ -275,7 +245,6 @@ class PathwiseLoss(LossModule):
         return {"rewards": (self._discounts(tensordict) * self._reward(tensordict)).sum((-2, -1))}
 
     def _objective(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """J of each environment, (*), and its metadata."""
         objective = total(self.objective_parts(tensordict).values())
         return objective, {"n_step_return": objective.detach().mean()}
 
@@ -284,40 +253,29 @@ class PathwiseLoss(LossModule):
         return 0.0
 
     def _next(self, tensordict: TensorDictBase, name: str) -> Tensor:
-        """The reward, done or terminated of each step: (*, horizon, 1)."""
         return leaf(tensordict, ("next", getattr(self.tensor_keys, name)))
 
     def _reward(self, tensordict: TensorDictBase) -> Tensor:
-        """The reward of each step, which has to have a gradient."""
         reward = self._next(tensordict, "reward")
         self._check_graph(reward, ("next", self.tensor_keys.reward))
         return reward
-
-    @property
-    def _name(self) -> str:
-        return str(type(self).__name__)
 
     @property
     def _gamma(self) -> Tensor:
         return cast(Tensor, self.value_estimator.gamma)
 
     def _discounts(self, tensordict: TensorDictBase) -> Tensor:
-        """The discount of each step in its segment: (*, horizon, 1)."""
-        gamma = self._gamma.to(self._next(tensordict, "reward").dtype)
-        return discounts(self._next(tensordict, "done"), gamma)
+        return discounts(self._next(tensordict, "done"), self._gamma.to(self._next(tensordict, "reward").dtype))
 
     def _measure(self, grad: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """From the gradients in the actions (*, horizon, k) those to learn from, and what is measured of them."""
-        grad, clipped = (grad, None) if self.clip is None else self.clip(grad)
-        return grad, {} if clipped is None else {"clipped": clipped}
+        if self.clip is None:
+            return grad, {}
+        grad, clipped = self.clip(grad)
+        return grad, {"clipped": clipped}
 
     def _entropy_bonus(self, tensordict: TensorDictBase) -> Tensor:
-        """What is added to J for the entropy of the policy: (*)."""
-        return self.alpha * self._entropy(tensordict)
-
-    def _entropy(self, tensordict: TensorDictBase) -> Tensor:
-        """Minus the log-probability of the actions taken, averaged over the steps: (*)."""
-        return self._surprise(tensordict).mean((-2, -1))
+        return self.alpha * self._surprise(tensordict).mean((-2, -1))
 
     def _surprise(self, tensordict: TensorDictBase) -> Tensor:
         """Minus the log-probability of each action taken, a sample of the policy's entropy: (*, horizon, 1)."""
@@ -336,10 +294,9 @@ class PathwiseLoss(LossModule):
         return float(self.target_entropy)
 
     def _check_rollout(self, tensordict: TensorDictBase) -> None:
-        name = self._name
+        name = str(type(self).__name__)
         check_tensordict(name, tensordict)
-        shape = tuple(tensordict.batch_size)
-        names = tensordict.names
+        shape, names = tuple(tensordict.batch_size), tensordict.names
         # Only the names of its dimensions distinguish a single flight from a batch of single steps.
         has_time = names[-1] == "time" if "time" in names else len(shape) > 1
         if not has_time or shape[-1] == 0:
@@ -359,13 +316,9 @@ class PathwiseLoss(LossModule):
                 f"loss.set_keys(...), which takes {', '.join(vars(self.tensor_keys))}."
             )
         for what in ("reward", "done", "terminated"):
-            key = ("next", getattr(self.tensor_keys, what))
-            entry = leaf(tensordict, key)
-            if (got := tuple(entry.shape)) != (*shape, 1):
+            key, got = ("next", getattr(self.tensor_keys, what)), tuple(self._next(tensordict, what).shape)
+            if got != (*shape, 1):
                 raise UserValueError(f"{name} needs {key!r} of shape {(*shape, 1)} in this rollout; got {got}.")
-            if not (entry.is_floating_point() if what == "reward" else entry.dtype == torch.bool):
-                kind = "floating-point numbers" if what == "reward" else "bool"
-                raise UserValueError(f"{name} needs {key!r} as {kind}; got {entry.dtype}.")
         device, own = self._next(tensordict, "reward").device, self._default_device
         if own not in (None, device):
             raise UserValueError(f"{name} is on {own}, and the rollout on {device}: loss.to({str(device)!r}) moves it.")
@@ -379,3 +332,118 @@ class PathwiseLoss(LossModule):
                 "break_when_any_done=False) with gradients enabled, on an environment that is differentiable. "
                 "The horizon must be longer than the delay between an action and its effect."
             )
+
+
+class PathwiseCriticLoss(PathwiseLoss):
+    """A pathwise loss with a critic, whose value ends each segment and which learns TD(lambda) targets."""
+
+    @dataclass
+    class _AcceptedKeys(PathwiseLoss._AcceptedKeys):
+        value_target: NestedKey = "value_target"
+
+    default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.TDLambda
+    supported_value_estimators = (ValueEstimators.TD0, ValueEstimators.TDLambda)
+
+    critic_name: str  # the attribute that holds the critic network
+    critic_loss_key: str
+    prediction_key: str  # the tensor key under which the critic writes its prediction
+    value_part = "terminal_value"
+    target_bootstrap = False  # whether the terminal value comes from the target network
+
+    @takes_rollout
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The losses of actor and critic and their metadata, the ``out_keys``, of a rollout that carries its graph."""
+        losses = PathwiseLoss.forward(self, tensordict)
+        loss_critic, metadata = self._critic_loss(tensordict)
+        return losses.update({self.critic_loss_key: loss_critic, **metadata})
+
+    def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """The terms whose sum is J, each (*,): discounted ``rewards`` of the segments, and their ``terminal_value``."""
+        return {**super().objective_parts(tensordict), "terminal_value": self._terminal_value(tensordict)}
+
+    def write_value_target(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the TD(lambda) target of each step (paper, equations 17 and 18) into a rollout, and return it.
+
+        Each step's next value comes from the target network. A step that terminated does not bootstrap, one that was
+        truncated and the horizon's last one do. The critic's loss reads the targets if they are there, so that several
+        critic steps share them, and computes them otherwise. They are (*, horizon, 1), without a graph.
+        """
+        self._check_rollout(tensordict)
+        data = tensordict.detach()
+        with torch.no_grad():
+            next_value = self._value(group(data, "next"), target=True)
+            # A terminated state may not be finite, nor its value.
+            next_value = torch.where(self._next(data, "terminated"), 0.0, next_value)
+            target = self.value_estimator.value_estimate(data, next_value=next_value)
+        return tensordict.set(self.tensor_keys.value_target, target)
+
+    def _critics(self, tensordict: TensorDictBase, *, target: bool = False, learning: bool = False) -> Tensor:
+        """The prediction of each critic or of its target, (critics, *, 1); for ``learning`` see ``predict``."""
+        params = getattr(self, f"{'target_' if target else ''}{self.critic_name}_params")
+        key, shape = getattr(self.tensor_keys, self.prediction_key), (*tensordict.shape, 1)
+        found = predict(getattr(self, self.critic_name), params, tensordict, key, learning=learning)
+        if found.shape[1:] != shape:
+            raise UserValueError(
+                f"{self.critic_name} must write one number for each state, {key!r} of shape {shape}; got "
+                f"{tuple(found.shape[1:])}."
+            )
+        return found
+
+    def _value(self, tensordict: TensorDictBase, *, target: bool) -> Tensor:
+        """The value (*, 1) of states: the least of the predictions of the critics or of their targets."""
+        return self._critics(tensordict, target=target).amin(0)
+
+    def _critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        check_tensordict(str(type(self).__name__), tensordict)
+        key = self.tensor_keys.value_target
+        missing = [name for name in getattr(self, self.critic_name).in_keys if name not in tensordict]
+        if missing:
+            raise UserValueError(f"{self.critic_name} reads {missing[0]!r}, which these samples lack.")
+        samples = tensordict if key in tensordict else self.write_value_target(tensordict.copy())
+        target, prediction = leaf(samples, key).detach(), self._critics(tensordict, learning=True)
+        if target.shape != prediction.shape[1:]:
+            raise UserValueError(
+                f"{key!r} has shape {tuple(target.shape)}, and the critic's predictions {tuple(prediction.shape[1:])}: "
+                "give targets as write_value_target writes them."
+            )
+        error = (prediction - target).square().sum(0)
+        residual = (target - prediction.detach()).var(correction=0) / target.var(correction=0).clamp_min(1e-12)
+        return self._reduce_loss(error, tensordict), {
+            "pred_value": prediction.detach().mean(),
+            "target_value": target.mean(),
+            "explained_variance": 1.0 - residual,
+        }
+
+    def _terminal_value(self, tensordict: TensorDictBase) -> Tensor:
+        """gamma^n V(s_n) of each segment that did not terminate, summed over the segments: (*)."""
+        return self._discounted_value(tensordict, segments(self._next(tensordict, "done"))[1])
+
+    def _discounted_value(self, tensordict: TensorDictBase, after: Tensor) -> Tensor:
+        """gamma^(t+1) V(s_(t+1)) after steps (*, horizon, 1), but for those that terminated, summed over steps: (*)."""
+        where = after & ~self._next(tensordict, "terminated")
+        next_state = group(tensordict, "next").select(*self._critic_inputs(), strict=False)[where.squeeze(-1)]
+        discount = self._gamma * self._discounts(tensordict)
+        if next_state.shape[0] == 0:  # a recurrent policy refuses an empty batch
+            return torch.zeros_like(discount).sum((-2, -1))
+        value = self._value(cast(TensorDictBase, next_state), target=self.target_bootstrap)
+        return (discount * torch.zeros_like(discount).masked_scatter(where, value.to(discount.dtype))).sum((-2, -1))
+
+    def _critic_inputs(self) -> set[NestedKey]:
+        """The entries of a state that the critic, and the actor before it, read."""
+        actor = self.actor_network
+        names = set(actor.in_keys) - set(actor.out_keys) | set(getattr(self, self.critic_name).in_keys)
+        return names - {self.tensor_keys.action}
+
+    def _check_rollout(self, tensordict: TensorDictBase) -> None:
+        critic, key = getattr(self, self.critic_name), getattr(self.tensor_keys, self.prediction_key)
+        if key not in critic.out_keys:
+            raise UserValueError(
+                f"{type(self).__name__} reads {key!r} of its {self.critic_name}, which writes "
+                f"{', '.join(map(str, critic.out_keys))}. Give another network, or set_keys({self.prediction_key}=...)."
+            )
+        super()._check_rollout(tensordict)
+
+    def _network_in_keys(self) -> set[NestedKey]:
+        inputs = self._critic_inputs()
+        return inputs | {unravel_key(("next", key)) for key in inputs}

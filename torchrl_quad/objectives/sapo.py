@@ -35,15 +35,12 @@ class SAPOLoss(SHACLoss):
 
     Args:
         actor_network: the policy that flew the rollout, with log-probabilities (``return_log_prob=True``).
-        value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
-        num_value_nets: the critics made from it, each initialised independently.
         alpha: the coefficient of the entropy: a positive number, or auto to hold the entropy at its target; without
             entropy take SHACLoss.
         alpha_init: what alpha=auto starts from.
         target_entropy: where alpha=auto holds the entropy: a negative number, or auto for minus half the number of
             action entries. The entropy is measured in its size.
-        **kwargs: ``terminal_gradient`` and ``average_over_horizon`` of :class:`SHACLoss`, and those of
-            :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
+        **kwargs: as for :class:`SHACLoss`.
     """
 
     def __init__(
@@ -70,7 +67,6 @@ class SAPOLoss(SHACLoss):
         return tensordict.set(target, leaf(super().write_value_target(soft), target))
 
     def _entropy_bonus(self, tensordict: TensorDictBase) -> Tensor:
-        """Alpha times the normalised entropy of each step, discounted as its reward is: (*)."""
         steps = tensordict.shape[-1] if self.average_over_horizon else 1
         entropy = self._discounts(tensordict) * self._normalized_entropy(tensordict)
         return self.alpha * entropy.sum((-2, -1)) / steps

@@ -14,7 +14,6 @@ from torch.distributions import Normal, kl_divergence
 
 from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.errors import UserTypeError, UserValueError
-from torchrl_quad.objectives.calls import check_function
 from torchrl_quad.options import NonNegative, Positive, checked
 
 
@@ -23,8 +22,8 @@ class TrustRegion:
     """Shortens an update that would move a Gaussian policy beyond a bound on the Kullback-Leibler divergence.
 
     The divergence KL(before || after) is summed over the entries of the action and averaged over the states of a
-    rollout. For short steps it grows with the square of the step, so a step that is too long is shortened by the root
-    of its excess until it keeps the bound. An update to numbers that are not finite is undone.
+    rollout. It grows with the square of the step, so a step that is too long is shortened by the root of its excess
+    until it keeps the bound. An update to numbers that are not finite is undone.
 
     .. code-block:: python
 
@@ -41,10 +40,6 @@ class TrustRegion:
 
     Attributes:
         metrics: ``kl``, the divergence of the last update before it was shortened; empty without a bound.
-
-    Raises:
-        TypeError: the actor is no such policy.
-        ValueError: (in use) the rollout has no ``loc`` and ``scale``.
     """
 
     def __init__(
@@ -56,11 +51,7 @@ class TrustRegion:
         average: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         if not hasattr(actor, "get_dist_params"):
-            raise UserTypeError(
-                f"actor must be a policy as make_actor builds it, which writes loc and scale; got "
-                f"{type(actor).__name__}."
-            )
-        check_function("average", average)
+            raise UserTypeError(f"actor must be a policy as make_actor builds it; got {type(actor).__name__}.")
         self.actor, self.max_kl, self.min_scale, self.average = actor, max_kl, min_scale, average
         self.metrics: dict[str, Tensor] = {}
 
@@ -76,20 +67,17 @@ class TrustRegion:
         before = [x.detach().clone() for x in parameters]
         yield
         with torch.no_grad():
-            kl = self._mean_divergence(rollout)
-            self.metrics = {"kl": kl}
-            for _ in range(20):
+            for attempt in range(21):
+                kl = self.divergence(rollout)
+                kl = kl if self.average is None else self.average(kl)
+                if attempt == 0:
+                    self.metrics = {"kl": kl}
                 if kl <= self.max_kl:
                     return
                 if not kl.isfinite():
                     break
                 torch._foreach_lerp_(parameters, before, 1.0 - (self.max_kl / float(kl)) ** 0.5)
-                kl = self._mean_divergence(rollout)
             torch._foreach_copy_(parameters, before)
-
-    def _mean_divergence(self, rollout: TensorDictBase) -> Tensor:
-        kl = self.divergence(rollout)
-        return kl if self.average is None else self.average(kl)
 
     def divergence(self, rollout: TensorDictBase) -> Tensor:
         """KL(policy that flew the rollout || policy as it is now), a scalar."""

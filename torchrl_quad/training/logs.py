@@ -41,17 +41,18 @@ class Logs:
     ) -> None:
         self.cfg, self.folder, self.rows = cfg, folder, rows
         self.backend: Any = None
-        if rows:
-            self._write()  # without those that came after the checkpoint
+        if rows:  # without those that came after the checkpoint
+            write_rows(folder / "metrics.csv", rows, missing=math.nan)
         if not cfg.logger.backend:
             return
         config = plain(cfg, resolve=True) | {"revision": revision}
         name = f"{cfg.task}_{cfg.algorithm}_seed{cfg.seed}"
         self.name = (saved or {}).get("name") or run_name(name, HydraConfig.get().overrides.task)
+        drone = Path(cfg.env.drone).stem if isinstance(cfg.env.get("drone"), str) else "own drone"
         wandb = {
             **{key: cfg.logger[key] for key in ("mode", "project", "group")},
             "name": self.name,
-            "tags": tags(cfg),
+            "tags": [str(tag)[:64] for tag in (cfg.task, cfg.algorithm, drone)],
             "job_type": "train",
             "config": config,
             "log_env_packages": False,  # would take the place of the configuration's own section env
@@ -74,7 +75,7 @@ class Logs:
     def add(self, row: dict[str, float]) -> None:
         """Log a row, and rewrite metrics.csv: after a resume it ends where the checkpoint does."""
         self.rows.append(row)
-        self._write()
+        write_rows(self.folder / "metrics.csv", self.rows, missing=math.nan)
         metrics = {key: x for key, x in row.items() if "/" in key}
         if self.cfg.logger.backend == "wandb":
             self.backend.experiment.log({"steps": row["steps"], **metrics})
@@ -125,9 +126,6 @@ class Logs:
         paths = [str(self.folder / file) for file in files if (self.folder / file).exists()]
         return {name: make(paths[0])} if paths else {}
 
-    def _write(self) -> None:
-        write_rows(self.folder / "metrics.csv", self.rows, missing=math.nan)
-
 
 def _logger(backend: str, *arguments: Any, **options: Any) -> Any:
     """TorchRL's logger; what wandb refuses, such as a run without a login, is a UserValueError."""
@@ -145,10 +143,3 @@ def run_name(name: str, overrides: Iterable[str]) -> str:
     given = [x.lstrip("+") for x in overrides if not x.lstrip("+~").startswith(NOT_IN_A_NAME)]
     name = " ".join([name, *given])
     return name if len(name) <= 128 else f"{name[:127]}…"
-
-
-def tags(cfg: DictConfig) -> list[str]:
-    """Task, algorithm and drone."""
-    drone = cfg.env.get("drone")
-    drone = Path(drone).stem if isinstance(drone, str) else "own drone"
-    return [str(tag)[:64] for tag in (cfg.task, cfg.algorithm, drone)]

@@ -1,11 +1,7 @@
-"""Rays per second of the depth camera on one core, compared with MuJoCo's ray casting.
+"""Rays per second of the depth camera on one core, compared with MuJoCo's ray casting: python -m benchmarks.camera
 
-python -m benchmarks.camera
-
-Trees are upright cylinders; the mixed scenes have a third each of balls, cylinders and boxes turned at random. Every
-camera has a scene of its own. MuJoCo casts the same rays, those of one camera in one call of ``mj_multiRay``, without
-normals. Time is that of the processor, so that other programs on the machine disturb little; the best of all rounds
-counts. Writes ``benchmarks/results/camera.csv``.
+Every camera has a scene of its own: upright cylinders, or a third each of balls, cylinders and boxes turned at random.
+Time is that of the processor; the best of all rounds counts.
 """
 
 import argparse
@@ -56,7 +52,6 @@ def fastest(function: Callable[[], object], rounds: int) -> float:
 
 
 def in_mujoco(solids: Primitives, i: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """One scene as a model of MuJoCo."""
     geoms = []
     for x, y, z, radius in solids.spheres[i].tolist():
         geoms.append(f'<geom type="sphere" size="{radius}" pos="{x} {y} {z}"/>')

@@ -1,7 +1,6 @@
 """Fit simulated flights whose truth is known: how close does the fit come, and do its intervals hold the truth?
 
-python -m benchmarks.identification            # ten flights: minutes; writes results/identification.csv
-python -m benchmarks.identification --seeds 1
+python -m benchmarks.identification            # ten flights: minutes
 """
 
 from __future__ import annotations

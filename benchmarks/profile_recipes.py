@@ -1,9 +1,6 @@
-"""What a training iteration spends its time on, per algorithm.
+"""What a training iteration spends its time on, per algorithm: per cent of its wall-clock time.
 
 python -m benchmarks.profile_recipes --algorithms bptt abpt --overrides num_envs=256 horizon=32
-
-Runs the recipes themselves, with clocks around their parts; a clock stops while one inside it runs. Writes
-``benchmarks/results/profile.csv``: per cent of the wall-clock time of the iterations, evaluations left out.
 """
 
 import argparse

@@ -1,9 +1,8 @@
 """Fit a drone to real flights, and judge it on flights of other shapes, next to what published drones predict.
 
-    python -m benchmarks.real_flights --flights FOLDER    # minutes; writes results/real_flights.csv
+python -m benchmarks.real_flights --flights FOLDER    # minutes
 
-The rows: constant velocity, the preset before and after, the parameters that others published, the fit, and a small
-network that learns on the same flights what the fitted physics leaves out.
+The last row is a small network that learns on the same flights what the fitted physics leaves out.
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -11,7 +10,7 @@ from typing import Any
 
 import torch
 
-from torchrl_quad.files import machine, replacing
+from torchrl_quad.files import machine, write_rows
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -23,11 +22,7 @@ def save(path: Path, rows: list[dict[str, Any]], **about: Any) -> None:
     widths = [max(len(str(row.get(key, ""))) for row in [*rows, {key: key}]) for key in columns]
     for row in [dict(zip(columns, columns, strict=True)), *rows]:
         print("  ".join(str(row.get(key, "")).rjust(width) for key, width in zip(columns, widths, strict=True)))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary, open(temporary, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys([*columns, *about])))
-        writer.writeheader()
-        writer.writerows({**about, **row} for row in rows)
+    write_rows(path, [{name: ({**about, **row}).get(name, "") for name in [*columns, *about]} for row in rows])
     print(f"\n{path}: {about}")
 
 

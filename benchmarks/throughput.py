@@ -2,19 +2,7 @@
 
 python -m benchmarks.throughput --num-envs 64 256 1024 --threads 1
 
-==========  ============================================================================================
-physics     the control step alone: rate controller, rotors and rigid body, four physics steps
-env         the whole environment through ``differentiable_rollout``, with fixed actions
-point mass  the same with ``dynamics="point_mass"``
-actor       the environment with a 64-64 policy
-called      the same with a policy that is called before each step, as policies of other classes are
-torchrl     the same through TorchRL's own loop, which transforms and other policies fall back to
-step        one eager ``env.step`` after another: racing with gusts and noisy sensors, fixed actions
-crazyflow   its body-rate model (JAX), ten substeps, where it is installed: pip install crazyflow
-==========  ============================================================================================
-
-All of one size are timed in turns, round after round, and the best round counts. Writes
-``benchmarks/results/throughput.csv`` size by size, and leaves out what is there already.
+Cases of one size are timed in turns, round after round, and the best round counts. What is there already is left out.
 """
 
 from __future__ import annotations

@@ -2,13 +2,11 @@
 
 python -m benchmarks.time_to_solve --algorithms abpt --seeds 0 1 2
 
-Runs the recipes, and takes the first evaluation, on fresh starts, in which at least 99 % of the episodes succeed.
-Nothing is left out of the clock: imports, compilation and evaluations count. "Cold" is an empty compile cache. Writes
-``benchmarks/results/time_to_solve.csv`` run by run, and leaves out what is there already.
+It is solved in the first evaluation in which at least 99 % of the episodes succeed. Imports, compilation and
+evaluations count. "Cold" is an empty compile cache. What is there already is left out.
 """
 
 import argparse
-import csv
 import itertools
 import os
 import subprocess
@@ -39,13 +37,10 @@ def solve(algorithm: str, seed: int, overrides: list[str], cache: Path) -> float
         ) as run:
             while True:
                 ended = run.poll() is not None
-                if metrics.exists():
-                    with open(metrics, newline="") as file:
-                        rows = list(csv.DictReader(file))
-                    if any(row["eval/solved"] and float(row["eval/solved"]) >= 0.99 for row in rows):
-                        seconds = time.perf_counter() - start
-                        run.kill()
-                        return seconds
+                if any(float(row["eval/solved"] or "nan") >= 0.99 for row in read_rows(metrics)):
+                    seconds = time.perf_counter() - start
+                    run.kill()
+                    return seconds
                 if ended:
                     return None
                 time.sleep(0.05)

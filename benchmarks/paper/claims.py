@@ -80,7 +80,6 @@ def sooner(
 
 
 def others(of: str) -> list[str]:
-    """List the other methods."""
     return [method for method in METHODS if method != of]
 
 
@@ -239,7 +238,6 @@ AS_PUBLISHED = ("C1", "C2", "C3", "C4", "C5", "C8", "C9", "C10", "C11", "C12", "
 
 
 def try_claim(claim: Claim, results: Results) -> Verdict:
-    """Reach the verdict on one claim, or say that its runs are missing."""
     results.used.clear()
     try:
         parts = list(claim.parts(results))

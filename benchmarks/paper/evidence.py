@@ -1,15 +1,8 @@
 """The results of the runs as arrays over seeds, and the statistics that claims are tested with.
 
-Three statistics carry most claims:
-
-- P(a > b): how often a seed of a beats a seed of b, ties counted half; compared with 0.5.
-- gap(a, b): (mean a - mean b) / max(|mean a|, |mean b|); compared with a share.
-- the end of a curve: the mean of its last tenth of evaluations. A run that diverged ends where it began.
-
-Each is a ``Part`` with a bootstrap over seeds and over sets of starts. All runs are judged from the same starts, so
-seeds alone cannot tell what other starts would give. ``reproduce starts`` flies policies from many sets. A draw of the
-bootstrap takes one set for all methods, and shifts each by as much as its policy returned more from that set than from
-all of them. A shift that two methods share does not change their difference.
+All runs are judged from the same starts, so seeds alone cannot tell what other starts would give. A draw of the
+bootstrap takes one set of starts for all methods, and shifts each by as much as its policy returned more from that set
+than from all of them (``reproduce starts``). A shift that two methods share does not change their difference.
 """
 
 from __future__ import annotations
@@ -38,7 +31,6 @@ def column(rows: Sequence[Row], name: str) -> list[float]:
 
 
 def grouped(rows: Sequence[Row], *names: str) -> dict[tuple[str, ...], list[Row]]:
-    """Group the rows by columns."""
     groups: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[name] for name in names), []).append(row)
@@ -200,11 +192,9 @@ class Results:
         return lowest - (1.0 - LEVEL[task]) * abs(lowest)
 
     def seeds(self, runs: Iterable[tuple[str, str]]) -> int:
-        """Count the seeds of the run that has the fewest; 0 where there are no runs."""
         return min((len(self.curves.get(run, {})) for run in runs), default=0)
 
     def dynamics(self, runs: Iterable[tuple[str, str]]) -> str:
-        """Name the dynamics under which these runs were flown, or "both"."""
         runs = set(runs)
         found = {row.get("dynamics") or "" for row in self.finals if (row["task"], row["variant"]) in runs}
         return "both" if len(found) > 1 else "".join(found)
@@ -230,7 +220,6 @@ def bootstrap(
 
 
 def mean(x: np.ndarray) -> np.ndarray:
-    """Average over seeds."""
     return x.mean(-1)
 
 
@@ -247,7 +236,6 @@ def gap(a: np.ndarray, *b: np.ndarray) -> np.ndarray:
 
 
 def beats(what: str, a: np.ndarray, b: np.ndarray) -> Part:
-    """Make the part that a is higher than b."""
     return bootstrap(f"P({what})", probability, a, b, low=0.5)
 
 

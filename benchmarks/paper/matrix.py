@@ -102,7 +102,6 @@ VARIANTS = {
 
 
 def on(tasks: tuple[str, ...], *variants: str) -> dict[str, tuple[str, ...]]:
-    """Put several variants on the same tasks."""
     return dict.fromkeys(variants, tasks)
 
 
@@ -133,7 +132,6 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Its folder, inside the folder of all runs."""
         search = "" if self.lr is None else f"/lr{self.lr:g}"
         return f"{self.task}/{self.variant}{search}/seed{self.seed}"
 

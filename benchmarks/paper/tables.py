@@ -1,9 +1,7 @@
 """Tables of the results, each a list of rows: CSV files in full, and those of the pages in Markdown.
 
-The conventions are those of Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical
-precipice": interquartile means, percentile intervals of the bootstrap, and the probability that one method improves on
-another. The bootstrap draws seeds and a set of starts (evidence.py); of tasks that were not flown from many sets, only
-seeds.
+Interquartile means, percentile intervals and probabilities of improvement are those of Agarwal et al. 2021. The
+bootstrap draws seeds and a set of starts (evidence.py); of tasks not flown from many sets, only seeds.
 """
 
 from __future__ import annotations
@@ -20,7 +18,6 @@ from scipy.stats import trim_mean
 from benchmarks.paper import elsewhere, flights
 from benchmarks.paper.claims import METHODS, Verdict, try_all
 from benchmarks.paper.evidence import NotRunError, Results, Row, Starts, bootstrap, column, grouped, judged, probability
-from benchmarks.paper.gradients import GRADIENTS
 from benchmarks.paper.matrix import EXPERIMENTS, TASKS, VARIANTS
 from torchrl_quad.envs import task_class
 from torchrl_quad.envs.metrics import EPISODE_METRICS
@@ -37,13 +34,11 @@ LABELS = {  # of variants of a task
 
 
 def make(data: Path) -> dict[str, Table]:
-    """Make all tables of which there are results, by name."""
     results = Results(data)
     made = shipped_tables(data) | {
         "ablations": ablations_table(data),
         "rates": rates_table(data),
         "forest": forest_table(data),
-        "phases": phases_table(data),
         "elsewhere": elsewhere_table(data),
         "tracks": reached_tables(read_rows(data / "tracks.csv"), Starts(data))["reached"],
     }
@@ -60,20 +55,17 @@ def make(data: Path) -> dict[str, Table]:
 
 
 def markdown(table: Table) -> str:
-    """Write a table in Markdown."""
     head = list(dict.fromkeys(name for row in table for name in row))
     lines = [head, ["---" for _ in head], *([row.get(name, "") for name in head] for row in table)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def spread(values: Iterable[float]) -> str:
-    """Write the mean over seeds, and the least and the greatest."""
     values = [x for x in values if np.isfinite(x)]
     return f"{np.mean(values):.4g} ({min(values):.4g} to {max(values):.4g})" if values else ""
 
 
 def seeds(count: int) -> str:
-    """Write a number of seeds."""
     return f"{count} seed{'s' * (count > 1)}"
 
 
@@ -183,7 +175,6 @@ def returns_of(rows: Sequence[Row], starts: Starts) -> np.ndarray:
 
 
 def in_order(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
-    """The rows by task and method, in the order of the tables."""
     groups, tasks = grouped(rows, "task", "algorithm"), dict.fromkeys(row["task"] for row in rows)
     return {
         task: {x: groups[task, x] for x in flights.METHODS if (task, x) in groups}
@@ -202,7 +193,6 @@ def metric_of(task: str) -> tuple[str, float, int, str]:
 
 
 def shipped_tables(data: Path) -> dict[str, Table]:
-    """Show what the recipes reach with the settings that ship."""
     runs, starts = read_rows(data / "shipped.csv"), Starts(data)
     made = {"summary": summary_table(runs), "choice": choice_table(runs, starts)}
     made |= reached_tables(runs, starts) | {"improvement": improvement_table(runs)}
@@ -349,16 +339,6 @@ def forest_table(data: Path) -> Table:
         million, cost = (np.median(column(own, name)) if own else math.nan for name in ("steps", "seconds"))
         row = {"": policy, "million steps": f"{million / 1e6:.1f}", "processor seconds": f"{cost:.0f}"}
         lines.append(row | {f"{x:g} m/s": cell([r for r in own if float(r["speed"]) == x]) for x in speeds})
-    return lines
-
-
-def phases_table(data: Path) -> Table:
-    """Show which of the hybrid's gradients points along the measured one in each phase of training: cosines."""
-    names = GRADIENTS | {"weight": "weight b", "explained_variance": "explained variance of V"}
-    lines = []
-    for (task, _), own in grouped(read_rows(data / "phases.csv"), "task", "share").items():
-        row = {"task": LABELS.get(task, task), "million steps": f"{np.mean(column(own, 'steps')) / 1e6:.1f}"}
-        lines.append(row | {head: f"{np.mean(column(own, name)):.2f}" for name, head in names.items()})
     return lines
 
 

@@ -4,10 +4,8 @@ Every camera has a scene of its own: upright cylinders, or a third each of balls
 Time is that of the processor; the best of all rounds counts.
 """
 
-import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -15,7 +13,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, save
+from benchmarks.report import command_line, save
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.vision import DepthCamera, Primitives
 
@@ -106,14 +104,9 @@ def measure(name: str, count: int, n: int, width: int, height: int, rounds: int)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--primitives", type=int, nargs="+", default=[10, 30, 100])
-    parser.add_argument("--scenes", nargs="+", default=list(KINDS), choices=list(KINDS))
-    parser.add_argument("--images", nargs="+", default=["256x16x12", "16x64x48"], help="cameras x width x height")
-    parser.add_argument("--rounds", type=int, default=32)
-    parser.add_argument("--output", type=Path, default=RESULTS / "camera.csv")
-    args = parser.parse_args()
-    torch.set_num_threads(1)
+    images = ["256x16x12", "16x64x48"]  # cameras x width x height
+    options = {"primitives": [10, 30, 100], "scenes": list(KINDS), "images": images, "rounds": 32}
+    args = command_line(__doc__, "camera.csv", **options)
     cases = [
         (name, count, *map(int, image.split("x")))
         for name in args.scenes

@@ -17,7 +17,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from benchmarks.report import RESULTS, save
+from benchmarks.report import RESULTS, command_line, save
 from torchrl_quad import MPC, GeometricController
 from torchrl_quad.files import read_rows, replacing
 from torchrl_quad.training.building import build_env
@@ -37,7 +37,7 @@ CONTROLLERS = {"geometric": GeometricController, "mpc": MPC}
 ERRORS = {"hovering": "position_error", "tracking": "tracking_rmse", "landing": "position_error"}
 
 
-def configuration(task: str, steps: int | None, **changes: Any) -> Any:
+def configuration(task: str, steps: int, **changes: Any) -> Any:
     cfg = compose("abpt", [f"task={task}"])
     for name, value in {**changes, **({"max_episode_steps": steps} if steps else {})}.items():
         cfg.env[name] = value
@@ -98,17 +98,9 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tasks", nargs="+", default=TASKS)
-    parser.add_argument("--controllers", nargs="*", default=list(CONTROLLERS), choices=list(CONTROLLERS))
-    parser.add_argument("--checkpoints", nargs="*", default=[], help="learned policies, of any of these tasks")
-    parser.add_argument("--starts", type=int, default=256)
-    parser.add_argument("--mpc-starts", type=int, default=64, help="fewer: it thinks long")
-    parser.add_argument("--steps", type=int, help="of an episode; by default as the recipes have it")
-    parser.add_argument("--calls", type=int, default=100)
-    parser.add_argument("--output", type=Path, default=RESULTS / "controllers.csv")
-    args = parser.parse_args()
-    torch.set_num_threads(1)
+    options = {"tasks": TASKS, "controllers": list(CONTROLLERS), "checkpoints": [], "starts": 256, "calls": 100}
+    options |= {"mpc_starts": 64, "steps": 0}  # it thinks long; 0 is an episode as the recipes have it
+    args = command_line(__doc__, "controllers.csv", **options)
     trained = [(cfg.task, cfg.algorithm, path) for path in args.checkpoints for cfg in [load_policy(Path(path))[0]]]
     jobs = [(task, name, path) for task, name, path in trained if task in args.tasks]
     jobs += [(task, name, None) for name in args.controllers for task in args.tasks]

@@ -6,7 +6,6 @@ Each policy is exported as it is, and once more behind an ObservationNormalizer.
 from Python: of C with what ctypes takes, of the bundle from the named quantities to newtons and radians per second.
 """
 
-import argparse
 import ctypes
 import subprocess
 import tempfile
@@ -22,7 +21,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, save
+from benchmarks.report import command_line, save
 from torchrl_quad import ObservationNormalizer, differentiable_rollout, make_actor, make_env, make_visual_actor
 from torchrl_quad.deploy import export_policy, load_bundle
 from torchrl_quad.envs import TASKS
@@ -113,12 +112,7 @@ def measure(source: str, with_normalizer: bool, count: int, calls: int) -> dict[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--checkpoints", nargs="+", default=list(TASKS), help="paths, or names of tasks")
-    parser.add_argument("--observations", type=int, default=10_000)
-    parser.add_argument("--calls", type=int, default=10_000)
-    parser.add_argument("--output", type=Path, default=RESULTS / "deployment.csv")
-    args = parser.parse_args()
+    args = command_line(__doc__, "deployment.csv", checkpoints=list(TASKS), observations=10_000, calls=10_000)
     cases = [(source, normalizer) for source in args.checkpoints for normalizer in (False, True)]
     save(args.output, [measure(*case, args.observations, args.calls) for case in tqdm(cases)])
 

@@ -6,7 +6,6 @@ In the mode "recompute" the eager step keeps only its input, and is done again b
 memory is what the process (on Linux) has gained between the start of a horizon and its end.
 """
 
-import argparse
 import functools
 import gc
 import os
@@ -17,7 +16,7 @@ import torch
 from torch.utils.checkpoint import checkpoint
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, in_own_process, save
+from benchmarks.report import command_line, in_own_process, save
 from torchrl_quad import ActionSequence, differentiable_rollout, make_env
 
 MODES = ["eager", "recompute", "compiled"]
@@ -57,13 +56,7 @@ def measure(mode: str, n: int, horizon: int, rounds: int) -> dict[str, float | s
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--num-envs", type=int, default=1024)
-    parser.add_argument("--modes", nargs="+", default=MODES, choices=MODES)
-    parser.add_argument("--horizon", type=int, default=32)
-    parser.add_argument("--rounds", type=int, default=4)
-    parser.add_argument("--output", type=Path, default=RESULTS / "memory.csv")
-    args = parser.parse_args()
+    args = command_line(__doc__, "memory.csv", num_envs=1024, modes=MODES, horizon=32, rounds=4)
     rows = [in_own_process(measure, mode, args.num_envs, args.horizon, args.rounds) for mode in tqdm(args.modes)]
     save(args.output, rows, num_envs=args.num_envs, horizon=args.horizon)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -13,6 +14,18 @@ import torch
 from torchrl_quad.files import machine, write_rows
 
 RESULTS = Path(__file__).parent / "results"
+
+
+def command_line(doc: str, output: str, **options: Any) -> argparse.Namespace:
+    """The options of a program with their defaults, which give their types; those with a list take several values."""
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
+    for name, default in options.items():
+        several = isinstance(default, list)
+        kind, count = type((default or [""])[0] if several else default), {"nargs": "*"} if several else {}
+        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, default=default, **count)
+    parser.add_argument("--output", type=Path, default=RESULTS / output)
+    torch.set_num_threads(1)
+    return parser.parse_args()
 
 
 def save(path: Path, rows: list[dict[str, Any]], **about: Any) -> None:

@@ -7,13 +7,11 @@ Cases of one size are timed in turns, round after round, and the best round coun
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import itertools
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -23,7 +21,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, save
+from benchmarks.report import command_line, save
 from torchrl_quad import ActionSequence, differentiable_rollout, make_actor, make_env
 from torchrl_quad.engine import Stepper, Transition
 from torchrl_quad.engine.policy import GivenActions
@@ -52,8 +50,6 @@ class Physics:
         start = self.stepper.example._replace(state=self.stepper.layout.pack(self.start))
         flight = self.stepper.fly(GivenActions(lambda _: actions), start, self.valid, len(actions), dict)
         return flight.ends.state.floats[-1].sum()
-
-    # -- for the engine ------------------------------------------------------------------------------------------------
 
     def example(self) -> tuple[State, State]:
         return self.start, self.outputs(self.start)
@@ -177,16 +173,9 @@ def measure(n: int, mode: str, task: str, horizon: int, rounds: int, device: str
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--num-envs", type=int, nargs="+", default=[64, 256, 1024, 4096, 16384])
-    parser.add_argument("--modes", nargs="+", default=["compiled", "eager"], choices=["compiled", "eager"])
-    parser.add_argument("--task", default="hovering")
-    parser.add_argument("--horizon", type=int, default=32)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--output", type=Path, default=RESULTS / "throughput.csv")
-    args = parser.parse_args()
+    sizes, options = [64, 256, 1024, 4096, 16384], {"task": "hovering", "horizon": 32, "device": "cpu"}
+    modes = ["compiled", "eager"]
+    args = command_line(__doc__, "throughput.csv", num_envs=sizes, modes=modes, rounds=5, threads=1, **options)
     torch.set_num_threads(args.threads)
     rows = read_rows(args.output)
     for mode, n in tqdm(list(itertools.product(args.modes, args.num_envs))):

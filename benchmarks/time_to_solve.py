@@ -6,7 +6,6 @@ It is solved in the first evaluation in which at least 99 % of the episodes succ
 evaluations count. "Cold" is an empty compile cache. What is there already is left out.
 """
 
-import argparse
 import itertools
 import os
 import subprocess
@@ -17,7 +16,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, save
+from benchmarks.report import command_line, save
 from torchrl_quad.files import read_rows
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -47,13 +46,8 @@ def solve(algorithm: str, seed: int, overrides: list[str], cache: Path) -> float
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--algorithms", nargs="+", default=["bptt", "shac", "abpt"])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--modes", nargs="+", default=["eager", "cold", "warm"], choices=["eager", "cold", "warm"])
-    parser.add_argument("--overrides", nargs="*", default=["eval.interval=5"])
-    parser.add_argument("--output", type=Path, default=RESULTS / "time_to_solve.csv")
-    args = parser.parse_args()
+    options = {"algorithms": ["bptt", "shac", "abpt"], "seeds": [0], "modes": ["eager", "cold", "warm"]}
+    args = command_line(__doc__, "time_to_solve.csv", overrides=["eval.interval=5"], **options)
     rows = read_rows(args.output)
     with tempfile.TemporaryDirectory() as cache:
         # "warm" follows "cold", and finds its cache.

@@ -116,7 +116,6 @@ def test_what_the_command_line_says_must_agree_with_the_checkpoint(train, refuse
     assert f"{tmp_path} holds another run. Continue with it, resume={tmp_path}/checkpoint.pt, or choose another" in said
     for words, message in {
         "bptt env.drone=small_racer": "env.drone=small_racer contradicts the checkpoint .*trained with env.drone=visf",
-        "bptt tuned=bptt_racing": " contradicts the checkpoint .*num_envs=",
         "bptt algorithm=shac": "algorithm=shac: this recipe is bptt",
         "shac": "algorithm=shac contradicts the checkpoint .*trained with algorithm=bptt",
     }.items():
@@ -125,10 +124,9 @@ def test_what_the_command_line_says_must_agree_with_the_checkpoint(train, refuse
 
 
 def test_a_run_that_is_resumed_by_path_goes_on_in_the_folder_of_its_checkpoint(train, launch, refused, tmp_path):
-    train("bptt", tmp_path / "first")
-    path = tmp_path / "first/checkpoint.pt"
+    saved, path = train("bptt", tmp_path / "first"), tmp_path / "first/checkpoint.pt"
     said = refused("bptt", f"resume={path}", "total_steps=240", f"hydra.run.dir={tmp_path}/elsewhere")
     assert f"hydra.run.dir={tmp_path}/elsewhere has no effect: resume={path} continues in the folder of that" in said
     launch("bptt", f"resume={path}", "total_steps=240")
-    assert read_checkpoint(path)["iteration"] == 10
+    assert (saved["iteration"], read_checkpoint(path)["iteration"]) == (8, 10)
     assert not (tmp_path / "elsewhere").exists()

@@ -1,8 +1,5 @@
 """The paper's claims as statistics over the results, each with its threshold and its rule, fixed before the first run.
 
-A claim is supported when all its parts are, refuted when one of them is, and undecided otherwise. With fewer than five
-seeds of any run that it needs it is preliminary, with fewer than three it has no verdict.
-
 In hovering and tracking most of the return is paid for staying in the air, and 2 % of it are about 20 cm: two methods
 are equal there when they are within 2 %. Two methods are compared in speed by when they first reach a level: 98 % of
 the lower one of their two ends in hovering and tracking, 90 % in landing and racing. Seconds are steps at the pace of
@@ -53,9 +50,6 @@ class Verdict:
     parts: list[Part]
     seeds: int
     dynamics: str
-
-
-# -- claims ------------------------------------------------------------------------------------------------------------
 
 
 def higher_end(

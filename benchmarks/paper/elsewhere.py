@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import product
 
 import torch
@@ -152,17 +152,20 @@ def learn(
     environment: str,
     place: Pendulum | Balance,
     actor: torch.nn.Module,
-    iterate: Callable[[int, float, TensorDictBase], tuple[TensorDictBase, TensorDictBase]],
+    iterate: Callable[[float, TensorDictBase], tuple[TensorDictBase, TensorDictBase]],
+    optimizers: Iterable[Optimizer] = (),
 ) -> tuple[float, float, float]:
     """Train by iterations: the mean returns before and after, and the seconds.
 
-    ``iterate`` takes the number of the iteration, the share of all steps that have been flown, and where the next
-    horizon starts; flies and learns, and gives the rollout and where it ended.
+    ``iterate`` takes the share of all steps that have been flown, and where the next horizon starts; flies and learns,
+    and gives the rollout and where it ended. The optimizers take their rates by the number of the iteration.
     """
     before, start = mean_return(environment, actor), time.process_time()
     carry, iteration, steps = place.starts(), 0, 0
     while steps < STEPS:
-        rollout, carry = iterate(iteration, steps / STEPS, carry)
+        for optimizer in optimizers:
+            optimizer.anneal(iteration)
+        rollout, carry = iterate(steps / STEPS, carry)
         iteration, steps = iteration + 1, steps + rollout.numel()
         carry = place.go_on(carry)
     return before, mean_return(environment, actor), time.process_time() - start
@@ -180,10 +183,9 @@ def train(name: str, environment: str, seed: int) -> tuple[float, float, float]:
     critic = [] if name == "bptt" else list(getattr(loss, f"{loss.critic_name}_params").parameters())
     critic_optimizer = torch.optim.Adam(critic, betas=(0.7, 0.95)) if critic else None
 
-    def iterate(_: int, share: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        for optimizer in (actor_optimizer, critic_optimizer):
-            if optimizer:
-                optimizer.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - 0.98 * share)
+    def iterate(share: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        for optimizer in filter(None, (actor_optimizer, critic_optimizer)):
+            optimizer.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - 0.98 * share)
         rollout, carry = differentiable_rollout(place.env, actor, carry, getattr(loss, "horizon", HORIZON))
         loss_actor, metadata = loss.loss_actor(rollout)
         actor_optimizer.zero_grad()
@@ -227,9 +229,7 @@ def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     actor_optimizer, critic_optimizer = AdaptiveOptimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
 
-    def iterate(iteration: int, _: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        for optimizer in (actor_optimizer, critic_optimizer):
-            optimizer.anneal(iteration)
+    def iterate(_: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         rollout, carry = differentiable_rollout(place.env, actor, carry, cfg.horizon)
         moved = 0.0
         for batch in shuffled(loss.write_targets(rollout).exclude("next"), cfg.batch_size, cfg.epochs):
@@ -241,7 +241,7 @@ def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
         actor_optimizer.adapt(moved)
         return rollout, carry
 
-    return learn(environment, place, actor, iterate)
+    return learn(environment, place, actor, iterate, (actor_optimizer, critic_optimizer))
 
 
 def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
@@ -251,9 +251,7 @@ def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
     loss = ClipPPOLoss(actor, value, **cfg.loss)
     actor_optimizer, critic_optimizer = Optimizer(cfg, "actor", actor), Optimizer(cfg, "critic", value)
 
-    def iterate(iteration: int, _: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        for optimizer in (actor_optimizer, critic_optimizer):
-            optimizer.anneal(iteration)
+    def iterate(_: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         with torch.no_grad():
             rollout, carry = differentiable_rollout(place.env, actor, carry, cfg.horizon)
             advantage(rollout)
@@ -267,7 +265,7 @@ def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
             optimise(critic_optimizer, losses["loss_critic"], cfg.critic.max_grad_norm)
         return rollout, carry
 
-    return learn(environment, place, actor, iterate)
+    return learn(environment, place, actor, iterate, (actor_optimizer, critic_optimizer))
 
 
 OWN_LOOPS = {"hybrid": train_hybrid, "ppo": train_ppo}

@@ -44,7 +44,6 @@ class Judged(np.ndarray):
 
 
 def judged(values: np.ndarray, shift: Shift | None) -> np.ndarray:
-    """Note on values over seeds how far another set of starts would shift them."""
     values = np.asarray(values, dtype=float).view(Judged)
     values.shift = shift
     return values
@@ -57,12 +56,9 @@ class Starts:
         self.rows = read_rows(data / "starts.csv")
 
     def shift(self, task: str, algorithm: str, name: str, starts: int = 256) -> Shift | None:
-        """How far each set of so many starts shifts a column: that of a policy of the method, drawn from those flown.
-
-        If none of the method was flown it is that of any other method; None if the column of the task is unknown.
-        """
+        """How far each set of so many starts shifts a column, drawn from the policies flown; None if unknown."""
         rows = [row for row in self.rows if row["task"] == task and row.get(name)]
-        rows = [row for row in rows if row["algorithm"] == algorithm] or rows
+        rows = [row for row in rows if row["algorithm"] == algorithm] or rows  # if none is of the method, of any other
         runs = [column(x, name) for x in grouped(rows, "algorithm", "seed").values()]
         if not runs:
             return None
@@ -98,23 +94,16 @@ class Part:
         return float(self.draws[cut]), float(self.draws[len(self.draws) - 1 - cut])
 
     def verdict(self, parts: int = 1) -> str:
-        """Decide: supported, refuted or undecided, as one of several parts.
-
-        Of many parts one looks refuted by chance: so that takes an interval which is wider the more there are.
-        """
+        """Decide: supported, refuted or undecided, as one of several parts."""
         least, most = self.interval()
         if self.low < least and most < self.high:
             return "supported"
-        least, most = self.interval(parts)
+        least, most = self.interval(parts)  # wider: of many parts one looks refuted by chance
         return "refuted" if most < self.low or least > self.high else "undecided"
 
 
 def best_learning_rate(task: str, variant: str, data: Path, rates: tuple[float, ...]) -> float | None:
-    """Find the rate whose run in the search ended highest, by the mean of its last tenth of evaluations.
-
-    Returns:
-        the rate, or None while the search is not complete. A run that diverged counts as the lowest.
-    """
+    """Find the rate whose run in the search ended highest; None while the search is not complete."""
     ends = {}
     for lr in rates:
         rows = [x for x in read_rows(data / f"search/{task}.csv") if x["variant"] == variant and x["lr"] == f"{lr:g}"]
@@ -125,12 +114,7 @@ def best_learning_rate(task: str, variant: str, data: Path, rates: tuple[float, 
 
 
 class Results:
-    """The CSV files by task and variant, as arrays over seeds.
-
-    Args:
-        data: the folder of the CSV files.
-        alias: for a task and a variant, the variant to read instead, such as ``claims.PUBLISHED``.
-    """
+    """The CSV files by task and variant, as arrays over seeds; ``alias`` names variants to read instead of others."""
 
     def __init__(self, data: Path, alias: dict[tuple[str, str], str] | None = None) -> None:
         self.data, self.alias = data, alias or {}
@@ -203,11 +187,7 @@ class Results:
 def bootstrap(
     what: str, statistic: Callable[..., np.ndarray], *samples: np.ndarray, low=-math.inf, high=math.inf
 ) -> Part:
-    """Compute a statistic of samples over seeds, and its bootstrap, which draws each sample separately.
-
-    The statistic takes samples (*, seeds) and gives numbers (*). A draw takes one set of starts for all
-    samples that are ``judged``.
-    """
+    """Compute a statistic, from samples (*, seeds) to numbers (*), and its bootstrap, which draws each sample apart."""
     rng = np.random.default_rng(0)
     drawn = [rng.choice(np.asarray(x), (RESAMPLES, len(x))) for x in samples]
     sets = rng.integers(0, 2**32, RESAMPLES)
@@ -240,7 +220,6 @@ def beats(what: str, a: np.ndarray, b: np.ndarray) -> Part:
 
 
 def deviation(x: np.ndarray) -> np.ndarray:
-    """Measure how far each seed is from the mean over seeds."""
     return np.abs(x - x.mean())
 
 

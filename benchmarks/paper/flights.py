@@ -52,8 +52,6 @@ CURVE = {  # columns of a curve, and their names in metrics.csv
 }
 RUN = ("task", "algorithm", "seed")  # what tells one run from another
 
-# -- the recipes with the settings that ship ---------------------------------------------------------------------------
-
 
 def overrides(task: str, method: str) -> list[str]:
     """Name the task to a recipe; a variant of a task may have tuned values of its own."""
@@ -106,8 +104,6 @@ def thinned(folder: Path) -> list[dict[str, str]]:
     names = ("steps", "seconds", "return", "solved")
     return [{name: f"{float(point[CURVE[name]]):.6g}" for name in names} for point in some]
 
-
-# -- one setting changed -----------------------------------------------------------------------------------------------
 
 OPTIONS = {  # with it, and without it
     "event times": ("env.event_discount", "${gamma}", "null"),
@@ -165,8 +161,6 @@ def _fly_changed(args: Namespace, column: str, jobs: Iterable[tuple[str, str, st
     side_by_side(args.cores, [(fly, *job) for job in jobs if tuple(map(str, job[:4])) not in done])
 
 
-# -- policies from many sets of starts ---------------------------------------------------------------------------------
-
 SETS, STARTS, FIRST = 16, 256, 2_000_000  # sets, starts in each, and the seed of the first, that of evaluate.py
 MEASURED = ("return", "solved", "gates_passed")
 
@@ -191,8 +185,6 @@ def starts(args: Namespace) -> None:
 
     side_by_side(args.cores, [(fly, *job) for job in missing(args, args.data / "starts.csv")])
 
-
-# -- the forest --------------------------------------------------------------------------------------------------------
 
 HALF = "total_steps=2_048_000"  # of what BPTT ships with
 POLICIES = {  # recipe, and what differs from what it ships with

@@ -26,21 +26,21 @@ from torchrl_quad.files import read_rows
 Table = list[dict[str, str]]
 RELIABLE = 0.99  # of the episodes, solved by the worst seed
 ENOUGH, WANTED = 3, 10  # seeds: for an interval, and of each method
-LABELS = {  # of variants of a task
-    "racing_position": "racing, position",
-    "six_gates": "six gates",
-    "six_gates_back": "six gates, backwards",
-}
+LABELS = {"racing_position": "racing, position", "six_gates": "six gates", "six_gates_back": "six gates, backwards"}
 
 
 def make(data: Path) -> dict[str, Table]:
-    results = Results(data)
-    made = shipped_tables(data) | {
+    results, starts, runs = Results(data), Starts(data), read_rows(data / "shipped.csv")
+    made = reached_tables(runs, starts) | {
+        "summary": summary_table(runs),
+        "choice": choice_table(runs, starts),
+        "improvement": improvement_table(runs),
+        "speed": speed_table([*runs, *read_rows(data / "rates.csv")]),
         "ablations": ablations_table(data),
         "rates": rates_table(data),
         "forest": forest_table(data),
         "elsewhere": elsewhere_table(data),
-        "tracks": reached_tables(read_rows(data / "tracks.csv"), Starts(data))["reached"],
+        "tracks": reached_tables(read_rows(data / "tracks.csv"), starts)["reached"],
     }
     if results.all_finals or results.curves:
         own, published = try_all(data)
@@ -67,9 +67,6 @@ def spread(values: Iterable[float]) -> str:
 
 def seeds(count: int) -> str:
     return f"{count} seed{'s' * (count > 1)}"
-
-
-# -- the trial ---------------------------------------------------------------------------------------------------------
 
 
 def claims_table(own: list[Verdict], published: list[Verdict]) -> Table:
@@ -116,18 +113,14 @@ def methods_table(results: Results) -> Table:
 
 
 def ends_table(results: Results, experiment: str) -> Table:
-    """Show where the curves of an experiment end, means over seeds, and when they converge, medians.
-
-    That is nearly at the highest of the methods' mean ends.
-    """
+    """Show where the curves of an experiment end, means over seeds, and when they converge, medians."""
     rows = []
     for task, variant in product(TASKS, EXPERIMENTS[experiment]):
         row = {"experiment": experiment, "task": task, "method": VARIANTS[variant].label}
         try:
+            row["seeds"] = str(len(results.end(task, variant)))
             for name in ("return", "solved", "gates_passed", "position_error"):
-                row |= {"seeds": str(len(results.end(task, variant)))} | {
-                    name: spread(results.end(task, variant, name))
-                }
+                row[name] = spread(results.end(task, variant, name))
             if experiment not in ("reward", "relaxation"):  # whose returns are of another kind
                 level = results.level(task, max((results.end(task, x) for x in METHODS), key=np.mean))
                 for axis in ("steps", "seconds"):
@@ -150,9 +143,6 @@ def ascent_table(data: Path) -> Table:
     ]
 
 
-# -- the recipes with the settings that ship ---------------------------------------------------------------------------
-
-
 def interquartile_mean(values: ArrayLike) -> NDArray[np.float64]:
     """The mean (*) of the middle half of values (*, seeds), without the quarter below and the quarter above it."""
     return trim_mean(values, 0.25, axis=-1)
@@ -170,7 +160,6 @@ def is_level(one: np.ndarray, best: np.ndarray) -> bool:
 
 
 def returns_of(rows: Sequence[Row], starts: Starts) -> np.ndarray:
-    """The returns of a method's seeds on a task, with what another set of starts would change."""
     return judged(np.array(column(rows, "return")), starts.shift(rows[0]["task"], rows[0]["algorithm"], "return"))
 
 
@@ -190,13 +179,6 @@ def metric_of(task: str) -> tuple[str, float, int, str]:
     own = [x for x in task_class(name).metric_info.items() if x[0] not in EPISODE_METRICS]
     name, metric = own[0] if own else ("return", EPISODE_METRICS["return"])
     return name, metric.scale, 2, metric.unit or metric.label
-
-
-def shipped_tables(data: Path) -> dict[str, Table]:
-    runs, starts = read_rows(data / "shipped.csv"), Starts(data)
-    made = {"summary": summary_table(runs), "choice": choice_table(runs, starts)}
-    made |= reached_tables(runs, starts) | {"improvement": improvement_table(runs)}
-    return made | {"speed": speed_table([*runs, *read_rows(data / "rates.csv")])}
 
 
 def summary_table(rows: Sequence[Row]) -> Table:
@@ -237,11 +219,7 @@ def reached_tables(rows: Sequence[Row], starts: Starts) -> dict[str, Table]:
 
 
 def choice_table(rows: Sequence[Row], starts: Starts) -> Table:
-    """Show for each task the quickest method that works with every seed, and the one of the highest return.
-
-    They are chosen among the methods that have flown with the most seeds. Those that :func:`is_level` finds are level
-    with the highest return.
-    """
+    """Show for each task the quickest method that works with every seed, and the one of the highest return."""
     lines = []
     for task, flown in in_order(rows).items():
         worst = {x: min(column(own, "solved")) for x, own in flown.items()}
@@ -287,14 +265,8 @@ def improvement_table(rows: Sequence[Row]) -> Table:
     return [{"": flights.METHODS[x]} | {flights.METHODS[y]: cell(x, y) for y in enough} for x in enough]
 
 
-# -- one setting changed, and other environments -----------------------------------------------------------------------
-
-
 def ablations_table(data: Path) -> Table:
-    """Show what each option adds to the return, over the seeds that have flown with it and without it.
-
-    A cell also has the episodes that the worst seed solves with the option, and without it, and the number of seeds.
-    """
+    """Show what each option adds to the return, and what the worst seed solves with it, and without it."""
     shipped = grouped(read_rows(data / "shipped.csv"), "task", "algorithm")
     changed = grouped(read_rows(data / "ablations.csv"), "task", "algorithm", "change")
     rows = []

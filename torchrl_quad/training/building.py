@@ -28,11 +28,9 @@ from torchrl_quad.training.configuration import own_disturbances, plain
 SEEDS_PER_PROCESS = 10_000
 _Loss = TypeVar("_Loss", bound=PathwiseLoss)
 
-# -- several processes that train one policy, as torchrun starts them; all this also works for a single one ------------
-
 
 def rank() -> int:
-    """Which of the processes this is; 0 logs, evaluates and saves."""
+    """Which of the processes that torchrun has started this is, and 0 without it; 0 logs, evaluates and saves."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
@@ -58,9 +56,6 @@ def mean_of_all(x: Tensor) -> Tensor:
 def own_seed(cfg: DictConfig) -> int:
     """The seed of this process."""
     return cfg.seed + SEEDS_PER_PROCESS * rank()
-
-
-# -- environment, networks and loss ------------------------------------------------------------------------------------
 
 
 def set_up(cfg: DictConfig) -> tuple[EnvBase, TensorDictModule]:
@@ -133,9 +128,6 @@ def make_loss(
     loss = kind(*networks, **options)
     loss.make_value_estimator(gamma=cfg.gamma, **({"lmbda": cfg.critic.lmbda} if "critic" in cfg else {}))
     return loss
-
-
-# -- optimisers and averages -------------------------------------------------------------------------------------------
 
 
 def iterations(cfg: DictConfig) -> int:
@@ -230,9 +222,6 @@ def average_policy(cfg: DictConfig, actor: TensorDictModuleBase) -> AveragedMode
 def trust_region(cfg: DictConfig, actor: TensorDictModule) -> TrustRegion:
     """The bound of a configuration on what an update does to the policy; all processes shorten alike."""
     return TrustRegion(cast("ProbabilisticActor", actor), cfg.actor.max_kl, average=mean_of_all)
-
-
-# -- data --------------------------------------------------------------------------------------------------------------
 
 
 def update_normalizer(env: EnvBase, rollout: TensorDictBase) -> None:

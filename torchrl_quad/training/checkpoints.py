@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl_quad.dynamics import presets
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import replacing
-from torchrl_quad.training.configuration import CONFIG, named_code, plain
+from torchrl_quad.training.configuration import named_code, plain
 from torchrl_quad.training.schema import check
 
 FORMAT = 5  # of the content; raise it when older files can no longer be read
@@ -46,12 +46,7 @@ def write_checkpoint(path: Path, content: dict[str, Any], keep: Path | None = No
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Read the content of a checkpoint, on the CPU. Nothing in the file is executed.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        UserValueError: the file is damaged, cut off, foreign, or of another version.
-    """
+    """Read the content of a checkpoint, on the CPU. Nothing in the file is executed."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"No checkpoint at {path}. Train one first: python recipes/abpt.py")
@@ -99,14 +94,11 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
         )
     if cfg.resume is None:
         return
-    overrides = [override.lstrip("+~").partition("=") for override in HydraConfig.get().overrides.task]
-    asked = {name: OmegaConf.select(cfg, name) for name, _, _ in overrides}
+    overrides = [override.lstrip("+~").partition("=")[0] for override in HydraConfig.get().overrides.task]
+    asked = {"algorithm": cfg.algorithm} | {name: OmegaConf.select(cfg, name) for name in overrides}
     path = Path(cfg.resume)
     saved = saved_config(path, read_checkpoint(path), [*cfg.trust, *named_code(plain(cfg))])
-    for name, _, value in overrides:
-        if name == "tuned" and value != "null":
-            asked |= _leaves(plain(OmegaConf.load(CONFIG / f"tuned/{value}.yaml")))
-    for key, value in ({"algorithm": cfg.algorithm} | asked).items():
+    for key, value in asked.items():
         was = OmegaConf.select(saved, key)
         if value != was and key.split(".")[0] not in MAY_CHANGE:
             raise UserValueError(
@@ -156,15 +148,6 @@ def fits(path: Path, what: str) -> Iterator[None]:
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         said = (str(error) or repr(error)).split("\n\t")[-1].splitlines()[0]
         raise UserValueError(f"{path}: {what} in it does not fit its configuration: {said} {_way_out(path)}") from error
-
-
-def _leaves(values: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """The settings of a YAML file by their whole names."""
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        found |= _leaves(value, f"{section}{name}.") if isinstance(value, Mapping) else {section + name: value}
-    found.pop("defaults", None)
-    return found
 
 
 def revision() -> str:

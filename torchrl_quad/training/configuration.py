@@ -36,10 +36,7 @@ def compose(recipe: str, overrides: Iterable[str] = ()) -> DictConfig:
 
 
 def command_line(arguments: Iterable[str]) -> list[str]:
-    """A command line in hydra's grammar, with a configuration on offer for each task that ships or is named on it.
-
-    What is no task is a UserError.
-    """
+    """A command line in hydra's grammar, with a configuration on offer for each task that ships or is named on it."""
     arguments = [re.sub(r"^task\._target_=", "task=", hydra_argument(argument)) for argument in arguments]
     if any(argument.startswith("loss._target_=") for argument in arguments):
         arguments = [re.sub(r"^loss\.", "++loss.", argument) for argument in arguments]  # the files lack its options
@@ -67,9 +64,6 @@ def defaults(cls: type[QuadrotorEnv]) -> dict[str, Any]:
         if is_plain and differs and name not in (*SET_BY_RECIPES, "disturbances"):
             settings[name] = default
     return settings
-
-
-# -- classes and recipes of your own -----------------------------------------------------------------------------------
 
 
 def own_class(path: Any, base: type, setting: str) -> type:

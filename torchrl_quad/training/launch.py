@@ -38,7 +38,6 @@ from torchrl_quad.training.configuration import CONFIG, OWN, command_line, named
 from torchrl_quad.training.schema import check
 
 LOCK = "run.lock"  # names the process that writes into the folder of a run
-FOLDER_SETTINGS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
 
 # A run that resumes continues in the folder of its checkpoint; hydra.run.dir asks for it by this name.
 OmegaConf.register_new_resolver(
@@ -199,7 +198,8 @@ def _run_folder(resume: str | None) -> Iterator[Path]:
     hydra_config: Any = HydraConfig.get()
     made = Path(hydra_config.runtime.output_dir)
     goes_on = resume not in (None, "auto")
-    named = goes_on or any(x.lstrip("+").startswith(FOLDER_SETTINGS) for x in hydra_config.overrides.hydra)
+    folders = ("hydra.run.dir", "hydra.sweep.")
+    named = goes_on or any(x.lstrip("+").startswith(folders) for x in hydra_config.overrides.hydra)
     folder = Path(str(resume)).resolve().parent if goes_on else made
     with own_folder(folder, named) if rank() == 0 else contextlib.nullcontext(folder) as own:
         values = [own]

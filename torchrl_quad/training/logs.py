@@ -5,15 +5,13 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, cast
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 from torchrl.record.loggers import get_logger
 
-from torchrl_quad.envs.metrics import Metric
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import write_rows
 from torchrl_quad.training.configuration import plain
@@ -24,28 +22,19 @@ NOT_IN_A_NAME = ("task=", "seed=", "resume=", "device=", "threads=", "logger.")
 
 
 class Logs:
-    """The log of a run: ``add`` a row, ``show_flight``, ``finish`` with the summary.
+    """The log of a run. ``saved`` is its state in the checkpoint from which the run goes on, in the same wandb run.
 
-    ``rows`` are those of metrics.csv so far, ``metrics`` the task's. ``saved`` is the logger's state in the checkpoint
-    from which the run continues, in the same wandb run; tensorboard forgets what it was given later.
+    Tensorboard forgets what it was given later than the checkpoint.
     """
 
-    def __init__(
-        self,
-        cfg: DictConfig,
-        folder: Path,
-        revision: str,
-        rows: list[dict[str, float]],
-        metrics: Mapping[str, Metric],
-        saved: dict[str, Any] | None,
-    ) -> None:
-        self.cfg, self.folder, self.rows = cfg, folder, rows
+    def __init__(self, run: Any, saved: dict[str, Any] | None) -> None:
+        cfg, folder, rows = self.cfg, self.folder, self.rows = run.cfg, run.folder, run.rows
         self.backend: Any = None
         if rows:  # without those that came after the checkpoint
             write_rows(folder / "metrics.csv", rows, missing=math.nan)
         if not cfg.logger.backend:
             return
-        config = plain(cfg, resolve=True) | {"revision": revision}
+        config = plain(cfg, resolve=True) | {"revision": run.revision}
         name = f"{cfg.task}_{cfg.algorithm}_seed{cfg.seed}"
         self.name = (saved or {}).get("name") or run_name(name, HydraConfig.get().overrides.task)
         drone = Path(cfg.env.drone).stem if isinstance(cfg.env.get("drone"), str) else "own drone"
@@ -64,7 +53,7 @@ class Logs:
         if cfg.logger.backend == "wandb":
             self.backend.experiment.define_metric("steps", hidden=True)
             self.backend.experiment.define_metric("*", step_metric="steps")
-            for metric, described in metrics.items():
+            for metric, described in run.task.metric_info.items():
                 if described.goal:  # the table of runs then shows the best value, not the last
                     self.backend.experiment.define_metric(f"eval/{metric}", step_metric="steps", summary=described.goal)
         if rows and cfg.logger.backend == "tensorboard":

@@ -67,11 +67,9 @@ class Run:
 
     Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
     to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
-    those the one with the greatest return. At the end that policy flies from other starts. With ``actor.average``
-    evaluations fly the average of the policy's weights.
+    those the one with the greatest return. At the end that policy flies from other starts.
 
-    The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints. Processor seconds count
-    the time in which the threads of this process computed. Of several processes the first evaluates, logs and saves.
+    The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
     Args:
         cfg, env: the configuration and its environment.
@@ -120,7 +118,7 @@ class Run:
         if rank() == 0 and not self.is_over:
             for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
                 (self.folder / name).unlink(missing_ok=True)
-            self.logs = Logs(cfg, self.folder, self.revision, self.rows, self.task.metric_info, logger_state)
+            self.logs = Logs(self, logger_state)
             with replacing(self.folder / "config.yaml") as path:
                 OmegaConf.save(cfg, path, resolve=True)
 

@@ -49,8 +49,6 @@ class Section(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid")
 
 
-# -- what is declared here ---------------------------------------------------------------------------------------------
-
 ACTIVATIONS = "CELU ELU GELU Hardswish LeakyReLU Mish PReLU ReLU SELU SiLU Sigmoid Softplus Softsign Tanh"  # torch.nn
 _Channels = Annotated[list[Annotated[int, Field(ge=1, le=4096)]], Field(min_length=1, max_length=8)]
 _Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
@@ -124,8 +122,6 @@ SETTINGS: dict[str, tuple[Any, str]] = {
 }
 PROGRAMS = {"logs": "identify", "folder": "export", "checkpoint": "evaluate"}  # by a setting that only they have
 IDENTIFYING = {"horizon": (Positive, ""), "folder": (str, "The folder to write.")}  # of identify.py, under these names
-# -- what is declared elsewhere ----------------------------------------------------------------------------------------
-
 #: The options of TorchRL's ClipPPOLoss that the recipe takes.
 PPO: dict[str, tuple[Any, str]] = {
     "clip_epsilon": (Annotated[Real, Field(gt=0, lt=1)], "How far the ratio of probabilities may move from 1."),
@@ -171,15 +167,8 @@ def settings(name: str) -> dict[str, Any]:
     return {name: value for name, value in merged.items() if name not in ("defaults", "hydra")}
 
 
-# -- the check ---------------------------------------------------------------------------------------------------------
-
-
 def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
-    """Check a configuration against the schema, and what the command line has changed in it.
-
-    Raises:
-        UserError: for the first setting that is unknown, has the wrong type, is out of its range, or has no effect.
-    """
+    """Raise a UserError for the first setting that is unknown, of a wrong value, or written without effect."""
     try:
         chosen = OmegaConf.masked_copy(cfg, [str(name) for name in cfg if name != "hydra"])
         values = plain(chosen, resolve=True, throw_on_missing=True)

@@ -58,6 +58,8 @@ def run(recipe: str, overrides: Iterable[str], folder: Path) -> None:
 
 def command(words: list[str], folder: Path) -> None:
     """Run a command in a process of its own, with its log in a folder; see :func:`run`."""
+    if STOPPED.is_set():
+        return
     folder.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "RL_LOGGING_LEVEL": "WARNING"}
     with (

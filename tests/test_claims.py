@@ -170,7 +170,6 @@ def test_claims_compare_visited_states_under_the_same_dynamics_and_shac_as_xu_wh
 
 def test_a_page_is_made_of_other_results_and_the_pages_of_the_project_stay_as_they_are(quick, monkeypatch, tmp_path):
     synthetic(tmp_path, strong=True)
-    monkeypatch.setattr(results, "EXPERIMENTS", {"main": matrix.EXPERIMENTS["main"]})
     monkeypatch.setattr(results, "pages", lambda: pytest.fail("These are other results."))
     run_main(monkeypatch, results, "--data", tmp_path)
     assert (tmp_path / "figures/main.png").read_bytes().startswith(b"\x89PNG")

@@ -81,10 +81,6 @@ def test_recipes_say_in_one_line_how_a_task_that_they_do_not_know_becomes_known(
         ("env.patience=0.5", "env.patience=0.5: it must be a whole number"),
         ("+env.rech=1", "argument 'rech'. Did you mean 'reach'?"),
         ("+env.seed=1", "env.seed: recipes set it for all environments. Write seed=..., without env"),
-        (
-            "env.wind={gust: None}",
-            "env.wind.gust=None: it is the word 'None' to YAML. For no value write env.wind.gust=null",
-        ),
     ],
 )
 def test_the_settings_of_a_task_come_from_its_signature_and_are_checked_by_it(words, message):

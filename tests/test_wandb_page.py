@@ -30,8 +30,8 @@ def test_a_sweep_hands_over_mappings_and_null_as_people_write_them(train, tmp_pa
     ("written", "read"),
     [
         ('env.wind={"mean": [1, 0.5, -1e-05], "gust": null}', "env.wind={mean: [1, 0.5, -1e-05], gust: null}"),
-        ("+a={'b c': \"it's\", 'd': True}", r"+a={b\ c: 'it\'s', d: true}"),
-        ("a=None,{'b': (1, 2)}", "a=null,{b: [1, 2]}"),  # a sweep of hydra's
+        ("+a={'b c': \"it's\", 'd': True}", r"""+a={b\ c: "it's", d: True}"""),
+        ("a=None,{'b': [1, 2]}", "a=null,{b: [1, 2]}"),  # a sweep of hydra's
         ("--actor.num_cells=[32, 32]", "actor.num_cells=[32, 32]"),
         ("env.wind={mean: [1, 0, 0]}", "env.wind={mean: [1, 0, 0]}"),
         *((x, x) for x in ("env.drone=None_of_them", "--config-name=abpt", "--cfg=job", "--multirun", "~env.wind")),

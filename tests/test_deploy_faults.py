@@ -56,8 +56,6 @@ FAULTS = [
         {"position": [0, 0, 1e9], "velocity": [0, math.nan, 0]},
     ),
     (NotFinite, "age", {"age": math.inf}),
-    (NotFinite, "beyond 1e.06: position", {"position": [10**400, 0, 0]}),
-    (NotFinite, "beyond 1e.06: age", {"age": 10**400}),
     (NotUnitQuaternion, "The quaternion has norm 1.01; it must be 1 to 0.001", {"quaternion": [1.01, 0, 0, 0]}),
     (NotUnitQuaternion, "norm 0;", {"quaternion": [0, 0, 0, 0]}),
     (StaleState, "The state is 0.03 s old; the contract allows 0 to 0.02 s", {"age": 0.03}),
@@ -147,7 +145,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
     refuses("the weights of the policy, or its normaliser, are not finite", broken)
     strong = load_drone("visfly").replace(max_thrust_to_weight=30.0)
     refuses(
-        r"export_policy: output.thrust.range_in_weights\[1\] is 30.0, and must be at most 20. A bundle flies within",
+        r"export_policy: output.thrust.range_in_weights.1.: 30.0 is greater than the maximum of 20. A bundle flies",
         env=HoveringEnv(num_envs=2, max_episode_steps=4, drone=strong),
     )
     other = HoveringEnv(num_envs=2, control="attitude")

@@ -168,9 +168,8 @@ def test_a_drone_that_no_simulator_can_fly_is_refused_with_the_name_of_its_bundl
     ):
         fly(bundle, "torchrl_quad")
     for options, why in (
-        ({"late": True}, "late must be a whole number from 0 to 1000, got True"),
-        ({"episodes": 0}, "episodes must be a whole number from 1 to 10000000, got 0"),
-        ({"scale": [1]}, "scale must be a mapping"),
+        ({"late": True}, "late must be a whole number, at least 0, got True"),
+        ({"episodes": 0}, "episodes must be a whole number, at least 1, got 0"),
         ({"scale": {"mass": "2"}}, "scale: mass must be a number from 0 to 1000, got '2'"),
         ({"mutant": "yaw"}, "mutant must be one of MUTANTS.values.., got 'yaw'"),
         ({"loop": ["pid"]}, "mujoco has no rate loop"),
@@ -256,7 +255,7 @@ def test_a_mistake_of_ours_keeps_its_traceback(hovering, tmp_path, monkeypatch):
     def mistake(*_):
         raise ValueError("of ours")
 
-    monkeypatch.setattr("torchrl_quad.deploy.table.summary", mistake)
+    monkeypatch.setattr("torchrl_quad.deploy.transfer.summary", mistake)
     with pytest.raises(ValueError, match="^of ours$"):
         runpy.run_path(*argv(monkeypatch, f"bundle={hovering}", f"folder={tmp_path}"), run_name="__main__")
 
@@ -273,7 +272,6 @@ WRONG_SETTINGS = {
     "late=-1": "late must be a whole number, at least 0, got '-1'",
     "late=1e999": "late must be a whole number",
     f"late={'9' * 5000}": "late must be a whole number",
-    "late=9999 ; loop=pd": "policy: late must be a whole number from 0 to 1000, got 9999",
     "mutants=maybe": "mutants must be true or false, got 'maybe'",
     "scale=[": r"scale must look like {mass: 1.2, inertia: 1.5}, got '\['",
     f"scale={'{a: ' * 5000}": "scale must look like {mass: 1.2, inertia: 1.5}, got",
@@ -281,7 +279,7 @@ WRONG_SETTINGS = {
     "scale={mass: 1, mass: 2}": "scale must look like",
     "scale={mass: 1e999}": "policy: scale: mass must be a number from 0 to 1000, got inf",
     "scale={mass: nan}": "scale: mass must be a number from 0 to 1000, got nan",
-    "scale={mass: 0}": "policy: scale: plant.mass is 0.0, and must be at least 0.001. Choose other factors",
+    "scale={mass: 0}": "policy: scale: plant.mass: 0.0 is less than the minimum of 0.001. Choose other factors",
     "scale={rate_gain: 2}": "policy: scale: the drone has no 'rate_gain' to scale. Choose from: mass, ",
     "late=1 ; late=2": "late is given twice",
     "scale={inertia: 1.0, rotor_positions: 0}": "policy: scale: plant.rotor_positions and rotor_spin cannot make",

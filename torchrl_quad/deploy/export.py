@@ -27,12 +27,10 @@ from torchrl_quad.data.unwrap import leaf, memory_keys, observed
 from torchrl_quad.deploy import contract as contracts
 from torchrl_quad.deploy.bundle import load_bundle
 from torchrl_quad.deploy.contract import MEASURED
-from torchrl_quad.deploy.describe import describe, envelope, results, seen_ranges
+from torchrl_quad.deploy.describe import describe, envelope, results, seen_ranges, write_page
 from torchrl_quad.deploy.folding import fold
 from torchrl_quad.deploy.judging import judge
 from torchrl_quad.deploy.network import write_c, write_onnx
-from torchrl_quad.deploy.page import write_page
-from torchrl_quad.deploy.reading import MOST_BYTES
 from torchrl_quad.deploy.tracing import Rules, trace
 from torchrl_quad.engine.packing import Key
 from torchrl_quad.envs import QuadrotorEnv
@@ -98,7 +96,7 @@ def export_policy(
         ImportError: onnx, onnxruntime or onnxscript is missing.
     """
     try:  # before anything flies
-        import onnx
+        import onnx  # noqa: F401
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401, which torch.onnx needs
     except ImportError as error:
@@ -122,8 +120,8 @@ def export_policy(
     states = {
         key: leaf(flight.replayed, _below("state", key)).flatten(0, 1)[:n] for key in task.control_step.safe_state
     }
-    rules, written = trace(task, states), write_onnx(network)
-    models = {"policy": onnx.load_from_string(written), **rules.graphs}
+    rules = trace(task, states)
+    models = {"policy": write_onnx(network), **rules.graphs}
     contract = {
         "version": contracts.VERSION,
         **describe(task, rules, models, memory=reads.get("memory", (0,))[0], visual="depth" in reads),
@@ -138,8 +136,8 @@ def export_policy(
     }
     keys = {name: name for name in MEASURED} | rules.entries
     starts = {name: _array(leaf(flight.whole, _below("state", key))[:, 0]) for name, key in keys.items()}
-    files = {f"{name}.onnx": x.SerializeToString(deterministic=True) for name, x in rules.graphs.items()}
-    files |= {"policy.onnx": written, "vectors.npz": _npz(vectors), "starts.npz": _npz(starts)}
+    files = {f"{name}.onnx": x.SerializeToString(deterministic=True) for name, x in models.items()}
+    files |= {"vectors.npz": _npz(vectors), "starts.npz": _npz(starts)}
     files["README.md"] = write_page(contract, type(task).__doc__)
     files |= write_c(network, contract, {name: x[:: count // self_test] for name, x in vectors.items()})
     contract["sha256"] = {name: contracts.sha256(content) for name, content in files.items()}
@@ -334,7 +332,8 @@ def check_bundle_only(folder: Path) -> None:
     names = {path.name for path in found}
     if names and not (folder / "contract.json").is_file():
         raise FileExistsError(f"{folder} exists and is no bundle. Choose another folder, or empty this one.")
-    if others := sorted(names - (plain & {*MOST_BYTES})):
+    own = {"contract.json", *contracts.OTHERS, *(f"{name}.onnx" for name in contracts.GRAPHS)}
+    if others := sorted(names - (plain & own)):
         raise FileExistsError(
             f"{folder} also holds {', '.join(others)}: an export replaces the folder, and would delete that. Move it "
             "away, or choose another folder."

@@ -8,15 +8,18 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from importlib import resources
 from string import Template
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.contract import Contract
-from torchrl_quad.deploy.graphs import IR_VERSION, OPSET
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
 
 Array = NDArray[np.float32]
+OPSET, IR_VERSION = 20, 10  # onnxruntime reads both since 1.18
 
 # By the name of a torch.nn activation with its default arguments: the ONNX operator (with those of its attributes that
 # are not ONNX's defaults), and the C expression of x.
@@ -101,14 +104,13 @@ class Network(NamedTuple):
 # -- ONNX --------------------------------------------------------------------------------------------------------------
 
 
-def write_onnx(network: Network) -> bytes:
+def write_onnx(network: Network) -> ModelProto:
     """The network as ONNX, all float32, with a free batch axis. The same weights give the same bytes.
 
     It reads ``observation`` (batch, k), ``depth`` (batch, 1, height, width) and ``memory`` (batch, m), of those that
     there are, and returns ``action`` (batch, 4) and ``next_memory``.
     """
-    import onnx  # only who exports needs it
-    from onnx import TensorProto, helper, numpy_helper
+    from onnx import TensorProto, helper, numpy_helper  # only who exports needs it
 
     nodes: list[Any] = []
     constants: list[Any] = []
@@ -158,11 +160,19 @@ def write_onnx(network: Network) -> bytes:
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape]) for name, shape in side.items()]
         for side in (shapes, written)
     )
-    graph = helper.make_graph(nodes, "policy", begin, end, constants)
+    return onnx_model("policy", nodes, begin, end, constants)
+
+
+def onnx_model(name: str, nodes: list[Any], reads: list[Any], writes: list[Any], constants: list[Any]) -> ModelProto:
+    """An ONNX model of one graph, checked."""
+    import onnx
+    from onnx import helper
+
+    graph = helper.make_graph(nodes, name, reads, writes, constants)
     opset = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(graph, producer_name="torchrl_quad", ir_version=IR_VERSION, opset_imports=opset)
     onnx.checker.check_model(model, full_check=True)
-    return model.SerializeToString(deterministic=True)
+    return model
 
 
 def _update_first(rows: Array) -> Array:

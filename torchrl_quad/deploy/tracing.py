@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.export import ExportedProgram
 
 from torchrl_quad.deploy.contract import ENDS, MEASURED
-from torchrl_quad.deploy.graphs import IR_VERSION, NOT_IN_TASKS, OPSET
+from torchrl_quad.deploy.network import OPSET, onnx_model
 from torchrl_quad.engine.packing import Key
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import QuadrotorEnv
@@ -329,7 +329,6 @@ class _Cut:
 
     def _graph(self, task: str, name: str, wanted: list[str]) -> ModelProto:
         """The ONNX with only these outputs. Values are numbered, so that the same rules give the same bytes."""
-        import onnx
         from onnx import helper, numpy_helper
 
         used = set().union(*(self._behind(output) for output in wanted))
@@ -348,7 +347,7 @@ class _Cut:
         for node in self.nodes:
             if used.isdisjoint(node.output):
                 continue
-            if node.op_type in NOT_IN_TASKS or node.domain:
+            if node.op_type in ("If", "Loop", "Scan") or node.domain:  # loops might never end
                 raise UserValueError(
                     f"export_policy: {task}: {name}.onnx would compute {node.domain}{node.op_type}, which bundles do "
                     "not. Write it with other operations of torch."
@@ -358,11 +357,7 @@ class _Cut:
             nodes[-1].attribute.extend(node.attribute)
         for output, end in zip(wanted, writes, strict=True):
             nodes.append(helper.make_node("Identity", [names[self.outputs[output]]], [end.name]))
-        graph = helper.make_graph(nodes, name, reads, writes, constants)
-        opset = [helper.make_opsetid("", OPSET)]
-        model = helper.make_model(graph, producer_name="torchrl_quad", ir_version=IR_VERSION, opset_imports=opset)
-        onnx.checker.check_model(model, full_check=True)
-        return model
+        return onnx_model(name, nodes, reads, writes, constants)
 
     def _end(self, name: str, source: str) -> ValueInfoProto:
         """An input or output of a graph: its axes of batch and time are free."""

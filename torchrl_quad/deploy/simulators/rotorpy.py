@@ -49,7 +49,6 @@ class RotorPy:
         self.vehicle = Multirotor(parameters, control_abstraction=kind, integrator_kwargs=solver)
 
     def reset(self, starts: Mapping[str, Array]) -> None:
-        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
         theirs = self.frame.to(starts)
         speeds = self.frame.to({"motors": self.hover_speed})["motors"]
         still = {"wind": np.zeros(3), "rotor_speeds": speeds}
@@ -57,13 +56,11 @@ class RotorPy:
         self.now = [{**{NAMES[k]: x[i] for k, x in theirs.items()}, **still} for i in range(n)]
 
     def state(self) -> dict[str, Array]:
-        """The present states (n, ...)."""
         theirs = {name: np.stack([x[theirs] for x in self.now]) for name, theirs in NAMES.items()}
         speeds = self.frame.back({"motors": np.stack([x["rotor_speeds"] for x in self.now])})["motors"]
         return {**self.frame.back(theirs), "rotor_speed": speeds}
 
     def step(self, thrust: Array, rates: Array) -> None:
-        """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
         rates = self.frame.to({"body_rate": rates})["body_rate"]
         for _ in range(self.substeps):
             if self.loop is None:
@@ -75,7 +72,6 @@ class RotorPy:
             self.now = [self.vehicle.step(x, c, self.dt) for x, c in zip(self.now, commands, strict=True)]
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Continue with only these drones (n)."""
         self.now = [x for x, on in zip(self.now, chosen, strict=True) if on]
         if self.loop is not None:
             self.loop.keep(chosen)

@@ -5,6 +5,8 @@ Arrays are (n, ...), one row for each drone. Nothing here imports torch.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +21,6 @@ class Drone:
     """A quadrotor from the fields of a contract's ``drone``: what :class:`~torchrl_quad.QuadrotorParams` documents.
 
     Attributes:
-        fields: the fields by name, as arrays.
         allocation: (4, 4), from four rotor thrusts [N] to collective thrust [N] and torque [N m].
         mixer: its inverse.
         thrust_limits: the least and the greatest thrust [N] that may be commanded of one rotor.
@@ -45,15 +46,15 @@ class Drone:
     rate_damping: Array
 
     def __init__(self, fields: Contract) -> None:
-        self.fields = {name: np.array(value, float) for name, value in fields.items()}
-        unknown = ["drag_height"] if self.fields.get("drag_height", np.zeros(1)).any() else []
-        unknown += ["two motor_time_constants"] if self.fields["motor_time_constant"].size > 1 else []
+        arrays = {name: np.array(value, float) for name, value in fields.items()}
+        unknown = ["drag_height"] if arrays.get("drag_height", np.zeros(1)).any() else []
+        unknown += ["two motor_time_constants"] if arrays["motor_time_constant"].size > 1 else []
         if unknown:
             raise UserValueError(
                 f"Third-party simulators do not fly drones with {' and '.join(unknown)}. Export the "
                 "policy of a drone without: env.drone with drag_height: 0 and one motor_time_constant."
             )
-        for name, value in self.fields.items():
+        for name, value in arrays.items():
             setattr(self, name, value if value.ndim else float(value))
         k2, k1, k0 = self.thrust_map
         self.vertex_speed, self.vertex_thrust = -k1 / (2.0 * k2), k0 - k1 * k1 / (4.0 * k2)
@@ -79,6 +80,18 @@ class Drone:
         """The force of the air (n, 3) [N], world frame, at an attitude (n, 4) and a velocity (n, 3) [m/s]."""
         body = rotate_inverse(quaternion, velocity)
         return rotate(quaternion, -(self.linear_drag + self.quadratic_drag * np.abs(body)) * body)
+
+
+class Flown:
+    """What the simulators have in common that fly a drone with the rate loops of this module, at 1 kHz."""
+
+    loops: tuple[str, ...] = ("contract", "pid", "pd")
+
+    def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
+        self.substeps = max(round(1000.0 * contract["control_dt"]), 1)
+        self.dt = contract["control_dt"] / self.substeps
+        nominal, self.drone = Drone(contract["drone"]), Drone(contract["drone"] | contract["plant"])
+        self.loop, self.hover_speed, self.motors = LOOPS[loop](nominal, self.dt), nominal.hover_speed, list(motors)
 
 
 class ContractLoop:

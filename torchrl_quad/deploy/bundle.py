@@ -30,7 +30,6 @@ from torchrl_quad.errors import UserTypeError, UserValueError, shown
 
 START = np.array([1.0, 0.0, 0.0, 0.0])  # the quaternion that the first one of a flight takes its sign from
 MOST = 1e6  # of a number that says where a flight starts in the task
-SINCE = {"age": ", the time since it was measured [s]", "depth_age": ", the time since the image was taken [s]"}
 
 
 class Bundle:
@@ -77,20 +76,16 @@ class Bundle:
             entries: where the flight starts in the task, by the names of ``contract["task"]["entries"]``: numbers, or
                 arrays of the shape there. By default those of the first start in ``starts.npz``. Such as ``target`` (3)
                 [m] in hovering and landing, ``phase`` [rad] in tracking, ``gate``, the index of the first one, in
-                racing, ``target`` and ``speed`` [m/s] in the forest.
-
-        Raises:
-            TypeError: the task has no such entry.
-            ValueError: an entry has another shape or type, or is out of its range.
+                racing, ``target`` and ``speed`` [m/s] in the forest. ValueError for another shape, type or range.
         """
         task = self.contract["task"]
-        progress = {name: self._starts[name][:1] for name in task["entries"]}
-        for name, value in entries.items():
-            if name not in progress:
-                choices = ", ".join(progress) or "nothing; it has no entries"
-                raise UserTypeError(f"{self.folder}: reset: {task['name']} has no {name!r}. Choose from: {choices}.")
-            progress[name] = self._entry(name, value)
-        self._progress = progress
+        if unknown := entries.keys() - task["entries"]:
+            choices = ", ".join(task["entries"]) or "nothing; it has no entries"
+            raise UserTypeError(
+                f"{self.folder}: reset: {task['name']} has no {min(unknown)!r}. Choose from: {choices}."
+            )
+        given = {name: self._entry(name, value) for name, value in entries.items()}
+        self._progress = {name: self._starts[name][:1] for name in task["entries"]} | given
         self.queue = np.tile(self._hover, (self.contract["action_delay"], 1))
         self.action = self._hover.copy()
         self.memory = np.zeros(self.contract["memory"], np.float32)
@@ -153,10 +148,7 @@ class Bundle:
         """Run the policy on all observations that came with it.
 
         Returns:
-            the greatest difference from the actions and memories stored with them.
-
-        Raises:
-            WrongActions: the difference is above the tolerance.
+            the greatest difference from the actions and memories stored with them; WrongActions above the tolerance.
         """
         with contracts.naming(self.folder):
             found = self.graphs["policy"](self._vectors)
@@ -249,7 +241,8 @@ class Bundle:
             given = state[name]
         except KeyError:
             needed = ", ".join((*MEASURED, *(["depth", "depth_age"] if self._camera else [])))
-            raise MissingQuantity(f"The state lacks {name!r}{SINCE.get(name, '')}: give {needed} and age.") from None
+            since = ", the time since that was measured [s]" if "age" in name else ""
+            raise MissingQuantity(f"The state lacks {name!r}{since}: give {needed} and age.") from None
         try:
             value = np.asarray(given)
             numbers = value.astype(float, copy=False) if value.dtype.kind in "fiuO" else None  # no text, no flags

@@ -72,9 +72,9 @@ def schema() -> Fields:
 
 
 def schema_table() -> str:
-    """The fields of the contract with their meaning, and what numbers they may hold, as a table in Markdown."""
-    rows = [f"| `{name}` | {entry['description']} | {_range(entry)} |" for name, entry in _fields(schema())]
-    return "\n".join(("| field | meaning | numbers |", "|---|---|---|", *rows))
+    """The fields of the contract with their meaning, as a table in Markdown."""
+    rows = [f"| `{name}` | {entry['description']} |" for name, entry in _fields(schema())]
+    return "\n".join(("| field | meaning |", "|---|---|", *rows))
 
 
 def _fields(part: Contract, prefix: str = "") -> Iterator[tuple[str, Contract]]:
@@ -84,19 +84,6 @@ def _fields(part: Contract, prefix: str = "") -> Iterator[tuple[str, Contract]]:
             inside = entry if key == "properties" else entry.get(key)
             if isinstance(inside, dict) and "properties" in inside:
                 yield from _fields(inside, f"{prefix}{name}{between}")
-
-
-def _range(entry: Contract) -> str:
-    """The range of a field's numbers as an interval: [0, 1] with its ends, (0, 1) without."""
-    while "prefixItems" in entry or "items" in entry:
-        entry = entry["prefixItems"][-1] if "prefixItems" in entry else entry["items"]
-    low = next(
-        (f"{end}{entry[rule]:g}" for rule, end in (("minimum", "["), ("exclusiveMinimum", "(")) if rule in entry), ""
-    )
-    high = next(
-        (f"{entry[rule]:g}{end}" for rule, end in (("maximum", "]"), ("exclusiveMaximum", ")")) if rule in entry), ""
-    )
-    return f"{low or '(-inf'}, {high or 'inf)'}" if low or high else ""
 
 
 @contextlib.contextmanager
@@ -126,19 +113,14 @@ def digest(contract: Contract) -> str:
 
 def problem(contract: Contract) -> str | None:
     """Where a contract does not fit its schema, or its drones cannot fly, if anywhere."""
-    misfits, drone = _misfits(contract), contract["drone"]
-    return next(itertools.chain(misfits, _contradictions(drone, "drone", hovers=True), _plant_problems(contract)), None)
+    misfit = next(_misfits(contract), None)
+    return misfit or next(_contradictions(contract["drone"], "drone", hovers=True), None) or drone_problem(contract)
 
 
 def drone_problem(contract: Contract) -> str | None:
     """What is wrong with the drone of a contract that flies, the nominal one with the fields of ``plant``, or None."""
-    return next(_plant_problems(contract), None)
-
-
-def _plant_problems(contract: Contract) -> Iterator[str]:
     flies = {**contract["drone"], **contract["plant"]}
-    yield from _misfits(flies, "drone", "plant")
-    yield from _contradictions(flies, "plant")
+    return next(itertools.chain(_misfits(flies, "drone", "plant"), _contradictions(flies, "plant")), None)
 
 
 def _misfits(value: Any, part: str | None = None, at: str = "") -> Iterator[str]:

@@ -93,15 +93,17 @@ def read(folder: Path) -> tuple[Contract, dict[str, Graph], Arrays, Arrays]:
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         why = f"it lacks {error}" if isinstance(error, KeyError) else one_line(error)
         raise TamperedBundle(f"{path} is no contract of a policy, or is damaged: {why}. {AGAIN}") from error
+    package = contract.get("origin", {}).get("package", "another version")
+    written = f"It was written by {package}: use that one, or export again."
     if version != VERSION:
         raise UnknownContract(
-            f"{path} has version {shown(version)}, and this torchrl_quad reads version {VERSION}. {_writer(contract)}"
+            f"{path} has version {shown(version)}, and this torchrl_quad reads version {VERSION}. {written}"
         )
     changed = f"was changed after the export: its checksum does not fit. {AGAIN}"
     if not fits:
         raise TamperedBundle(f"{path} {changed}")
     if said := problem(contract):
-        raise UnknownContract(f"{path}: {said}. This torchrl_quad cannot fly it. {_writer(contract)}")
+        raise UnknownContract(f"{path}: {said}. This torchrl_quad cannot fly it. {written}")
     content = {}
     for name in files(contract):
         try:
@@ -115,8 +117,3 @@ def read(folder: Path) -> tuple[Contract, dict[str, Graph], Arrays, Arrays]:
     }
     vectors, starts = (dict(np.load(io.BytesIO(content[name]))) for name in ("vectors.npz", "starts.npz"))
     return contract, graphs, vectors, starts
-
-
-def _writer(contract: Contract) -> str:
-    package = contract.get("origin", {}).get("package", "another version")
-    return f"It was written by {package}: use that one, or export again."

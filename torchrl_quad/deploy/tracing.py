@@ -38,9 +38,8 @@ METHODS = {"observe": "observe", "judge": "is_crash and is_success", "measure": 
 class Rules(NamedTuple):
     """What a task computes outside the network."""
 
-    graphs: dict[
-        str, ModelProto
-    ]  #: ONNX models by name, "observe" and those that there are of "advance", "judge", "episode"
+    #: ONNX models by name, "observe" and those that there are of "advance", "judge", "episode"
+    graphs: dict[str, ModelProto]
     entries: dict[str, Key]  #: the keys in the state of the task's own entries that these read, by name
     unjudged: str | None  #: why there are no graphs "judge" and "episode", or None
 
@@ -57,7 +56,7 @@ def trace(env: QuadrotorEnv, state: State) -> Rules:
             values in a way that cannot be traced.
     """
     rules = _Methods(env, state)
-    with _quietly(), _without_randomness(env), torch.no_grad():
+    with _quietly_without_randomness(env), torch.no_grad():
         program, outputs = _exported(rules)
         try:
             found: Any = torch.onnx.export(program, (), dynamo=True, opset_version=OPSET, verbose=False)
@@ -111,7 +110,6 @@ class _Methods:
             self.inputs[name] = torch.stack(STEPS * [value], 1)
 
     def state(self, x: Tensors) -> State:
-        """The state, by its own keys."""
         return {key: x[name] for name, key in (self.known | self.hidden).items()}
 
     def observe(self, x: Tensors) -> Tensors:
@@ -138,7 +136,6 @@ class _Methods:
         return {f"judge.{name}": ends[name] for name in ENDS}
 
     def measure(self, x: Tensors) -> Tensors:
-        """The metrics of a state."""
         return {f"judge.metrics.{name}": value for name, value in self.env.metrics(self.state(x)).items()}
 
     def sum_up(self, x: Tensors) -> Tensors:
@@ -158,19 +155,17 @@ class _Methods:
 
 
 class _Whole(nn.Module):
-    """Some methods together, as torch.export takes them."""
+    """Some methods together, as torch.export takes them: of tensors in the order of the names."""
 
     def __init__(self, names: Iterable[str], methods: Iterable[Method]) -> None:
         super().__init__()
         self.names, self.methods = [*names], [*methods]
 
     def found(self, *tensors: Tensor) -> Tensors:
-        """What the methods make of tensors in the order of the names."""
         given = dict(zip(self.names, tensors, strict=True))
         return {name: x for method in self.methods for name, x in method(given).items()}
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """The same, without names."""
         return tuple(self.found(*tensors).values())
 
 
@@ -212,22 +207,9 @@ def _refusal(env: QuadrotorEnv, what: str, why: Exception) -> UserValueError:
 
 
 @contextlib.contextmanager
-def _quietly() -> Iterator[None]:
-    """torch.onnx tells of packages that are not installed, and of its own future."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    try:
-        logger.setLevel(logging.CRITICAL)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)
-
-
-@contextlib.contextmanager
-def _without_randomness(env: QuadrotorEnv) -> Iterator[None]:
-    """Refuse random numbers while rules are traced; they would be the same ones for ever."""
+def _quietly_without_randomness(env: QuadrotorEnv) -> Iterator[None]:
+    """Refuse random numbers while rules are traced, which would be the same ones for ever; and silence torch.onnx,
+    which tells of missing packages and of its own future."""
 
     class Refusing:
         tensor = env.randomness.tensor
@@ -235,26 +217,23 @@ def _without_randomness(env: QuadrotorEnv) -> Iterator[None]:
         def __getattr__(self, name: str) -> Any:
             raise UserValueError(RANDOM.format(name))
 
-    randomness = env.randomness
+    logger, randomness = logging.getLogger("torch.onnx"), env.randomness
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    env.randomness = cast(Randomness, Refusing())
     try:
-        env.randomness = cast(Randomness, Refusing())
-        yield
+        with warnings.catch_warnings(action="ignore"):
+            yield
     finally:
         env.randomness = randomness
+        logger.setLevel(level)
 
 
 # -- from one model to a graph for each file ---------------------------------------------------------------------------
 
 
 class _Cut:
-    """The one model, from which graphs are cut.
-
-    Args:
-        model: ONNX.
-        inputs: names of its inputs, in their order.
-        outputs: names of its outputs.
-        entries: names of the task's own entries.
-    """
+    """The one model, from which graphs are cut, with names of its inputs and outputs, and of the task's entries."""
 
     def __init__(self, model: ModelProto, inputs: list[str], outputs: list[str], entries: Iterable[str]) -> None:
         graph = model.graph

@@ -11,7 +11,6 @@ from __future__ import annotations
 import copy
 import csv
 import json
-import sys
 import time
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -23,7 +22,7 @@ import numpy as np
 
 from torchrl_quad.deploy.bundle import Bundle, load_bundle
 from torchrl_quad.deploy.contract import ENDS, MEASURED, Arrays, Contract, Fields, drone_problem, naming
-from torchrl_quad.deploy.judging import Judge, summary
+from torchrl_quad.deploy.judging import Judge
 from torchrl_quad.deploy.simulators import Array, Simulator, make_simulator
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.files import add_rows, machine, read_rows
@@ -75,8 +74,8 @@ def fly(
 ) -> Fields:
     """Fly a bundle from its fresh starts, one episode each, in a simulator.
 
-    The simulator applies the contract's ``action_delay``: the hover command is on its way at the start. It reports
-    states as late as the contract's ``observation_delay``, but exactly.
+    The contract's ``action_delay`` holds: the hover command is on its way at the start. States are reported as late as
+    its ``observation_delay``, but exactly.
 
     Args:
         folder: a bundle.
@@ -217,14 +216,9 @@ def measure(
     late: int = 0,
     episodes: int | None = None,
 ) -> None:
-    """Fly once, and add the result to a table, unless it is there; the arguments are those of ``fly``.
-
-    Raises:
-        ValueError: the file is no table of flights, or an argument is one that ``fly`` refuses.
-        OSError: the result cannot be written; then it is printed.
-    """
+    """Fly once, and add the result to a table, unless it is there; the arguments are those of :func:`fly`."""
     task = bundle.contract["task"]
-    about = {**(scale or {}), **({"late": late} if late else {})}
+    drone = {**(scale or {}), **({"late": late} if late else {})}
     starts = len(bundle.starts()["position"])
     with naming(bundle.folder):
         version = make_simulator(simulator, bundle.contract, loop).version
@@ -233,32 +227,29 @@ def measure(
         "simulator": version,
         "loop": loop,
         "mutant": mutant,
-        "drone": json.dumps(about, sort_keys=True) if about else "nominal",
+        "drone": json.dumps(drone, sort_keys=True) if drone else "nominal",
         "episodes": str(min(starts, episodes or starts)),
     }
     if any(all(row[name] == flown[name] for name in KEY) for row in _rows(path)):
         return
-    begin = time.perf_counter()
+    begin, ends = time.perf_counter(), ("solved", "crash")
     flight = fly(bundle, simulator, loop, MUTANTS.get(mutant), scale=scale, late=late, episodes=episodes)
-    metrics = {name: x for name, x in flight["metrics"].items() if name not in ("solved", "crash")}
-    totals = summary({name: task["metrics"][name] for name in metrics}, metrics)
+    totals = []
+    for name, about in task["metrics"].items():
+        known = flight["metrics"][name][~np.isnan(flight["metrics"][name])]
+        total = (np.median if about["median"] else np.mean)(known) if len(known) else None
+        text = "none" if total is None else f"{about['scale'] * total:.3g} {about['unit']}".rstrip()
+        totals += [] if name in ends else [f"{about['label']} {text}"]
     row = {
         "task": task["name"],
         **flown,
-        **{name: f"{flight['metrics'][name].mean():.4f}" for name in ("solved", "crash")},
-        "metrics": "; ".join(f"{task['metrics'][name]['label']} {value}" for name, value in totals.items()),
+        **{name: f"{flight['metrics'][name].mean():.4f}" for name in ends},
+        "metrics": "; ".join(totals),
         "seconds": f"{time.perf_counter() - begin:.1f}",
         "faults": sum(flight["faults"].values()),
         "machine": machine(),
     }
-    try:
-        add_rows(path, [row])
-    except BaseException:
-        print(f"Flown, and not written to {path}:")
-        table = csv.DictWriter(sys.stdout, row)
-        table.writeheader()
-        table.writerow(row)
-        raise
+    add_rows(path, [row])
 
 
 def table(path: Path, bundle: Bundle) -> str:

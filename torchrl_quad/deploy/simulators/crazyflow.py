@@ -17,14 +17,15 @@ from numpy.typing import NDArray
 
 from torchrl_quad.deploy import frames
 from torchrl_quad.deploy.contract import Fields
-from torchrl_quad.deploy.simulators.vehicle import Array, Drone, Flown
+from torchrl_quad.deploy.simulators import Simulator
+from torchrl_quad.deploy.simulators.vehicle import Array, Drone
 
 RPM = 60.0 / (2.0 * np.pi)  # in 1 rad/s
 NAMES = {"position": "pos", "quaternion": "quat", "velocity": "vel", "angular_velocity": "ang_vel"}
 
 
-class Crazyflow(Flown):
-    """Independent drones in Crazyflow; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
+class Crazyflow(Simulator):
+    """Independent drones in Crazyflow.
 
     Its dynamics have everything that a contract says of a drone except quadratic drag. They compute in
     float32, and hold drones above the ground. Physics and rate loop run at 1 kHz, by symplectic Euler.

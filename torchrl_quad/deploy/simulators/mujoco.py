@@ -10,10 +10,10 @@ from mujoco import rollout
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.contract import Contract
-from torchrl_quad.deploy.simulators.vehicle import Array, Drone, Flown
+from torchrl_quad.deploy.simulators import Simulator
+from torchrl_quad.deploy.simulators.vehicle import Array, Drone
 from torchrl_quad.errors import UserValueError
 
-FRONT_TO_BACK = ("front_left", "back_left", "back_right", "front_right")
 # qpos of a free joint: position and quaternion (w, x, y, z), body to world. qvel: velocity in the world frame, angular
 # velocity in the body frame. act: the rotor speeds.
 STATE = {"position": slice(1, 4), "quaternion": slice(4, 8), "velocity": slice(8, 11)}
@@ -29,14 +29,12 @@ def model(drone: Drone, timestep: float) -> str:
     written into them, and turn by its drag torque.
     """
     places, spins = drone.rotor_positions.tolist(), drone.rotor_spin.tolist()
-    sites = "".join(
-        f'<site name="{name}" pos="{x!r} {y!r} 0"/>' for name, (x, y) in zip(FRONT_TO_BACK, places, strict=True)
-    )
+    sites = "".join(f'<site name="rotor{i}" pos="{x!r} {y!r} 0"/>' for i, (x, y) in enumerate(places))
     lag = f'dyntype="filterexact" dynprm="{drone.motor_time_constant!r}" gaintype="fixed" gainprm="0" biastype="none"'
-    lags = "".join(f'<general site="{name}" {lag} gear="0 0 1 0 0 0" ctrllimited="false"/>' for name in FRONT_TO_BACK)
+    lags = "".join(f'<general site="rotor{i}" {lag} gear="0 0 1 0 0 0" ctrllimited="false"/>' for i in range(4))
     thrusts = "".join(
-        f'<motor site="{name}" gear="0 0 1 0 0 {spin * drone.yaw_torque_coefficient!r}" ctrllimited="false"/>'
-        for name, spin in zip(FRONT_TO_BACK, spins, strict=True)
+        f'<motor site="rotor{i}" gear="0 0 1 0 0 {spin * drone.yaw_torque_coefficient!r}" ctrllimited="false"/>'
+        for i, spin in enumerate(spins)
     )
     inertia = " ".join(map(repr, drone.inertia.tolist()))
     return f"""<mujoco>
@@ -56,8 +54,8 @@ def model(drone: Drone, timestep: float) -> str:
 </mujoco>"""
 
 
-class MuJoCo(Flown):
-    """Independent drones in MuJoCo; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
+class MuJoCo(Simulator):
+    """Independent drones in MuJoCo.
 
     Thrust follows from the speed of the rotors by the contract's thrust map, and drag by its coefficients; both are
     forces to MuJoCo, held over a step of 1 ms. The rate loop runs at 1 kHz, too.

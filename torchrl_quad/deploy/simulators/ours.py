@@ -10,13 +10,14 @@ import torch
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.contract import Contract
+from torchrl_quad.deploy.simulators import Simulator
 from torchrl_quad.deploy.simulators.vehicle import Array
 from torchrl_quad.dynamics import DYNAMICS, load_drone
 from torchrl_quad.errors import UserValueError, shown
 
 
-class Ours:
-    """The simulator of the contract; see :class:`~torchrl_quad.deploy.simulators.Simulator`."""
+class Ours(Simulator):
+    """The simulator of the contract."""
 
     loops = ("contract",)
 

@@ -5,8 +5,6 @@ Arrays are (n, ...), one row for each drone. Nothing here imports torch.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -82,27 +80,12 @@ class Drone:
         return rotate(quaternion, -(self.linear_drag + self.quadratic_drag * np.abs(body)) * body)
 
 
-class Flown:
-    """What the simulators have in common that fly a drone with the rate loops of this module, at 1 kHz."""
-
-    loops: tuple[str, ...] = ("contract", "pid", "pd")
-
-    def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
-        self.substeps = max(round(1000.0 * contract["control_dt"]), 1)
-        self.dt = contract["control_dt"] / self.substeps
-        nominal, self.drone = Drone(contract["drone"]), Drone(contract["drone"] | contract["plant"])
-        self.loop, self.hover_speed, self.motors = LOOPS[loop](nominal, self.dt), nominal.hover_speed, list(motors)
-
-
 class ContractLoop:
     """The rate loop of the contract, as the drone was trained with; it reads rotor speeds.
 
     torque = J K (desired - rate) - D (angular acceleration) + w x J w, where the angular acceleration follows from the
-    rotor speeds. Where rotors saturate it gives up yaw first, then thrust, then roll and pitch.
-
-    Args:
-        drone: the nominal drone.
-        dt: time between two calls [s].
+    rotor speeds. Where rotors saturate it gives up yaw first, then thrust, then roll and pitch. ``drone`` is nominal,
+    ``dt`` the time between two calls [s].
     """
 
     def __init__(self, drone: Drone, dt: float) -> None:
@@ -117,15 +100,12 @@ class ContractLoop:
     def __call__(self, thrust: Array, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
         """Rotor speeds (n, 4) [rad/s] to command, for a collective thrust (n) [N] and body rates (n, 3) [rad/s], from
         the body rates (n, 3) [rad/s] and rotor speeds (n, 4) [rad/s] of this moment."""
-        return self.mix(thrust, self.torque(rates, angular_velocity, rotor_speed))
-
-    def torque(self, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
-        """The torque to ask for (n, 3) [N m]."""
         drone = self.drone
         gyroscopic = cross(angular_velocity, drone.inertia * angular_velocity)
         believed = drone.thrust(rotor_speed) @ drone.allocation[1:].T
         acceleration = (believed - gyroscopic) / drone.inertia
-        return gyroscopic + self.gain * (rates - angular_velocity) - drone.rate_damping * acceleration
+        torque = gyroscopic + self.gain * (rates - angular_velocity) - drone.rate_damping * acceleration
+        return self.mix(thrust, torque)
 
     def mix(self, collective: Array, torque: Array) -> Array:
         """Rotor speeds (n, 4) [rad/s] for a collective thrust (n) [N] and a torque (n, 3) [N m], within the limits."""
@@ -177,7 +157,6 @@ class PIDLoop(ContractLoop):
         self.before: Array | None = None
 
     def __call__(self, thrust: Array, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
-        """The command; see :class:`ContractLoop`. The rotor speeds are not read."""
         if self.before is None:
             self.before = angular_velocity
         error = rates - angular_velocity
@@ -192,7 +171,6 @@ class PIDLoop(ContractLoop):
         return self.mix(thrust, torque)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Continue with only these drones."""
         if self.before is not None:
             self.integral, self.derivative = self.integral[chosen], self.derivative[chosen]
             self.before = self.before[chosen]
@@ -207,14 +185,8 @@ class PDLoop(PIDLoop):
 def damping_ratio(gain: Array, inertia: Array, damping: Array, motor_time_constant: float) -> Array:
     """The damping ratio (3) of a rate loop about hover, which is a second-order system about each axis.
 
-    torque = J K (desired - rate) - D (angular acceleration) + gyroscopic torque, and rotors that lag by tau, give
-    tau w'' + (1 + D / J) w' + K w = K desired.
-
-    Args:
-        gain: K (3) [1/s].
-        inertia: J (3) [kg m2].
-        damping: D (3) [kg m2].
-        motor_time_constant: tau [s].
+    The torque of :class:`ContractLoop`, with gain K (3) [1/s], inertia J (3) [kg m2], damping D (3) [kg m2], and rotors
+    that lag by tau [s], give tau w'' + (1 + D / J) w' + K w = K desired.
     """
     return (1.0 + damping / inertia) / (2.0 * np.sqrt(gain * motor_time_constant))
 

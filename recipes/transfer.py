@@ -24,8 +24,7 @@ from typing import Any
 from torchrl_quad.deploy import load_bundle
 from torchrl_quad.deploy.contract import naming
 from torchrl_quad.deploy.simulators import simulator_class
-from torchrl_quad.deploy.table import measure, table
-from torchrl_quad.deploy.transfer import MUTANTS
+from torchrl_quad.deploy.transfer import MUTANTS, measure, table
 from torchrl_quad.errors import MissingPackage, UserError, UserValueError, shown
 from torchrl_quad.files import make_folder
 

@@ -95,24 +95,15 @@ def test_the_settings_of_a_task_come_from_its_signature_and_are_checked_by_it(wo
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (
-            "env.disturbances=[own_parts.ABPTLoss]",
-            "env.disturbances=own_parts.ABPTLoss: it must be a subclass of Disturbance",
-        ),
-        (
-            "env.disturbances=[own_parts.Pull]",
-            "env.disturbances 'own_parts.Pull': the module 'own_parts' .* has no 'Pull'",
-        ),
+        ("env.disturbances=[own_task.ABPTLoss]", "=own_task.ABPTLoss: it must be a subclass of Disturbance"),
+        ("env.disturbances=[own_task.Pull]", "'own_task.Pull': the module 'own_task' .* has no 'Pull'"),
         ("env.disturbances=[Push]", "env.disturbances='Push': it must be the path of a class"),
-        ("env.disturbances=own_parts.Push", "env.disturbances=own_parts.Push: it must be a list"),
-        (
-            "env.disturbances=[{_target_: own_parts.Push, force: 1}]",
-            "env.disturbances: unknown key 'force'. Allowed: streng",
-        ),
-        ("loss._target_=own_parts.Push", "loss._target_=own_parts.Push: it must be a subclass of ABPTLoss"),
-        ("loss._target_=own_parts.ThriftyLoss loss.efort=1", "loss.efort is unknown.* effort, "),
-        ("loss._target_=own_parts.ThriftyLoss loss.effort=low", "loss.effort=low: it must be a number"),
-        ("loss._target_=own_parts.ThriftyLoss loss.alpha=-1", "loss.alpha=-1: it must be at least 0"),
+        ("env.disturbances=own_task.Push", "env.disturbances=own_task.Push: it must be a list"),
+        ("env.disturbances=[{_target_: own_task.Push, force: 1}]", "unknown key 'force'. Allowed: streng"),
+        ("loss._target_=own_task.Push", "loss._target_=own_task.Push: it must be a subclass of ABPTLoss"),
+        ("loss._target_=own_task.ThriftyLoss loss.efort=1", "loss.efort is unknown.* effort, "),
+        ("loss._target_=own_task.ThriftyLoss loss.effort=low", "loss.effort=low: it must be a number"),
+        ("loss._target_=own_task.ThriftyLoss loss.alpha=-1", "loss.alpha=-1: it must be at least 0"),
     ],
 )
 def test_a_disturbance_or_a_loss_of_your_own_that_does_not_fit_is_refused(words, message):
@@ -123,16 +114,15 @@ def test_a_disturbance_or_a_loss_of_your_own_that_does_not_fit_is_refused(words,
 
 
 def test_what_is_your_own_trains_resumes_is_evaluated_and_exported_as_what_ships(train, launch, refused, tmp_path):
-    own = ["task._target_=own_task.CornerEnv", "env.disturbances=[{_target_: own_parts.Push, strength: 0.1}]"]
-    own += ["loss._target_=own_parts.ThriftyLoss", "loss.effort=0.2"]
+    own = ["task._target_=own_task.CornerEnv", "env.disturbances=[{_target_: own_task.Push, strength: 0.1}]"]
+    own += ["loss._target_=own_task.ThriftyLoss", "loss.effort=0.2"]
     first = train("abpt", tmp_path, *own, "env.reach=0.1")
     saved = train("abpt", tmp_path, *own, "resume=auto", "total_steps=240")
-    assert (
-        saved["iteration"] == 10 and "task: own_task.CornerEnv" in saved["config"] and "effort: 0.2" in saved["config"]
-    )
+    assert saved["iteration"] == 10
+    assert "task: own_task.CornerEnv" in saved["config"] and "effort: 0.2" in saved["config"]
     assert first["rows"][0]["train/effort"] < 0
     assert float(rows(tmp_path)[-1]["eval/corner_error"]) > 0
-    trust = "trust=[own_task.CornerEnv, own_parts.Push, own_parts.ThriftyLoss]"
+    trust = "trust=[own_task.CornerEnv, own_task.Push, own_task.ThriftyLoss]"
     for recipe, setting in ("evaluate", "checkpoint"), ("abpt", "resume"):
         said = refused(recipe, f"{setting}={tmp_path}/checkpoint.pt")
         assert said.endswith(f"file names is not run: if you trust it, write '{trust}'.")
@@ -149,15 +139,9 @@ def test_a_recipe_outside_the_repository_is_short_and_takes_any_task(tmp_path, m
     """The programs of docs/writing.md, in files, as the page says."""
     assert all(len(content.splitlines()) < 60 for content in files().values())
     register_task("fly_to_corner", CornerEnv)
-    sweep = [
-        "--multirun",
-        *SMALL,
-        "hydra/launcher=basic",
-        f"hydra.sweep.dir={tmp_path}/run",
-        "hydra.sweep.subdir=${task}",
-    ]
+    sweep = ["hydra/launcher=basic", f"hydra.sweep.dir={tmp_path}/run", "hydra.sweep.subdir=${task}"]
     own = ["task=shuttle.ShuttleEnv,fly_to_corner", "loss.smoothness=0.3"]
-    monkeypatch.setattr(sys, "argv", ["smooth.py", *sweep, *own])
+    monkeypatch.setattr(sys, "argv", ["smooth.py", "--multirun", *SMALL, *sweep, *own])
     importlib.import_module("smooth").main()
     printed = capsys.readouterr().out
     assert "smooth on shuttle.ShuttleEnv, seed 0" in printed and "smooth on fly_to_corner, seed 0" in printed

@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl_quad.dynamics import presets
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import replacing
-from torchrl_quad.training.configuration import named_code, plain
+from torchrl_quad.training.configuration import CONFIG, named_code, plain
 from torchrl_quad.training.schema import check
 
 FORMAT = 5  # of the content; raise it when older files can no longer be read
@@ -94,8 +94,11 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
         )
     if cfg.resume is None:
         return
-    overrides = [override.lstrip("+~").partition("=")[0] for override in HydraConfig.get().overrides.task]
-    asked = {"algorithm": cfg.algorithm} | {name: OmegaConf.select(cfg, name) for name in overrides}
+    overrides = [override.lstrip("+~").partition("=") for override in HydraConfig.get().overrides.task]
+    asked = {"algorithm": cfg.algorithm} | {name: OmegaConf.select(cfg, name) for name, _, _ in overrides}
+    for name, _, value in overrides:
+        if name == "tuned" and value != "null":
+            asked |= _leaves(OmegaConf.load(CONFIG / f"tuned/{value}.yaml"))
     path = Path(cfg.resume)
     saved = saved_config(path, read_checkpoint(path), [*cfg.trust, *named_code(plain(cfg))])
     for key, value in asked.items():
@@ -111,6 +114,15 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
     with open_dict(cfg):
         cfg.clear()
         cfg.update(saved)
+
+
+def _leaves(node: Any, section: str = "") -> dict[str, Any]:
+    """The settings of a YAML file by their whole names."""
+    found = {}
+    for name, value in node.items():
+        inner = _leaves(value, f"{section}{name}.") if OmegaConf.is_dict(value) else {f"{section}{name}": value}
+        found |= {} if name == "defaults" else inner
+    return found
 
 
 def saved_config(path: Path, content: Mapping[str, Any], trust: Collection[str] = ()) -> DictConfig:

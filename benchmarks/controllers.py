@@ -17,6 +17,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
+from benchmarks.laps import racing
 from benchmarks.report import RESULTS, command_line, save
 from torchrl_quad import MPC, GeometricController
 from torchrl_quad.files import read_rows, replacing
@@ -61,7 +62,9 @@ def measure(task: str, name: str, checkpoint: str | None, args: argparse.Namespa
     learned = load_policy(Path(checkpoint)) if checkpoint else None
 
     def policy(env: EnvBase) -> TensorDictModuleBase:
-        return learned[1] if learned else CONTROLLERS[name](env)
+        if learned:
+            return learned[1]
+        return CONTROLLERS[name](env, reference=racing(env) if task == "racing" else None)
 
     if learned and learned[2] is not None:
         raise SystemExit(f"{checkpoint} has a normaliser: give checkpoints without one.")

@@ -17,10 +17,9 @@ from tqdm import tqdm
 from benchmarks.report import command_line, save
 from torchrl_quad import QuadrotorParams, load_drone
 from torchrl_quad.dynamics import MotorCommand, quaternion
-from torchrl_quad.dynamics.modes import make_controller
-from torchrl_quad.dynamics.quadrotor import QuadrotorState
-from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations, rk4
-from torchrl_quad.dynamics.rotors import Rotors
+from torchrl_quad.dynamics.control import make_controller
+from torchrl_quad.dynamics.model import QuadrotorState
+from torchrl_quad.dynamics.rigid_body import RigidBodyState, Rotors, accelerations, rk4
 from torchrl_quad.files import read_rows
 from torchrl_quad.identification import FlightLog, identify
 

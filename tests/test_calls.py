@@ -10,14 +10,6 @@ from torchrl_quad import ABPTLoss, HoveringEnv, SHACLoss, differentiable_rollout
 IN_KEYS = ["observation", ("state", "rotor_speed")]
 
 
-def make_loss(name, env):
-    torch.manual_seed(0)
-    actor = make_actor(env, return_log_prob=True)
-    make_critic, make = (make_value, SHACLoss) if name == "shac" else (make_qvalue, ABPTLoss)
-    loss = make(actor, make_critic(env, in_keys=IN_KEYS, input_scale=(1.0, 1e-3)))
-    return loss.make_value_estimator(gamma=0.9, lmbda=0.8)
-
-
 def results(loss, rollout):
     """All that a loss computes of a rollout, its gradients, and the next random number; the graph is kept."""
     torch.manual_seed(1)
@@ -37,7 +29,9 @@ def results(loss, rollout):
 @pytest.mark.parametrize("name", ["shac", "abpt"])
 def test_pure_functions_give_the_numbers_and_draw_the_random_numbers_of_the_networks(name):
     env = HoveringEnv(num_envs=3, max_episode_steps=4, random_start={"tilt": 0.5, "velocity": 1.0}, seed=0)
-    loss = make_loss(name, env)
+    make_critic, make = (make_value, SHACLoss) if name == "shac" else (make_qvalue, ABPTLoss)
+    actor, critic = make_actor(env, return_log_prob=True), make_critic(env, in_keys=IN_KEYS, input_scale=(1.0, 1e-3))
+    loss = make(actor, critic).make_value_estimator(gamma=0.9, lmbda=0.8)
     critic, calls = getattr(loss, loss.critic_name), []
     rollout, _ = differentiable_rollout(env, make_actor(env, return_log_prob=True), None, 6)
     loss.actor_network_params.data.apply_(lambda x: x.add_(0.1 * torch.randn_like(x)))
@@ -68,10 +62,6 @@ class Doubled(nn.Module):
         return 2.0 * self.network(*inputs)
 
 
-def replace(owner, name, part):
-    setattr(owner, name, part)
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -81,9 +71,9 @@ def replace(owner, name, part):
         lambda critic: critic.module.mlp.__setitem__(2, nn.PReLU()),
         lambda critic: nn.utils.parametrizations.weight_norm(critic.module.mlp[0]),
         lambda critic: critic.module.mlp.__setitem__(5, critic.module.mlp[2]),
-        lambda critic: replace(critic.module, "head", nn.Softplus()),
-        lambda critic: replace(critic, "module", Doubled(critic.module)),
-        lambda critic: replace(critic, "__class__", type("Mine", (ValueOperator,), {})),
+        lambda critic: setattr(critic.module, "head", nn.Softplus()),
+        lambda critic: setattr(critic, "module", Doubled(critic.module)),
+        lambda critic: setattr(critic, "__class__", type("Mine", (ValueOperator,), {})),
     ],
     ids=["hook", "backward", "dropout", "parameters", "parametrization", "shared", "head", "module", "class"],
 )

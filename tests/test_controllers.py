@@ -8,12 +8,11 @@ from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 from torch import nn
 
+from benchmarks.laps import basis, plan_lap, racing
 from torchrl_quad import MPC, ActionSequence, GeometricController, HoveringEnv, LandingEnv, RacingEnv, TrackingEnv
 from torchrl_quad.controllers import follow
 from torchrl_quad.controllers.mpc import feedback
-from torchrl_quad.controllers.references import basis, plan_lap
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.envs import TASKS
 
 DOUBLE = {"dtype": torch.float64}
 
@@ -35,36 +34,27 @@ def test_a_drone_that_hovers_where_it_shall_gets_exactly_the_action_that_hovers(
     torch.testing.assert_close(action, env.hover_action.expand(2, 4), rtol=0, atol=1e-9)
 
 
-def turned(x, y, z):
-    """By how much to change the quaternion of a level drone to turn it by a small angle [rad] about an axis."""
-    level = torch.tensor([1.0, 0.0, 0.0, 0.0])
-    return (quaternion.from_axis_angle(torch.tensor([x, y, z])) - level).tolist()
-
-
-SIGNS = {  # what is wrong, and the signs of (thrust beyond hovering, roll rate, pitch rate, yaw rate) that mend it
-    "ahead: nose up": ({"position": [0.1, 0, 0]}, [0, 0, -1, 0]),
-    "on the left: roll right": ({"position": [0, 0.1, 0]}, [0, 1, 0, 0]),
-    "too high: less thrust": ({"position": [0, 0, 0.1]}, [-1, 0, 0, 0]),
-    "flies ahead: nose up": ({"velocity": [0.1, 0, 0]}, [0, 0, -1, 0]),
-    "flies left: roll right": ({"velocity": [0, 0.1, 0]}, [0, 1, 0, 0]),
-    "climbs: less thrust": ({"velocity": [0, 0, 0.1]}, [-1, 0, 0, 0]),
-    "rolled right: roll left": ({"quaternion": turned(0.1, 0, 0)}, [0, -1, 0, 0]),
-    "nose down: nose up": ({"quaternion": turned(0, 0.1, 0)}, [0, 0, -1, 0]),
-    "heads left: turn right": ({"quaternion": turned(0, 0, 0.1)}, [0, 0, 0, -1]),
+SIGNS = {  # what is wrong along x, y or z, and what mends it: action, sign (0 thrust, 1 roll, 2 pitch, 3 yaw rate)
+    "position": [(2, -1), (1, 1), (0, -1)],  # ahead: nose up; on the left: roll right; too high: less thrust
+    "velocity": [(2, -1), (1, 1), (0, -1)],
+    "quaternion": [(1, -1), (2, -1), (3, -1)],  # rolled right: roll left; nose down: nose up; heads left: turn right
 }
 
 
-@pytest.mark.parametrize("case", SIGNS)
-def test_errors_of_each_axis_are_mended_in_the_right_direction(case):
-    changes, signs = SIGNS[case]
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("entry", SIGNS)
+def test_errors_of_each_axis_are_mended_in_the_right_direction(entry, axis):
     env = HoveringEnv(num_envs=1, action_delay=0, **DOUBLE)
-    more = GeometricController(env, heading=0.0)(at(env, **changes))["action"][0] - env.hover_action
-    wanted = torch.tensor(signs, dtype=env.dtype)
-    assert (more[wanted != 0] * wanted[wanted != 0] > 0.01).all()
-    assert more[1:][wanted[1:] == 0].abs().max() < 1e-9
-    if "quaternion" not in changes:  # the planner agrees; what a tilt costs it trades off
-        more = MPC(env, horizon=12)(at(env, **changes))["action"][0] - env.hover_action
-        assert (more[wanted != 0] * wanted[wanted != 0] > 0.01).all()
+    wrong, (action, sign) = 0.1 * torch.eye(3, dtype=env.dtype)[axis], SIGNS[entry][axis]
+    if entry == "quaternion":  # turned by a small angle
+        wrong = quaternion.from_axis_angle(wrong) - quaternion.identity(wrong)
+    td = at(env, **{entry: wrong.tolist()})
+    more = sign * (GeometricController(env, heading=0.0)(td.copy())["action"][0] - env.hover_action)
+    assert more[action] > 0.01
+    assert all(more[i].abs() < 1e-9 for i in {1, 2, 3} - {action})
+    if entry != "quaternion":  # the planner agrees; what a tilt costs it trades off
+        more = sign * (MPC(env, horizon=12)(td)["action"][0] - env.hover_action)
+        assert more[action] > 0.01
 
 
 def test_the_geometric_law_is_that_of_the_formulas():
@@ -157,13 +147,13 @@ def test_the_backward_pass_solves_the_linear_quadratic_problem():
     steps, wide = 200, torch.full((200, 1, 2), torch.inf).double()
     linear = torch.cat((a, b), 1).expand(steps, 1, 3, 5)
     no = torch.zeros(steps, 1, 3).double(), torch.zeros(steps, 1, 2).double()
-    _, gains = feedback(linear, q.repeat(steps, 1), no[0], r, no[1], -wide, wide)
+    _, gains = feedback(linear, (q.repeat(steps, 1), no[0]), (r, no[1]), (-wide, wide))
     p = solve_discrete_are(a.numpy(), b.numpy(), np.diag(q), np.diag(r))
     wanted = -np.linalg.solve(np.diag(r) + b.numpy().T @ p @ b.numpy(), b.numpy().T @ p @ a.numpy())
     np.testing.assert_allclose(gains[0, 0].numpy(), wanted, atol=1e-9)
     slope, act_slope = torch.randn(1, 1, 3).double(), torch.zeros(1, 1, 2).double()
     bound = torch.full((1, 1, 2), 0.1).double()
-    step, gain = feedback(linear[:1], q[None], slope, r, act_slope, -bound, bound)
+    step, gain = feedback(linear[:1], (q[None], slope), (r, act_slope), (-bound, bound))
     grid = torch.cartesian_prod(*2 * [torch.linspace(-0.1, 0.1, 401).double()])
     x = grid @ b.T
     cost = 0.5 * (q * x * x).sum(1) + x @ slope[0, 0] + 0.5 * (r * grid * grid).sum(1)
@@ -191,7 +181,7 @@ def test_the_lap_passes_the_gates_within_the_limits_of_the_drone():
     rate = torch.linalg.cross(force, jerk).norm(dim=1) / force.square().sum(1)
     assert rate.max() < 2.0 and force.norm(dim=1).max() < 3 * 9.81
     assert 2.5 < lap.period < 4.0
-    flight = env.rollout(100, GeometricController(env), break_when_any_done=False)
+    flight = env.rollout(100, GeometricController(env, reference=racing(env)), break_when_any_done=False)
     assert flight["next", "state", "gates_passed"][0, -1] >= 1
 
 
@@ -216,21 +206,12 @@ def test_controllers_know_the_nominal_drone_alone_and_see_what_sensors_give():
         assert not torch.equal(controller(measured)["action"], before)
 
 
-class OwnTask(TASKS["hovering"].__base__):
-    """Hovering at a place of its own, by another class."""
-
-    initial_state, observe, reward_terms = HoveringEnv.initial_state, HoveringEnv.observe, HoveringEnv.reward_terms
-    is_crash, is_success, metrics = HoveringEnv.is_crash, HoveringEnv.is_success, HoveringEnv.metrics
-    target, start_range, box_half_width, box_height = (1.0, 0.0, 1.5), (1.0, 1.0, 0.5), 5.0, 6.0
-    weights, success_radius = HoveringEnv.weights, 0.1
-
-
 def test_what_they_cannot_fly_is_refused_and_a_reference_of_ones_own_is_flown():
-    own = OwnTask(num_envs=1)
+    own = RacingEnv(num_envs=1)
     for env, message in (
         (HoveringEnv(num_envs=1, dynamics="point_mass"), "dynamics='quadrotor'"),
         (HoveringEnv(num_envs=1, control="velocity"), "control='rates'"),
-        (own, "has no reference for OwnTask"),
+        (own, "has no reference for RacingEnv"),
     ):
         for controller in (GeometricController, MPC):
             with pytest.raises(ValueError, match=message):
@@ -244,8 +225,11 @@ def test_what_they_cannot_fly_is_refused_and_a_reference_of_ones_own_is_flown():
         (MPC, {"weights": {"speed": 1.0}}, "weights: unknown weight 'speed'. Choose from: position"),
         (MPC, {"weights": {"action": 0.0}}, "weights: action must be at least 1e-6"),
         (GeometricController, {"position_gain": 0.0}, "position_gain must be at least 0.001, got 0.0"),
-        (GeometricController, {"max_tilt": 1.6}, "max_tilt must be at most 1.5, got 1.6"),
-        (MPC, {"reference": 3}, r"reference is a function from the state and times \(T\) .*; got 3"),
+        (
+            MPC,
+            {"reference": 3},
+            r"reference is a function from the state and times \(T\) .* is not callable",
+        ),
         (MPC, {"reference": lambda state, t: state["target"]}, r"here \(1, 2, 3\), torch.float32; it made \(1, 3\)"),
         (MPC, {"reference": lambda state, t: state["goal"]}, "given two times it failed: 'goal'"),
     ):

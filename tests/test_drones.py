@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 import yaml
 
 from torchrl_quad import HoveringEnv, QuadrotorParams, available_drones, load_drone
-from torchrl_quad.dynamics import presets
+from torchrl_quad.dynamics import FlightController, presets
 from torchrl_quad.errors import UserValueError, shown
 
 VISFLY = {name: value.squeeze().tolist() for name, value in load_drone("visfly").fields().items()}
@@ -19,16 +20,13 @@ VISFLY = {name: value.squeeze().tolist() for name, value in load_drone("visfly")
 @pytest.mark.parametrize("name", available_drones())
 def test_every_preset_can_hover_and_reach_its_commanded_thrust(name):
     params = load_drone(name)
-    env = HoveringEnv(num_envs=1, drone=name)
-    hover, highest = env.dynamics.controller.hover_speed, env.dynamics.controller.thrust_max
-    assert ((params.rotor_speed_min < hover) & (hover < params.rotor_speed_max)).all()
-    assert (4 * highest >= params.max_thrust_to_weight * params.mass * params.gravity).all()
+    controller = FlightController(params)  # which refuses a drone that cannot hover
+    assert (4 * controller.thrust_max >= params.max_thrust_to_weight * params.mass * params.gravity).all()
 
 
 def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump({**VISFLY, "mass": 0.5}).replace("mass: 0.5", "mass: 5e-1"))
-    assert "5e-1" in path.read_text()
     for source in (path, str(path), {**VISFLY, "mass": 0.5}):
         assert load_drone(source).mass.item() == 0.5
 
@@ -45,7 +43,6 @@ def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
         ({"linear_drag": [0.0, -0.1, 0.0]}, r"mine.yaml: field 'linear_drag' must be between 0 and 100"),
         ({"rotor_spin": [1, 1, 0, -1]}, r"mine.yaml: field 'rotor_spin' must be \+1 or -1"),
         ({"thrust_map": [0.0, 1.0, 0.0]}, r"mine.yaml: field 'thrust_map' must be rising at high speed, k2 above zero"),
-        ({"mass": "heavy"}, r"mine.yaml: field 'mass' is not a number or a list of numbers: 'heavy'"),
         ({"mass": "1:59:59"}, r"mine.yaml: field 'mass' is not a number or a list of numbers: '1:59:59'"),
         ({"thrust_map": [4e-7, -5e-3, 0.0]}, r"thrust_map must not fall with rotor speed"),
         ({"rotor_speed_min": 4000.0}, r"rotor_speed_min must be below rotor_speed_max, got \[4000.0\] and \[3500.0\]"),
@@ -63,44 +60,41 @@ def test_what_is_no_drone_is_refused_by_name(tmp_path):
     assert available_drones() == sorted(path.stem for path in Path(presets.__file__).parent.glob("drones/*.yaml"))
     (tmp_path / "list.yaml").write_text("- 1\n- 2\n")
     (tmp_path / "bad.yaml").write_text("mass: [1")
-    for drone, message in (
-        ("visflu", f"Unknown drone 'visflu'. Choose from: {', '.join(available_drones())}"),
-        (tmp_path / "list.yaml", "expected a mapping of names to values, got list"),
-        (tmp_path / "bad.yaml", "bad.yaml: not a YAML file"),
+    drone = load_drone()
+    for make, message in (
+        (lambda: load_drone("visflu"), f"Unknown drone 'visflu'. Choose from: {', '.join(available_drones())}"),
+        (lambda: load_drone(tmp_path / "list.yaml"), "expected a mapping of names to values, got list"),
+        (lambda: load_drone(tmp_path / "bad.yaml"), "bad.yaml: not a YAML file"),
+        (
+            lambda: FlightController(drone.replace(rotor_spin=[1.0] * 4)),
+            "cannot make thrust and torque about each axis",
+        ),
+        (lambda: drone.replace(weight=1.0), "QuadrotorParams has no field 'weight'. Choose from: mass,"),
+        (lambda: drone.replace(mass=torch.ones(5)), r"field 'mass' has shape \(5,\); it must be \(1,\) for one drone"),
+        (lambda: load_drone("visfly", torch.int64), "dtype must be torch.float32 or torch.float64"),
     ):
         with pytest.raises(ValueError, match=message):
-            load_drone(drone)
+            make()
     with pytest.raises(FileNotFoundError, match="No drone file at .*none.yaml. Choose from: crazyflie"):
         load_drone(tmp_path / "none.yaml")
-    with pytest.raises(ValueError, match="cannot make thrust and torque about each axis"):
-        HoveringEnv(num_envs=1, drone=load_drone().replace(rotor_spin=[1.0, 1.0, 1.0, 1.0]))
-    with pytest.raises(ValueError, match="QuadrotorParams has no field 'weight'. Choose from: mass,"):
-        load_drone().replace(weight=1.0)
-
-
-def test_a_value_per_environment_needs_its_trailing_dimension():
-    params = load_drone()
-    assert params.replace(mass=torch.full((5, 1), 0.4)).mass.shape == (5, 1)
-    with pytest.raises(ValueError, match=r"field 'mass' has shape \(5,\); it must be \(1,\) for one drone"):
-        params.replace(mass=torch.full((5,), 0.4))
 
 
 def test_gradients_flow_through_replace_to_and_construction():
-    mass = torch.tensor(0.5, requires_grad=True)
+    mass = torch.full((5, 1), 0.5, requires_grad=True)
     params = load_drone().replace(mass=mass).to(dtype=torch.float64)
     QuadrotorParams(**params.fields()).mass.sum().backward()
-    assert mass.grad == 1.0
+    assert (mass.grad == 1.0).all() and params.mass.shape == (5, 1)
     assert not params.detach().mass.requires_grad
 
 
 def test_a_drone_shows_itself_as_a_table_with_units():
     drone = load_drone("crazyflie")
-    lines = str(drone.replace(mass=torch.tensor([[0.02], [0.03]], requires_grad=True))).splitlines()
-    assert lines[0] == "QuadrotorParams" and len(lines) == 1 + len(drone.fields()) + 1
-    shown = {label.strip(): value for label, value in (line.strip().split("  ", 1) for line in lines[1:])}
-    assert shown["mass [kg]"].strip() == "0.02 to 0.03 over 2 drones"
-    assert shown["inertia [kg m2]"].strip() == "3.7e-05, 3.2e-05, 5.3e-05"
-    assert shown["rotor_positions [m]"].strip().startswith("(0.028072, 0.028072), (-0.028072, ")
+    first, *lines = str(drone.replace(mass=torch.tensor([[0.02], [0.03]], requires_grad=True))).splitlines()
+    assert first == "QuadrotorParams" and len(lines) == len(drone.fields()) + 1
+    shown = dict(re.split(" {2,}", line.strip(), maxsplit=1) for line in lines)
+    assert shown["mass [kg]"] == "0.02 to 0.03 over 2 drones"
+    assert shown["inertia [kg m2]"] == "3.7e-05, 3.2e-05, 5.3e-05"
+    assert shown["rotor_positions [m]"].startswith("(0.028072, 0.028072), (-0.028072, ")
     assert "speed_per_volt=519.0" in shown["motor_command"]
 
 
@@ -133,6 +127,3 @@ def test_a_drone_of_a_float64_environment_is_in_its_precision_and_may_lie_at_a_l
     assert (env.params.mass.item(), env.params.inertia[..., 0].item()) == (0.027, 1e-8)
     rounded = load_drone(drone, torch.float32)  # whose 1e-8 is a little less
     assert rounded.to(dtype=torch.float64).inertia[0] < 1e-8
-    for dtype in ("float32", torch.int64, None):
-        with pytest.raises(UserValueError, match="dtype must be torch.float32 or torch.float64"):
-            load_drone("visfly", dtype)

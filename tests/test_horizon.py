@@ -1,5 +1,7 @@
 """The quick rollout against TorchRL's own, and the compiled step against the eager one."""
 
+import copy
+
 import pytest
 import torch
 from flying import Looks, look_at_nothing
@@ -9,7 +11,17 @@ from torch._dynamo.utils import counters
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import ActionSequence, BPTTLoss, HoveringEnv, RacingEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad import (
+    ActionSequence,
+    BPTTLoss,
+    HoveringEnv,
+    RacingEnv,
+    audit_reward,
+    differentiable_rollout,
+    make_actor,
+    make_env,
+)
+from torchrl_quad.dynamics import DYNAMICS, PointMass
 from torchrl_quad.envs import TASKS
 
 EVERYTHING = {
@@ -42,11 +54,11 @@ def entries(flight):
 @pytest.mark.parametrize("options", [{}, EVERYTHING], ids=["plain", "everything"])
 @pytest.mark.parametrize("task", TASKS)
 def test_the_quick_rollout_is_that_of_torchrl_in_every_entry_and_gradient(task, options):
-    env = make_env(task, num_envs=3, max_episode_steps=15, dtype=torch.float64, **options)
+    env = make_env(task, num_envs=3, max_episode_steps=7, dtype=torch.float64, **options)
     actor = make_actor(env)
-    quick, quick_grad = fly(env.rollout, env, actor, env.reset(), 40)
+    quick, quick_grad = fly(env.rollout, env, actor, env.reset(), 20)
     env.set_seed(0)
-    slow, slow_grad = fly(torchrls_loop(env), env, actor, env.reset(), 40)
+    slow, slow_grad = fly(torchrls_loop(env), env, actor, env.reset(), 20)
     assert quick.names == slow.names and quick.shape == slow.shape
     assert quick["next", "done"].sum() >= 6
     torch.testing.assert_close(entries(quick), entries(slow))
@@ -55,12 +67,10 @@ def test_the_quick_rollout_is_that_of_torchrl_in_every_entry_and_gradient(task, 
 
 
 def test_episodes_that_end_on_the_way_start_anew_from_different_states():
-    env = HoveringEnv(num_envs=8, max_episode_steps=20)
-    flight = env.rollout(100, make_actor(env), break_when_any_done=False)
-    starts = flight["state", "position"][:, ::20]
-    assert (flight["state", "step"][:, ::20] == 0).all()
-    distances = torch.cdist(starts.flatten(0, 1), starts.flatten(0, 1)).fill_diagonal_(1.0)
-    assert (distances > 0).sum() > 0.9 * distances.numel()
+    env = HoveringEnv(num_envs=8, max_episode_steps=5)
+    flight = env.rollout(25, make_actor(env), break_when_any_done=False)
+    assert (flight["state", "step"][:, ::5] == 0).all()
+    assert len(flight["state", "position"][:, ::5].flatten(0, 1).unique(dim=0)) == 40
 
 
 def test_a_policy_may_read_the_state_and_any_other_flies_in_torchrls_loop(env):
@@ -129,66 +139,71 @@ def break_drones(env, parameter):
 
 def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
     options = {**EVERYTHING, "reward": "position", "control": "velocity"}
-    env = RacingEnv(num_envs=4, max_episode_steps=20, dtype=torch.float64, **options)
+    env = RacingEnv(num_envs=4, max_episode_steps=11, dtype=torch.float64, **options)
     drag = env.nominal.linear_drag.clone().requires_grad_()
     env.params = env.nominal.replace(linear_drag=drag)
     actor = make_actor(env, in_keys=["observation", ("state", "velocity")], return_log_prob=True)
     called = TensorDictSequential(actor)
     explorer = make_actor(env, in_keys=actor.in_keys, return_log_prob=True, noise_correlation=0.9)
 
-    def train(policy):
-        """Two horizons, through the ends of episodes, from a start that wants a gradient."""
+    def seeded():
         env.set_seed(0)
         torch.manual_seed(0)
+
+    def train(policy):
+        """Two horizons, through the ends of episodes, from a start that wants a gradient."""
+        seeded()
         start = env.reset()
         start["state", "position"][:2] = start["state", "target"][:2] - torch.tensor([0.5, 0.0, 0.0])
         start["state", "velocity"][:2, 0] = 3.0  # through the gate, which is an event
         start["state", "velocity"].requires_grad_()
-        flight, carry = differentiable_rollout(env, policy, start, 24)
+        flight, carry = differentiable_rollout(env, policy, start, 14)
         assert flight["next", "state", "gate_passed"].any()
-        more, _ = differentiable_rollout(env, policy, carry, 7)
+        more, _ = differentiable_rollout(env, policy, carry, 3)
         wanted = [drag, start["state", "velocity"], *policy.parameters()]
         return flight, torch.autograd.grad(losses_of(flight) + losses_of(more), wanted)
 
-    def train_in_torchrls_loop():
-        env.set_seed(0)
-        return fly(torchrls_loop(env), env, actor, env.reset(), 22)
-
     def optimise_actions():
-        env.set_seed(0)
-        actions = (env.hover_action + 0.05 * torch.ones(24, 4, 4, dtype=env.dtype)).requires_grad_()
-        flight, _ = differentiable_rollout(env, ActionSequence(actions), None, 24)
+        seeded()
+        actions = (env.hover_action + 0.05 * torch.ones(14, 4, 4, dtype=env.dtype)).requires_grad_()
+        flight, _ = differentiable_rollout(env, ActionSequence(actions), None, 14)
         torch.testing.assert_close(flight["action"], actions.transpose(0, 1))
         return flight, torch.autograd.grad(losses_of(flight), actions)
 
     def train_with_clipped_gradients():
-        env.set_seed(0)
-        torch.manual_seed(0)
-        flight, _ = differentiable_rollout(env, actor, None, 24)
+        seeded()
+        flight, _ = differentiable_rollout(env, actor, None, 14)
         loss = BPTTLoss(actor, clip_action_gradient=2.0).loss_actor(flight)[0]
         return flight, torch.autograd.grad(loss, list(actor.parameters()))
 
-    def as_on_an_accelerator():
-        with monkeypatch.context() as patch:
-            look_at_nothing(patch)
-            return train(actor)
+    def audit():
+        """The gradients in actions."""
+        seeded()
+        flight, _ = differentiable_rollout(env, actor, None, 14)
+        return {name: term.gradient_norm for name, term in audit_reward(flight, flight["action"]).items()}
 
     def all_ways():
-        more = train_in_torchrls_loop(), optimise_actions(), as_on_an_accelerator(), train_with_clipped_gradients()
-        return train(actor), train(called), train(explorer), *more
+        seeded()
+        in_torchrls_loop = fly(torchrls_loop(env), env, actor, env.reset(), 12)
+        with monkeypatch.context() as patch:
+            look_at_nothing(patch)
+            as_on_an_accelerator = train(actor)
+        flights = train(actor), train(called), train(explorer), optimise_actions(), train_with_clipped_gradients()
+        return *flights, in_torchrls_loop, as_on_an_accelerator
 
-    eager, (broken, broken_grads) = all_ways(), break_drones(env, drag)
+    eager, eager_audit, (broken, broken_grads) = all_ways(), audit(), break_drones(env, drag)
     env.compile()
     assert env.flies_inside(actor) and env.flies_inside(explorer) and not env.flies_inside(called)
     all_ways()
+    assert audit() == pytest.approx(eager_audit, rel=1e-9)
     compiled_so_far = counters["stats"]["unique_graphs"]
     compiled, (end, end_grads) = all_ways(), break_drones(env, drag)
     with torch.no_grad():
-        train_free = env.rollout(11, actor, break_when_any_done=False)
+        train_free = env.rollout(4, actor, break_when_any_done=False)
         env.rollout(3, actor)
     env.rollout(3)
     env.set_initial_state_source(lambda n: train_free["next", "state"][:, 2])
-    env.rollout(22, actor, break_when_any_done=False)["next", "reward"].sum().backward()
+    env.rollout(12, actor, break_when_any_done=False)["next", "reward"].sum().backward()
     assert counters["stats"]["unique_graphs"] == compiled_so_far
     for (flight, grads), (expected, expected_grads) in zip(compiled, eager, strict=True):
         torch.testing.assert_close(entries(flight), entries(expected))
@@ -248,7 +263,6 @@ def test_an_entry_of_a_task_may_have_more_than_one_dimension():
     start = env.reset()
     flight = env.rollout(5, make_actor(env), tensordict=start.clone(), auto_reset=False, break_when_any_done=False)
     torch.testing.assert_close(flight["next", "state", "waypoints"][:, 0], start["state", "waypoints"].roll(-1, 1))
-    torch.testing.assert_close(flight["next", "state", "waypoints"][:, 2], start["state", "waypoints"])
     start["state", "velocity"][1] = torch.nan  # its state cannot go on, and its waypoints stay
     after = env.step(start.set("action", env.hover_action.repeat(3, 1)))["next", "state", "waypoints"]
     torch.testing.assert_close(after[1], start["state", "waypoints"][1])
@@ -315,8 +329,7 @@ def test_policies_that_somebody_has_changed_are_called():
     compiled, actor = HoveringEnv(num_envs=2).compile(), make_actor(env)
     assert compiled.flies_inside(actor) and not env.flies_inside(actor)
     assert compiled.flies_inside(ActionSequence(torch.zeros(3, 2, 4)))
-    seen = []
-    hook = actor[0].module.mlp[1].register_forward_hook(lambda *_: seen.append(1))
+    hook = actor[0].module.mlp[1].register_forward_hook(lambda *_: None)
     assert not compiled.flies_inside(actor)
     hook.remove()
     with set_exploration_type(ExplorationType.MODE):
@@ -325,11 +338,11 @@ def test_policies_that_somebody_has_changed_are_called():
     actor[0].module.mlp[1] = nn.PReLU()
     other_head = make_actor(env)
     other_head[0].module.head = nn.Identity()
+    windy = HoveringEnv(num_envs=2, wind={"gust": 0.5})
     others = [actor, other_head, make_actor(env, activation=nn.RReLU)]
-    others += [
-        make_actor(HoveringEnv(num_envs=2, **x)) for x in ({"dtype": torch.float64}, {"observe_last_action": True})
-    ]
-    others += [make_actor(HoveringEnv(num_envs=2, wind={"gust": 0.5}), in_keys=["observation", ("state", "wind")])]
+    others += [make_actor(HoveringEnv(num_envs=2, dtype=torch.float64))]
+    others += [make_actor(HoveringEnv(num_envs=2, observe_last_action=True))]
+    others += [make_actor(windy, in_keys=["observation", ("state", "wind")])]
     others += [TensorDictModule(nn.Linear(13, 4), ["observation"], ["action"])]
     others += [make_actor(env, in_keys=["observation", "observation"])]
     for change in ({0: nn.Linear(13, 64, bias=False)}, {1: nn.ELU(inplace=True)}, {5: nn.Tanh()}):
@@ -343,3 +356,80 @@ def test_a_sequence_of_actions_is_played_once(env):
     env.rollout(3, sequence, break_when_any_done=False)
     with pytest.raises(ValueError, match="5 actions, 0 of them unplayed, and the flight needs 1 more"):
         env.rollout(3, sequence, break_when_any_done=False)
+
+
+# -- a compiled environment follows every change that an eager one follows ---------------------------------------------
+
+BONUS = 1.0
+LIFT = 1.0
+
+
+def moved(state, dt):
+    return [state[0] + state[2] * (LIFT * dt), *state[1:]]
+
+
+class Gliding(PointMass):
+    """Keeps its velocity; a global and a function of this module move it."""
+
+    def physics_step(self, state, setpoint, plant, controller, wind):
+        return moved(state, self.dt)
+
+
+class Bonus(HoveringEnv):
+    """Pays a global of this module and an attribute of its class."""
+
+    extra = 10.0
+
+    def reward_terms(self, state):
+        return {"paid": torch.full_like(state["position"][:, :1], BONUS + self.extra)}
+
+
+def test_a_compiled_step_sees_changed_attributes_classes_and_globals(monkeypatch):
+    # What is watched does not depend on the backend, and this one generates no code.
+    eager, compiled = Bonus(num_envs=2), Bonus(num_envs=2).compile(backend="eager")
+
+    def step(env):
+        td = env.reset().set("action", env.hover_action.repeat(2, 1))
+        after = env.step(td)["next"]
+        return after["reward"].flatten().tolist(), after["success"].flatten().tolist()
+
+    def both():
+        assert step(compiled) == step(eager)
+        return step(eager)
+
+    assert both() == ([11.0, 11.0], [False, False])
+    for env in (eager, compiled):
+        env.success_radius = 50.0  # an attribute of the class becomes one of the environment
+    monkeypatch.setattr(Bonus, "extra", 20.0)
+    assert both() == ([21.0, 21.0], [True, True])
+    monkeypatch.setitem(globals(), "BONUS", 2.0)
+    assert both()[0] == [22.0, 22.0]
+    before = counters["stats"]["unique_graphs"]
+    both()
+    assert counters["stats"]["unique_graphs"] == before
+    copied = copy.deepcopy(compiled)
+    copied.extra = 30.0  # a copy shares nothing with what it was made of
+    assert step(copied)[0] == [32.0, 32.0] and step(compiled)[0] == [22.0, 22.0]
+
+
+def test_a_compiled_step_sees_changes_of_dynamics_in_a_module_of_ones_own(monkeypatch):
+    monkeypatch.setitem(DYNAMICS, "gliding", Gliding)
+    eager, compiled = (HoveringEnv(num_envs=2, dynamics="gliding") for _ in range(2))
+    compiled.compile(backend="eager")
+    start = eager.reset()
+    start["state", "velocity"] = torch.ones(2, 3)
+
+    def height():
+        ends = [env.step(start.copy().set("action", torch.zeros(2, 4)))["next", "state"] for env in (eager, compiled)]
+        torch.testing.assert_close(ends[0]["position"], ends[1]["position"])
+        return (ends[1]["position"] - start["state", "position"])[0, 2].item()
+
+    step = eager.control_dt
+    assert height() == pytest.approx(step, rel=1e-3)
+    monkeypatch.setitem(globals(), "LIFT", 2.0)
+    assert height() == pytest.approx(2 * step, rel=1e-3)
+    for env in (eager, compiled):
+        env.dynamics.dt *= 2
+    assert height() == pytest.approx(4 * step, rel=1e-3)
+    monkeypatch.setitem(globals(), "moved", lambda state, dt: state)
+    assert height() == 0.0

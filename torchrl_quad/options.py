@@ -1,20 +1,9 @@
-"""Options by type and range, declared once: in the signature of what takes them.
+"""Options by type and range, declared once, in the signature of what takes them; recipes read the same annotations.
 
-``@checked`` holds the arguments of a function or a class against their annotations, and the recipes make the schema of
-their configuration from the same ones::
-
-    @checked
-    def fly(*, seconds: Positive = 1.0, mode: Literal["rates", "attitude"] = "rates") -> None:
-        '''Fly.
-
-        Args:
-            seconds: how long [s]; 5 is usual.
-        '''
-
-    fly(seconds=-1)  # UserValueError: seconds must be greater than 0, got -1. How long [s]; 5 is usual.
-
-An annotation in plain types (numbers, bool, str, None, Literal, lists and mappings of them) is checked, and nothing is
-converted but numpy's scalars. What has another type, such as a tensor or a network, the function checks itself.
+``@checked`` holds arguments against annotations in plain types (numbers, bool, str, None, Literal, lists and mappings
+of them), such as ``seconds: Positive = 1.0``: -1 is refused with "seconds must be greater than 0, got -1.", and what
+the docstring says of the argument under "Args:". Nothing is converted but numpy's scalars. What has another type, such
+as a tensor or a network, the function checks itself.
 """
 
 from __future__ import annotations
@@ -116,9 +105,7 @@ _T = TypeVar("_T")
 def checked(target: _F, described_by: type | None = None) -> _F:
     """Make a function, or a class when it is built, refuse arguments that do not fit its annotations.
 
-    Args:
-        target: the function or the class.
-        described_by: of a method, the class whose docstring describes the arguments.
+    Of a method, ``described_by`` is the class whose docstring describes the arguments.
 
     Raises:
         UserValueError: (in use) the first argument that has the wrong type or is out of its range.
@@ -137,21 +124,16 @@ def checked(target: _F, described_by: type | None = None) -> _F:
             called = type(args[0]) if target.__name__ == "__init__" and args else target
             check_known(called, kwargs)
             raise UserTypeError(f"{called.__name__}: {error}.") from None
-        adapters = _adapters(target, described_by)
-        for name, value in bound.arguments.items():
-            if name in adapters:
-                bound.arguments[name] = _checked(name, value, *adapters[name])
+        adapters = _adapters(described_by or target)
+        for name in [name for name in bound.arguments if name in adapters]:
+            bound.arguments[name] = _checked(name, bound.arguments[name], *adapters[name])
         return target(*bound.args, **bound.kwargs)
 
     return cast("_F", function)
 
 
 def check_value(name: str, value: Any, kind: Any, description: str = "") -> Any:
-    """A value that fits an annotation, for what no signature can hold.
-
-    Raises:
-        UserValueError: it does not fit.
-    """
+    """A value that fits an annotation, for what no signature can hold; a UserValueError if it does not."""
     return _checked(name, value, TypeAdapter(kind, config=_CONFIG), description)
 
 
@@ -164,18 +146,16 @@ def build(cls: type[_T], name: str, spec: Any, **more: Any) -> _T:
     if isinstance(spec, cls):
         changes = {key: value for key, value in more.items() if value}
         return dataclasses.replace(cast("Any", spec), **changes) if changes else spec
-    arguments = inspect.signature(cls).parameters
-    allowed = [key for key in arguments if key not in more]
+    allowed = {key: x for key, x in inspect.signature(cls).parameters.items() if key not in more}
+    listed = ", ".join(allowed)
     if not isinstance(spec, Mapping):
-        raise UserValueError(
-            f"{name} must be a mapping with any of {', '.join(allowed)}, or a {cls.__name__}; got {shown(spec)}."
-        )
+        raise UserValueError(f"{name} must be a mapping with any of {listed}, or a {cls.__name__}; got {shown(spec)}.")
     for key in spec:
         if key not in allowed:
-            raise UserValueError(f"{name}: unknown key {shown(key)}. Allowed: {', '.join(allowed)}.")
-    for key in allowed:
-        if key not in spec and arguments[key].default is inspect.Parameter.empty:
-            raise UserValueError(f"{name}: missing key {key!r}. Allowed: {', '.join(allowed)}.")
+            raise UserValueError(f"{name}: unknown key {shown(key)}. Allowed: {listed}.")
+    for key, argument in allowed.items():
+        if key not in spec and argument.default is argument.empty:
+            raise UserValueError(f"{name}: missing key {key!r}. Allowed: {listed}.")
     try:
         return cls(**spec, **more)
     except UserValueError as error:
@@ -206,10 +186,8 @@ def imported(path: str, what: str = "task") -> Any:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # the module is there, and needs one that is not
-        raise UserValueError(
-            f"{what} {path!r}: Python finds no module {error.name!r}. Put its folder on PYTHONPATH, or install its "
-            "package."
-        ) from None
+        mend = "Put its folder on PYTHONPATH, or install its package."
+        raise UserValueError(f"{what} {path!r}: Python finds no module {error.name!r}. {mend}") from None
     if not hasattr(found, name):
         raise UserValueError(f"{what} {path!r}: the module {module!r} ({found.__file__}) has no {name!r}.")
     return getattr(found, name)
@@ -235,8 +213,7 @@ def must(error: Mapping[str, Any]) -> str:
         return f"have other entries: {said.rstrip('.')}"
     if error["type"] == "is_instance_of" and error["ctx"]["class"] == "Sequence":
         return "be a list"
-    asked = _MUST.get(error["type"], said)
-    value = error["input"]
+    asked, value = _MUST.get(error["type"], said), error["input"]
     if error["type"] == "float_type" and isinstance(value, int) and not isinstance(value, bool):
         asked += " that a float holds"
     if error["type"] == "int_type" and isinstance(value, float) and value.is_integer():
@@ -280,19 +257,16 @@ def check_known(called: Callable[..., Any], given: Iterable[str]) -> None:
     known = argument_names(called)
     for unknown in (name for name in given if name not in known):
         close = difflib.get_close_matches(unknown, known, 1)
-        hint = f" Did you mean {close[0]!r}?" if close else ""
-        raise UserTypeError(
-            f"{called.__name__} got an unexpected keyword argument {shown(unknown)}.{hint} Choose from: "
-            f"{', '.join(known)}."
-        )
+        hint = f"Did you mean {close[0]!r}? " if close else ""
+        what = f"{called.__name__} got an unexpected keyword argument {shown(unknown)}"
+        raise UserTypeError(f"{what}. {hint}Choose from: {', '.join(known)}.")
 
 
 def argument_names(called: Callable[..., Any]) -> list[str]:
     """The names of all arguments; those of a class include what it hands on to its bases."""
     whole = [called] if hasattr(called, "__signature__") else [function for _, function in _takers(called)]
-    parameters = (inspect.signature(function).parameters.items() for function in whole)
-    variable = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
-    return sorted({name for some in parameters for name, x in some if x.kind not in variable} - {"self"})
+    given = [x for function in whole for x in inspect.signature(function).parameters.values()]
+    return sorted({x.name for x in given if x.kind not in (x.VAR_KEYWORD, x.VAR_POSITIONAL)} - {"self"})
 
 
 def _takers(called: Callable[..., Any]) -> list[tuple[Any, Callable[..., Any]]]:
@@ -310,14 +284,8 @@ def _takers(called: Callable[..., Any]) -> list[tuple[Any, Callable[..., Any]]]:
 
 
 @functools.cache
-def _adapters(
-    function: Callable[..., Any], described_by: type | None = None
-) -> dict[str, tuple[TypeAdapter[Any], str]]:
-    described = _descriptions(described_by or function)
-    return {
-        name: (TypeAdapter(kind, config=_CONFIG), described.get(name, ""))
-        for name, kind in _annotations(function).items()
-    }
+def _adapters(target: Callable[..., Any]) -> dict[str, tuple[TypeAdapter[Any], str]]:
+    return {name: (TypeAdapter(kind, config=_CONFIG), said) for name, (kind, said) in declared(target).items()}
 
 
 def _annotations(function: Callable[..., Any]) -> dict[str, Any]:

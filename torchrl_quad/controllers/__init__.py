@@ -2,7 +2,6 @@
 
 from torchrl_quad.controllers.geometric import GeometricController
 from torchrl_quad.controllers.mpc import MPC
-from torchrl_quad.controllers.policy import Controller
-from torchrl_quad.controllers.references import Motion, follow
+from torchrl_quad.controllers.policy import Controller, Motion, follow
 
 __all__ = ["MPC", "Controller", "GeometricController", "Motion", "follow"]

@@ -10,11 +10,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
-from torchrl_quad.controllers.policy import Controller, State
-from torchrl_quad.controllers.references import Reference, follow
+from torchrl_quad.controllers.policy import Controller, Reference, State, follow
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.dynamics.modes import Tilt
-from torchrl_quad.options import between
+from torchrl_quad.dynamics.control import Tilt
+from torchrl_quad.options import between, checked
 
 LEAST_LIFT = 0.3  # vertical part of the thrust, in weights: the drone never turns over to dive
 GREATEST_LIFT = 0.9  # of the greatest thrust: there is always some left to go sideways
@@ -22,6 +21,7 @@ GREATEST_LIFT = 0.9  # of the greatest thrust: there is always some left to go s
 Gain = Annotated[float, between(1e-3, 1e3)]
 
 
+@checked
 class GeometricController(Controller):
     r"""Geometric tracking control (Lee, Leok and McClamroch 2010) for thrust and body rates.
 
@@ -32,14 +32,9 @@ class GeometricController(Controller):
     - the wanted attitude :math:`R_d`, whose third axis is :math:`b_3 = F / |F|` and whose first is next to a heading;
     - the attitude error :math:`e_R = \frac12 (R_d^T R - R^T R_d)^\vee`, the sine of the angle left to turn.
 
-    Lee's law ends in moments. Actions here are body rates, and the flight controller below turns them into moments:
-
-    .. math:: \Omega_c = R^T R_d \Omega_d - k_R e_R, \qquad
-              M = J K (\Omega_c - \Omega) - D \dot\Omega + \Omega \times J \Omega.
-
-    So the moments are Lee's, with the gains :math:`J K k_R` of :math:`e_R` and :math:`J K` of :math:`e_\Omega`, without
-    his term of :math:`\dot\Omega_d`, and with the damping D of the rate loop. :math:`\Omega_d` is the rate at which
-    :math:`a_d + g\,e_3` turns, from the jerk of the reference.
+    Lee's law ends in moments. Actions here are body rates, :math:`\Omega_c = R^T R_d \Omega_d - k_R e_R`, and the rate
+    loop below turns them into his moments, but for his term of :math:`\dot\Omega_d` and its own damping.
+    :math:`\Omega_d` is the rate at which :math:`a_d + g\,e_3` turns, from the jerk of the reference.
 
     F keeps within the greatest thrust and tilt, its vertical part first, and at least 0.3 of the weight; the action is
     clamped. ``env.rollout(256, GeometricController(env))`` flies it.
@@ -49,8 +44,7 @@ class GeometricController(Controller):
         reference: likewise; its derivatives are taken by central differences.
         position_gain: :math:`k_x`, 0.001 to 1000 per s2.
         velocity_gain: :math:`k_v`, 0.001 to 1000 per s.
-        attitude_gain: :math:`k_R`, 0.001 to 1000 per s; None makes this loop half as quick as the rate loop of the
-            drone.
+        attitude_gain: :math:`k_R`, 0.001 to 1000 per s; None makes this loop half as quick as the drone's rate loop.
         max_error: greatest error of the position that counts, 0.001 to 1000 m.
         max_tilt: greatest angle of F from the vertical, 0.01 to 1.5 rad, 86 degrees.
         heading: angle of :math:`b_1` from world x, -2 pi to 2 pi rad; None leaves it where it is.
@@ -70,11 +64,11 @@ class GeometricController(Controller):
     ) -> None:
         super().__init__(env, reference)
         self.position_gain, self.velocity_gain, self.max_error = position_gain, velocity_gain, max_error
-        self.max_tilt, self.heading = max_tilt, heading
-        nominal = self.nominal
-        lag = (1.0 + nominal.rate_damping / nominal.inertia) / nominal.rate_gain  # of the rate loop [s]
+        self.max_tilt, like = max_tilt, self.nominal.mass
+        self.ahead = None if heading is None else like.new_tensor((math.cos(heading), math.sin(heading), 0.0))
+        lag = (1.0 + self.nominal.rate_damping / self.nominal.inertia) / self.nominal.rate_gain  # of the rate loop [s]
         self.attitude_gain = 0.5 / lag if attitude_gain is None else torch.full_like(lag, attitude_gain)
-        self.gravity = pad(nominal.gravity, (2, 0))
+        self.gravity = pad(self.nominal.gravity, (2, 0))
 
     def act(self, state: State, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action for the drone as it will be when the action takes effect."""
@@ -88,7 +82,12 @@ class GeometricController(Controller):
         up = normalize(force, dim=-1)
         axes = torch.eye(3).to(attitude).expand(len(attitude), 3, 3)
         rotation = quaternion.rotate(attitude.unsqueeze(1), axes).mT
-        error = attitude_error(rotation, wanted_rotation(up, self.first_axis(rotation)))
+        ahead = rotation[..., 0] if self.ahead is None else self.ahead.expand_as(up)  # body x keeps close to this
+        left = normalize(torch.linalg.cross(up, ahead), dim=-1)
+        wanted = torch.stack((torch.linalg.cross(left, up), left, up), -1)
+        difference = wanted.mT @ rotation
+        skew = 0.5 * (difference - difference.mT)
+        error = torch.stack((skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]), -1)  # Lee's e_R, body frame
         steady = acceleration + self.gravity
         turn = torch.linalg.cross(steady, jerk) / steady.square().sum(-1, keepdim=True).clamp_min(1e-6)
         rates = quaternion.rotate_inverse(attitude, turn) - self.attitude_gain * error
@@ -104,23 +103,3 @@ class GeometricController(Controller):
         room = torch.minimum((greatest.square() - lift.square()).sqrt(), math.tan(self.max_tilt) * lift)
         sideways = torch.linalg.vector_norm(force[..., :2], dim=-1, keepdim=True)
         return torch.cat((force[..., :2] * (room / torch.maximum(sideways, room)), lift), -1)
-
-    def first_axis(self, rotation: Tensor) -> Tensor:
-        """The direction that body x keeps close to, (n, 3): the heading, or its present one."""
-        if self.heading is None:
-            return rotation[..., 0]
-        ahead = (math.cos(self.heading), math.sin(self.heading), 0.0)
-        return rotation.new_tensor(ahead).expand(rotation.shape[:-1])
-
-
-def wanted_rotation(up: Tensor, ahead: Tensor) -> Tensor:
-    """The rotation (n, 3, 3), body to world, whose body z is ``up`` (n, 3), and whose body x is next to ``ahead``."""
-    left = normalize(torch.linalg.cross(up, ahead), dim=-1)
-    return torch.stack((torch.linalg.cross(left, up), left, up), -1)
-
-
-def attitude_error(rotation: Tensor, wanted: Tensor) -> Tensor:
-    """Lee's attitude error (n, 3), body frame, of rotations (n, 3, 3): about which axis it has turned too far."""
-    difference = wanted.mT @ rotation
-    skew = 0.5 * (difference - difference.mT)
-    return torch.stack((skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]), -1)

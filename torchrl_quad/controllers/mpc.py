@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import torch
@@ -10,11 +11,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
-from torchrl_quad.controllers.policy import Controller, State
-from torchrl_quad.controllers.references import Reference, follow
+from torchrl_quad.controllers.policy import Controller, Reference, State, follow
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import between
+from torchrl_quad.options import between, checked
 
 # Of the squared residuals: each is the square of what one unit of it weighs, and half of it counts.
 WEIGHTS = {
@@ -29,6 +29,7 @@ SHORTENED = (1.0, 0.5, 0.2, 0.05)  # shares of a step of Gauss-Newton that are t
 ROWS = 4096  # states whose derivatives are taken at once: what fits into the cache of a processor
 
 
+@checked
 class MPC(Controller):
     r"""Model predictive control: at each step, plan actions through the physics of the environment, and fly the first.
 
@@ -45,16 +46,14 @@ class MPC(Controller):
     problem that is left by Riccati's recursion, within the bounds of the actions: iLQR (Li and Todorov 2004) with
     control limits (Tassa, Mansard and Todorov 2014). Of some lengths of the step it takes the best, and none where all
     are worse. The next control step starts from this plan, moved by one step, so that a single iteration is usual
-    ("real-time iteration", Diehl 2001). The plan stands in the tensordict under ``plan`` (num_envs, H, 4), which a
-    rollout hands on, as ``step_mdp`` does. Where it is missing, or an episode begins, the reference gives the first.
+    ("real-time iteration", Diehl 2001). The plan (num_envs, H, 4) stands in the tensordict under ``plan``, which a
+    rollout hands on. Where it is missing, or an episode begins, the reference gives the first.
 
     Args:
-        env: as for :class:`~torchrl_quad.controllers.policy.Controller`, which gives the errors, too.
+        env, reference: as for :class:`~torchrl_quad.controllers.policy.Controller`, which gives the errors, too.
         horizon: control steps of a plan, 1 to 1000.
         iterations: steps of Gauss-Newton in each control step, 1 to 100.
-        reference: as for :class:`~torchrl_quad.controllers.policy.Controller`.
-        weights: changes of the default weights by name, 0 to 1e6: position, attitude, velocity, angular_velocity,
-            terminal, and action, which is 1e-6 or more.
+        weights: changes of the default weights by name, 0 to 1e6; that of action is 1e-6 or more.
     """
 
     def __init__(
@@ -67,21 +66,19 @@ class MPC(Controller):
         weights: Mapping[str, Annotated[float, between(0.0, 1e6)]] | None = None,
     ) -> None:
         super().__init__(env, reference)
-        for name in weights or {}:
-            if name not in WEIGHTS:
-                raise UserValueError(f"weights: unknown weight {shown(name)}. Choose from: {', '.join(WEIGHTS)}.")
-        self.weights = {**WEIGHTS, **(weights or {})}
-        if self.weights["action"] < 1e-6:
-            raise UserValueError(f"weights: action must be at least 1e-6, got {self.weights['action']!r}.")
+        for name in (name for name in weights or {} if name not in WEIGHTS):
+            raise UserValueError(f"weights: unknown weight {shown(name)}. Choose from: {', '.join(WEIGHTS)}.")
+        all_weights = {**WEIGHTS, **(weights or {})}
+        if all_weights["action"] < 1e-6:
+            raise UserValueError(f"weights: action must be at least 1e-6, got {all_weights['action']!r}.")
         self.out_keys.append("plan")
         self.horizon, self.iterations = horizon, iterations
         self.hover_speed, like = self.dynamics.controller.hover_speed, self.nominal.mass
         self.sizes = dict(self.dynamics.sizes)
-        self.width = sum(self.sizes.values())
-        costs = [like.new_full((k,), self.weights.get(name, 0.0)) for name, k in self.sizes.items()]
+        costs = [like.new_full((k,), all_weights.get(name, 0.0)) for name, k in self.sizes.items()]
         self.state_cost = torch.cat(costs).repeat(horizon, 1)
-        self.state_cost[-1] *= self.weights["terminal"]
-        self.action_cost = like.new_full((4,), self.weights["action"])
+        self.state_cost[-1] *= all_weights["terminal"]
+        self.action_cost = like.new_full((4,), all_weights["action"])
         self.times = self.lead + self.control_dt * torch.arange(horizon + 1).to(like)
         self.shares = like.new_tensor(SHORTENED)[:, None, None]
 
@@ -121,15 +118,10 @@ class MPC(Controller):
 
     def improve(self, states: Tensor, actions: Tensor, goal: Tensor, neutral: Tensor) -> tuple[Tensor, Tensor]:
         """One step of Gauss-Newton from a trajectory (H + 1, n, 17) and its actions (H, n, 4); never to a worse one."""
-        steps, gains = feedback(
-            self.linearise(states[:-1], actions),
-            self.state_cost,
-            self.state_cost.unsqueeze(1) * (states[1:] - goal),
-            self.action_cost,
-            self.action_cost * (actions - neutral),
-            -1.0 - actions,
-            1.0 - actions,
-        )
+        of_states = self.state_cost, self.state_cost.unsqueeze(1) * (states[1:] - goal)
+        of_actions = self.action_cost, self.action_cost * (actions - neutral)
+        transition, bounds = self.linearise(states[:-1], actions), (-1.0 - actions, 1.0 - actions)
+        steps, gains = feedback(transition, of_states, of_actions, bounds)
         state = states[0].expand(len(SHORTENED), -1, -1)
         tried, acted = [], []
         for t in range(self.horizon):
@@ -164,20 +156,15 @@ class MPC(Controller):
 
     def predict(self, start: Tensor, actions: Tensor) -> Tensor:
         """Where actions (H, n, 4) lead from states (n, 17): (H + 1, n, 17), the start first."""
-        states = [start]
-        for action in actions:
-            states.append(self.step(states[-1], action))
-        return torch.stack(states)
+        return torch.stack(list(itertools.accumulate(actions, self.step, initial=start)))
 
     def linearise(self, states: Tensor, actions: Tensor) -> Tensor:
         """The derivatives of :meth:`step` by states (T, n, 17) and actions (T, n, 4): (T, n, 17, 21).
 
         Each entry of the end has a copy of the inputs, so that one backward pass gives all rows.
         """
-        k, at_once = self.width, max(1, ROWS // (self.width * states.shape[1]))
-        inputs = torch.cat((states, actions), -1)
-        rows = []
-        for part in inputs.split(at_once):
+        k, rows = states.shape[-1], []
+        for part in torch.cat((states, actions), -1).split(max(1, ROWS // (k * states.shape[1]))):
             with torch.enable_grad():
                 copies = part.expand(k, *part.shape).clone().requires_grad_()
                 end = self.step(*copies.flatten(0, 1).split((k, 4), -1)).unflatten(0, copies.shape[:2])
@@ -187,13 +174,7 @@ class MPC(Controller):
 
 
 def feedback(
-    transition: Tensor,
-    state_cost: Tensor,
-    state_slope: Tensor,
-    action_cost: Tensor,
-    action_slope: Tensor,
-    low: Tensor,
-    high: Tensor,
+    transition: Tensor, states: Sequence[Tensor], actions: Sequence[Tensor], bounds: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor]:
     """The actions u_t = k_t + K_t x_t that minimise a quadratic cost, by Riccati's recursion, for a batch of drones.
 
@@ -201,10 +182,11 @@ def feedback(
     where x_{t+1} = A_t x_t + B_t u_t. Where k_t would leave its bounds, it stops there, and the gains of that entry are
     zero; the other entries are optimal given that (control-limited DDP, with one round of its active set).
 
-    ``transition`` (T, n, s, s + m) holds A_t and B_t side by side, ``state_cost`` (T, s) and ``action_cost`` (m) the
-    diagonals of Q and R, and ``state_slope`` (T, n, s) and ``action_slope`` (T, n, m) q and r. ``low`` and ``high``
-    (T, n, m) are the bounds of k. Returns k (T, n, m) and K (T, n, m, s).
+    ``transition`` (T, n, s, s + m) holds A_t and B_t side by side, ``states`` the diagonal of Q (T, s), and q
+    (T, n, s), ``actions`` that of R (m), and r (T, n, m). The two bounds of k are (T, n, m). Returns k (T, n, m) and
+    K (T, n, m, s).
     """
+    (state_cost, state_slope), (action_cost, action_slope), (low, high) = states, actions, bounds
     s = transition.shape[-2]
     eye, penalty = torch.eye(len(action_cost)).to(transition), torch.diag(action_cost)
     value, slope = torch.diag(state_cost[-1]), state_slope[-1]
@@ -222,8 +204,7 @@ def feedback(
         wanted = torch.cat((slope_actions.unsqueeze(-1) + of_actions @ stop, mixed), -1)
         reduced = torch.where(held | held.mT, eye, of_actions)
         solution = -torch.linalg.solve_ex(reduced, torch.where(held, 0.0, wanted))[0]
-        step = (solution[..., :1] + stop).squeeze(-1).clamp(low[t], high[t])
-        gain = solution[..., 1:]
+        step, gain = (solution[..., :1] + stop).squeeze(-1).clamp(low[t], high[t]), solution[..., 1:]
         steps.append(step)
         gains.append(gain)
         if t > 0:

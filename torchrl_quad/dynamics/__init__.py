@@ -1,23 +1,18 @@
 """The drone as pure functions on plain tensors: no TorchRL, no TensorDict, differentiable in everything."""
 
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.dynamics.control import FlightController, Setpoint
-from torchrl_quad.dynamics.model import Dynamics
-from torchrl_quad.dynamics.modes import (
+from torchrl_quad.dynamics.control import (
     CONTROLS,
     AttitudeController,
+    FlightController,
     RotorThrustController,
+    Setpoint,
     VelocityController,
     make_controller,
 )
+from torchrl_quad.dynamics.model import Dynamics, PointMass, Quadrotor, QuadrotorState
 from torchrl_quad.dynamics.parameters import MotorCommand, QuadrotorParams, available_drones, load_drone
-from torchrl_quad.dynamics.point_mass import PointMass
-from torchrl_quad.dynamics.quadrotor import Quadrotor, QuadrotorState
-from torchrl_quad.dynamics.rigid_body import (
-    INTEGRATORS,
-    RigidBodyState,
-    accelerations,
-)
+from torchrl_quad.dynamics.rigid_body import INTEGRATORS, RigidBodyState, accelerations
 
 #: The dynamics models by name.
 DYNAMICS: dict[str, type[Dynamics]] = {"quadrotor": Quadrotor, "point_mass": PointMass}

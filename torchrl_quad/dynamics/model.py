@@ -1,19 +1,20 @@
-"""The protocol of dynamics models, and what the two that ship share."""
+"""The protocol of dynamics models, and the two that ship: the whole quadrotor, and a point mass with an attitude."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
-from torchrl_quad.dynamics.control import FlightController
-from torchrl_quad.dynamics.modes import make_controller
-from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
-from torchrl_quad.dynamics.vector import Components, Vector, cat, stack
-from torchrl_quad.options import between
+from torchrl_quad.dynamics.control import FlightController, Nominal, RotorThrustController, make_controller
+from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams, RawParams
+from torchrl_quad.dynamics.rigid_body import INTEGRATORS, Integrator, RigidBodyState, Rotors, accelerations, drag
+from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, clamp, stack
+from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import between, checked
 
 # [s]. In a shorter step a drone at 1 m/s does not move in single precision; with a longer one the rate loop of no drone
 # that ships is stable.
@@ -29,66 +30,68 @@ class Dynamics(Protocol):
     as well. :class:`~torchrl_quad.dynamics.Quadrotor` and :class:`~torchrl_quad.dynamics.PointMass` are the examples.
     """
 
+    #: The entries of its state and their widths, first those that tasks observe: ``position``, ``quaternion``,
+    #: ``velocity`` and ``angular_velocity``.
     sizes: dict[str, int]
-    """The entries of its state and their widths. All start with ``position``, ``quaternion``, ``velocity`` and
-    ``angular_velocity``, which tasks observe."""
-
+    #: The fields of :class:`~torchrl_quad.QuadrotorParams` that the flying drone reads. They may differ from those of
+    #: the nominal drone, be drawn for each episode, and carry gradients.
     plant_fields: tuple[str, ...]
-    """The fields of :class:`~torchrl_quad.QuadrotorParams` that the flying drone reads. They may differ from those of
-    the nominal drone, be drawn for each episode, and carry gradients."""
-
+    #: Greatest absolute values of its own entries, beyond which the numbers mean nothing and the episode ends.
     limits: dict[str, Tensor]
-    """Greatest absolute values of its own entries, beyond which the numbers mean nothing and the episode ends."""
-
-    nominal: QuadrotorParams
-    """The drone that the controller is built for."""
-
-    hover_action: Tensor
-    """The action (4) that holds the nominal drone where it is; (num_envs, 4) where drones differ in it."""
-
-    action_units: dict[str, str]
-    """What the four entries of an action command, by name, and the unit of each. A model may leave this out."""
-
-    substeps: int
-    """Physics steps in a control step."""
+    nominal: QuadrotorParams  #: the drone that the controller is built for
+    hover_action: Tensor  #: (4), holds the nominal drone where it is; (num_envs, 4) where drones differ in it
+    action_units: dict[str, str]  #: the four entries of an action by name, with their units; a model may leave this out
+    substeps: int  #: physics steps in a control step
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
         """The state of a drone that hovers at the positions (n, 3) [m]."""
-        ...
 
     def control_step(
         self, state: dict[str, Tensor], action: Tensor, params: QuadrotorParams, wind: Tensor | None
     ) -> dict[str, Tensor]:
         """Its entries (n, k) after a control step under an action (n, 4): the drone ``params`` in the wind (n, 3)."""
-        ...
 
     def setpoint_rows(self, action: Tensor) -> Tensor:
         """What an action (n, 4) asks for, as rows (k, n) that ``rows_step`` reads."""
-        ...
 
     def rows_step(self) -> Callable[..., Tensor]:
-        """One physics step for a compiler: ``step(x, setpoint, plant, wind)``.
+        """One physics step for a compiler: ``step(x, setpoint, plant, wind)``, which returns the next ``x``.
 
         ``x`` are the state's entries below each other (rows, n). ``plant`` are the ``plant_fields`` as rows (k, n), or
-        empty for the nominal drone. ``wind`` holds one tensor (3, n) or none. It returns the next ``x``.
+        empty for the nominal drone. ``wind`` holds one tensor (3, n) or none.
         """
-        ...
 
 
+@checked
 class ControlledModel:
-    """What both models share: the flight controller, and how a physics step becomes a control step in both forms."""
+    """What both models share: the flight controller, and how a physics step becomes a control step in both forms.
+
+    Args:
+        dt: physics step, 1e-6 to 0.1 s.
+        substeps: physics steps in a control step, 1 to 200.
+        control: what an action commands, as :func:`~torchrl_quad.dynamics.make_controller` takes it.
+    """
 
     sizes: dict[str, int]
     plant_fields: tuple[str, ...]
 
     def __init__(
-        self, nominal: QuadrotorParams, dt: float, substeps: int, integrator: str, control: str | Mapping[str, Any]
+        self,
+        nominal: Nominal,
+        dt: PhysicsStep,
+        substeps: Substeps,
+        integrator: Integrator,
+        control: str | Mapping[str, Any] = "rates",
     ) -> None:
         self.controller = make_controller(control, nominal)
         self.nominal, self.hover_action = self.controller.nominal, self.controller.hover_action
         self.action_units = self.controller.action_units
         self.dt, self.substeps, self.integrator = dt, substeps, integrator
         self.limits: dict[str, Tensor] = {}
+        self.finish()
+
+    def finish(self) -> None:
+        """What a model adds to its construction: its limits, or a refusal of what it cannot fly."""
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
         """Level and still, at the positions (n, 3) [m]."""
@@ -133,3 +136,91 @@ class ControlledModel:
             return stack(cat(*self.physics_step(state, wanted, self.plant(params, controller), controller, air)))
 
         return step
+
+
+class QuadrotorState(NamedTuple):
+    """A rigid body with four turning rotors."""
+
+    position: Vector  #: (*, 3) [m], world frame
+    quaternion: Vector  #: (*, 4), body to world, unit norm
+    velocity: Vector  #: (*, 3) [m/s], world frame
+    angular_velocity: Vector  #: (*, 3) [rad/s], body frame
+    rotor_speed: Vector  #: (*, 4) [rad/s]
+
+
+class Quadrotor(ControlledModel):
+    """The quadrotor as environments fly it, with flight controller, rotors and rigid body.
+
+    An implementation of :class:`~torchrl_quad.dynamics.Dynamics`, with the arguments of
+    :class:`~torchrl_quad.dynamics.model.ControlledModel`.
+    """
+
+    sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3, "rotor_speed": 4}
+    plant_fields = PLANT_FIELDS
+
+    def finish(self) -> None:
+        """Limit the rotor speeds."""
+        self.limits = {"rotor_speed": 2.0 * self.nominal.rotor_speed_max}
+
+    def rest(self, position: Tensor) -> dict[str, Tensor]:
+        """Level, still, rotors at hover speed, at the positions (n, 3) [m]."""
+        return {**super().rest(position), "rotor_speed": self.controller.hover_speed.expand(len(position), 4).clone()}
+
+    def plant(self, params: QuadrotorParams, controller: FlightController) -> tuple[QuadrotorParams, Rotors]:
+        """The parameters and the rotors."""
+        return params, controller.rotors if params is controller.nominal else Rotors(params)
+
+    def physics_step(
+        self, state: Sequence[Vector], setpoint: Any, plant: Any, controller: FlightController, wind: Vector | None
+    ) -> QuadrotorState:
+        """The present rotor speeds make the wrench, and the controller, by its own rotors, sets their next target."""
+        (params, rotors), before = plant, QuadrotorState(*state)
+        speed = before.rotor_speed
+        wrench = rotors.wrench(speed)
+        believed = wrench if rotors is controller.rotors else controller.rotors.wrench(speed)
+        commanded = controller.command(setpoint, before, believed)
+        if rotors is not controller.rotors:  # the nominal rotors can do what the controller asks of them; these may not
+            commanded = clamp(commanded, params.rotor_speed_min, params.rotor_speed_max)
+        integrate = INTEGRATORS[self.integrator]
+        body = integrate(RigidBodyState(*before[:4]), lambda s: accelerations(s, wrench, params, wind), self.dt)
+        return QuadrotorState(*body, rotors.follow(speed, commanded, self.dt))
+
+
+class PointMass(ControlledModel):
+    """Thrust and body rates follow the command at once: no rotors, no rate controller, no moments.
+
+    An implementation of :class:`~torchrl_quad.dynamics.Dynamics`, on which much of the literature trains. Drag, mass
+    and gravity are those of the drone. Each physics step turns the attitude with the commanded rate, then moves
+    velocity and position (semi-implicit Euler). It flies commands that the rotors of the drone may not reach. The
+    arguments are those of :class:`~torchrl_quad.dynamics.Quadrotor`.
+
+    Raises:
+        ValueError: another integrator is asked for, or actions command rotors.
+    """
+
+    sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}
+    plant_fields = ("mass", "linear_drag", "quadratic_drag", "gravity")
+
+    def finish(self) -> None:
+        """Refuse what it cannot fly."""
+        if self.integrator != "semi_implicit_euler":
+            raise UserValueError(
+                f'dynamics="point_mass" supports only the integrator "semi_implicit_euler", got {self.integrator!r}.'
+            )
+        if isinstance(self.controller, RotorThrustController):
+            raise UserValueError(
+                'dynamics="point_mass" has no rotors, so control="rotor_thrusts" commands nothing. Use '
+                'dynamics="quadrotor", or another control.'
+            )
+
+    def physics_step(
+        self, state: Sequence[Vector], setpoint: Any, plant: Any, controller: FlightController, wind: Vector | None
+    ) -> Sequence[Vector]:
+        """Turn, then move."""
+        position, attitude, velocity, _ = state
+        thrust, rates = controller.rate_setpoint(setpoint, attitude, velocity)
+        attitude = quaternion.normalize(attitude + quaternion.derivative(attitude, rates) * self.dt)
+        air = velocity if wind is None else velocity - wind
+        force = drag(quaternion.rotate_inverse(attitude, air), plant) + along_z(thrust)
+        velocity = velocity + (quaternion.rotate(attitude, force / plant.mass) - along_z(plant.gravity)) * self.dt
+        return position + velocity * self.dt, attitude, velocity, rates

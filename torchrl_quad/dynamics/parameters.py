@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,8 +18,6 @@ from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import between, build, checked
 
 _DRONES = resources.files("torchrl_quad.dynamics") / "drones"
-
-
 # The fields that only the flight controller reads, from its nominal drone.
 CONTROLLER_FIELDS = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
 _OTHER_SHAPES = {"motor_time_constant": (2,)}  # which a field may have as well
@@ -27,10 +25,7 @@ _OPTIONAL = {"drag_height": 0.0}
 
 
 def _field(shape: tuple[int, ...], low: float, high: float, unit: str = "", **default: Any) -> Any:
-    """A field, with the shape of one drone's value, its unit, and the least and the greatest number that makes sense.
-
-    Beyond them the numbers of a drone that could never fly overflow, and their derivatives with them.
-    """
+    """A field with the shape of one drone's value, its unit, and limits, beyond which numbers could overflow."""
     return dataclasses.field(metadata={"shape": shape, "low": low, "high": high, "unit": unit}, **default)
 
 
@@ -40,11 +35,10 @@ class MotorCommand:
     """The rotor speed that a motor command asks for: ``speed_at_zero + speed_per_volt * command * voltage``.
 
     The command is 0 to 1 of what the electronics can give. It is needed to replay flights
-    (:func:`~torchrl_quad.identification.prediction_error`); environments command rotor speeds or thrusts.
+    (:func:`~torchrl_quad.identification.prediction_error`).
 
     Args:
-        speed_per_volt: of command times battery voltage, which is what the motor gets on average, 0.001 to 1e5 rad/s
-            per V.
+        speed_per_volt: of command times battery voltage, what the motor gets on average, 0.001 to 1e5 rad/s per V.
         nominal_voltage: where a log has no battery voltage, 0.1 to 1000 V.
         speed_at_zero: -1e4 to 1e4 rad/s.
         delay: from the command to the motor, -0.1 to 0.5 s.
@@ -94,53 +88,42 @@ class QuadrotorParams:
         for name, value in self.fields().items():
             object.__setattr__(self, name, _checked(name, value, like, "QuadrotorParams"))
         low, high = self.rotor_speed_min.detach(), self.rotor_speed_max.detach()
-        if not (low < high).all():
-            raise UserValueError(
-                "QuadrotorParams: rotor_speed_min must be below rotor_speed_max, "
-                f"got {low.tolist()} and {high.tolist()}."
-            )
         k2, k1, _ = self.thrust_map.detach().split(1, -1)
-        slope = k1 + 2.0 * k2 * low
+        slope, broken = k1 + 2.0 * k2 * low, ""
         if not (slope >= 0).all():
-            raise UserValueError(
-                "QuadrotorParams: thrust_map must not fall with rotor speed: k1 + 2 k2 rotor_speed_min must be zero "
-                f"or positive, got {slope.tolist()}."
-            )
+            broken = f"thrust_map must not fall with rotor speed: k1 + 2 k2 rotor_speed_min is {slope.tolist()}"
+        if not (low < high).all():
+            broken = f"rotor_speed_min must be below rotor_speed_max, got {low.tolist()} and {high.tolist()}"
+        if broken:
+            raise UserValueError(f"QuadrotorParams: {broken}.")
 
     def __repr__(self) -> str:
         """A table with units."""
-        units = {name: f" [{about['unit']}]" if about["unit"] else "" for name, about in _FIELDS.items()}
-        rows = {name + units[name]: _table(x, self.dim(name)) for name, x in self.fields().items()}
-        rows |= {} if self.motor_command is None else {"motor_command": str(self.motor_command)}
+        rows = {"motor_command": str(self.motor_command)} if self.motor_command else {}
+        for name, value in reversed(self.fields().items()):
+            unit = _FIELDS[name]["unit"]
+            rows = {f"{name} [{unit}]" if unit else name: _table(value, self.dim(name)), **rows}
         width = max(map(len, rows))
-        return "\n  ".join([type(self).__name__, *(f"{label:{width}}  {value}" for label, value in rows.items())])
+        return "\n  ".join(["QuadrotorParams", *(f"{label:{width}}  {value}" for label, value in rows.items())])
 
     def fields(self) -> dict[str, Tensor]:
         """The fields by name, in the order of their declaration."""
         return {name: getattr(self, name) for name in _FIELDS}
 
-    def plant(self) -> tuple[Tensor, ...]:
-        """The fields of the drone that flies, in the order of ``PLANT_FIELDS``."""
-        return tuple(getattr(self, name) for name in PLANT_FIELDS)
-
     def replace(self, **changes: Any) -> QuadrotorParams:
-        """A copy with some fields changed, to tensors, numbers or lists: ``params.replace(mass=0.5)``.
-
-        A tensor keeps its graph, so that a parameter can be fitted through the simulator.
-        """
-        unknown = sorted(set(changes) - set(_FIELDS))
-        if unknown:
-            raise UserValueError(f"QuadrotorParams has no field {unknown[0]!r}. Choose from: {', '.join(_FIELDS)}.")
+        """A copy with some fields changed, to tensors, with their graph, numbers or lists: ``replace(mass=0.5)``."""
+        for unknown in (name for name in changes if name not in _FIELDS):
+            raise UserValueError(f"QuadrotorParams has no field {unknown!r}. Choose from: {', '.join(_FIELDS)}.")
         changed = {k: _tensor(k, v, self.mass, "QuadrotorParams").to(self.mass) for k, v in changes.items()}
         return dataclasses.replace(self, **changed)
 
     def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> QuadrotorParams:
         """A copy on another device or with another floating-point type; gradients flow through the copy."""
-        return self._map(lambda value: value.to(device=device, dtype=dtype))
+        return dataclasses.replace(self, **{k: x.to(device=device, dtype=dtype) for k, x in self.fields().items()})
 
     def detach(self) -> QuadrotorParams:
         """A copy of the values, without gradient."""
-        return self._map(lambda value: value.detach().clone())
+        return dataclasses.replace(self, **{name: value.detach().clone() for name, value in self.fields().items()})
 
     @property
     def requires_grad(self) -> bool:
@@ -151,10 +134,6 @@ class QuadrotorParams:
     def dim(name: str) -> int:
         """The number of dimensions of a field of a single drone."""
         return len(_FIELDS[name]["shape"])
-
-    def _map(self, function: Callable[[Tensor], Tensor]) -> QuadrotorParams:
-        mapped = {name: function(value) for name, value in self.fields().items()}
-        return QuadrotorParams(**mapped, motor_command=self.motor_command)
 
 
 _FIELDS = {field.name: field.metadata for field in dataclasses.fields(QuadrotorParams) if field.metadata}
@@ -175,11 +154,7 @@ else:
 
 
 def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torch.float32) -> QuadrotorParams:
-    """Load a preset by name, a YAML file by path, or a mapping of field names to numbers.
-
-    Args:
-        drone: one of :func:`available_drones`, the path of a file that ends in .yaml, or a mapping.
-        dtype: floating-point type of the fields.
+    """A preset by its name (:func:`available_drones`), a YAML file by its path, or a mapping of fields to numbers.
 
     Raises:
         ValueError: the preset is unknown, a field is missing, unknown, of the wrong shape, or out of its range, or the
@@ -189,15 +164,12 @@ def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torc
     if not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
         raise UserValueError(f"load_drone: dtype must be torch.float32 or torch.float64, got {shown(dtype)}.")
     source, values = presets.read("drone", drone, _DRONES)
-    values = {**_OPTIONAL, **values}
-    motors = values.pop("motor_command", None)
+    motors, values = values.get("motor_command"), {**_OPTIONAL, **values}
     required = [name for name in _FIELDS if name not in _OPTIONAL]
-    missing = [name for name in required if name not in values]
-    unknown = sorted(str(name) for name in values if name not in _FIELDS)
-    if missing:
-        raise UserValueError(f"{source}: missing field {missing[0]!r}. Required: {', '.join(required)}.")
-    if unknown:
-        raise UserValueError(f"{source}: unknown field {unknown[0]!r}. Allowed: {', '.join(_FIELDS)}, motor_command.")
+    for missing in (name for name in required if name not in values):
+        raise UserValueError(f"{source}: missing field {missing!r}. Required: {', '.join(required)}.")
+    for unknown in (name for name in values if name not in (*_FIELDS, "motor_command")):
+        raise UserValueError(f"{source}: unknown field {shown(unknown)}. Allowed: {', '.join(_FIELDS)}, motor_command.")
     like = torch.empty(0, dtype=torch.float64)
     fields = {name: _checked(name, values[name], like, source).to(torch.float64) for name in _FIELDS}
     command = None if motors is None else build(MotorCommand, f"{source}: motor_command", motors)
@@ -210,7 +182,6 @@ def available_drones() -> list[str]:
 
 
 def _table(value: Tensor, dim: int) -> str:
-    """A field as its table shows it; of several drones the least and the greatest number."""
     if value.dim() > dim:
         return f"{value.min():.5g} to {value.max():.5g} over {len(value)} drones"
     if dim == 2:
@@ -227,13 +198,11 @@ def _tensor(name: str, value: Any, like: Tensor, source: str) -> Tensor:
             return torch.stack([_tensor(name, x, like, source).to(like) for x in value])
         return torch.from_numpy(np.asarray(presets.as_array(value))).to(like)
     except (ValueError, RuntimeError, RecursionError) as error:
-        raise UserValueError(
-            f"{source}: field {name!r} is not a number or a list of numbers: {shown(value)}."
-        ) from error
+        what = f"field {name!r} is not a number or a list of numbers: {shown(value)}"
+        raise UserValueError(f"{source}: {what}.") from error
 
 
 def _checked(name: str, value: Any, like: Tensor, source: str) -> Tensor:
-    """A value as the tensor of a field, checked."""
     value = _tensor(name, value, like, source)
     value = value if value.dim() else value.reshape(1)
     shape, low, high, _ = _FIELDS[name].values()

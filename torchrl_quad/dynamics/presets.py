@@ -1,6 +1,5 @@
 """YAML presets: by the name of one that ships with the package, by path, or as a mapping."""
 
-import math
 import numbers
 import re
 from collections.abc import Hashable, Mapping, Sequence
@@ -33,10 +32,10 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
     """
     if isinstance(preset, Mapping):
         return kind, preset
-    known = [] if folder is None else names(folder)
+    known = {} if folder is None else {name: folder / f"{name}.yaml" for name in names(folder)}
     choices = f"Choose from: {', '.join(known)}; or give" if known else "Give"
-    if folder is not None and isinstance(preset, str) and preset in known:
-        source, path = f"{preset}.yaml", folder / f"{preset}.yaml"
+    if isinstance(preset, str) and preset in known:
+        source, path = f"{preset}.yaml", known[preset]
     elif isinstance(preset, Path) or (isinstance(preset, str) and preset.endswith((".yaml", ".yml"))):
         source, path = str(preset), Path(preset)
     else:
@@ -57,21 +56,15 @@ def parse(content: bytes, source: str) -> Any:
     a file of a few lines can mean billions of values through them.
 
     Raises:
-        ValueError: the content is too large, too deep, not in UTF-8, no YAML, or has an alias, a tag, a name that is no
-            string or comes twice, or a number of more than 400 digits.
+        ValueError: the content is too large, too deep, not in UTF-8, no YAML, or not plain values that come once.
     """
     if len(content) > MAX_BYTES:
-        raise UserValueError(
-            f"{source}: has more than {MAX_BYTES:,} bytes, which no file of settings needs. Leave out the rest."
-        )
+        raise UserValueError(f"{source}: has more than {MAX_BYTES:,} bytes. Settings need less: leave out the rest.")
     try:
-        text = content.decode()
+        return _Loader(content.decode()).get_single_data()
     except UnicodeDecodeError as error:
-        raise UserValueError(
-            f"{source}: not in UTF-8 (byte {error.start} is {content[error.start]:#04x}). Save it as UTF-8."
-        ) from None
-    try:
-        return _Loader(text).get_single_data()
+        byte = f"byte {error.start} is {content[error.start]:#04x}"
+        raise UserValueError(f"{source}: not in UTF-8 ({byte}). Save it as UTF-8.") from None
     except yaml.YAMLError as error:
         raise UserValueError(f"{source}: not a YAML file: {' '.join(str(error).split())}") from error
     except UserValueError as error:
@@ -102,11 +95,11 @@ class _Loader(yaml.SafeLoader):
         found: dict[Hashable, Any] = {}
         for key, value in node.value:
             name = self.construct_object(key, deep=True) if isinstance(key, yaml.ScalarNode) else None
-            line = key.start_mark.line + 1
+            where = f"line {key.start_mark.line + 1} names"
             if not isinstance(name, str):
-                raise UserValueError(f"line {line} names a value by {shown(name)}, and a name must be a word.")
+                raise UserValueError(f"{where} a value by {shown(name)}, and a name must be a word.")
             if name in found:
-                raise UserValueError(f"line {line} names {shown(name)} for the second time. Leave one of them out.")
+                raise UserValueError(f"{where} {shown(name)} for the second time. Leave one of them out.")
             found[name] = self.construct_object(value, deep=True)
         return found
 
@@ -129,14 +122,6 @@ for _tag, _pattern, _first in (
 ):
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first))
 _Loader.add_constructor("tag:yaml.org,2002:number", _Loader.construct_number)
-
-
-def is_number(value: Any) -> bool:
-    """Whether a setting is one finite number, of Python or of numpy."""
-    try:
-        return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:  # an integer beyond what a float holds
-        return False
 
 
 def as_array(value: Any) -> NDArray[np.float64]:

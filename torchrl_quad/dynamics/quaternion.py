@@ -1,7 +1,6 @@
 """Unit quaternions (w, x, y, z) that turn body-frame vectors into world-frame vectors.
 
-All functions broadcast over leading dimensions and have finite derivatives for every finite input. What a physics step
-needs takes vectors in either form (:mod:`~torchrl_quad.dynamics.vector`).
+All functions broadcast over leading dimensions and have finite derivatives for every finite input.
 """
 
 import torch
@@ -13,8 +12,7 @@ from torchrl_quad.dynamics.vector import Vector, cat, cross, dot
 
 def multiply(p: Tensor, q: Tensor) -> Tensor:
     """Hamilton product p q, (*, 4): the rotation q followed, in the outer frame, by p."""
-    pw, pv = p.split((1, 3), -1)
-    qw, qv = q.split((1, 3), -1)
+    (pw, pv), (qw, qv) = p.split((1, 3), -1), q.split((1, 3), -1)
     scalar = pw * qw - dot(pv, qv)
     return torch.cat((scalar, pw * qv + qw * pv + torch.linalg.cross(pv, qv)), -1)
 
@@ -29,14 +27,17 @@ def normalize(q: Vector) -> Vector:
     return q * dot(q, q).clamp_min(1e-12).rsqrt()
 
 
-def rotate(q: Vector, v: Vector) -> Vector:
-    """Body to world: the vector v (*, 3) turned by the unit quaternion q (*, 4)."""
-    return _rotate(q, v, 1.0)
+def rotate(q: Vector, v: Vector, sign: float = 1.0) -> Vector:
+    """Body to world: the vector v (*, 3) turned by the unit quaternion q (*, 4); the other way with the sign -1."""
+    # v + u x t + sign w t with t = 2 u x v, for q = (w, u)
+    w, u = q[..., :1] * sign, q[..., 1:]
+    turned = cross(u * 2.0, v)
+    return v + cross(u, turned).addcmul(w, turned)
 
 
 def rotate_inverse(q: Vector, v: Vector) -> Vector:
     """World to body: the vector v (*, 3) turned by the inverse of the unit quaternion q (*, 4)."""
-    return _rotate(q, v, -1.0)
+    return rotate(q, v, -1.0)
 
 
 def up_in_body(q: Vector) -> Vector:
@@ -60,26 +61,6 @@ def from_axis_angle(axis_angle: Tensor) -> Tensor:
 
 
 def distance(p: Tensor, q: Tensor) -> Tensor:
-    """Attitude error min(|p - q|, |p + q|), (*, 1): 0 for the same attitude, sqrt(2) for half a turn.
-
-    p and -p are one attitude, so the error does not depend on either sign.
-    """
+    """Attitude error min(|p - q|, |p + q|), (*, 1), as q and -q are one: 0 for the same, sqrt(2) for half a turn."""
     flip = torch.where(dot(p, q) < 0, -1.0, 1.0).to(p)
     return torch.linalg.vector_norm(p - flip * q, dim=-1, keepdim=True)
-
-
-def to_xyzw(q: Tensor) -> Tensor:
-    """Reorder (w, x, y, z) into the (x, y, z, w) that ROS and SciPy use, (*, 4)."""
-    return q.roll(-1, -1)
-
-
-def from_xyzw(q_xyzw: Tensor) -> Tensor:
-    """Reorder (x, y, z, w) into (w, x, y, z), (*, 4)."""
-    return q_xyzw.roll(1, -1)
-
-
-def _rotate(q: Vector, v: Vector, sign: float) -> Vector:
-    # v + u x t + sign w t with t = 2 u x v, for q = (w, u)
-    w, u = q[..., :1] * sign, q[..., 1:]
-    turned = cross(u * 2.0, v)
-    return v + cross(u, turned).addcmul(w, turned)

@@ -1,18 +1,18 @@
-"""Vectors (*, k) in two forms: one tensor, or k components.
+"""Vectors (*, k) in two forms, one tensor or k components; the physics is written once, in the methods of a tensor.
 
-The physics is written once for both, in the methods of a tensor. One tensor takes the fewest calls, which is what an
-eager step costs. Components leave no indices, so that a compiler fuses everything into one loop over drones and keeps
-its numbers in registers.
+One tensor takes the fewest calls, which is what an eager step costs. Components leave no indices, so that a compiler
+fuses everything into one loop over drones and keeps its numbers in registers.
 """
 
 from __future__ import annotations
 
+import copy
 import functools
 import itertools
 import math
 import operator
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -29,6 +29,18 @@ if TYPE_CHECKING:  # to a type checker both forms are tensors
 
     Vector = Tensor
 else:
+
+    def _of_each(function):
+        def method(self):
+            return Components([function(x) for x in self.components])
+
+        return method
+
+    def _of_both(function):
+        def method(self, other):
+            return _each(function, self, other)
+
+        return method
 
     class Components:
         """The k components of a vector (*, k), each a tensor (*) or, where all drones share it, a number.
@@ -47,35 +59,15 @@ else:
         def __getitem__(self, index):
             return Components(self.components[index[1]])  # of [..., a:b]
 
-        def __add__(self, other):
-            return _each(operator.add, self, other)
-
-        def __sub__(self, other):
-            return _each(operator.sub, self, other)
-
-        def __mul__(self, other):
-            return _each(operator.mul, self, other)
-
-        def __truediv__(self, other):
-            return _each(operator.truediv, self, other)
+        __add__, __sub__ = _of_both(operator.add), _of_both(operator.sub)
+        __mul__, __truediv__ = _of_both(operator.mul), _of_both(operator.truediv)
+        __neg__, abs, sqrt, rsqrt = map(_of_each, (operator.neg, operator.abs, torch.sqrt, torch.rsqrt))
 
         def __rtruediv__(self, other):
             return Components([other / x for x in self.components])
 
-        def __neg__(self):
-            return Components([-x for x in self.components])
-
-        def abs(self):
-            return Components([abs(x) for x in self.components])
-
         def square(self):
             return self * self
-
-        def sqrt(self):
-            return Components([x.sqrt() for x in self.components])
-
-        def rsqrt(self):
-            return Components([torch.rsqrt(x) for x in self.components])
 
         def exp(self):
             return Components([x.exp() if isinstance(x, Tensor) else math.exp(x) for x in self.components])
@@ -117,9 +109,15 @@ def unbind(vector: Tensor, constant: bool = False) -> Components:
     return Components(vector.flatten().tolist() if shared else vector.unbind(-1))
 
 
-def unbind_rows(matrix: Tensor) -> Components:
-    """The rows of a constant matrix (*, k, k), each as components."""
-    return Components([unbind(row, constant=True) for row in matrix.unbind(-2)])
+def unbind_all(owner: Any, matrices: Sequence[str]) -> Any:
+    """A copy whose tensors, all of them constants, are components; those of matrices (*, k, k) are their rows."""
+    apart = copy.copy(owner)
+    for name, value in vars(owner).items():
+        if name in matrices:
+            setattr(apart, name, Components([unbind(row, constant=True) for row in value.unbind(-2)]))
+        elif isinstance(value, Tensor):
+            setattr(apart, name, unbind(value, constant=True))
+    return apart
 
 
 def parts(vector: Vector) -> tuple[Tensor, ...]:
@@ -194,9 +192,7 @@ def where_positive(condition: Vector, a: Vector, b: Vector) -> Vector:
 
 def is_same(a: Vector, b: Vector) -> bool:
     """Whether a tensor on the CPU equals another; False where reading values would cost a device synchronisation."""
-    if not isinstance(a, Tensor) or a.device.type != "cpu":
-        return False
-    return not is_traced() and torch.equal(a, b)
+    return isinstance(a, Tensor) and a.device.type == "cpu" and not is_traced() and torch.equal(a, b)
 
 
 def is_traced() -> bool:

@@ -1,13 +1,9 @@
-"""The engine: a pure control step becomes a fast horizon with its graph. It is independent of quadrotors.
+"""The engine: a pure control step, a :class:`Simulation` of anything, becomes a fast horizon with its graph."""
 
-It takes a :class:`Simulation`, packs its entries into rows, compiles it and its derivative where asked to, and loops it
-through the ends of episodes.
-"""
-
-from torchrl_quad.engine.compiling import has_compiler
 from torchrl_quad.engine.horizon import can_fly, flies_inside, fly
 from torchrl_quad.engine.packing import flat, looks_are_free, nested
 from torchrl_quad.engine.policy import ActionSequence, PlainPolicy
+from torchrl_quad.engine.program import has_compiler
 from torchrl_quad.engine.simulation import Simulation, Transition
 from torchrl_quad.engine.stepper import Stepper
 

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_quad.engine.packing import Record, flat, like, looks_are_free, nested
-from torchrl_quad.engine.policy import GivenActions, PlainPolicy, plain
+from torchrl_quad.engine.policy import GivenActions, PlainPolicy
 from torchrl_quad.engine.program import policy_inputs
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.engine.stepper import Stepper
@@ -24,18 +24,16 @@ class Source(Protocol):
 
     def noise(self) -> dict[str, Tensor]:
         """What the next step needs at random, by name."""
-        ...
 
     def starts(self, mask: Tensor) -> dict[str, Any]:
         """What a reset writes, nested, for the environments of the mask, bool (n); rows of the others mean nothing."""
-        ...
 
 
 def can_fly(stepper: Stepper, policy: Any, tensordict: TensorDictBase) -> bool:
     """Whether :func:`fly` gives what TorchRL's own loop does.
 
-    So it is if the policy reads nothing but state, observation and the other outputs of a step, and what it has written
-    itself in the step before, which includes the memory of a recurrent one.
+    So it is if the policy reads nothing but the state, the outputs of a step, and what it has written in the step
+    before, which includes the memory of a recurrent one.
     """
     if not isinstance(policy, TensorDictModuleBase) or "_" in policy.out_keys:
         return False
@@ -59,8 +57,7 @@ def fly(
 ) -> TensorDict:
     """A rollout (n, steps) with its graph, through the ends of episodes.
 
-    It begins at ``state``, about which a reset or a step wrote ``tensordict``. The policy reads the observation, or the
-    state, and writes the action.
+    It begins at ``state``, about which a reset or a step wrote ``tensordict``.
     """
     state, valid = stepper.simulation.guard(state)
     loop, acts = _Loop(stepper, source, policy, tensordict), _plain(stepper, policy)
@@ -167,10 +164,7 @@ class _Loop:
         return written["action"], written
 
     def hand_on(self, written: Entries, done: Tensor) -> None:
-        """Keep what the policy reads in the next step; where an episode ends, bool (n, 1), it forgets.
-
-        The gradient ends there with the memory.
-        """
+        """Keep what the policy reads in the next step; where an episode ends, bool (n, 1), memory and gradient end."""
         if not self.memory:
             self.before = written
             return
@@ -194,11 +188,8 @@ class _Loop:
         """The record to continue from, with fresh starts where ``done`` (1, n); gradients stop there."""
         entries = {key: x.detach() for key, x in flat(self.source.starts(done[0])).items()}
         fresh = self.record({key: entries[unravel_key(("state", key))] for key in self.stepper.layout.place}, entries)
-        return Record(
-            fresh.state.where(done, end.state),
-            fresh.outputs.where(done, end.outputs),
-            torch.where(done.t(), fresh.observation, end.observation),
-        )
+        pairs = zip(fresh.leaves, end.leaves, strict=True)
+        return Record.of([torch.where(done if i < 6 else done.t(), *pair) for i, pair in enumerate(pairs)])
 
     def entries(self, records: Record, *prefix: str) -> Entries:
         """All entries of the records of a horizon, each (n, time, ...)."""
@@ -209,7 +200,8 @@ class _Loop:
 
 def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | GivenActions | None:
     """The policy as the engine can fly it inside its step, if it can."""
-    acts = plain(policy) if stepper.is_compiled else None
+    make = getattr(policy, "plain", None)
+    acts = make() if stepper.is_compiled and callable(make) else None
     if acts is None:
         return None
     state = stepper.layout.unpack(stepper.example.state)
@@ -219,7 +211,6 @@ def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | GivenActions | None:
 
 
 def _entries(tensordict: TensorDictBase, keys: list[Any]) -> Entries:
-    """Some entries of a tensordict."""
     return {key: cast(Tensor, tensordict.get(key)) for key in keys}
 
 
@@ -230,7 +221,6 @@ def _memory(policy: TensorDictModuleBase) -> list[Any]:
 
 
 def _over_time(steps: list[Entries]) -> Entries:
-    """The entries of several steps, each (n, time, ...)."""
     return {key: torch.stack([entries[key] for entries in steps], 1) for key in steps[0]}
 
 
@@ -245,6 +235,5 @@ def _may_restart(done: Tensor) -> bool:
 
 
 def _stacked(records: list[Record]) -> Record:
-    """Some records as one, as :meth:`_Loop.entries` reads it."""
-    rows = [torch.stack(x) for x in zip(*(record.leaves[:6] for record in records), strict=True)]
-    return Record.of([*rows, torch.stack([record.observation for record in records], 1)])
+    leaves = zip(*(record.leaves for record in records), strict=True)
+    return Record.of([torch.stack(x, 0 if i < 6 else 1) for i, x in enumerate(leaves)])

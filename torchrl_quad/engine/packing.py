@@ -1,7 +1,6 @@
 """Pack the many entries of a state into the rows of a few tensors, and convert names of nested entries.
 
-A tensordict with its thirty entries costs far more than the physics of a step. Inside a horizon all entries of one kind
-lie below each other as the rows of one tensor. Only the finished horizon becomes a tensordict again.
+A tensordict with its thirty entries costs far more than the physics of a step: only a finished horizon becomes one.
 """
 
 from __future__ import annotations
@@ -24,10 +23,6 @@ class Rows(NamedTuple):
     floats: Tensor
     integers: Tensor
     flags: Tensor
-
-    def where(self, condition: Tensor, other: Rows) -> Rows:
-        """These where the condition holds, the others elsewhere."""
-        return Rows(*(torch.where(condition, mine, its) for mine, its in zip(self, other, strict=True)))
 
 
 class Record(NamedTuple):
@@ -83,8 +78,7 @@ class Layout:
         if not entries:
             return floats
         own = [(where, entries.get(key)) for key, (kind, where, _) in self.place.items() if kind == 0]
-        parts = [floats[where] if x is None else floats[where] + x.flatten(1).t() for where, x in own]
-        return torch.cat(parts)
+        return torch.cat([floats[where] if x is None else floats[where] + x.flatten(1).t() for where, x in own])
 
 
 def record(end: Transition, layout: Layout, output_layout: Layout) -> Record:
@@ -97,8 +91,7 @@ def flat(entries: Mapping[Any, Any], *prefix: str) -> dict[Any, Tensor]:
     result = {}
     for key, value in entries.items():
         path = (*prefix, *key) if isinstance(key, tuple) else (*prefix, key)
-        own = {path if len(path) > 1 else path[0]: value}
-        result |= flat(value, *path) if isinstance(value, Mapping) else own
+        result |= flat(value, *path) if isinstance(value, Mapping) else {path if len(path) > 1 else path[0]: value}
     return result
 
 

@@ -19,37 +19,26 @@ class PlainPolicy(Protocol):
     a single batch. So ``adjoint`` returns traces, and ``weight_gradient`` goes on from there.
     """
 
+    #: Policies with the same signature compute the same function of their tensors, and share what is compiled.
     signature: Hashable
-    """Policies with the same signature compute the same function of their tensors, and share what is compiled."""
-
-    in_keys: Sequence[Any]
-    """The entries that it reads, of the state or the observation."""
-
-    out_keys: Sequence[Any]
-    """The entries that it writes."""
-
-    weights: tuple[Tensor, ...]
-    """The tensors that it learns, of which gradients are wanted."""
-
-    size: int | None
-    """The entries of an action, of those drawn; None for all of them."""
+    in_keys: Sequence[Any]  #: the entries that it reads, of the state or the observation
+    out_keys: Sequence[Any]  #: the entries that it writes
+    weights: tuple[Tensor, ...]  #: the tensors that it learns, of which gradients are wanted
+    size: int | None  #: the entries of an action, of those drawn; None for all of them
 
     def fits(self, inputs: Sequence[Tensor]) -> bool:
         """Whether it can read inputs of this width, precision and device; otherwise it is called, and can complain."""
-        ...
 
     def drawn(self, steps: int, n: int, before: Mapping[Any, Tensor]) -> Tensor:
         """What changes from step to step and does not depend on the state, such as noise: (steps, n, at least size).
 
         ``before`` holds what the policy has written in the step before the first one, if it was there.
         """
-        ...
 
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
     ) -> tuple[list[Tensor], dict[Any, Tensor]]:
         """What a backward pass needs, each (n, ...), and the entries that it writes, ``action`` among them."""
-        ...
 
     def adjoint(
         self,
@@ -60,11 +49,9 @@ class PlainPolicy(Protocol):
         grads: dict[Any, Tensor],
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """Traces for ``weight_gradient``, each (n, ...), and the gradients of its inputs and of what was drawn."""
-        ...
 
     def weight_gradient(self, traces: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of its weights, over a batch (n) of any steps."""
-        ...
 
 
 class GivenActions:
@@ -85,7 +72,7 @@ class GivenActions:
 
 
 class ActionSequence(TensorDictModuleBase):
-    """A policy that plays given actions one after another, to optimise a trajectory itself. It plays them once.
+    """A policy that plays given actions one after another, once, to optimise a trajectory itself.
 
     .. code-block:: python
 
@@ -131,9 +118,3 @@ class ActionSequence(TensorDictModuleBase):
             )
         self.played += steps
         return self.actions[self.played - steps : self.played]
-
-
-def plain(policy: Any) -> PlainPolicy | GivenActions | None:
-    """A policy as pure functions, or None where it can only be called."""
-    make = getattr(policy, "plain", None)
-    return make() if callable(make) else None

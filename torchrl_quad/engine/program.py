@@ -1,8 +1,16 @@
-"""Two compiled functions and their adjoints: a control step on rows, and a policy on plain tensors."""
+"""Compiled functions of tensors: a control step on rows and a policy, each with its adjoint.
+
+What was assumed of everything else is checked once per horizon, not at every step.
+"""
 
 from __future__ import annotations
 
 import copy
+import gc
+import os
+import shutil
+import types
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,26 +18,139 @@ import torch
 from torch import Tensor
 from torch.func import vjp
 
-from torchrl_quad.engine.compiling import Compiled
 from torchrl_quad.engine.packing import Layout, Rows, like, record
 from torchrl_quad.engine.policy import GivenActions, PlainPolicy
 from torchrl_quad.engine.simulation import Simulation, State
+
+Function = Callable[..., tuple[Tensor, ...]]
+
+
+def has_compiler() -> bool:
+    """Whether torch can compile here, and may (TORCH_COMPILE_DISABLE); a warning says what is missing."""
+    if torch._dynamo.config.disable:
+        return False
+    if shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++"):
+        return True
+    warnings.warn(
+        "compile: torch.compile needs a C++ compiler, and neither g++ nor clang++ is on the PATH. The environment "
+        "stays eager: correct, but several times slower. Install one (Debian: apt install g++), or name yours in the "
+        "environment variable CXX.",
+        stacklevel=3,
+    )
+    return False
+
+
+class Compiled:
+    """A compiled method from tensors to a tuple of tensors; ``options`` are keywords of ``torch.compile``.
+
+    A call checks every assumption of the compiler: on the tensors, and on whatever else the method reads, such as
+    attributes of a task. Where one no longer holds, it compiles again. :meth:`again` calls what the last call has
+    compiled with other tensors of the same kind, and checks nothing else.
+    """
+
+    def __init__(self, method: types.MethodType, options: dict[str, Any]) -> None:
+        mode = torch._inductor.list_mode_options(options["mode"]) if options.get("mode") else {}
+        self.patches = {"cpp.vec_isa_ok": True, **mode, **options.get("options", {})}
+        backend = options.get("backend", "inductor")
+        self.backend = None if backend == "inductor" else torch._dynamo.lookup_backend(backend)
+        given = {name: x for name, x in options.items() if name not in ("mode", "options", "backend")}
+        keywords: dict[str, Any] = {"fullgraph": True, "dynamic": False, **given, "backend": self._compile}
+        # With a code object of its own: what is compiled for it is not shared with other environments.
+        f = method.__func__
+        own = types.FunctionType(f.__code__.replace(), f.__globals__, f.__name__, f.__defaults__, f.__closure__)
+        method = types.MethodType(own, method.__self__)
+        self.checked = torch.compile(method, **keywords, options={"guard_filter_fn": _watched})
+        self.last: tuple[Function, Sequence[Any], Sequence[Any]] | None = None  # what was compiled, inputs and outputs
+        self.direct: Function | None = None
+
+    def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Check everything, and call."""
+        self.direct = None
+        collects = gc.isenabled()
+        gc.disable()  # an eighth of a compilation went by finding that its graphs are in use
+        try:
+            outputs = self.checked(*inputs)
+            self.direct = self.last and _direct(*self.last, inputs, outputs)
+        finally:
+            self.last = None  # it holds tensors
+            if collects:
+                gc.enable()
+        return outputs
+
+    def again(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Call on the assumptions of the last call, with tensors of the same shapes, strides and types."""
+        return self(*inputs) if self.direct is None else self.direct(*inputs)
+
+    def _compile(self, graph: torch.fx.GraphModule, examples: list[Tensor], **_: Any) -> Function:
+        if self.backend is None:
+            function = torch._inductor.compile(graph, list(examples), options=self.patches)
+        else:
+            function = self.backend(graph, examples)
+
+        def call(*inputs: Tensor) -> tuple[Tensor, ...]:
+            outputs = function(*inputs)
+            self.last = function, inputs, outputs
+            return outputs
+
+        return call
+
+
+def _direct(
+    function: Function, taken: Sequence[Any], given: Sequence[Any], inputs: Sequence[Tensor], outputs: Sequence[Tensor]
+) -> Function | None:
+    """A compiled function that takes and gives the method's own inputs and outputs, wherever its graph has them.
+
+    None where their places are not unique, as when one tensor is given twice.
+    """
+    place = {id(x): i for i, x in enumerate(taken)}
+    source = {id(x): i for i, x in enumerate(given)}
+    if not all(id(x) in source for x in outputs) or len({id(x) for x in inputs}) < len(inputs):
+        return None
+    places, results = [place.get(id(x)) for x in inputs], [source[id(x)] for x in outputs]
+    template = [None if i in places else x for i, x in enumerate(taken)]
+
+    def call(*inputs: Tensor) -> tuple[Tensor, ...]:
+        values = template.copy()
+        for i, x in zip(places, inputs, strict=True):
+            if i is not None:
+                values[i] = x
+        outputs = function(*values)
+        return tuple([outputs[i] for i in results])
+
+    return call
+
+
+# Of some 700 assumptions the compiled step keeps those that a user can break: on its input, on torch's state, on the
+# attributes of the simulation, its class and its physics, on globals of the modules that they live in. The others are
+# about torch and the engine.
+_FIXED_TYPES = {"TYPE_MATCH", "BUILTIN_MATCH", "MODULE_MATCH", "CLASS_MATCH", "DUPLICATE_INPUT"}
+_FIXED_PLACES = ("self.layout", "self.output_layout", "__import__", "list(dict.keys(__imp")
+_FIXED_MODULES = ("torch_dot", "torch'", "torchrl_quad_dot_engine", "builtins")
+
+
+def _watched(guards: Sequence[Any]) -> list[bool]:
+    return [_is_watched(guard.name, guard.guard_type) for guard in guards]
+
+
+def _is_watched(name: str, kind: str) -> bool:
+    if kind in _FIXED_TYPES or name.startswith(_FIXED_PLACES) or "___unnamed" in name:
+        return False
+    if kind == "NOT_PRESENT_IN_GENERIC_DICT":
+        return name.startswith("self.simulation")
+    if name.startswith("G["):
+        imported = "G['__import_"
+        return name.startswith(imported) and not name.removeprefix(imported).startswith(_FIXED_MODULES)
+    return True
 
 
 class StepProgram:
     """A compiled control step and its adjoint, on flat lists of tensors.
 
-    ======== ======================================================================================================
-    start    the rows of the state (floats, integers, flags), valid (n), the action (n, k)
-    others   the parameters that gradients may reach, then the noise of each disturbance
-    end      the rows of the state and of the outputs, and the observation (n, k)
-    ======== ======================================================================================================
-
-    ``forward(*start, *others)`` returns the state after each substep, each (rows, n), and the end.
+    ``forward(*start, *others)`` takes the rows of the state (floats, integers, flags), valid (n) and the action (n, k);
+    then the parameters that gradients may reach, and the noise of each disturbance. It returns the state after each
+    substep, each (rows, n), and the end: the rows of the state and of the outputs, and the observation (n, k).
     ``adjoint(*start, *others, *states, *grads)`` takes the gradients in the floats of the end (state, outputs,
     observation), and returns those in the floats of the start (state, action), and in the parameters.
-
-    ``options`` are keywords of ``torch.compile``.
     """
 
     def __init__(self, simulation: Simulation, layout: Layout, output_layout: Layout, options: dict[str, Any]) -> None:
@@ -72,8 +193,11 @@ class StepProgram:
             end_record = record(end, self.layout, self.output_layout)
             return (end_record.state.floats, end_record.outputs.floats, end_record.observation), end.valid
 
-        (first, inputs, before), pull_begin, (is_valid, others) = _vjp(begin, rows.floats, action, parameters)
-        _, pull_finish, keep = _vjp(finish, before, states[-1])
+        derive: Any = vjp  # its annotations leave out has_aux
+        (first, inputs, before), pull_begin, (is_valid, others) = derive(
+            begin, rows.floats, action, parameters, has_aux=True
+        )
+        _, pull_finish, keep = derive(finish, before, states[-1], has_aux=True)
         grad_before, grad_x = pull_finish(grads)
         total: list[Tensor] = []
         for x in reversed((first, *states[:-1])):
@@ -94,11 +218,11 @@ class StepProgram:
 
 
 class PolicyProgram:
-    """A compiled policy and its adjoint, on flat lists of tensors.
+    """A compiled policy and its adjoint, on flat lists of tensors; all policies of one signature share a program.
 
     ``forward(*weights, *inputs, drawn)`` returns what the policy keeps, and what it writes, in the order of its
     ``out_keys``. ``adjoint(*weights, *inputs, drawn, *kept, *grads)`` takes the gradients of what it wrote, and returns
-    the traces, and the gradients of its inputs and of what was drawn. All policies of one signature share a program.
+    the traces, and the gradients of its inputs and of what was drawn.
     """
 
     def __init__(self, policy: PlainPolicy, options: dict[str, Any]) -> None:
@@ -134,12 +258,6 @@ def policy_inputs(policy: PlainPolicy | GivenActions, state: State, observation:
 def name_in_state(key: tuple[str, ...]) -> Any:
     """The name within the state of a key ("state", ...)."""
     return key[1] if len(key) == 2 else key[1:]
-
-
-def _vjp(function: Callable[..., Any], *primals: Any) -> tuple[Any, Callable[..., Any], Any]:
-    """What the function returns, its derivative, and what it returns besides."""
-    outputs: Any = vjp(function, *primals, has_aux=True)
-    return outputs
 
 
 def _flat(inputs: Sequence[Any]) -> list[Tensor]:

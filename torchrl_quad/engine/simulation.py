@@ -25,15 +25,12 @@ class Simulation(Protocol):
     The parts exist because a compiler that gets a whole step unrolls its physics steps and takes minutes.
     """
 
-    substeps: int
-    """How often ``substep`` runs between ``begin`` and ``finish``."""
+    substeps: int  #: how often ``substep`` runs between ``begin`` and ``finish``
+    constants: frozenset[str]  #: the outputs that carry no gradient, such as what is only measured
 
     @property
     def parameters(self) -> tuple[Tensor, ...]:
         """Tensors in addition to state and action that gradients may reach, such as the mass of a drone."""
-
-    constants: frozenset[str]
-    """The outputs that carry no gradient, such as what is only measured."""
 
     def example(self) -> tuple[State, dict[str, Any]]:
         """A state, and outputs of the kind that a step gives; the engine reads names, shapes and types."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
 import torch
@@ -91,8 +92,7 @@ class Stepper:
             restarted: from the end of a step where to continue, and who restarts, bool (n); None if nobody does.
             before: what the policy has written in the step before.
         """
-        if self.options is None:
-            raise RuntimeError("Only a compiled stepper flies horizons.")
+        assert self.options is not None  # only a compiled stepper flies horizons
         drawn, parameters = policy.drawn(steps, len(valid), before or {}), self.simulation.parameters
         self.simulation.check_action(drawn[0, :, : policy.size])
         if len(parameters) not in self.steps:
@@ -158,7 +158,7 @@ class _Horizon(torch.autograd.Function):
                 horizon.restarts.append((t, *again))
                 end = again[0]
             rows, observation = end.state, end.observation
-        ctx.horizon, ctx.parameter_count = horizon, len(parameters)
+        ctx.horizon = horizon
         ctx.like = [(x.shape, x.dtype, x.device) for x in (leaves[0], leaves[3], leaves[6], *written)]
         ctx.shapes = [tuple(map(len, parts[:4])) for parts in saved]
         ctx.save_for_backward(
@@ -179,8 +179,8 @@ class _Horizon(torch.autograd.Function):
             )
         horizon, policy, step = ctx.horizon, _Policy(ctx.horizon, ctx.learns), ctx.horizon.step
         saved = iter(ctx.saved_tensors)
-        policy.weights = _take(saved, len(policy.weights))
-        steps = [(*(_take(saved, count) for count in counts), next(saved)) for counts in ctx.shapes]
+        policy.weights = [*islice(saved, len(policy.weights))]
+        steps = [(*([*islice(saved, count)] for count in counts), next(saved)) for counts in ctx.shapes]
         # A tensor for each: a compiler would count on two being one.
         zeros = [torch.zeros(shape, dtype=dtype, device=device) for shape, dtype, device in ctx.like]
         restarted = {t: who for t, _, who in horizon.restarts}
@@ -274,10 +274,6 @@ class _Policy:
         grads = program.policy.weight_gradient(traces)
         self.total = grads if self.total is None else [a + b for a, b in zip(self.total, grads, strict=True)]
         self.steps = []
-
-
-def _take(values: Iterator[Tensor], count: int) -> list[Tensor]:
-    return [next(values) for _ in range(count)]
 
 
 def _stack(steps: Any, dim: int) -> Tensor:

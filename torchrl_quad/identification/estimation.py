@@ -16,7 +16,6 @@ from pydantic import Field
 from torch import Tensor
 
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
-from torchrl_quad.dynamics.presets import is_number
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.files import replacing
 from torchrl_quad.identification.errors import TooShort
@@ -170,7 +169,7 @@ def _with_motors(
         nominal = float(np.mean(volts)) if volts else 1.0
         motors = MotorCommand(float(np.mean([carrying_speed(prior, x, nominal) for x in logs])), nominal)
     if delay is not None:
-        motors = dataclasses.replace(motors, delay=float(delay) if is_number(delay) else delay)
+        motors = dataclasses.replace(motors, delay=delay)
     return dataclasses.replace(prior, motor_command=motors), motors
 
 

@@ -14,8 +14,7 @@ from pydantic import Field
 from torch import Tensor
 
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams, load_drone, quaternion
-from torchrl_quad.dynamics.rigid_body import RigidBodyState, accelerations, rk4
-from torchrl_quad.dynamics.rotors import Rotors
+from torchrl_quad.dynamics.rigid_body import RigidBodyState, Rotors, accelerations, rk4
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.identification.errors import NoFlight, TooShort
 from torchrl_quad.identification.log import FlightLog

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.vector import is_traced
-from torchrl_quad.engine.compiling import Compiled
+from torchrl_quad.engine.program import Compiled
 from torchrl_quad.vision.primitives import KINDS, Primitives
 
 CHUNK = 2**16  # pairs of a ray and a solid that an eager flight handles at once: they fit into a cache

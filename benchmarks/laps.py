@@ -1,23 +1,14 @@
-"""Where a drone is wanted, and when: references of the tasks that ship, the quickest lap, and derivatives of any."""
-
-from __future__ import annotations
+"""The quickest lap of a race, as a reference for classical controllers: ``MPC(env, reference=racing(env))``."""
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchrl_quad.dynamics import QuadrotorParams
-from torchrl_quad.envs import HoveringEnv, LandingEnv, QuadrotorEnv, RacingEnv, TrackingEnv
-from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad import QuadrotorParams, RacingEnv
+from torchrl_quad.controllers.policy import Reference
 
-Reference = Callable[[dict[Any, Tensor], Tensor], Tensor]
-
-STENCIL = 0.03  # [s], between the points that derivatives are taken from: with less, rounding makes noise of the jerk
-# Landing: this fast [m/s] at this height [m], which lies below that of success; higher up faster, by the rate [1/s].
-LANDING_SPEED, LANDING_HEIGHT, LANDING_RATE = 0.15, 0.1, 1.1
 CATCH_UP = 0.15  # of the speed of the lap, by which the reference runs ahead of a drone that is slower
 # Laps:
 THRUST_SHARE, RATE_SHARE = 0.9, 0.9  # of the greatest thrust and body rate; the rest is left to the feedback
@@ -28,86 +19,12 @@ WEIGHTS = (300.0, 3_000.0, 30_000.0)  # of what breaks a limit, one after the ot
 POINTS = 33  # in the table of each stretch between two gates
 
 
-class Motion(NamedTuple):
-    """A reference and its derivatives in time, each (num_envs, T, 3), world frame."""
-
-    position: Tensor  #: [m]
-    velocity: Tensor  #: [m/s]
-    acceleration: Tensor  #: [m/s2]
-    jerk: Tensor  #: [m/s3]
-
-
-def follow(reference: Reference, state: dict[Any, Tensor], times: Tensor) -> Motion:
-    """A reference at times (T) [s] from now, with its derivatives by central differences over five points."""
-    h = STENCIL
-    around = torch.arange(-2.0, 3.0).to(times) * h
-    points = reference(state, (times[:, None] + around).flatten())
-    a, b, now, d, e = points.unflatten(1, (len(times), 5)).unbind(2)
-    return Motion(
-        now,
-        (8.0 * (d - b) - (e - a)) / (12.0 * h),
-        (16.0 * (b + d) - (a + e) - 30.0 * now) / (12.0 * h**2),
-        (e - a - 2.0 * (d - b)) / (2.0 * h**3),
-    )
-
-
-def task_reference(env: QuadrotorEnv, lead: float, name: str) -> Reference:
-    """The reference of a task; the action takes effect ``lead`` [s] from now, and the state is the drone's then."""
-    for task, make in REFERENCES.items():
-        if isinstance(env, task):
-            return make(env, lead)
-    raise UserValueError(
-        f"{name} has no reference for {type(env).__name__}. Write {name}(env, reference=function), with a function "
-        "from the state and times (T) [s] to positions (num_envs, T, 3) [m], such as "
-        'lambda state, t: state["target"].unsqueeze(1).expand(-1, len(t), 3).'
-    )
-
-
-def check_reference(reference: Any, env: QuadrotorEnv) -> None:
-    """Raise a ValueError for what is no reference: it must give the positions at two times in a safe state."""
-    rule = "reference is a function from the state and times (T) [s] to positions (num_envs, T, 3) [m]"
-    if not callable(reference):
-        raise UserValueError(f"{rule}; got {shown(reference)}.")
-    state = {key: x.clone() for key, x in env.control_step.safe_state.items()}
-    like = state["position"]
-    try:
-        points = reference(state, like.new_tensor((0.0, 0.1)))
-    except Exception as error:
-        raise UserValueError(f"{rule}; given two times it failed: {error}") from error
-    if not isinstance(points, Tensor) or points.shape != (len(like), 2, 3) or points.dtype != like.dtype:
-        got = f"{tuple(points.shape)}, {points.dtype}" if isinstance(points, Tensor) else type(points).__name__
-        raise UserValueError(f"{rule}, here ({len(like)}, 2, 3), {like.dtype}; it made {got}.")
-
-
-def hovering(env: HoveringEnv, lead: float) -> Reference:
-    """The target."""
-    return lambda state, t: state["target"].unsqueeze(1).expand(-1, len(t), 3)
-
-
-def tracking(env: TrackingEnv, lead: float) -> Reference:
-    """The point that runs along the curve."""
-    curve, rate = env.curve, env.phase_rate
-    return lambda state, t: curve(state["phase"] + rate * t)
-
-
-def landing(env: LandingEnv, lead: float) -> Reference:
-    """Above the target, and from the height of the drone down, ever more slowly."""
-    bottom = LANDING_HEIGHT - LANDING_SPEED / LANDING_RATE
-
-    def reference(state: dict[Any, Tensor], t: Tensor) -> Tensor:
-        above = (state["position"][:, 2:] - bottom).clamp_min(0.0)
-        height = bottom + above * (-LANDING_RATE * (t - lead)).exp()
-        return torch.cat((state["target"][:, None, :2].expand(-1, len(t), 2), height.unsqueeze(-1)), -1)
-
-    return reference
-
-
-def racing(env: RacingEnv, lead: float) -> Reference:
+def racing(env: RacingEnv) -> Reference:
     """The quickest lap, from its point next to the drone on, and a little ahead of a slower drone.
 
     A drone that has missed its gate has to come back, and stop at the gate.
     """
-    lap = plan_lap(env.gates, env.nominal, env.track["gate_radius"])
+    lap, lead = plan_lap(env.gates, env.nominal, env.track["gate_radius"]), env.action_delay * env.control_dt
 
     def reference(state: dict[Any, Tensor], t: Tensor) -> Tensor:
         begin, is_missed = lap.locate(state["position"], state["gate"][:, 0], lead)
@@ -119,21 +36,10 @@ def racing(env: RacingEnv, lead: float) -> Reference:
     return reference
 
 
-REFERENCES: dict[type[QuadrotorEnv], Callable[[Any, float], Reference]] = {
-    HoveringEnv: hovering,
-    LandingEnv: landing,
-    RacingEnv: racing,
-    TrackingEnv: tracking,
-}
-
-
 class Lap:
-    """A closed path in time.
+    """A closed path of a period [s], from the coefficients (2 K + 1, 3) [m] of 1, K cosines and K sines.
 
-    Args:
-        coefficients: (2 K + 1, 3) [m], of 1, K cosines and K sines.
-        period: [s].
-        passes: when it passes the gates, (gates) [s], the first at zero, rising.
+    It passes the gates at the times ``passes`` (gates) [s], the first at zero, rising.
     """
 
     def __init__(self, coefficients: Tensor, period: float, passes: Tensor) -> None:
@@ -156,8 +62,7 @@ class Lap:
     def locate(self, position: Tensor, gate: Tensor, beyond: float) -> tuple[Tensor, Tensor]:
         """The time (n, 1) [s] at which it is next to positions (n, 3) [m] on the way to their next gates (n).
 
-        The time lies between the gate before and ``beyond`` [s] behind the gate, where the gate has been missed: the
-        second result, bool (n, 1).
+        Second, bool (n, 1), whether the gate has been missed: the time is then ``beyond`` [s] behind it.
         """
         nearest = (self.points[gate] - position.unsqueeze(1)).square().sum(-1).argmin(1, keepdim=True)
         t, low, high = self.times[gate].gather(1, nearest), self.times[gate, :1], self.times[gate, -1:] + beyond
@@ -172,15 +77,14 @@ def plan_lap(gates: Tensor, drone: QuadrotorParams, gate_radius: float) -> Lap:
     """Plan the quickest lap through gates (g, 3) [m] that leaves some thrust and body rate to the feedback.
 
     A quadrotor is differentially flat (Mellinger and Kumar 2011): a path with the acceleration a and the jerk j asks
-    for the thrust m |a + g| and, where the heading is free, for the body rate |(a + g) x j| / |a + g|^2. L-BFGS finds
-    the path, the times of the gates and the period that minimise the period, and a penalty on what breaks the limits
-    of the drone or misses the centre of a gate, from the smoothest path through all centres: near the best.
+    for the thrust m |a + g| and, where the heading is free, for the body rate |(a + g) x j| / |a + g|^2. L-BFGS
+    minimises the period and a penalty on what breaks the limits of the drone or misses the centre of a gate.
     """
-    low = {name: value.detach().double().amin().item() for name, value in drone.fields().items()}
-    centres = gates.detach().double().cpu()
-    gravity = centres.new_tensor((0.0, 0.0, low["gravity"]))
+    centres, least_gravity = gates.detach().double().cpu(), drone.gravity.detach().double().amin().item()
+    gravity = centres.new_tensor((0.0, 0.0, least_gravity))
     max_rate = RATE_SHARE * drone.max_body_rate[..., :2].amin().item()
-    max_thrust = THRUST_SHARE * low["max_thrust_to_weight"] * low["gravity"]  # per mass [m/s2]
+    most = drone.max_thrust_to_weight.detach().double().amin().item()
+    max_thrust = THRUST_SHARE * most * least_gravity  # per mass [m/s2]
     harmonics = HARMONICS * max(len(centres), 4)
     orders = torch.arange(1, harmonics + 1).to(centres)
     scale = torch.cat((orders.new_tensor([1e-3]), orders**3, orders**3)).unsqueeze(1)  # jerk costs alike in all

@@ -19,7 +19,7 @@ test: $(READY)
 # Build the documentation site; open docs/_build/html/index.html.
 docs: $(READY)
 	rm -rf docs/_api
-	$(BIN)/python -m sphinx -W --keep-going -n -q -c docs . docs/_build/html
+	$(BIN)/python -m sphinx -W --keep-going -n -q -j auto -c docs . docs/_build/html
 
 $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

@@ -1,17 +1,11 @@
-"""Rays per second of the depth camera on one core, compared with MuJoCo's ray casting.
+"""Rays per second of the depth camera on one core, compared with MuJoCo's ray casting: python -m benchmarks.camera
 
-python -m benchmarks.camera
-
-Trees are upright cylinders; the mixed scenes have a third each of balls, cylinders and boxes turned at random. Every
-camera has a scene of its own. MuJoCo casts the same rays, those of one camera in one call of ``mj_multiRay``, without
-normals. Time is that of the processor, so that other programs on the machine disturb little; the best of all rounds
-counts. Writes ``benchmarks/results/camera.csv``.
+Every camera has a scene of its own: upright cylinders, or a third each of balls, cylinders and boxes turned at random.
+Time is that of the processor; the best of all rounds counts.
 """
 
-import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -19,7 +13,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, save
+from benchmarks.report import command_line, save
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.vision import DepthCamera, Primitives
 
@@ -56,7 +50,6 @@ def fastest(function: Callable[[], object], rounds: int) -> float:
 
 
 def in_mujoco(solids: Primitives, i: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """One scene as a model of MuJoCo."""
     geoms = []
     for x, y, z, radius in solids.spheres[i].tolist():
         geoms.append(f'<geom type="sphere" size="{radius}" pos="{x} {y} {z}"/>')
@@ -111,14 +104,9 @@ def measure(name: str, count: int, n: int, width: int, height: int, rounds: int)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--primitives", type=int, nargs="+", default=[10, 30, 100])
-    parser.add_argument("--scenes", nargs="+", default=list(KINDS), choices=list(KINDS))
-    parser.add_argument("--images", nargs="+", default=["256x16x12", "16x64x48"], help="cameras x width x height")
-    parser.add_argument("--rounds", type=int, default=32)
-    parser.add_argument("--output", type=Path, default=RESULTS / "camera.csv")
-    args = parser.parse_args()
-    torch.set_num_threads(1)
+    images = ["256x16x12", "16x64x48"]  # cameras x width x height
+    options = {"primitives": [10, 30, 100], "scenes": list(KINDS), "images": images, "rounds": 32}
+    args = command_line(__doc__, "camera.csv", **options)
     cases = [
         (name, count, *map(int, image.split("x")))
         for name in args.scenes

@@ -1,11 +1,9 @@
 """Classical controllers beside learned policies: success, error, gates, and milliseconds per control step.
 
-python -m benchmarks.controllers --checkpoints outputs/.../checkpoint.pt ...
+python -m benchmarks.controllers --checkpoints outputs/.../checkpoint.pt ...   # and fills in docs/controllers.md
 
-All fly the same fresh starts with the same delay and limits, as the recipes configure each task. "Other drones" are the
-same starts with mass and motors drawn at random in each episode, which neither the controllers nor the policies know. A
-time is the median processor time of single calls with one drone. Writes ``benchmarks/results/controllers.csv`` row by
-row, leaves out what is there already, and fills in the table of docs/controllers.md.
+All fly the same fresh starts, as the recipes configure each task. In "other drones" mass and motors are drawn at random
+in each episode, which neither the controllers nor the policies know. A time is the median of single calls.
 """
 
 import argparse
@@ -20,10 +18,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from benchmarks.laps import racing
-from benchmarks.report import RESULTS, save
+from benchmarks.report import RESULTS, command_line, save
 from torchrl_quad import MPC, GeometricController
 from torchrl_quad.files import read_rows, replacing
 from torchrl_quad.training.building import build_env
+from torchrl_quad.training.configuration import compose
 from torchrl_quad.training.evaluation import evaluate, load_policy
 
 PAGE = Path(__file__).parents[1] / "docs/controllers.md"
@@ -34,14 +33,12 @@ OTHER_DRONES = {
     "thrust_map": {"scale": [0.9, 1.1]},
     "motor_time_constant": {"scale": [0.7, 1.3]},
 }
+TASKS = ["hovering", "tracking", "landing", "racing"]
 CONTROLLERS = {"geometric": GeometricController, "mpc": MPC}
 ERRORS = {"hovering": "position_error", "tracking": "tracking_rmse", "landing": "position_error"}
 
 
-def configuration(task: str, steps: int | None, **changes: Any) -> Any:
-    """What the recipes configure for a task, with changes of the environment."""
-    from torchrl_quad.training.configuration import compose
-
+def configuration(task: str, steps: int, **changes: Any) -> Any:
     cfg = compose("abpt", [f"task={task}"])
     for name, value in {**changes, **({"max_episode_steps": steps} if steps else {})}.items():
         cfg.env[name] = value
@@ -62,7 +59,6 @@ def milliseconds(env: EnvBase, policy: TensorDictModuleBase, calls: int) -> floa
 
 
 def measure(task: str, name: str, checkpoint: str | None, args: argparse.Namespace) -> dict[str, Any]:
-    """One row of the table."""
     learned = load_policy(Path(checkpoint)) if checkpoint else None
 
     def policy(env: EnvBase) -> TensorDictModuleBase:
@@ -89,18 +85,8 @@ def measure(task: str, name: str, checkpoint: str | None, args: argparse.Namespa
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The results in Markdown."""
-    head = [
-        "task",
-        "policy",
-        "starts",
-        "solved",
-        "error or gates",
-        "ms per step",
-        "other drones: solved",
-        "error or gates",
-    ]
-    lines = [head, ["---"] * len(head)]
+    head = "task | policy | starts | solved | error or gates | ms per step | other drones: solved | error or gates"
+    lines = [head.split(" | "), ["---"] * 8]
     for row in rows:
         solved, reached = [], []
         for suffix in ("", ", other drones"):
@@ -108,25 +94,16 @@ def table(rows: list[dict[str, Any]]) -> str:
             solved.append(f"{float(row[f'solved{suffix}']):.1%}" if row.get(f"solved{suffix}") else "")
             racing = f"{float(gates):.1f} gates, lap {float(lap):.2f} s" if gates else ""
             reached.append(racing or (f"{float(error):.1f} cm" if error else ""))
-        names = {"geometric": "geometric", "mpc": "MPC"}
-        name = names.get(row["policy"], f"{row['policy'].upper()}, learned")
-        lines.append([row["task"], name, str(row["starts"]), solved[0], reached[0], f"{float(row['ms per step']):.1f}"])
-        lines[-1] += [solved[1], reached[1]]
+        name = {"geometric": "geometric", "mpc": "MPC"}.get(row["policy"], f"{row['policy'].upper()}, learned")
+        cells = [row["task"], name, str(row["starts"]), solved[0], reached[0], f"{float(row['ms per step']):.1f}"]
+        lines.append([*cells, solved[1], reached[1]])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tasks", nargs="+", default=["hovering", "tracking", "landing", "racing"])
-    parser.add_argument("--controllers", nargs="*", default=list(CONTROLLERS), choices=list(CONTROLLERS))
-    parser.add_argument("--checkpoints", nargs="*", default=[], help="learned policies, of any of these tasks")
-    parser.add_argument("--starts", type=int, default=256)
-    parser.add_argument("--mpc-starts", type=int, default=64, help="fewer: it thinks long")
-    parser.add_argument("--steps", type=int, help="of an episode; by default as the recipes have it")
-    parser.add_argument("--calls", type=int, default=100)
-    parser.add_argument("--output", type=Path, default=RESULTS / "controllers.csv")
-    args = parser.parse_args()
-    torch.set_num_threads(1)
+    options = {"tasks": TASKS, "controllers": list(CONTROLLERS), "checkpoints": [], "starts": 256, "calls": 100}
+    options |= {"mpc_starts": 64, "steps": 0}  # it thinks long; 0 is an episode as the recipes have it
+    args = command_line(__doc__, "controllers.csv", **options)
     trained = [(cfg.task, cfg.algorithm, path) for path in args.checkpoints for cfg in [load_policy(Path(path))[0]]]
     jobs = [(task, name, path) for task, name, path in trained if task in args.tasks]
     jobs += [(task, name, None) for name in args.controllers for task in args.tasks]
@@ -134,13 +111,11 @@ def main() -> None:
     for job in jobs:
         if not any((row["task"], row["policy"]) == job[:2] for row in rows):
             rows.append(measure(*job, args))
-            order = ["hovering", "tracking", "landing", "racing"]
-            save(args.output, sorted(rows, key=lambda row: (order.index(row["task"]), row["policy"])))
+            save(args.output, sorted(rows, key=lambda row: (TASKS.index(row["task"]), row["policy"])))
     if args.output == RESULTS / "controllers.csv":
-        text = re.sub(f"{MARKER}.*?{END}", lambda _: f"{MARKER}\n\n{table(read_rows(args.output))}\n\n{END}",
-                      PAGE.read_text(), flags=re.DOTALL)  # fmt: skip
+        block = f"{MARKER}\n\n{table(read_rows(args.output))}\n\n{END}"
         with replacing(PAGE) as temporary:
-            temporary.write_text(text)
+            temporary.write_text(re.sub(f"{MARKER}.*?{END}", lambda _: block, PAGE.read_text(), flags=re.DOTALL))
 
 
 if __name__ == "__main__":

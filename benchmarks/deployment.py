@@ -1,14 +1,11 @@
 """How far torch, ONNX and C differ on what a policy has visited, and how long a call takes.
 
-python -m benchmarks.deployment --checkpoints outputs/.../checkpoint.pt ...
+python -m benchmarks.deployment --checkpoints outputs/.../checkpoint.pt ...   # without them, untrained policies
 
-Each policy is exported as it is, and once more behind an ObservationNormalizer. Fresh flights give the observations. A
-time is the median over single calls from Python: of C with what ctypes takes, of the bundle from the named quantities
-to newtons and radians per second. Without checkpoints, the policies are untrained.
-Writes ``benchmarks/results/deployment.csv``.
+Each policy is exported as it is, and once more behind an ObservationNormalizer. A time is the median of single calls
+from Python: of C with what ctypes takes, of the bundle from the named quantities to newtons and radians per second.
 """
 
-import argparse
 import ctypes
 import subprocess
 import tempfile
@@ -24,10 +21,12 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, save
+from benchmarks.report import command_line, save
 from torchrl_quad import ObservationNormalizer, differentiable_rollout, make_actor, make_env, make_visual_actor
 from torchrl_quad.deploy import export_policy, load_bundle
 from torchrl_quad.envs import TASKS
+from torchrl_quad.training.building import build_env
+from torchrl_quad.training.evaluation import load_policy
 
 GCC = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
 ENVS = 64
@@ -38,9 +37,6 @@ def build(source: str) -> tuple[EnvBase, TensorDictModuleBase]:
     if source in TASKS:
         env = make_env(source, num_envs=ENVS, seed=7)
         return env, (make_visual_actor if "depth" in env.observation_spec else make_actor)(env)
-    from torchrl_quad.training.building import build_env
-    from torchrl_quad.training.evaluation import load_policy
-
     cfg, actor, normalizer = load_policy(Path(source))
     if normalizer is not None:
         raise SystemExit(f"{source} has a normaliser already: give checkpoints without one.")
@@ -52,16 +48,11 @@ def normalized(env: EnvBase, actor: TensorDictModuleBase) -> EnvBase:
     """The environment behind a normaliser; the first layer of the policy changes so that it does the same as before."""
     env = TransformedEnv(env, ObservationNormalizer(env))
     env.transform.update(fly(env.base_env, actor))
-    network, normalizer = actor[0][0].module.trunk if is_visual(actor) else actor[0].module, env.transform
+    network, normalizer = actor[0][0].module.trunk if "depth" in actor.in_keys else actor[0].module, env.transform
     first, size = network.mlp[0], len(normalizer.loc)  # the observation is the last that it reads
     first.bias.add_(first.weight[:, -size:] @ (network.scales[-1] * normalizer.loc))
     first.weight[:, -size:].mul_(normalizer.scale)
     return env
-
-
-def is_visual(actor: TensorDictModuleBase) -> bool:
-    """Whether a policy reads images."""
-    return "depth" in actor.in_keys
 
 
 @torch.no_grad()
@@ -72,7 +63,6 @@ def fly(env: EnvBase, actor: TensorDictModuleBase) -> Any:
 
 
 def median_us(call: Callable[[], Any], calls: int) -> float:
-    """The median duration of a call [us]."""
     durations = []
     for _ in range(calls):
         begin = time.perf_counter()
@@ -82,7 +72,6 @@ def median_us(call: Callable[[], Any], calls: int) -> float:
 
 
 def measure(source: str, with_normalizer: bool, count: int, calls: int) -> dict[str, Any]:
-    """Differences and times of one policy."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     env, actor = build(source)
@@ -107,7 +96,7 @@ def measure(source: str, with_normalizer: bool, count: int, calls: int) -> dict[
         ends = [z.ctypes.data_as(pointer) for z in (*x, y)]
         policy(*ends)
     still = {"position": [1.0, 0.0, 1.4], "quaternion": [1.0, 0, 0, 0], "velocity": np.zeros(3)}
-    image = {"depth": raw["depth"][0], "depth_age": 0.0} if is_visual(actor) else {}
+    image = {"depth": raw["depth"][0], "depth_age": 0.0} if "depth" in actor.in_keys else {}
     state = {**still, "angular_velocity": np.zeros(3), "age": 0.0, **image}
     return {
         "task": bundle.contract["task"]["name"],
@@ -123,12 +112,7 @@ def measure(source: str, with_normalizer: bool, count: int, calls: int) -> dict[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--checkpoints", nargs="+", default=list(TASKS), help="paths, or names of tasks")
-    parser.add_argument("--observations", type=int, default=10_000)
-    parser.add_argument("--calls", type=int, default=10_000)
-    parser.add_argument("--output", type=Path, default=RESULTS / "deployment.csv")
-    args = parser.parse_args()
+    args = command_line(__doc__, "deployment.csv", checkpoints=list(TASKS), observations=10_000, calls=10_000)
     cases = [(source, normalizer) for source in args.checkpoints for normalizer in (False, True)]
     save(args.output, [measure(*case, args.observations, args.calls) for case in tqdm(cases)])
 

@@ -1,23 +1,20 @@
 """Fit simulated flights whose truth is known: how close does the fit come, and do its intervals hold the truth?
 
-python -m benchmarks.identification            # ten flights: minutes; writes results/identification.csv
-python -m benchmarks.identification --seeds 1
+python -m benchmarks.identification            # ten flights: minutes
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import time
-from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.signal import savgol_filter
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, save
+from benchmarks.report import command_line, save
 from torchrl_quad import QuadrotorParams, load_drone
 from torchrl_quad.dynamics import MotorCommand, quaternion
 from torchrl_quad.dynamics.control import make_controller
@@ -29,17 +26,6 @@ from torchrl_quad.identification import FlightLog, identify
 STEP = 0.001  # [s], of the simulated truth
 CONTROL = 2  # steps of the on-board controller's loop: 500 Hz
 SAMPLE = 10  # steps between samples of the log: 100 Hz
-WANTED = {  # how close the fit should come
-    "k2/m": 0.01,
-    "motor_time_constant": 0.05,
-    "arm k2/Jx": 0.03,
-    "arm k2/Jy": 0.03,
-    "kappa k2/Jz": 0.05,
-    "drag xy/m": 0.10,
-    "drag z/m": 0.10,
-    "command_delay": 0.01,  # [s], as a difference
-    "stream_delay": 0.01,
-}
 NOISE = {"position": 1e-3, "attitude": 3e-3, "gyro": 2e-2, "bias": 1e-2, "voltage": 1e-2}  # m, rad, rad/s, rad/s, V
 
 
@@ -194,26 +180,18 @@ def fit(seed: int, seconds: float = 20.0) -> list[dict[str, object]]:
 
 def table(rows: list[dict[str, object]]) -> str:
     """One line for each parameter: worst and median error, how many intervals hold the truth."""
-    lines = ["| parameter | wanted | median error | worst | intervals that hold the truth |", "|---|---|---|---|---|"]
+    lines = ["| parameter | median error | worst | intervals that hold the truth |", "|---|---|---|---|"]
     for name in dict.fromkeys(str(row["parameter"]) for row in rows):
         own = [row for row in rows if row["parameter"] == name and row.get("value") not in (None, "")]
         kind, scale, unit = ("error", 1e3, " ms") if name.endswith("delay") else ("relative", 1e2, " %")
         errors = [abs(float(row[kind])) * scale for row in own] or [math.nan]
-        wanted = f"{WANTED[name] * scale:g}{unit}" if name in WANTED else ""
         holds = sum(int(row["holds"]) for row in own)
-        lines.append(
-            f"| {name} | {wanted} | {np.median(errors):.2g}{unit} | {max(errors):.2g}{unit} | {holds} of {len(own)} |"
-        )
+        lines.append(f"| {name} | {np.median(errors):.2g}{unit} | {max(errors):.2g}{unit} | {holds} of {len(own)} |")
     return "\n".join(lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(10)))
-    parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--output", type=Path, default=RESULTS / "identification.csv")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
+    options = command_line(__doc__, "identification.csv", seeds=list(range(10)), seconds=20.0)
     rows = [row for row in read_rows(options.output) if row["seed"] not in map(str, options.seeds)]
     for seed in tqdm(options.seeds):
         rows += fit(seed, options.seconds)

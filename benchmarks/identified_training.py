@@ -3,8 +3,7 @@
     python -m benchmarks.identified_training --drones before=old.yaml fitted=outputs/real_flights/fitted/drone.yaml \\
         --randomize fitted=outputs/real_flights/fitted/randomization.yaml --judge outputs/judge/drone.yaml
 
-Each policy flies with the controller of the drone that it was trained on, as it would on board. Writes
-``benchmarks/results/identified_training.csv``.
+Each policy flies with the controller of the drone that it was trained on, as it would on board.
 """
 
 from __future__ import annotations

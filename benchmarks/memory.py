@@ -2,17 +2,10 @@
 
 python -m benchmarks.memory --num-envs 1024
 
-=========  =============================================================================================
-eager      autograd keeps every intermediate result
-recompute  the eager step under ``torch.utils.checkpoint``: only its input is kept, it is done again backward
-compiled   the compiled step keeps the states between its physics steps, and does those again backward
-=========  =============================================================================================
-
-The memory is what the process (on Linux) has gained between the start of a horizon and its end. Writes
-``benchmarks/results/memory.csv``.
+In the mode "recompute" the eager step keeps only its input, and is done again backward (torch.utils.checkpoint). The
+memory is what the process (on Linux) has gained between the start of a horizon and its end.
 """
 
-import argparse
 import functools
 import gc
 import os
@@ -21,24 +14,16 @@ from pathlib import Path
 
 import torch
 from torch.utils.checkpoint import checkpoint
-from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, in_own_process, save
+from benchmarks.report import command_line, in_own_process, save
 from torchrl_quad import ActionSequence, differentiable_rollout, make_env
 
 MODES = ["eager", "recompute", "compiled"]
 
 
 def resident() -> int:
-    """Memory of this process [byte]."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
-def recompute(env: EnvBase) -> None:
-    """Let an environment keep only the input of each step."""
-    once = env._stepper.step
-    env._stepper.step = functools.partial(checkpoint, once, use_reentrant=False)
 
 
 def measure(mode: str, n: int, horizon: int, rounds: int) -> dict[str, float | str]:
@@ -46,7 +31,7 @@ def measure(mode: str, n: int, horizon: int, rounds: int) -> dict[str, float | s
     torch.set_num_threads(1)
     env = make_env("hovering", num_envs=n, compile=mode == "compiled")
     if mode == "recompute":
-        recompute(env)
+        env._stepper.step = functools.partial(checkpoint, env._stepper.step, use_reentrant=False)
     start = env.reset()
 
     def fly(steps: int) -> dict[str, float]:
@@ -71,13 +56,7 @@ def measure(mode: str, n: int, horizon: int, rounds: int) -> dict[str, float | s
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--num-envs", type=int, default=1024)
-    parser.add_argument("--modes", nargs="+", default=MODES, choices=MODES)
-    parser.add_argument("--horizon", type=int, default=32)
-    parser.add_argument("--rounds", type=int, default=4)
-    parser.add_argument("--output", type=Path, default=RESULTS / "memory.csv")
-    args = parser.parse_args()
+    args = command_line(__doc__, "memory.csv", num_envs=1024, modes=MODES, horizon=32, rounds=4)
     rows = [in_own_process(measure, mode, args.num_envs, args.horizon, args.rounds) for mode in tqdm(args.modes)]
     save(args.output, rows, num_envs=args.num_envs, horizon=args.horizon)
 

@@ -1,12 +1,8 @@
-"""What a training iteration spends its time on, per algorithm.
+"""What a training iteration spends its time on, per algorithm: per cent of its wall-clock time.
 
 python -m benchmarks.profile_recipes --algorithms bptt abpt --overrides num_envs=256 horizon=32
-
-Runs the recipes themselves, with clocks around their parts; a clock stops while one inside it runs. Writes
-``benchmarks/results/profile.csv``: per cent of the wall-clock time of the iterations, evaluations left out.
 """
 
-import argparse
 import functools
 import runpy
 import sys
@@ -19,7 +15,7 @@ import torch
 from tensordict.nn import ProbabilisticTensorDictSequential
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, in_own_process, save
+from benchmarks.report import command_line, in_own_process, save
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -124,13 +120,9 @@ def profile(algorithm: str, overrides: list[str], skip: int, iterations: int) ->
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--algorithms", nargs="+", default=["bptt", "shac", "abpt"], choices=["bptt", "shac", "abpt"])
-    parser.add_argument("--overrides", nargs="*", default=["num_envs=256", "horizon=32", "compile=true"])
-    parser.add_argument("--iterations", type=int, default=20)
-    parser.add_argument("--skip", type=int, default=5, help="iterations before the clocks start")
-    parser.add_argument("--output", type=Path, default=RESULTS / "profile.csv")
-    args = parser.parse_args()
+    overrides = ["num_envs=256", "horizon=32", "compile=true"]
+    options = {"algorithms": ["bptt", "shac", "abpt"], "overrides": overrides, "iterations": 20, "skip": 5}
+    args = command_line(__doc__, "profile.csv", **options)
     rows = [
         in_own_process(profile, algorithm, args.overrides, args.skip, args.iterations)
         for algorithm in tqdm(args.algorithms)

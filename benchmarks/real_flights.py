@@ -1,14 +1,12 @@
 """Fit a drone to real flights, and judge it on flights of other shapes, next to what published drones predict.
 
-    python -m benchmarks.real_flights --flights FOLDER    # minutes; writes results/real_flights.csv
+python -m benchmarks.real_flights --flights FOLDER    # minutes
 
-The rows: constant velocity, the preset before and after, the parameters that others published, the fit, and a small
-network that learns on the same flights what the fitted physics leaves out.
+The last row is a small network that learns on the same flights what the fitted physics leaves out.
 """
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, save
+from benchmarks.report import command_line, save
 from torchrl_quad import QuadrotorParams, load_drone
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.rigid_body import RigidBodyState
@@ -150,13 +148,8 @@ def read_all(folder: Path) -> dict[str, FlightLog]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--flights", type=Path, required=True, help="folder of the logs")
-    parser.add_argument("--network-steps", type=int, default=300)
-    parser.add_argument("--output", type=Path, default=RESULTS / "real_flights.csv")
-    parser.add_argument("--folder", type=Path, default=Path("outputs/real_flights"), help="where the fits are saved")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
+    folders = {"flights": Path("flights"), "folder": Path("outputs/real_flights")}  # of logs, and where fits are saved
+    options = command_line(__doc__, "real_flights.csv", network_steps=300, **folders)
     logs = read_all(options.flights)
     judged = [log for name, log in logs.items() if any(shape in name for shape in JUDGED)]
     fitted = [log for name, log in logs.items() if not any(shape in name for shape in JUDGED)]

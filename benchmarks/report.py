@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import csv
+import argparse
 import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -11,9 +11,21 @@ from typing import Any
 
 import torch
 
-from torchrl_quad.files import machine, replacing
+from torchrl_quad.files import machine, write_rows
 
 RESULTS = Path(__file__).parent / "results"
+
+
+def command_line(doc: str, output: str, **options: Any) -> argparse.Namespace:
+    """The options of a program with their defaults, which give their types; those with a list take several values."""
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
+    for name, default in options.items():
+        several = isinstance(default, list)
+        kind, count = type((default or [""])[0] if several else default), {"nargs": "*"} if several else {}
+        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, default=default, **count)
+    parser.add_argument("--output", type=Path, default=RESULTS / output)
+    torch.set_num_threads(1)
+    return parser.parse_args()
 
 
 def save(path: Path, rows: list[dict[str, Any]], **about: Any) -> None:
@@ -23,11 +35,7 @@ def save(path: Path, rows: list[dict[str, Any]], **about: Any) -> None:
     widths = [max(len(str(row.get(key, ""))) for row in [*rows, {key: key}]) for key in columns]
     for row in [dict(zip(columns, columns, strict=True)), *rows]:
         print("  ".join(str(row.get(key, "")).rjust(width) for key, width in zip(columns, widths, strict=True)))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary, open(temporary, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys([*columns, *about])))
-        writer.writeheader()
-        writer.writerows({**about, **row} for row in rows)
+    write_rows(path, [{name: ({**about, **row}).get(name, "") for name in [*columns, *about]} for row in rows])
     print(f"\n{path}: {about}")
 
 

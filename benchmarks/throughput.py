@@ -2,30 +2,16 @@
 
 python -m benchmarks.throughput --num-envs 64 256 1024 --threads 1
 
-==========  ============================================================================================
-physics     the control step alone: rate controller, rotors and rigid body, four physics steps
-env         the whole environment through ``differentiable_rollout``, with fixed actions
-point mass  the same with ``dynamics="point_mass"``
-actor       the environment with a 64-64 policy
-called      the same with a policy that is called before each step, as policies of other classes are
-torchrl     the same through TorchRL's own loop, which transforms and other policies fall back to
-step        one eager ``env.step`` after another: racing with gusts and noisy sensors, fixed actions
-crazyflow   its body-rate model (JAX), ten substeps, where it is installed: pip install crazyflow
-==========  ============================================================================================
-
-All of one size are timed in turns, round after round, and the best round counts. Writes
-``benchmarks/results/throughput.csv`` size by size, and leaves out what is there already.
+Cases of one size are timed in turns, round after round, and the best round counts. What is there already is left out.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import itertools
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -35,7 +21,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, save
+from benchmarks.report import command_line, save
 from torchrl_quad import ActionSequence, differentiable_rollout, make_actor, make_env
 from torchrl_quad.engine import Stepper, Transition
 from torchrl_quad.engine.policy import GivenActions
@@ -64,8 +50,6 @@ class Physics:
         start = self.stepper.example._replace(state=self.stepper.layout.pack(self.start))
         flight = self.stepper.fly(GivenActions(lambda _: actions), start, self.valid, len(actions), dict)
         return flight.ends.state.floats[-1].sum()
-
-    # -- for the engine ------------------------------------------------------------------------------------------------
 
     def example(self) -> tuple[State, State]:
         return self.start, self.outputs(self.start)
@@ -189,16 +173,9 @@ def measure(n: int, mode: str, task: str, horizon: int, rounds: int, device: str
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--num-envs", type=int, nargs="+", default=[64, 256, 1024, 4096, 16384])
-    parser.add_argument("--modes", nargs="+", default=["compiled", "eager"], choices=["compiled", "eager"])
-    parser.add_argument("--task", default="hovering")
-    parser.add_argument("--horizon", type=int, default=32)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--output", type=Path, default=RESULTS / "throughput.csv")
-    args = parser.parse_args()
+    sizes, options = [64, 256, 1024, 4096, 16384], {"task": "hovering", "horizon": 32, "device": "cpu"}
+    modes = ["compiled", "eager"]
+    args = command_line(__doc__, "throughput.csv", num_envs=sizes, modes=modes, rounds=5, threads=1, **options)
     torch.set_num_threads(args.threads)
     rows = read_rows(args.output)
     for mode, n in tqdm(list(itertools.product(args.modes, args.num_envs))):

@@ -2,13 +2,10 @@
 
 python -m benchmarks.time_to_solve --algorithms abpt --seeds 0 1 2
 
-Runs the recipes, and takes the first evaluation, on fresh starts, in which at least 99 % of the episodes succeed.
-Nothing is left out of the clock: imports, compilation and evaluations count. "Cold" is an empty compile cache. Writes
-``benchmarks/results/time_to_solve.csv`` run by run, and leaves out what is there already.
+It is solved in the first evaluation in which at least 99 % of the episodes succeed. Imports, compilation and
+evaluations count. "Cold" is an empty compile cache. What is there already is left out.
 """
 
-import argparse
-import csv
 import itertools
 import os
 import subprocess
@@ -19,7 +16,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks.report import RESULTS, save
+from benchmarks.report import command_line, save
 from torchrl_quad.files import read_rows
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -39,26 +36,18 @@ def solve(algorithm: str, seed: int, overrides: list[str], cache: Path) -> float
         ) as run:
             while True:
                 ended = run.poll() is not None
-                if metrics.exists():
-                    with open(metrics, newline="") as file:
-                        rows = list(csv.DictReader(file))
-                    if any(row["eval/solved"] and float(row["eval/solved"]) >= 0.99 for row in rows):
-                        seconds = time.perf_counter() - start
-                        run.kill()
-                        return seconds
+                if any(float(row["eval/solved"] or "nan") >= 0.99 for row in read_rows(metrics)):
+                    seconds = time.perf_counter() - start
+                    run.kill()
+                    return seconds
                 if ended:
                     return None
                 time.sleep(0.05)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--algorithms", nargs="+", default=["bptt", "shac", "abpt"])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--modes", nargs="+", default=["eager", "cold", "warm"], choices=["eager", "cold", "warm"])
-    parser.add_argument("--overrides", nargs="*", default=["eval.interval=5"])
-    parser.add_argument("--output", type=Path, default=RESULTS / "time_to_solve.csv")
-    args = parser.parse_args()
+    options = {"algorithms": ["bptt", "shac", "abpt"], "seeds": [0], "modes": ["eager", "cold", "warm"]}
+    args = command_line(__doc__, "time_to_solve.csv", overrides=["eval.interval=5"], **options)
     rows = read_rows(args.output)
     with tempfile.TemporaryDirectory() as cache:
         # "warm" follows "cold", and finds its cache.

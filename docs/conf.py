@@ -24,7 +24,7 @@ version = release = torchrl_quad.__version__
 root_doc = "docs/index"
 include_patterns = ["docs/**.md", "docs/_api/*.rst", "recipes/README.md", "CONTRIBUTING.md"]
 include_patterns += ["examples/*", "examples/data/README.md"]
-exclude_patterns = ["docs/_build"]
+exclude_patterns = ["docs/_build", ".venv", ".git"]
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",

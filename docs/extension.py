@@ -92,6 +92,11 @@ def link_to_sources(app: Sphinx, doctree: nodes.document) -> None:
             node.replace_self(nodes.reference("", "", *node.children, internal=True, refuri=uri))
 
 
+def merge_sources(app: Sphinx, env: BuildEnvironment, docnames: object, other: BuildEnvironment) -> None:
+    """Keep the files to which the pages link that another process has read."""
+    vars(env).setdefault("linked_files", set()).update(getattr(other, "linked_files", ()))
+
+
 def source_pages(app: Sphinx) -> Iterator[tuple[str, dict[str, Any], str]]:
     """Show the files to which pages link."""
     for name in sorted(getattr(app.env, "linked_files", ())):
@@ -229,6 +234,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("source-read", add_examples)
     app.connect("doctree-read", link_to_sources, priority=400)  # before downloads are collected
     app.connect("doctree-read", leave_out_of_navigation, priority=400)
+    app.connect("env-merge-info", merge_sources)
     app.connect("html-collect-pages", source_pages)
     app.connect("build-finished", write_race)
     app.connect("html-page-context", share_navigation, priority=400)  # before the theme asks for it
@@ -237,4 +243,4 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("autodoc-before-process-signature", show_plain_types)
     app.connect("autodoc-process-signature", show_constructor)
     app.connect("env-updated", add_short_names)
-    return {"parallel_read_safe": False}
+    return {"parallel_read_safe": True}

@@ -19,20 +19,10 @@ def main(cfg: DictConfig) -> None:
         print(log)
     settings = OmegaConf.to_container(cfg)
     known = dict(settings["known"] or {}) | ({} if cfg.mass is None else {"mass": cfg.mass})
+    options = {name: cfg[name] for name in ("past", "horizon", "iterations", "draws", "seed")}
     folder = make_folder(cfg.folder)
-    result = identify(
-        logs,
-        settings["drone"],
-        known,
-        settings["fields"],
-        past=cfg.past,
-        horizon=cfg.horizon,
-        iterations=cfg.iterations,
-        draws=cfg.draws,
-        seed=cfg.seed,
-        progress=True,
-        checkpoint=folder / "checkpoint.json",
-    )
+    options |= {"progress": True, "checkpoint": folder / "checkpoint.json"}
+    result = identify(logs, settings["drone"], known, settings["fields"], **options)
     print(result)
     result.save(folder)
     print(f"{folder}: python recipes/abpt.py env.drone={folder}/drone.yaml env.randomize={folder}/randomization.yaml")

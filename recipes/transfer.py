@@ -24,8 +24,7 @@ from typing import Any
 from torchrl_quad.deploy import load_bundle
 from torchrl_quad.deploy.contract import naming
 from torchrl_quad.deploy.simulators import simulator_class
-from torchrl_quad.deploy.table import measure, table
-from torchrl_quad.deploy.transfer import MUTANTS
+from torchrl_quad.deploy.transfer import MUTANTS, measure, table
 from torchrl_quad.errors import MissingPackage, UserError, UserValueError, shown
 from torchrl_quad.files import make_folder
 
@@ -69,15 +68,11 @@ def settings(arguments: list[str]) -> dict[str, Any]:
         if name in cfg:
             raise UserValueError(f"{name} is given twice. Give it once.")
         read, default = SETTINGS[name]
-        cfg[name] = default if value in ("", "null") else read(name, value)
+        cfg[name] = default if value in ("", "null") else read(name, value) if read else value
     cfg = {name: default for name, (_, default) in SETTINGS.items()} | cfg
     if cfg["bundle"] is None:
         raise UserValueError("bundle is missing: write bundle=FOLDER, of a policy that recipes/export.py has written.")
     return cfg
-
-
-def text(name: str, value: str) -> str:
-    return value
 
 
 def flag(name: str, value: str) -> bool:
@@ -106,15 +101,15 @@ def factors(name: str, value: str) -> dict[str, float]:
     return found
 
 
-SETTINGS: dict[str, tuple[Any, Any]] = {  # how each is read, and its default
-    "bundle": (text, None),
-    "simulator": (text, "mujoco"),
-    "loop": (text, None),
+SETTINGS: dict[str, tuple[Any, Any]] = {  # how each is read, if it is not text, and its default
+    "bundle": (None, None),
+    "simulator": (None, "mujoco"),
+    "loop": (None, None),
     "mutants": (flag, False),
     "scale": (factors, {}),
     "late": (whole, 0),
     "episodes": (whole, None),
-    "folder": (text, None),
+    "folder": (None, None),
     "pictures": (flag, False),
 }
 

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import time
 
 import numpy as np
 import pytest
@@ -65,22 +66,13 @@ def open_page(browser):
         def step(self):
             return int(self.page.locator("#time").input_value())
 
-        def wait(self, condition):
-            """Waits until a condition on the ``step`` of the slider holds."""
+        def wait(self, holds):
+            """Waits until a condition on the step of the slider holds."""
             # Not page.wait_for_function, which evaluates a string in the page: its policy does not allow that.
-            done = self.page.evaluate(
-                """(deadline) => new Promise((done) => {
-                    deadline += performance.now();
-                    requestAnimationFrame(function look() {
-                        const step = Number(document.getElementById("time").value);
-                        const holds = CONDITION;
-                        if (holds || performance.now() > deadline) done(holds);
-                        else requestAnimationFrame(look);
-                    });
-                })""".replace("CONDITION", condition),
-                TIMEOUT,
-            )
-            assert done, f"{condition} did not become true"
+            deadline = time.monotonic() + TIMEOUT / 1000
+            while not holds(self.step()):
+                assert time.monotonic() < deadline
+                self.page.wait_for_timeout(20)
 
         def series(self):
             """The names of the curves, and of the panels."""

@@ -2,9 +2,11 @@
 
 import ctypes
 import functools
+import json
 import subprocess
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from filelock import FileLock
@@ -14,6 +16,7 @@ from torchrl.envs import TransformedEnv
 
 from torchrl_quad import ObservationNormalizer, make_actor, make_env, make_visual_actor
 from torchrl_quad.deploy import export, export_policy
+from torchrl_quad.deploy.tracing import Rules, name_of
 
 # torch.onnx builds its table of operators again in each call, which takes longer than most of a small export.
 ONNXRegistry.from_torchlib = staticmethod(functools.cache(ONNXRegistry.from_torchlib))  # called of an instance, too
@@ -33,12 +36,8 @@ TASKS = {  # with all that policies may read, spread over the tasks
     },
     "racing": {"action_delay": 0},
     "forest": {"camera": CAMERA, "density": 0.05, "random_start": {"tilt": 0.5, "yaw": 3.0, "velocity": 3.0}},
-    "forest, blind": {
-        "camera": {"width": 4, "height": 3},
-        "density": 0.01,
-        "observe_velocity": False,
-        "observe_last_action": True,
-    },
+    "forest, blind": {"camera": {"width": 4, "height": 3}, "density": 0.01}
+    | {"observe_velocity": False, "observe_last_action": True},
     "hovering, without memory": {"camera": {"width": 5, "height": 4, "position": [0.1, 0, 0], "along_ray": True}},
 }
 NORMALIZED = ("tracking", "racing", "forest")
@@ -95,20 +94,21 @@ def measured(bundle, **changes):
     """A state that the policy of a bundle can fly from."""
     camera = bundle.contract["camera"]
     images = {"depth": np.full((camera["height"], camera["width"]), 3.0), "depth_age": 0.0} if camera else {}
-    return resting(**images, **changes)
+    return resting(**images | changes)
 
 
 @pytest.fixture(scope="session")
 def export_once(tmp_path_factory, worker_id):
-    """Environment, policy and bundle of one of TASKS, exported once for all processes, since tracing takes seconds."""
+    """Environment, policy and bundle of a task, exported once for all processes, since tracing takes seconds."""
     base = tmp_path_factory.getbasetemp()
     shared = (base if worker_id == "master" else base.parent) / "bundles"
     shared.mkdir(exist_ok=True)
 
     @functools.cache
-    def export_once(task):
+    def export_once(task, make=build):
+        """``make`` builds environment and policy by the name of the task; by default it is one of TASKS."""
         torch.set_num_threads(1)
-        env, actor = build(task)
+        env, actor = make(task)
         with FileLock(shared / f"{task}.lock"):
             if not (shared / task).exists():
                 export_policy(actor, env, shared / task)
@@ -118,16 +118,18 @@ def export_once(tmp_path_factory, worker_id):
 
 
 @pytest.fixture
-def trace_once(monkeypatch):
-    """Trace each environment once in a test that exports it several times."""
-    trace, traced = export.trace, {}
+def trace_once(export_once, monkeypatch):
+    """Makes further exports of a task in a test take its rules from the bundle that all share."""
 
-    def once(env, state):
-        if env not in traced:
-            traced[env] = trace(env, state)
-        return traced[env]
+    def trace_once(task):
+        env, _, folder = export_once(task)
+        about = json.loads((folder / "contract.json").read_text())
+        graphs = {name: onnx.load(folder / f"{name}.onnx") for name in about["graphs"] if name != "policy"}
+        keys = {name_of(key): key for key in getattr(env, "base_env", env).task_entries}
+        rules = Rules(graphs, {name: keys[name] for name in about["task"]["entries"]}, about["task"]["unjudged"])
+        monkeypatch.setattr(export, "trace", lambda *_: rules)
 
-    monkeypatch.setattr(export, "trace", once)
+    return trace_once
 
 
 def compiled(folder, out):

@@ -8,13 +8,16 @@ from scipy.spatial.transform import Rotation
 
 END = 10.0  # [s]
 G = 9.80665
+OURS = {
+    "position": ("x", "y", "z"),
+    "quaternion": ("qw", "qx", "qy", "qz"),
+    "velocity": ("vx", "vy", "vz"),
+    "angular_velocity": ("wx", "wy", "wz"),
+    "acceleration": ("fx", "fy", "fz"),
+    "motor_command": ("u0", "u1", "u2", "u3"),
+}
+TABLE = {"time": "t", **OURS}
 ULOG = b"ULog\x01\x12\x35\x01" + bytes(8)  # its header
-
-
-def product(p, q):
-    w = p[:, 0] * q[:, 0] - (p[:, 1:] * q[:, 1:]).sum(-1)
-    v = p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])
-    return np.concatenate((w[:, None], v), -1)
 
 
 def matrix(q):
@@ -36,26 +39,33 @@ def _attitude(t):
     x, y, z = (pull / size[:, None]).T
     lean = np.stack((1.0 + z, -y, x, np.zeros_like(x)), -1)
     yaw = 1.2 * np.sin(0.8 * t) * (t > 0.0)
-    turn = np.stack((np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)), -1)
-    return product(lean / np.linalg.norm(lean, axis=-1, keepdims=True), turn), size
+    return Rotation.from_quat(lean, scalar_first=True) * Rotation.from_rotvec(yaw[:, None] * (0, 0, 1)), size
 
 
 def flight(t):
     """What is true at times t [s]: it stands for a second, flies for eight, lands and stands again."""
     h = 1e-4
-    q, size = _attitude(t)
-    rate = (_attitude(t + h)[0] - _attitude(t - h)[0]) / (2.0 * h)
+    attitude, size = _attitude(t)
+    turned = _attitude(t - h)[0].inv() * _attitude(t + h)[0]
     on = ((t > 0.7) & (t < 9.3))[:, None]
     k = np.arange(4)
     return {
         "position": _position(t),
-        "quaternion": q,
+        "quaternion": attitude.as_quat(scalar_first=True),
         "velocity": (_position(t + h) - _position(t - h)) / (2.0 * h),
-        "angular_velocity": 2.0 * product(q * (1, -1, -1, -1), rate)[:, 1:],
+        "angular_velocity": turned.as_rotvec() / (2.0 * h),
         "acceleration": size[:, None] * (0.0, 0.0, 1.0),
         "motor_command": on * (0.5 + 0.05 * k + 0.03 * np.sin(t[:, None] * (k + 1))),
         "battery_voltage": 4.1 - 0.04 * t,
     }
+
+
+def own_table(t, **changes):
+    true = flight(t) | changes
+    columns = {"t": t}
+    for quantity, names in OURS.items():
+        columns |= dict(zip(names, true[quantity].T, strict=True))
+    return columns | {"v": true["battery_voltage"]}
 
 
 def write_csv(path, columns):

@@ -1,10 +1,9 @@
 """Small training runs, and how to compare them."""
 
-import csv
-
 import torch
 
 from torchrl_quad import BPTTLoss
+from torchrl_quad.files import read_rows
 
 SMALL = [
     *("num_envs=4", "horizon=6", "total_steps=192", "env.max_episode_steps=15", "compile=false"),
@@ -24,8 +23,7 @@ EVERYTHING = [  # that draws random numbers or keeps a memory
 
 def rows(folder):
     """metrics.csv, without the clock."""
-    with open(folder / "metrics.csv", newline="") as file:
-        return [{k: v for k, v in row.items() if not k.startswith("time/")} for row in csv.DictReader(file)]
+    return [{k: v for k, v in row.items() if "time/" not in k} for row in read_rows(folder / "metrics.csv")]
 
 
 def assert_equal(a, b, path=""):

@@ -6,17 +6,8 @@ from tensordict.nn import TensorDictSequential
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import (
-    ABPTLoss,
-    BPTTLoss,
-    HoveringEnv,
-    SHACLoss,
-    TrustRegion,
-    differentiable_rollout,
-    make_actor,
-    make_qvalue,
-    make_value,
-)
+from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_qvalue, make_value
+from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss, TrustRegion
 from torchrl_quad.objectives.calls import MedianClip, action_gradient, sources_of_steps
 
 LOSSES = {
@@ -60,7 +51,7 @@ def test_a_clip_that_never_clips_changes_no_gradient(env, name):
         torch.testing.assert_close(found, expected)
 
 
-def test_the_gradient_of_an_action_is_that_of_all_that_follows(env):
+def test_the_gradient_of_an_action_is_that_of_all_that_follows_in_torchrls_loop_too(env):
     actor = make_actor(env)
     weight = torch.linspace(0.5, 1.5, 9, dtype=env.dtype).view(1, 9, 1)
 
@@ -71,6 +62,12 @@ def test_the_gradient_of_an_action_is_that_of_all_that_follows(env):
     found = action_gradient(objective(rollout), rollout["action"])
     again = torch.autograd.grad(objective(rollout), list(actor.parameters()))  # the graph is still whole
     assert all(g.isfinite().all() for g in again)
+
+    env.set_seed(0)
+    torch.manual_seed(0)
+    with set_exploration_type(ExplorationType.RANDOM):
+        slow = EnvBase.rollout(env, 9, actor, break_when_any_done=False)
+    torch.testing.assert_close(action_gradient(objective(slow), slow["action"]), found)
 
     def with_push(size):
         """The objective with all of a policy's actions, but one is pushed, and the policy goes on from there."""
@@ -90,17 +87,6 @@ def test_the_gradient_of_an_action_is_that_of_all_that_follows(env):
 
     numeric = (with_push(1e-5) - with_push(-1e-5)) / 2e-5
     torch.testing.assert_close(found[1, 2, 2], numeric, rtol=1e-6, atol=1e-9)
-
-
-def test_in_torchrls_loop_actions_have_the_same_gradients(env):
-    actor = make_actor(env)
-    rollout = flight(env, actor)
-    expected = action_gradient(rollout["next", "reward"].sum(), rollout["action"])
-    env.set_seed(0)
-    torch.manual_seed(0)
-    with set_exploration_type(ExplorationType.RANDOM):
-        slow = EnvBase.rollout(env, 9, actor, break_when_any_done=False)
-    torch.testing.assert_close(action_gradient(slow["next", "reward"].sum(), slow["action"]), expected)
 
 
 def test_the_sources_of_an_entry_are_its_steps_whatever_their_shape_but_for_those_without_a_graph():
@@ -160,15 +146,12 @@ def test_with_a_clip_the_entropy_bonus_counts_at_the_states_visited(env):
 
 def test_what_cannot_be_clipped_is_refused(env):
     actor = make_actor(env)
-    for bad in (0.0, -1.0, float("inf")):
-        with pytest.raises(
-            ValueError, match="clip_action_gradient must be .*, got .*in running medians of their length"
-        ):
+    for bad in (0.0, float("inf")):
+        with pytest.raises(ValueError, match="clip_action_gradient must be .*, got .*in running medians of their"):
             BPTTLoss(actor, clip_action_gradient=bad)
     rollout = flight(env, actor)
     loss = BPTTLoss(actor, clip_action_gradient=5.0)
-    square = torch.stack([flight(env, actor, steps=4) for _ in range(4)])
-    for changed in (rollout[:2], square):
+    for changed in (rollout[:2], torch.stack([flight(env, actor, steps=4) for _ in range(4)])):
         with pytest.raises(ValueError, match="needs one rollout as differentiable_rollout returned it, whole"):
             loss.loss_actor(changed)
     with pytest.raises(ValueError, match="BPTTLoss needs a policy as make_actor builds it, .*no 'loc'"):
@@ -232,9 +215,6 @@ def test_a_trust_region_knows_what_it_needs(env):
     with free.around(env.reset()):
         pass
     assert free.metrics == {}
-    trust_region = TrustRegion(actor, 0.1)
-    with (
-        pytest.raises(ValueError, match="reads loc and scale, which are not in the rollout"),
-        trust_region.around(env.reset()),
-    ):
-        raise AssertionError("It is refused before the block runs.")
+    around = TrustRegion(actor, 0.1).around(env.reset())
+    with pytest.raises(ValueError, match="reads loc and scale, which are not in the rollout"):
+        around.__enter__()  # before the block runs

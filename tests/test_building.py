@@ -51,16 +51,10 @@ def test_a_target_critic_follows_as_with_torchrl_s_soft_update(kind, critic):
     [("constant", 1e-2, 1e-2), ("linear", 5.05e-3, 1e-4), ("exponential", 1e-3, 1e-4), ("cosine", 5.05e-3, 1e-4)],
 )
 def test_a_schedule_goes_from_the_first_to_the_last_learning_rate(schedule, halfway, last):
-    adam = optimizer(101, schedule=schedule)
-    for iteration, rate in ((0, 1e-2), (50, halfway), (100, last), (200, last)):
+    adam = optimizer(100, schedule=schedule)
+    for iteration, rate in ((0, 1e-2), (49.5, halfway), (99, last), (200, last)):
         adam.anneal(iteration)
         assert adam.param_groups[0]["lr"] == pytest.approx(rate)
-
-
-def test_a_schedule_may_be_set_between_two_iterations():
-    adam = optimizer(11)
-    adam.anneal(5.5)
-    assert adam.param_groups[0]["lr"] == pytest.approx(4.555e-3)
 
 
 def test_the_gradient_of_alpha_takes_nothing_of_the_actor_s_norm():
@@ -74,13 +68,11 @@ def test_the_gradient_of_alpha_takes_nothing_of_the_actor_s_norm():
     assert loss.log_alpha.grad.item() == pytest.approx(0.5, rel=1e-4)
 
 
-def test_how_far_a_horizon_may_move_the_policy_falls_to_a_fiftieth():
+@pytest.mark.parametrize(("iteration", "limit"), [(0, 0.3), (5, 0.15), (9, 0.03), (10, 0.006)])
+def test_how_far_a_horizon_may_move_the_policy_falls_to_a_fiftieth(iteration, limit):
     adam = optimizer(10, AdaptiveOptimizer, max_kl=0.2)
-    limits = []
-    for iteration in (0, 5, 9, 10):
-        adam.anneal(iteration)
-        limits.append(adam.limit)
-    assert limits == pytest.approx([0.3, 0.15, 0.03, 0.006])
+    adam.anneal(iteration)
+    assert adam.limit == pytest.approx(limit)
 
 
 @pytest.mark.parametrize(("moved", "factor", "end"), [(0.31, 1 / 1.5, 1e-6), (0.2, 1.0, 1e-3), (0.13, 1.5, 0.02)])

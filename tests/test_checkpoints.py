@@ -9,25 +9,18 @@ import pytest
 import torch
 import yaml
 from omegaconf import OmegaConf
-from small_runs import SMALL, poison, rows, stop_at_save
+from small_runs import SMALL, rows, stop_at_save
 
-from torchrl_quad.training import checkpoints, evaluation
 from torchrl_quad.training.building import average_policy
 from torchrl_quad.training.checkpoints import previous, read_checkpoint, write_checkpoint
 
-
-@pytest.fixture(scope="module")
-def content():
-    torch.manual_seed(0)
-    whole = {name: kind() for name, kind in checkpoints.CONTENT.items() if isinstance(kind, type)}
-    best = {"actor": {"weight": torch.randn(40, 40)}}
-    return {**whole, "config": "task: hovering", "best": best, "logger": None, "version": "0.1"}
+CONTENT = {"config": "task: hovering", "best": {"actor": {"weight": torch.ones(40, 40)}}, "version": "0.1"}
 
 
-def test_no_flipped_bit_of_a_checkpoint_goes_unnoticed(content, tmp_path):
+def test_no_flipped_bit_of_a_checkpoint_goes_unnoticed(tmp_path):
     path = tmp_path / "checkpoint.pt"
-    write_checkpoint(path, content)
-    torch.testing.assert_close(read_checkpoint(path)["best"], content["best"])
+    write_checkpoint(path, CONTENT)
+    torch.testing.assert_close(read_checkpoint(path)["best"], CONTENT["best"])
     whole, draw = path.read_bytes(), random.Random(0)
     positions = [draw.randrange(len(whole)) for _ in range(200)] + list(range(len(whole) - 110, len(whole)))
     for at in positions:
@@ -54,32 +47,21 @@ def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(train, refused, 
     assert read_checkpoint(previous(path))["iteration"] == 6  # and not the damaged one
 
 
-def test_a_file_that_is_no_checkpoint_of_this_version_is_named_with_the_reason(content, train, refused, tmp_path):
+def test_a_file_that_is_no_checkpoint_of_this_version_is_named_with_the_reason(refused, tmp_path):
     path = tmp_path / "bad.pt"
 
-    def fails(error, match):
-        with pytest.raises(error, match=match):
+    def fails(match):
+        with pytest.raises((ValueError, FileNotFoundError), match=match):
             read_checkpoint(path)
 
-    fails(FileNotFoundError, "No checkpoint at .*bad.pt. Train one first")
-    write_checkpoint(path, content)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    foreign = "bad.pt is cut off, or no checkpoint of these recipes. There is none before it"
-    fails(ValueError, foreign)
-    path.write_text("hello")
-    fails(ValueError, foreign)
+    fails("No checkpoint at .*bad.pt. Train one first")
     torch.save({"weights": torch.zeros(1)}, path)
-    fails(ValueError, foreign)
-    write_checkpoint(path, {**content, "config": Path("anything that is pickled")})
-    fails(ValueError, "anything else could run code, and is not loaded")
-    write_checkpoint(path, {**content, "format": 2})
-    fails(ValueError, "has checkpoint format 2, this version reads format 5. It was written by torchrl_quad 0.1 at .*:")
+    fails("bad.pt is cut off, or no checkpoint of these recipes. There is none before it")
+    write_checkpoint(path, {**CONTENT, "config": Path("anything that is pickled")})
+    fails("anything else could run code, and is not loaded")
+    write_checkpoint(path, {**CONTENT, "format": 2})
+    fails("has checkpoint format 2, this version reads format 5. It was written by torchrl_quad 0.1 at .*:")
     assert "bad.pt has checkpoint format 2" in refused("evaluate", f"checkpoint={path}")
-    good = train("bptt", tmp_path)
-    write_checkpoint(tmp_path / "checkpoint.pt", {**good, "processes": good["processes"] * 2})
-    said = refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "resume=auto")
-    assert "was written by 2 processes, and 1 want to continue" in said
 
 
 def test_a_full_disk_is_named_and_leaves_the_last_checkpoint_intact(refused, no_pictures, tmp_path, monkeypatch):
@@ -106,27 +88,8 @@ def test_a_full_disk_is_named_and_leaves_the_last_checkpoint_intact(refused, no_
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
-def test_without_hard_links_the_checkpoint_before_is_copied(content, tmp_path, monkeypatch):
-    def fail(*_):
-        raise PermissionError
-
-    path = tmp_path / "checkpoint.pt"
-    write_checkpoint(path, content)
-    monkeypatch.setattr(checkpoints.os, "link", fail)
-    write_checkpoint(path, {**content, "version": "0.2"}, keep=path)
-    assert [read_checkpoint(x)["version"] for x in (path, previous(path))] == ["0.2", "0.1"]
-
-
-def test_a_checkpoint_without_an_evaluated_policy_is_no_policy(refused, no_pictures, tmp_path, monkeypatch):
-    poison(monkeypatch, None)
-    refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "max_skipped=0")
-    with pytest.raises(ValueError, match="failure.pt holds no policy: the run stopped before its first evaluation"):
-        evaluation.load_policy(tmp_path / "failure.pt")
-
-
 EVIL = {  # what somebody else may have written into the configuration of a checkpoint
     "task: evilmod.Evil": "names evilmod.Evil. Code that a file names is not run",
-    "{task: evilmod.Evil, loss: 5}": "names evilmod.Evil. Code",
     "env: {disturbances: [{_target_: evilmod.Evil}]}": "names evilmod.Evil. Code",
     "env: {disturbances: evilmod.Evil}": "it must be a list",
     "loss: {_target_: evilmod.Evil}": "names evilmod.Evil. Code",
@@ -136,11 +99,7 @@ EVIL = {  # what somebody else may have written into the configuration of a chec
     "env: {control_dt: 1e400}": "env.control_dt",
     "env: {evil: 1}": "unexpected keyword argument 'evil'",
     "env: 5": "env=5: it must be a section",
-    "actor: {num_cells: [64]}": "actor.activation is missing",
-    "actor: null": "actor=null: it must be a section",
     "num_envs: abc": "num_envs=abc: it must be a whole number",
-    "normalize: 3": "normalize=3: it must be true or false",
-    "loss: [1]": "loss=[1]: it must be a section",
     "algorithm: [1]": "algorithm=[1]: it must be a name",
     "[": "not a YAML file",
     "": "is no mapping with a task",
@@ -174,35 +133,25 @@ def test_a_configuration_from_somebody_else_runs_no_code_and_passes_the_schema_o
 
 def test_content_that_does_not_fit_its_configuration_is_refused_in_one_line(train, refused, tmp_path):
     saved, path = train("abpt", tmp_path), tmp_path / "checkpoint.pt"
-    best, own = saved["best"], saved["processes"][0]
-    weights = {name: x[:1] for name, x in best["actor"].items()}
+    weights = {name: x[:1] for name, x in saved["best"]["actor"].items()}
     for change in (
         {"best": {}},
-        {"best": {**best, "actor": 5}},
-        {"best": {**best, "actor": {}}},
-        {"best": {**best, "actor": weights}},
+        {"best": {**saved["best"], "actor": weights}},
         {"config": saved["config"].replace("normalize: false", "normalize: true")},
     ):
         write_own(path, saved, **change)
-        assert re.search(
-            f"{path}(: the policy in it does not fit| holds no policy)", refused("evaluate", f"checkpoint={path}")
-        )
-    damaged = [
-        {"processes": [{}]},
-        {"stateful": []},
-        {"stateful": saved["stateful"][::-1]},
-        {"rows": [{"a": "b"}]},
-        {"best": {}},
-        *({"processes": [{**own, name: 5}]} for name in own for value in (5, {}) if name not in ("clip", "parameters")),
-    ]
-    for change in damaged:
+        said = refused("evaluate", f"checkpoint={path}")
+        assert re.search(f"{path}(: the policy in it does not fit| holds no policy)", said)
+    unfit = "the state of the run in it does not fit its configuration"
+    for change, message in (
+        ({"processes": saved["processes"] * 2}, "was written by 2 processes, and 1 want to continue"),
+        ({"processes": [{}]}, unfit),
+        ({"stateful": saved["stateful"][::-1]}, unfit),
+        ({"rows": [{"a": "b"}]}, unfit),
+    ):
         write_own(path, saved, **change)
         said = refused("abpt", f"resume={path}", "total_steps=240")
-        assert f"{path}" in said and "Traceback" not in said, change
-    for name in checkpoints.CONTENT:
-        write_own(path, saved, **{name: (1,)})
-        with pytest.raises(ValueError, match=f"{path} lacks {name}, or has it in another type"):
-            read_checkpoint(path)
+        assert str(path) in said and message in said, change
 
 
 def test_the_average_of_the_policy_spans_a_share_of_the_iterations_and_is_what_a_run_keeps(train, tmp_path):

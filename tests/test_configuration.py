@@ -1,13 +1,10 @@
 """The schema of the configuration: what is refused, and what is said instead."""
 
-from pathlib import Path
-
 import pytest
 import yaml
 from omegaconf import OmegaConf
 
 from torchrl_quad import load_drone
-from torchrl_quad.dynamics import presets
 from torchrl_quad.envs import TASKS
 from torchrl_quad.training.configuration import CONFIG, compose
 from torchrl_quad.training.launch import _joined
@@ -19,85 +16,44 @@ UNTUNED = {("abpt", "forest"), ("ahac", "forest"), ("sapo", "forest"), ("hybrid"
 
 REFUSED = [  # of ABPT, unless a recipe is named
     ("actor.max_grad_norm=-1", "actor.max_grad_norm=-1: it must be greater than 0. Longer gradients are shortened"),
-    ("critic.max_grad_norm=0", "critic.max_grad_norm=0: it must be greater than 0"),
-    ("actor.final_lr=-1", "actor.final_lr=-1: it must be at least 0"),
     ("actor.lr=0", "actor.lr=0: it must be greater than 0"),
     ("actor.betas=[0.9]", r"actor.betas=\[0.9\]: it must have at least 2 items, not 1. .* such as \[0.9, 0.999\]"),
     ("actor.betas=[0.9,1.0]", r"actor.betas\[1\]=1.0: it must be less than 1"),
     ("actor.num_cells=64", r"actor.num_cells=64: it must be a list. .* or \[64\] for one layer"),
-    ("actor.num_cells=[64,0]", r"actor.num_cells\[1\]=0: it must be at least 1"),
     ("actor.activation=functional", "actor.activation=functional: it must be 'CELU', 'ELU', .* or 'Tanh'"),
+    ("actor.final_lr=0 actor.schedule=exponential", "actor.final_lr=0: it must be above 0 with schedule=exponential"),
     ("actor.schedule=step", "actor.schedule=step: it must be 'constant', 'linear', 'exponential' or 'cosine'"),
-    ("actor.scale_init=1e-5", "actor.scale_init=1e-05: it must be at least 0.0001"),
     ("critic.updates=null", "critic.updates=null: it must be a whole number"),
-    ("critic.tau=null", "critic.tau=null: it must be a number"),
-    ("restart_fraction=null", "restart_fraction=null: it must be a number"),
-    ("ppo epochs=null", "epochs=null: it must be a whole number"),
     ("shac loss.terminal_gradient=null", "loss.terminal_gradient=null: it must be true or false"),
     ("actor.scale_init=abc", "actor.scale_init=abc: it must be a number"),
-    ("critic.lmbda=3", "critic.lmbda=3: it must be at most 1"),
-    ("critic.updates=0", "critic.updates=0: it must be at least 1"),
-    ("critic.batch_size=0", "critic.batch_size=0: it must be at least 1"),
-    ("critic.tau=0", "critic.tau=0: it must be greater than 0"),
     ("gamma=2", "gamma=2: it must be at most 1. .* 0.99 is usual"),
-    ("gamma=-1", "gamma=-1: it must be at least 0"),
     ("gamma=nan", "gamma=nan: it must be a finite number"),
-    ("gamma=null", "gamma=null: it must be a number"),
     ("restart_fraction=5", "restart_fraction=5: it must be at most 1"),
     ("buffer.fraction=2", "buffer.fraction=2: it must be at most 1. .* null for none"),
-    ("buffer.capacity=0", "buffer.capacity=0: it must be at least 1"),
-    ("eval.interval=-1", "eval.interval=-1: it must be at least 1"),
     ("eval.interval=0", "eval.interval=0: it must be at least 1. Iterations between evaluations"),
-    ("eval.seed=-1", "eval.seed=-1: it must be at least 0"),
-    ("max_skipped=-1", "max_skipped=-1: it must be at least 0"),
-    ("diagnostics=-1", "diagnostics=-1: it must be at least 0"),
     ("normalize=5", "normalize=5: it must be true or false"),
-    ("compile=1", "compile=1: it must be true or false"),
-    ("horizon=0", "horizon=0: it must be at least 1"),
     ("horizon=2.5", "horizon=2.5: it must be a whole number"),
-    ("total_steps=nan", "total_steps=nan: it must be a whole number"),
     ("total_steps=1e6", "total_steps=1000000.0: it must be a whole number, written 1000000"),
-    ("seed=-1", "seed=-1: it must be at least 0"),
     ("seed=true", "seed=True: it must be a whole number"),
-    ("threads=0", "threads=0: it must be at least 1"),
-    ("device=gpu", "device=gpu: it must be cpu, cuda, or one of several GPUs"),
+    ("device=gpu", "device=gpu: it must be a device of this machine that torch knows"),
     ("num_envs=100000000", "num_envs=100000000: it must be at most 10000000. .* no memory holds more"),
-    ("env.action_delay=1000000", "env.action_delay=1000000: it must be at most 1000"),
     ("env.dt=0", "env.dt=0: it must be at least 0.000001. The physics step"),
     ("env.event_discount=0", "env.event_discount=0.*: it must be greater than 0. .* null for no gradient in it"),
     ("env.dynamics=point", "env.dynamics=point: it must be one of quadrotor, point_mass"),
     ("env=3", "env=3: it must be a section with settings of its own"),
     ("loss.alpha=never", "loss.alpha=never: it must be a number. .* or auto to hold the entropy"),
-    ("loss.alpha=-1", "loss.alpha=-1: it must be at least 0"),
-    ("shac loss.target_bootstrap=1", "loss.target_bootstrap=1: it must be true or false"),
-    ("shac loss.average_over_horizon=maybe", "loss.average_over_horizon=maybe: it must be true or false"),
-    ("loss.simulated_steps=-1", "loss.simulated_steps=-1: it must be at least 0"),
-    (
-        "sapo loss.target_entropy=1",
-        "loss.target_entropy=1: it must be at most -0.001. .* auto for minus half the number of action entries",
-    ),
-    ("ahac loss.max_stiffness=1", "loss.max_stiffness=1: it must be greater than 1"),
-    ("ahac loss.horizon_lr=1", "loss.horizon_lr=1: it must be less than 1"),
+    ("sapo loss.target_entropy=1", "loss.target_entropy=1: it must be at most -0.001. .* auto for minus half"),
     ("logger.backend=csvv", "logger.backend=csvv: it must be 'wandb', 'tensorboard' or 'csv'"),
-    ("logger.flight_every=-1", "logger.flight_every=-1: it must be at least 0"),
     ("resume=none.pt", "resume=none.pt: it must be the path of a checkpoint.pt that exists, or auto"),
     ("+gama=0.9", "gama is unknown: this recipe has no such setting. Did you mean gamma?"),
     ("+loss.delay_value=abc", "loss.delay_value is unknown, or set by the recipe. Choose from: alpha"),
-    ("loss.n_step_return=abc", "loss.n_step_return=abc: it must be true or false"),
-    ("loss.zero_step_return=nan", "loss.zero_step_return=nan: it must be true or false"),
-    ("ppo loss.normalize_advantage=maybe", "loss.normalize_advantage=maybe: it must be true or false"),
     ("ppo loss.loss_critic_type=l3", "loss.loss_critic_type=l3: it must be 'l1', 'l2' or 'smooth_l1'"),
     ("ppo +loss.gamma=0.9", "loss.gamma is unknown, or set by the recipe"),
     ("critic=null", "critic=null: it must be a section with settings of its own"),
     ("~critic.tau", "critic.tau is missing: do not delete it"),
-    ("num_envs=10000 horizon=20000", "num_envs times horizon must be at most 100,000,000"),
     ("env.control_dt=${nothing}", "env.control_dt: Interpolation key 'nothing' not found"),
-    ("env.observe_last_action='False'", "env.observe_last_action=False: it must be true or false"),
     ("+actor.rate=0.9", "actor.rate is unknown"),
     ("ppo loss.clip_epsilon=-1", "loss.clip_epsilon=-1: it must be greater than 0"),
-    ("ppo batch_size=0", "batch_size=0: it must be at least 1"),
-    ("ppo epochs=0", "epochs=0: it must be at least 1"),
-    ("evaluate episodes=0 checkpoint=x", "episodes=0: it must be at least 1"),
     ("evaluate", "checkpoint is missing: write checkpoint=... on the command line"),
 ]
 
@@ -150,12 +106,6 @@ def test_every_setting_that_another_may_switch_off_is_one():
             assert shipped or name in ("env.difficulty", "loss.entropy_coeff"), name
 
 
-def test_an_exponential_schedule_does_not_end_at_zero_while_a_linear_one_may():
-    check(composed("abpt", "actor.final_lr=0"))
-    with pytest.raises(ValueError, match="actor.final_lr=0: it must be above 0 with schedule=exponential"):
-        check(composed("abpt", "actor.final_lr=0", "actor.schedule=exponential"))
-
-
 @pytest.mark.parametrize("path", TUNED, ids=[path.stem for path in TUNED])
 def test_every_configuration_that_ships_passes_the_schema_with_its_tuned_values(path):
     recipe, task = path.stem.split("_", 1)
@@ -165,7 +115,7 @@ def test_every_configuration_that_ships_passes_the_schema_with_its_tuned_values(
     check(cfg)
     tuned = yaml.safe_load(path.read_text())
     tuned.pop("defaults", None)
-    assert contains(OmegaConf.to_container(cfg), tuned)
+    assert OmegaConf.merge(cfg, tuned) == cfg
 
 
 def test_almost_every_recipe_is_tuned_for_every_task_and_the_others_pass_the_schema_too():
@@ -179,12 +129,6 @@ def test_almost_every_recipe_is_tuned_for_every_task_and_the_others_pass_the_sch
 def test_the_command_line_has_the_last_word_and_may_set_what_is_optional(recipe):
     assert composed(recipe, "task=racing", "horizon=7").horizon == 7
     check(composed(recipe, "env.weights={velocity: 0}", "env.wind={gust: 0.5}", "env.event_discount=0.99"))
-
-
-def contains(whole, part):
-    if not isinstance(part, dict):
-        return whole == part
-    return all(contains(whole[key], value) for key, value in part.items())
 
 
 def numbers(values, schema, path=""):
@@ -207,6 +151,7 @@ def test_every_number_that_ships_has_a_type_and_a_range(recipe):
 
 
 def test_a_refused_run_leaves_no_folder_and_one_line(refused, tmp_path):
+    assert "Could not override 'nonsense'" in refused("bptt", "nonsense=1")
     line = refused("bptt", "gamma=2", f"hydra.run.dir={tmp_path}/outputs/run")
     assert line.startswith("Error: gamma=2: it must be at most 1.")
     assert not list(tmp_path.iterdir())
@@ -217,11 +162,6 @@ def test_under_torchrun_no_gpu_is_named_for_all_processes(monkeypatch):
     said = "device=cuda:0: under torchrun each process takes its own GPU. Write device=cuda."
     with pytest.raises(ValueError, match=said), _joined(OmegaConf.create({"device": "cuda:0"})):
         raise AssertionError("It is refused before anything is joined.")
-
-
-def test_what_hydra_refuses_ends_in_one_line_too(refused):
-    assert "Could not override 'nonsense'" in refused("bptt", "nonsense=1")
-    assert "nests more than 20 lists" in refused("bptt", f"env.randomize={'[' * 600}{']' * 600}")
 
 
 # -- YAML --------------------------------------------------------------------------------------------------------------
@@ -248,10 +188,3 @@ def test_a_yaml_file_that_no_setting_needs_is_refused_by_name(content, message, 
     (tmp_path / "mine.yaml").write_bytes(content)
     with pytest.raises(ValueError, match=f"mine.yaml: {message}"):
         load_drone(tmp_path / "mine.yaml")
-
-
-def test_the_configuration_files_of_the_recipes_are_read_with_the_same_limits(refused, monkeypatch):
-    read = Path.read_bytes
-    monkeypatch.setattr(Path, "read_bytes", lambda path: b"a: \xe9" if path.name == "shac.yaml" else read(path))
-    assert "config/shac.yaml: not in UTF-8" in refused("bptt")
-    assert presets.parse(b"a: {b: [1, 2]}", "x") == {"a": {"b": [1, 2]}}

@@ -17,15 +17,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad import HoveringEnv, files, make_actor, make_visual_actor
-from torchrl_quad.deploy import (
-    StaleState,
-    UnknownContract,
-    WrongActions,
-    contract,
-    export_policy,
-    load_bundle,
-)
-from torchrl_quad.deploy import TamperedBundle as Tampered
+from torchrl_quad.deploy import StaleState, contract, export_policy, load_bundle
 from torchrl_quad.deploy.network import ACTIVATIONS, Layer, Network, write_c, write_onnx
 from torchrl_quad.deploy.tracing import name_of
 
@@ -158,7 +150,7 @@ def test_every_activation_is_written_alike_as_onnx_and_c(tmp_path):
     library = compiled(tmp_path, tmp_path / "policy.so")
     for name in ACTIVATIONS:
         expected = getattr(nn, name)()(torch.from_numpy(x))
-        content = write_onnx(Network([Layer(one, zero, name), Layer(small, zero, "Tanh")]))
+        content = write_onnx(Network([Layer(one, zero, name), Layer(small, zero, "Tanh")])).SerializeToString()
         session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
         found = session.run(None, {"observation": x[:, None]})[0][:, 0]
         np.testing.assert_allclose(found, torch.tanh(0.02 * expected), rtol=0, atol=1e-6, err_msg=name)
@@ -168,7 +160,8 @@ def test_every_activation_is_written_alike_as_onnx_and_c(tmp_path):
 
 
 @pytest.mark.parametrize("task", ["hovering", "forest"])
-def test_the_bound_of_a_mean_is_written_too(task, tmp_path):
+def test_the_bound_of_a_mean_is_written_too(task, tmp_path, trace_once):
+    trace_once(task)
     env = build(task)[0]
     make = make_visual_actor if task == "forest" else make_actor
     actor = make(env, num_cells=(4,), return_log_prob=True)
@@ -201,7 +194,7 @@ def test_c_answers_what_is_not_finite_with_the_hover_action_and_decodes_commands
 # -- the folder --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("task", ["landing", "tracking", "forest"])
+@pytest.mark.parametrize("task", ["landing", "forest"])
 def test_the_same_policy_gives_the_same_bytes_and_leaves_the_environment_as_it_was(
     export_once, task, tmp_path, monkeypatch
 ):
@@ -259,52 +252,8 @@ def test_the_rate_loop_of_a_contract_is_that_of_the_simulator(hovering):
         assert abs(w * w / (s * s + 2 * z * w * s + w * w)) == pytest.approx(0.5**0.5, rel=1e-4)
 
 
-@pytest.mark.parametrize("name", [*contract.OTHERS, "policy.onnx", "observe.onnx", "episode.onnx", "contract.json"])
-def test_a_file_that_was_changed_or_is_missing_is_named(hovering, tmp_path, name):
-    folder = tmp_path / "policy"
-    folder.mkdir()
-    for path in hovering.iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
-    assert load_bundle(folder).check() <= 1e-5
-    content = (folder / name).read_bytes()
-    damaged = content.replace(b"0.46", b"0.45") if name == "contract.json" else content[:-3] + b"abc"
-    (folder / name).write_bytes(damaged)
-    with pytest.raises(Tampered, match=f"{name} was changed after the export: its checksum does not fit"):
-        load_bundle(folder)
-    (folder / name).unlink()
-    with pytest.raises((Tampered, FileNotFoundError), match=f"{name} cannot be read|No bundle at .* has no contract"):
-        load_bundle(folder)
-
-
-def test_a_contract_of_another_version_is_refused(hovering, tmp_path):
-    about = json.loads((hovering / "contract.json").read_text())
-    path = tmp_path / "contract.json"
-    for text in ("[]", "{", "{}"):
-        path.write_text(text)
-        with pytest.raises(Tampered, match="is no contract of a policy"):
-            load_bundle(tmp_path)
-    path.write_text(json.dumps(about | {"version": 3}))
-    with pytest.raises(
-        UnknownContract, match="has version 3, and this torchrl_quad reads version 4. It was written by torchrl_quad"
-    ):
-        load_bundle(tmp_path)
-    for name in contract.files(about):
-        (tmp_path / name).write_bytes((hovering / name).read_bytes())
-    reads = about["graphs"]["observe"]["reads"]
-    reads["smell"] = reads["target"]  # of a later package, with checksums that fit
-    path.write_text(json.dumps(about | {"digest": contract.digest(about)}))
-    with pytest.raises(UnknownContract, match="graphs.observe.reads.smell is .*, and must be nothing of that name"):
-        load_bundle(tmp_path)
-
-
-def test_another_runtime_that_gives_different_results_is_found(hovering):
-    bundle = load_bundle(hovering)
-    bundle._vectors["action"] += np.float32(1e-3)
-    with pytest.raises(WrongActions, match="hovering/policy.onnx: the policy differs by 0.001"):
-        bundle.check()
-
-
 def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_path, monkeypatch, trace_once):
+    trace_once("hovering")
     env, actor = build("hovering")
     folder = shutil.copytree(hovering, tmp_path / "policy")
     old = (folder / "contract.json").read_bytes()
@@ -338,17 +287,6 @@ def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_pa
     export_policy(actor, env, folder)
     assert (folder / "contract.json").read_bytes() != old
     assert [path.name for path in tmp_path.iterdir()] == ["policy"]
-    (tmp_path / "link").symlink_to(folder)
-    os.mkfifo(tmp_path / "pipe")
-    for name in ("link", "pipe"):
-        with pytest.raises(FileExistsError, match=f"{name} is a {name}, and no plain folder: it is not replaced"):
-            export_policy(actor, env, tmp_path / name)
-        assert (tmp_path / "pipe").is_fifo() and (tmp_path / "link").is_symlink()
-    (folder / "policy.h").unlink()
-    os.mkfifo(folder / "policy.h")  # which is not the bundle's
-    with pytest.raises(FileExistsError, match=r"policy also holds policy.h"):
-        export_policy(actor, env, folder)
-    (folder / "policy.h").unlink()
     (folder / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match=r"policy also holds notes.txt: .* Move it away, or choose another"):
         export_policy(actor, env, folder)

@@ -22,6 +22,7 @@ from torchrl_quad import HoveringEnv, ObservationNormalizer, load_drone, make_ac
 from torchrl_quad.deploy import (
     BrokenPolicy,
     MissingQuantity,
+    NegativeDepth,
     NotFinite,
     NotUnitQuaternion,
     StaleState,
@@ -36,12 +37,8 @@ from torchrl_quad.training.drawing import environment_beside
 ROOT = Path(__file__).parent.parent
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-    env = HoveringEnv(num_envs=64, max_episode_steps=16, action_delay=2, observe_last_action=True)
-    return export_policy(make_actor(env, (8,)), env, tmp_path_factory.mktemp("bundle") / "policy")
+def far(value):
+    return [[0.0, value, 12.0, 1.0, 3.0, 10.0], *4 * [6 * [3.0]]]
 
 
 FAULTS = [
@@ -49,15 +46,9 @@ FAULTS = [
     (MissingQuantity, "The state lacks 'age'", {"age": None}),
     (MissingQuantity, r"position must have shape \(3,\), got \(2,\)", {"position": [1, 2]}),
     (MissingQuantity, "quaternion must be 4 numbers, got 'level'", {"quaternion": "level"}),
-    (MissingQuantity, "age must be a number", {"age": "new"}),
-    (
-        NotFinite,
-        "Not finite, or beyond 1e.06: position, velocity",
-        {"position": [0, 0, 1e9], "velocity": [0, math.nan, 0]},
-    ),
+    (MissingQuantity, "age must be a number", {"age": True}),
+    (NotFinite, "beyond 1e.06: position, velocity", {"position": [0, 0, 1e9], "velocity": [0, math.nan, 0]}),
     (NotFinite, "age", {"age": math.inf}),
-    (NotFinite, "beyond 1e.06: position", {"position": [10**400, 0, 0]}),
-    (NotFinite, "beyond 1e.06: age", {"age": 10**400}),
     (NotUnitQuaternion, "The quaternion has norm 1.01; it must be 1 to 0.001", {"quaternion": [1.01, 0, 0, 0]}),
     (NotUnitQuaternion, "norm 0;", {"quaternion": [0, 0, 0, 0]}),
     (StaleState, "The state is 0.03 s old; the contract allows 0 to 0.02 s", {"age": 0.03}),
@@ -65,16 +56,34 @@ FAULTS = [
     (MissingQuantity, "The state must be a mapping of position, quaternion, .* and age, got None", None),
     (MissingQuantity, r"and age, got \[\]", []),
 ]
+FAULTS_OF_IMAGES = [
+    (MissingQuantity, "lacks 'depth': give position, .*, depth, depth_age and age", {"depth": None}),
+    (MissingQuantity, "lacks 'depth_age', the time since that was measured", {"depth_age": None}),
+    (MissingQuantity, r"depth must have shape \(5, 6\) or \(1, 5, 6\), got \(3, 2\)", {"depth": [[1, 1]] * 3}),
+    (MissingQuantity, "depth must be 30 numbers, got 'far'", {"depth": "far"}),
+    (MissingQuantity, "whole numbers, uint16: give metres. Are they milli", {"depth": np.ones((5, 6), np.uint16)}),
+    (NotFinite, "Not finite: depth. Give 0 for a pixel that measures nothing", {"depth": far(math.nan)}),
+    (NotFinite, "Not finite: depth. .* and the range for far", {"depth": far(math.inf)}),
+    (NotFinite, "Not finite: depth_age", {"depth_age": math.nan}),
+    (NegativeDepth, "depth must not be negative, got -0.1 m", {"depth": far(-0.1)}),
+    (StaleState, "The image is 0.07 s old; the contract allows 0 to 0.06 s", {"depth_age": 0.07}),
+    (StaleState, "The image is -1 s old", {"depth_age": -1}),
+    (StaleState, "The state is 1 s old", {"age": 1}),
+]
 
 
-@pytest.mark.parametrize(("kind", "message", "changes"), FAULTS)
-def test_each_fault_has_a_name_and_changes_nothing_or_hovers_and_is_counted(folder, kind, message, changes):
-    state = changes
-    if isinstance(changes, dict):
-        state = {key: x for key, x in resting(**changes).items() if x is not None}
+@pytest.mark.parametrize(
+    ("task", "kind", "message", "changes"),
+    [*(("tracking", *x) for x in FAULTS), *(("forest", *x) for x in FAULTS_OF_IMAGES)],
+)
+def test_each_fault_has_a_name_and_changes_nothing_or_hovers_and_is_counted(export_once, task, kind, message, changes):
+    folder = export_once(task)[2]
     raising, hovering, untouched = load_bundle(folder), load_bundle(folder, on_fault="hover"), load_bundle(folder)
+    good, state = measured(raising), changes
+    if isinstance(changes, dict):
+        state = {key: x for key, x in (good | changes).items() if x is not None}
     for bundle in (raising, hovering, untouched):
-        bundle(resting())
+        bundle(good)
     with pytest.raises(kind, match=message):
         raising(state)
     assert raising.faults == {kind.__name__: 1}
@@ -83,36 +92,48 @@ def test_each_fault_has_a_name_and_changes_nothing_or_hovers_and_is_counted(fold
     assert hovering.faults == {kind.__name__: 1} and isinstance(hovering.last_fault, kind)
     np.testing.assert_allclose(hovering.queue[-1], hovering.contract["output"]["hover_action"])
     np.testing.assert_array_equal(raising.queue, untouched.queue)
-    assert raising(resting())[0] == untouched(resting())[0]
+    assert task != "forest" or untouched.memory.any()
+    for bundle in (raising, hovering):
+        np.testing.assert_array_equal(bundle.memory, untouched.memory)
+    assert raising(good)[0] == untouched(good)[0]
     assert not untouched.faults and untouched.last_fault is None
     hovering.reset()
     assert hovering.faults  # readable after the flight
+    assert not hovering.memory.any()
 
 
-def test_a_bundle_keeps_the_queue_and_starts_again(folder):
-    bundle = load_bundle(folder)
+def test_what_is_beyond_the_range_of_the_camera_counts_as_its_range(export_once):
+    bundle = load_bundle(export_once("forest")[2])
+    thrusts = []
+    for depth in (far(12.0), np.minimum(far(12.0), 10.0)[None]):
+        bundle.reset()
+        thrusts.append(bundle(measured(bundle, depth=depth))[0])
+    assert thrusts[0] == thrusts[1]
+
+
+def test_a_bundle_keeps_the_queue_and_starts_again(export_once):
+    bundle = load_bundle(export_once("tracking")[2])
     hover = np.float32(bundle.contract["output"]["hover_action"])
-    bundle(resting())
-    np.testing.assert_array_equal(bundle.observation[13:], [*hover, *hover])
-    first = bundle.action
-    bundle(resting())
-    np.testing.assert_array_equal(bundle.observation[13:], [*hover, *first])
-    second = bundle.action
-    bundle.reset(target=[1, 0, 1.9])
+    queues, actions = [[*hover, *hover]], []
+    for _ in range(2):
+        bundle(resting())
+        np.testing.assert_array_equal(bundle.observation[-8:], queues[-1])
+        actions.append(bundle.action)
+        queues.append([*hover, *bundle.action])
+    bundle.reset(phase=1.0)
     np.testing.assert_array_equal(bundle.queue, [hover, hover])
+    assert bundle.progress["phase"] == 1.0
     bundle(resting())
-    np.testing.assert_allclose(bundle.observation[:3], [0, 0, 0.5], atol=1e-6)
-    assert not np.array_equal(bundle.action, second)
-    np.testing.assert_array_equal(bundle.progress["target"], np.float32([1, 0, 1.9]))
-    with pytest.raises(TypeError, match="reset: hovering has no 'gate'. Choose from: target"):
+    assert not np.array_equal(bundle.action, actions[0])
+    with pytest.raises(TypeError, match="reset: tracking has no 'gate'. Choose from: phase"):
         bundle.reset(gate=1)
     bundle.reset()
-    np.testing.assert_array_equal(bundle.progress["target"], bundle.starts()["target"][0])
+    np.testing.assert_array_equal(bundle.progress["phase"], bundle.starts()["phase"][0])
     with pytest.raises(ValueError, match='on_fault must be "raise" or "hover", got \'land\''):
-        load_bundle(folder, on_fault="land")
+        load_bundle(bundle.folder, on_fault="land")
 
 
-def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
+def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch, trace_once):
     env, actor = build("hovering")
 
     class Counting(HoveringEnv):
@@ -145,13 +166,14 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
     with torch.no_grad():
         broken[0].module.mlp[0].bias[0] = math.nan
     refuses("the weights of the policy, or its normaliser, are not finite", broken)
+    trace_once("hovering")
     strong = load_drone("visfly").replace(max_thrust_to_weight=30.0)
     refuses(
-        r"export_policy: output.thrust.range_in_weights\[1\] is 30.0, and must be at most 20. A bundle flies within",
+        r"export_policy: output.thrust.range_in_weights.1.: 30.0 is greater than the maximum of 20. A bundle flies",
         env=HoveringEnv(num_envs=2, max_episode_steps=4, drone=strong),
     )
     other = HoveringEnv(num_envs=2, control="attitude")
-    refuses("exports only thrust and body rates, control=\"rates\"; got 'attitude'", env=other)
+    refuses("exports thrust and body rates, control=\"rates\"; got 'attitude'", env=other)
     of_an_error = ObservationNormalizer(env, ("metrics", "position_error"))
     refuses('the normalizer must be that of "observation", got ', normalizer=of_an_error)
     refuses("needs an environment of this package, got PendulumEnv", env=PendulumEnv())
@@ -165,7 +187,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
 
 
 def test_a_normalizer_is_that_of_the_transforms_or_is_given_beside_a_bare_environment(tmp_path, trace_once):
-    torch.manual_seed(0)
+    trace_once("hovering")
     env = HoveringEnv(num_envs=64, max_episode_steps=16)
     actor, normalizer = make_actor(env, (8,)), ObservationNormalizer(env)
     normalizer.update(env.rollout(16, break_when_any_done=False))
@@ -194,18 +216,10 @@ def crash(found):
     raise RuntimeError("[ONNXRuntimeError] : 6 :\n out of everything")
 
 
-class Hostile:
-    def __array__(self, *_, **__):
-        raise ZeroDivisionError
-
-
 FAILURES = {  # of the state, or of a graph
     "stale": (StaleState, {"age": 1.0}, None),
     "missing": (MissingQuantity, {"velocity": None}, None),
-    "NaN": (NotFinite, {"position": [np.nan, 0, 0]}, None),
     "text": (MissingQuantity, {"position": ["1", "2", "3"]}, None),
-    "truth": (MissingQuantity, {"age": True}, None),
-    "own type": (MissingQuantity, {"position": Hostile()}, None),
     "onnxruntime": (BrokenPolicy, {}, crash),
     "observe": (NotFinite, {}, lambda found: [np.full_like(x, np.nan) for x in found]),
     "advance": (BrokenPolicy, {}, lambda found: [x[:, :0] for x in found]),
@@ -226,8 +240,8 @@ def test_a_step_that_failed_and_is_repeated_equals_one_that_never_failed(export_
     if failure == "advance" != name:
         pytest.skip("no entry of this task changes")
     graph = failing.graphs[name]
-    session, gate = graph.session, getattr(export_once(task)[0], "base_env", export_once(task)[0])
-    gate = gate.gates[0].numpy() if task == "racing" else np.array([1, 0, 1.4])
+    session = graph.session
+    gate = export_once(task)[0].base_env.gates[0].numpy() if task == "racing" else np.array([1, 0, 1.4])
 
     def content(bundle):
         return copy.deepcopy({k: x for k, x in vars(bundle).items() if k not in ("graphs", "faults", "last_fault")})
@@ -245,10 +259,8 @@ def test_a_step_that_failed_and_is_repeated_equals_one_that_never_failed(export_
         graph.session = session
         if fails:
             np.testing.assert_equal(content(failing), before)
-            (thrust, rates), (expected, turning) = failing(state), untouched(state)
-        else:
-            (thrust, rates), (expected, turning) = (0.0, 0.0), (untouched(state)[0] * 0, 0.0)
-        assert thrust == expected and np.array_equal(rates, turning)
+        given = failing(state) if fails else failing.command(failing.action)
+        np.testing.assert_equal(given, untouched(state))
     np.testing.assert_equal(content(failing), content(untouched))
     assert task != "racing" or failing.progress["gate"] == 1
     if kind is not KeyboardInterrupt:
@@ -261,11 +273,8 @@ def test_a_step_that_failed_and_is_repeated_equals_one_that_never_failed(export_
     [
         ("hovering", {"target": "here"}, r"numbers of shape \(3,\), from -1e\+06 to 1e\+06; got 'here'"),
         ("hovering", {"target": [1, 2]}, r"numbers of shape \(3,\)"),
-        ("hovering", {"target": [10**400, 0, 0]}, "numbers"),
         ("hovering", {"target": [True, False, True]}, "numbers"),
         ("tracking", {"phase": "late"}, r"numbers of shape \(1,\), from 0 to 6.28319; got 'late'"),
-        ("tracking", {"phase": 1e308}, "numbers"),
-        ("tracking", {"phase": 10**5000}, "numbers"),
         ("racing", {"gate": [0, 1]}, r"whole numbers of shape \(1,\), from 0 to 3; got \[0, 1\]"),
         ("racing", {"gate": np.arange(2)}, "whole numbers"),
         *(("racing", {"gate": gate}, "whole numbers") for gate in (4, -1, True, 0.5)),
@@ -301,7 +310,8 @@ def python(program):
     return done.stdout
 
 
-def test_flying_needs_numpy_onnxruntime_and_jsonschema_alone(folder):
+def test_flying_needs_numpy_onnxruntime_and_jsonschema_alone(export_once):
+    folder = export_once("hovering")[2]
     fly = f"""
 import numpy
 from torchrl_quad.deploy import frames, load_bundle
@@ -320,9 +330,8 @@ except MissingPackage as error:
     print(error)
 """
     for name, why in {"onnxruntime": "flies", "jsonschema": "is checked"}.items():
-        assert (
-            python(BLOCKED + missing.format(name, str(folder))) == f"A bundle {why} with {name}: pip install {name}\n"
-        )
+        said = python(BLOCKED + missing.format(name, str(folder)))
+        assert said == f"A bundle {why} with {name}: pip install {name}\n"
 
 
 def test_the_package_imports_its_parts_when_they_are_asked_for():

@@ -44,14 +44,19 @@ HARDER = {  # so that some episodes succeed, some do not, and some crash
 PILOTS = {"relay": {"after": 6}, "ring": {"beyond": 0.5}}
 
 
-@pytest.mark.parametrize("task", HARDER)
-def test_flights_are_judged_as_the_environment_judges_them(task, tmp_path):
-    """In flights of its own, and in those of a bundle in our simulator, of tasks of one's own, too."""
+def harder(name):
+    task = name.removesuffix(", harder")
     options = {"num_envs": 16, "max_episode_steps": 130, "seed": 1, "random_start": {"velocity": 2.0, "tilt": 0.3}}
     env = OWN[task](**options) if task in OWN else make_env(task, **options)
     vars(env).update(HARDER[task])
-    actor = pilot(env, **PILOTS.get(task, {}))
-    bundle = load_bundle(export_policy(actor, env, tmp_path / "policy"))
+    return env, pilot(env, **PILOTS.get(task, {}))
+
+
+@pytest.mark.parametrize("task", HARDER)
+def test_flights_are_judged_as_the_environment_judges_them(export_once, task):
+    """In flights of its own, and in those of a bundle in our simulator, of tasks of one's own, too."""
+    env, actor, folder = export_once(f"{task}, harder", harder)
+    bundle = load_bundle(folder)
     with torch.no_grad():
         mode = {"exploration_type": ExplorationType.DETERMINISTIC}
         flight, _ = differentiable_rollout(env, actor, None, 130, **mode)
@@ -79,13 +84,10 @@ def test_flights_are_judged_as_the_environment_judges_them(task, tmp_path):
         assert ours["metrics"][name].mean() == pytest.approx(bundle.contract["results"][name], abs=1 / 15)
 
 
-def test_a_contract_names_what_the_rules_of_a_task_read_and_nothing_else(tmp_path):
-    env = RelayEnv(4, max_episode_steps=8)
-    about = load_bundle(export_policy(make_actor(env, (4,)), env, tmp_path / "policy")).contract
-    assert (
-        about["task"]["name"] == "own_task.RelayEnv"
-        and about["task"]["about"] == "Visit points in turn, over and over."
-    )
+def test_a_contract_names_what_the_rules_of_a_task_read_and_nothing_else(export_once):
+    about = load_bundle(export_once("relay, harder", harder)[2]).contract
+    assert about["task"]["name"] == "own_task.RelayEnv"
+    assert about["task"]["about"] == "Visit points in turn, over and over."
     entries = {name: (x["shape"], x["dtype"]) for name, x in about["task"]["entries"].items()}
     whole, flag, real = ([1], "int64"), ([1], "bool"), ([1], "float32")
     assert entries == {"stage": whole, "visited": whole, "is_near": flag, "record.gap": real}
@@ -93,9 +95,8 @@ def test_a_contract_names_what_the_rules_of_a_task_read_and_nothing_else(tmp_pat
     assert reads["observe"] == {"stage", "is_near", "step", "action_queue"}
     assert reads["advance"] == {"previous.stage", "previous.visited", "previous.is_near", "previous.record.gap"}
     assert reads["judge"] == {"visited", "record.gap", "step"}
-    assert about["graphs"]["observe"]["reads"]["velocity"] == {
-        "shape": [3], "dtype": "float32", "unit": "m/s", "frame": "world"
-    }  # fmt: skip
+    velocity = {"shape": [3], "dtype": "float32", "unit": "m/s", "frame": "world"}
+    assert about["graphs"]["observe"]["reads"]["velocity"] == velocity
     assert set(about["task"]["metrics"]) == {"solved", "crash", "visited", "nearest"}  # but no speed of rotors
     assert about["task"]["metrics"]["nearest"] == {"label": "nearest", "unit": "cm", "scale": 100.0, "median": False}
 

@@ -1,86 +1,16 @@
-"""Visual policies that remember, exported: images and their faults, the memory, and what is refused."""
+"""Visual policies that remember, exported: the memory in C, and what is refused."""
 
 import ctypes
-import math
-import re
 
 import numpy as np
 import pytest
-import torch
-from deploying import compiled, resting
+from deploying import build, compiled
 from torch import nn
 
 from torchrl_quad import ForestEnv, HoveringEnv, make_visual_actor
-from torchrl_quad.deploy import (
-    MissingQuantity,
-    NegativeDepth,
-    NotFinite,
-    StaleState,
-    WrongActions,
-    export,
-    export_policy,
-    load_bundle,
-    transfer,
-)
+from torchrl_quad.deploy import WrongActions, export, export_policy, load_bundle, transfer
 from torchrl_quad.deploy.bundle import Bundle
 from torchrl_quad.deploy.judging import Judge
-
-
-def a_visual_policy():
-    """A small one that remembers, with its environment."""
-    env = HoveringEnv(num_envs=64, max_episode_steps=16, camera={"width": 3, "height": 2, "rate": 3, "delay": 2})
-    actor = make_visual_actor(env, num_cells=(4,), channels=(2,), hidden_size=2)
-    with torch.no_grad():
-        actor[0][-1].module.mlp[-1].weight.mul_(30.0)
-    return env, actor
-
-
-@pytest.fixture(scope="module")
-def visual(tmp_path_factory):
-    torch.manual_seed(0)
-    env, actor = a_visual_policy()
-    return export_policy(actor, env, tmp_path_factory.mktemp("visual") / "policy")
-
-
-IMAGE = [[0.0, 2.0, 12.0], [1.0, 3.0, 10.0]]
-
-
-def pixel(value):
-    return [[0.0, value, 12.0], [1.0, 3.0, 10.0]]
-
-
-@pytest.mark.parametrize(
-    ("kind", "message", "changes"),
-    [
-        (MissingQuantity, "lacks 'depth': give position, .*, depth, depth_age and age", {"depth": None}),
-        (MissingQuantity, "lacks 'depth_age', the time since the image was taken", {"depth_age": None}),
-        (MissingQuantity, r"depth must have shape \(2, 3\) or \(1, 2, 3\), got \(3, 2\)", {"depth": [[1, 1]] * 3}),
-        (MissingQuantity, "depth must be 6 numbers, got 'far'", {"depth": "far"}),
-        (MissingQuantity, "whole numbers, uint16: give metres. Are they milli", {"depth": np.ones((2, 3), np.uint16)}),
-        (NotFinite, "Not finite: depth. Give 0 for a pixel that measures nothing", {"depth": pixel(math.nan)}),
-        (NotFinite, "Not finite: depth. .* and the range for far", {"depth": pixel(math.inf)}),
-        (NotFinite, "Not finite: depth_age", {"depth_age": math.nan}),
-        (NegativeDepth, "depth must not be negative, got -0.1 m", {"depth": pixel(-0.1)}),
-        (StaleState, "The image is 0.11 s old; the contract allows 0 to 0.1 s", {"depth_age": 0.11}),
-        (StaleState, "The image is -1 s old", {"depth_age": -1}),
-        (StaleState, "The state is 1 s old", {"age": 1}),
-    ],
-)
-def test_each_fault_of_an_image_has_a_name_and_leaves_the_memory_as_it_was(visual, kind, message, changes):
-    bundle, untouched = load_bundle(visual, on_fault="hover"), load_bundle(visual)
-    state = resting(depth=IMAGE, depth_age=0.1)
-    first = bundle(state)
-    assert not np.array_equal(bundle.memory, [0, 0]) and bundle.memory.dtype == np.float32
-    memory = bundle.memory.copy()
-    bundle({key: x for key, x in (state | changes).items() if x is not None})
-    assert bundle.faults == {kind.__name__: 1} and re.search(message, str(bundle.last_fault))
-    np.testing.assert_array_equal(bundle.memory, memory)
-    np.testing.assert_allclose(bundle.action, bundle.contract["output"]["hover_action"])
-    assert untouched(state)[0] == first[0] != bundle(state)[0] == untouched(state)[0]
-    bundle.reset()
-    np.testing.assert_array_equal(bundle.memory, [0, 0])
-    clipped = np.minimum(IMAGE, 10.0)[None]  # what is beyond the range counts as the range
-    assert bundle(state | {"depth": clipped})[0] == first[0]
 
 
 def test_c_leaves_the_memory_as_it_was_where_it_reads_what_is_not_finite(export_once, tmp_path):
@@ -97,7 +27,8 @@ def test_c_leaves_the_memory_as_it_was_where_it_reads_what_is_not_finite(export_
 
 
 def test_a_bundle_that_acts_or_remembers_differently_from_its_policy_is_not_written(tmp_path, monkeypatch, trace_once):
-    env, actor = a_visual_policy()
+    trace_once("forest")
+    env, actor = build("forest")
 
     def forgets(self, *given, read=Bundle._read):
         return read(self, *given) | {"memory": np.zeros_like(self.memory)}

@@ -6,7 +6,7 @@ from flying import fly, hold
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
-from torchrl_quad import HoveringEnv, VisitedStateBuffer, differentiable_rollout, load_drone, make_actor, make_env
+from torchrl_quad import HoveringEnv, load_drone, make_env
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.disturbances import Disturbance, Sensors
@@ -25,15 +25,9 @@ EVERYTHING = {
 }
 
 
-def test_sensors_that_are_given_whole_keep_their_delay():
-    for kwargs, delay in (({}, 3), ({"observation_delay": 1}, 1)):
-        env = HoveringEnv(num_envs=2, observation_noise=Sensors(position=0.1, delay=3), **kwargs)
-        assert env.reset()["state", "measurements"].shape == (2, delay + 1, 13)
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_takes_every_disturbance_and_a_restored_state_flies_the_same(task):
-    env = make_env(task, num_envs=3, dtype=torch.float64, **EVERYTHING)
+    env = make_env(task, num_envs=3, dtype=torch.float64, disturbances=own(), **EVERYTHING)
     check_env_specs(env, break_when_any_done="both")
     env.set_seed(1)
     whole = fly(env, env.reset(), hold(env, 4))
@@ -69,20 +63,6 @@ def test_gradients_with_every_disturbance_agree_with_finite_differences(task):
     assert torch.autograd.gradcheck(rewards_and_observations, inputs, fast_mode=True, atol=1e-6, rtol=1e-5)
 
 
-def test_the_visited_state_buffer_keeps_the_drone_and_the_sensors():
-    env = make_env("racing", num_envs=4, **EVERYTHING)
-    actor, buffer = make_actor(env), VisitedStateBuffer(100)
-    rollout, _ = differentiable_rollout(env, actor, None, 5)
-    buffer.extend(rollout)
-    carry = buffer.initial_state(env, fraction=1.0)
-    masses = rollout["state", "drone", "mass"].flatten()
-    assert torch.isin(carry["state", "drone", "mass"].flatten(), masses).all()
-    assert carry["state", "measurements"].shape == (4, 3, 13)
-
-
-# -- drones ------------------------------------------------------------------------------------------------------------
-
-
 def test_drones_are_drawn_at_reset_within_their_bounds_and_stay_for_an_episode():
     env = HoveringEnv(num_envs=2000, randomize=EVERYTHING["randomize"], max_episode_steps=3)
     td = env.reset()
@@ -99,7 +79,7 @@ def test_drones_are_drawn_at_reset_within_their_bounds_and_stay_for_an_episode()
     assert (flight[:, 2] != flight[:, 3]).all()
 
 
-def test_a_drone_that_is_heavier_than_its_controller_believes_sinks():
+def test_a_drone_that_is_heavier_or_weaker_than_its_controller_believes_flies_so(tmp_path):
     env = HoveringEnv(num_envs=1, randomize={"mass": {"uniform": [0.552, 0.552]}}, dtype=torch.float64)
     fixed = HoveringEnv(num_envs=1, dtype=torch.float64)
     fixed.params = fixed.params.replace(mass=0.552)
@@ -110,18 +90,10 @@ def test_a_drone_that_is_heavier_than_its_controller_believes_sinks():
     # 20 % too heavy: it falls with (1 - 1 / 1.2) g.
     assert flight["next", "state", "velocity"][0, -1, 2].item() == pytest.approx(-9.81 / 6 * 0.4, rel=0.02)
     assert env.nominal.mass.item() == pytest.approx(0.46)
-
-
-def test_weaker_rotors_do_not_turn_faster_than_they_can():
-    env = HoveringEnv(num_envs=1, randomize={"rotor_speed_max": {"uniform": [1800.0, 1800.0]}})
-    flight = fly(env, env.reset(), [torch.tensor([[1.0, 0.0, 0.0, 0.0]])] * 30)
+    (tmp_path / "drones.yaml").write_text("rotor_speed_max: {uniform: [1800, 1800]}\n")
+    weak = HoveringEnv(num_envs=1, randomize=str(tmp_path / "drones.yaml"))
+    flight = fly(weak, weak.reset(), [torch.tensor([[1.0, 0.0, 0.0, 0.0]])] * 30)
     assert flight["next", "state", "rotor_speed"].max().item() == pytest.approx(1800.0, rel=1e-3)
-
-
-def test_a_yaml_file_of_distributions_is_read(tmp_path):
-    (tmp_path / "drones.yaml").write_text("mass: {scale: [0.9, 1.1]}\n")
-    env = HoveringEnv(num_envs=2, randomize=str(tmp_path / "drones.yaml"))
-    assert env.reset()["state", "drone", "mass"].shape == (2, 1)
 
 
 @pytest.mark.parametrize(
@@ -131,10 +103,7 @@ def test_a_yaml_file_of_distributions_is_read(tmp_path):
         ({"rate_gain": {"scale": [0.9, 1.1]}}, "'rate_gain' belongs to the flight controller, which keeps the nominal"),
         ({"mass": {"gamma": [1, 2]}}, "mass needs one distribution of: uniform: low and high; scale: .*; normal: "),
         ({"mass": 0.5}, "mass needs one distribution of"),
-        ({"mass": {"uniform": [1.0]}}, "mass needs two numbers"),
-        ({"mass": {"uniform": [2.0, 1.0]}}, "mass needs two numbers"),
         ({"mass": {"uniform": [-0.1, 1.0]}}, "drones that may be drawn are not all possible: .*'mass' must be between"),
-        ({"mass": {"normal": [0.5, 0.2]}}, "not all possible"),
         ({"mass": {"normal": [0.5, -0.1]}}, "mass needs two numbers, mean and standard deviation"),
         ({"rotor_spin": {"scale": [-1, 1]}}, "unknown field 'rotor_spin'"),
         (
@@ -149,9 +118,6 @@ def test_impossible_drones_are_refused(randomize, message):
         HoveringEnv(num_envs=1, randomize=randomize)
 
 
-# -- wind --------------------------------------------------------------------------------------------------------------
-
-
 def test_in_the_wind_a_drone_drifts_until_it_moves_with_the_air():
     drone = load_drone("visfly").replace(linear_drag=[2.0, 2.0, 2.0])
     env = HoveringEnv(num_envs=1, drone=drone, wind={"mean": [1.0, -0.5, 0.0]})
@@ -161,22 +127,15 @@ def test_in_the_wind_a_drone_drifts_until_it_moves_with_the_air():
     assert fly(calm, calm.reset(), hold(calm, 10))["next", "state", "velocity"].abs().max() < 1e-5
 
 
-def test_gusts_have_the_strength_and_the_memory_asked_for():
+def test_wind_has_the_strength_the_memory_and_the_spread_asked_for():
     env = HoveringEnv(num_envs=4000, wind={"mean": [2.0, 0.0, 0.0], "gust": 1.5, "gust_time": 0.1})
     wind = fly(env, env.reset(), hold(env, 6))["next", "state", "wind"] - torch.tensor([2.0, 0.0, 0.0])
     for t in (0, 5):
         assert wind[:, t].std(0).tolist() == pytest.approx([1.5] * 3, rel=0.05)
     correlation = (wind[:, 0] * wind[:, 5]).mean(0) / 1.5**2
     assert correlation.tolist() == pytest.approx([0.368] * 3, abs=0.06)
-
-
-def test_the_mean_wind_differs_between_episodes_within_its_spread():
-    env = HoveringEnv(num_envs=1000, wind={"spread": [3.0, 0.0, 1.0]})
-    wind = env.reset()["state", "wind"]
-    assert wind.abs().amax(0).tolist() == pytest.approx([3.0, 0.0, 1.0], abs=0.05)
-
-
-# -- sensors -----------------------------------------------------------------------------------------------------------
+    mean = HoveringEnv(num_envs=1000, wind={"spread": [3.0, 0.0, 1.0]}).reset()["state", "wind"]
+    assert mean.abs().amax(0).tolist() == pytest.approx([3.0, 0.0, 1.0], abs=0.05)
 
 
 def test_the_observation_lags_behind_by_the_delay():
@@ -186,6 +145,9 @@ def test_the_observation_lags_behind_by_the_delay():
     torch.testing.assert_close(seen["observation"][:, 3:], true["observation"][:, :-3])
     torch.testing.assert_close(seen["next", "reward"], true["next", "reward"])
     assert (seen["observation"][:, :3] == true["observation"][:, :1]).all()
+    for kwargs, delay in (({}, 3), ({"observation_delay": 1}, 1)):  # sensors that are given whole keep their delay
+        env = HoveringEnv(num_envs=2, observation_noise=Sensors(position=0.1, delay=3), **kwargs)
+        assert env.reset()["state", "measurements"].shape == (2, delay + 1, 13)
 
 
 def test_the_noise_has_the_size_asked_for_and_rewards_do_not_see_it():
@@ -193,18 +155,14 @@ def test_the_noise_has_the_size_asked_for_and_rewards_do_not_see_it():
     env = HoveringEnv(num_envs=4000, observation_noise=noise)
     flight = fly(env, env.reset(), hold(env, 3))
     seen, state = flight["next", "observation"][:, -1], flight["next", "state"][:, -1]
-    error = seen[:, :3] - (state["target"] - state["position"])
-    assert error.std(0).tolist() == pytest.approx([0.2] * 3, rel=0.05)
-    assert seen[:, 7:10].std(0).tolist() == pytest.approx([0.3] * 3, rel=0.05)
-    assert seen[:, 10:].std(0).tolist() == pytest.approx([0.4] * 3, rel=0.05)
+    sizes = {"position": seen[:, :3] - (state["target"] - state["position"]), "velocity": seen[:, 7:10]}
+    for name, error in {**sizes, "angular_velocity": seen[:, 10:]}.items():
+        assert error.std(0).tolist() == pytest.approx([noise[name]] * 3, rel=0.05)
     angle = quaternion.rotate(seen[:, 3:7] / 10, torch.tensor([0.0, 0.0, 1.0]).expand(4000, 3))[:, :2]
     assert angle.std(0).tolist() == pytest.approx([0.05] * 2, rel=0.05)
     assert seen[:, 3:7].norm(dim=-1).tolist() == pytest.approx([10.0] * 4000, abs=1e-4)
     silent = HoveringEnv(num_envs=4000)
     assert torch.equal(flight["next", "reward"], fly(silent, silent.reset(), hold(env, 3))["next", "reward"])
-
-
-# -- starts ------------------------------------------------------------------------------------------------------------
 
 
 def test_random_starts_tilt_turn_and_push_within_their_bounds():
@@ -227,25 +185,16 @@ def test_random_starts_tilt_turn_and_push_within_their_bounds():
         ({"wind": {"speed": 3}}, "wind: unknown key 'speed'. Allowed: mean, spread, gust, gust_time"),
         ({"wind": {"mean": [1.0]}}, "wind: mean must have at least 3 items, not 1, got .* Along x, y and z"),
         ({"wind": {"spread": [-1.0, 0.0, 0.0]}}, r"wind: spread\[0\] must be at least 0, got -1"),
-        ({"wind": {"gust": -1.0}}, "wind: gust must be at least 0, got -1"),
-        ({"wind": {"gust_time": 0.0}}, "wind: gust_time must be at least 0.001, got 0"),
         ({"wind": {"mean": [-60, 0, 0], "spread": [25, 0, 0], "gust": 4.0}}, "add up to 105 m/s; .* to 100 m/s"),
         ({"wind": 3.0}, "wind must be a mapping with any of mean"),
-        ({"observation_noise": {"yaw": 1.0}}, "observation_noise: unknown key 'yaw'"),
         ({"observation_noise": {"delay": 1}}, "observation_noise: unknown key 'delay'"),
-        ({"observation_noise": {"position": -1.0}}, "observation_noise: position must be at least 0, got -1"),
         ({"observation_delay": -1}, "observation_delay must be at least 0, got -1. Control steps by which"),
-        ({"observation_delay": 10**7}, "observation_delay must be at most 1000, got 10000000"),
         ({"random_start": {"tilt": float("nan")}}, "random_start: tilt must be a finite number, got nan"),
-        ({"random_start": {"velocity": 1e9}}, "random_start: velocity must be at most 300, got 1000000000.0"),
     ],
 )
 def test_bad_options_say_what_is_allowed(kwargs, message):
     with pytest.raises(ValueError, match=message):
         HoveringEnv(num_envs=1, **kwargs)
-
-
-# -- of one's own -----------------------------------------------------------------------------------------------------
 
 
 class GyroBias(Disturbance):
@@ -282,25 +231,15 @@ def own():
     return [GyroBias(), BatterySag(load_drone("visfly").thrust_map)]
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_disturbances_of_one_s_own_fly_in_every_task_and_are_restored_with_the_state(task):
-    env = make_env(task, num_envs=3, dtype=torch.float64, max_episode_steps=40, disturbances=own())
-    check_env_specs(env)
+def test_disturbances_of_one_s_own_change_what_is_seen_and_what_flies():
+    env = HoveringEnv(num_envs=3, dtype=torch.float64, disturbances=own())
     td = env.reset()
-    flight = fly(env, td, hold(env, 20))
-    state = flight["next", "state"]
-    if task != "forest":  # where no body rates are observed
-        torch.testing.assert_close(td["observation"][:, -3:], td["state", "gyro_bias"])  # at rest there is nothing else
+    state = fly(env, td, hold(env, 20))["next", "state"]
+    torch.testing.assert_close(td["observation"][:, -3:], td["state", "gyro_bias"])  # at rest there is nothing else
     assert (state["gyro_bias"].diff(dim=1) != 0).all()
     torch.testing.assert_close(state["charge"][:, -1], td["state", "charge"] - 0.02 * 0.4)
     torch.testing.assert_close(state["drone", "thrust_map"][:, -1], state["charge"][:, -1] * env.nominal.thrust_map)
     assert (state["velocity"][:, -1, 2] < -0.02).all()  # the controller believes in a full battery
-    env.set_seed(99)  # other noise; it changes what is seen, and not the battery
-    restored = env.reset(TensorDict({"state": state[:, 11].clone()}, [3]), set_state=True)
-    torch.testing.assert_close(restored["observation"], flight["next", "observation"][:, 11], rtol=0, atol=0)
-    again = fly(env, restored, hold(env, 3))["next", "state"]
-    for key in ("position", "charge", ("drone", "thrust_map")):
-        assert torch.equal(again[key], state[key][:, 12:15])
 
 
 @pytest.mark.parametrize("drift", [GyroBias, f"{__name__}.GyroBias", {"_target_": f"{__name__}.GyroBias"}])
@@ -312,20 +251,19 @@ def test_a_disturbance_may_be_given_by_its_class_or_its_path_alone_or_in_a_list(
         HoveringEnv(num_envs=1, disturbances={"_target_": f"{__name__}.GyroBias", "size": 3})
 
 
-def test_what_is_not_a_disturbance_is_refused():
-    for wrong, message in ((3.0, "must be a list of Disturbance, got float"), ([3.0], "each must .* got float")):
-        with pytest.raises(TypeError, match=f"disturbances:? {message}"):
-            HoveringEnv(num_envs=1, disturbances=wrong)
-    with pytest.raises(TypeError, match="disturbances: each must be a Disturbance, .* got HoveringEnv"):
-        HoveringEnv(num_envs=1, disturbances=HoveringEnv)
-    with pytest.raises(ValueError, match="disturbance 'disturbed.Gyro': Python finds no module 'disturbed'"):
-        HoveringEnv(num_envs=1, disturbances="disturbed.Gyro")
-    sag = own()[1]
-    with pytest.raises(ValueError, match=r"Entry \('drone', 'thrust_map'\) changes no parameter of the drone"):
-        HoveringEnv(num_envs=1, disturbances=[sag], dynamics="point_mass")
-
-
-# -- weights -----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("wrong", "error", "message"),
+    [
+        (3.0, TypeError, "disturbances must be a list of Disturbance, got float"),
+        ([3.0], TypeError, "disturbances=3.0: it must be a subclass of Disturbance, its path, or an instance"),
+        (HoveringEnv, TypeError, "disturbances=HoveringEnv: it must be a subclass of Disturbance"),
+        ("disturbed.Gyro", ValueError, "disturbances 'disturbed.Gyro': Python finds no module 'disturbed'"),
+        (own()[1], ValueError, r"Entry \('drone', 'thrust_map'\) changes no parameter of the drone"),
+    ],
+)
+def test_what_is_not_a_disturbance_is_refused(wrong, error, message):
+    with pytest.raises(error, match=message):
+        HoveringEnv(num_envs=1, disturbances=wrong, dynamics="point_mass")
 
 
 def test_a_weight_may_be_changed_and_an_unknown_one_is_named():

@@ -7,16 +7,11 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import StepCounter, TransformedEnv
 
-from torchrl_quad import HoveringEnv, available_tasks, differentiable_rollout, load_drone, make_actor, make_env
+from torchrl_quad import HoveringEnv, differentiable_rollout, load_drone, make_actor, make_env
 from torchrl_quad.envs import Event
 
 nan = float("nan")
 visfly = load_drone("visfly")
-
-
-@pytest.fixture
-def flight(env):
-    return differentiable_rollout(env, make_actor(env), None, 3)
 
 
 def linear(inputs, outputs, in_key="observation", out_key="action", **kwargs):
@@ -28,52 +23,32 @@ def near(state, **other):
     return Event(**{"happened": state["step"] > 0, "time": state["position"][:, :1], "amount": 1.0, **other})
 
 
-# -- options -----------------------------------------------------------------------------------------------------------
+def adding(**entries):
+    return lambda self, n: {**HoveringEnv.initial_state(self, n), **entries}
 
 
-@pytest.mark.parametrize(
-    ("task", "kwargs", "message"),
-    [
+def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them():
+    for task, kwargs, message in (
         ("hovering", {"num_env": 3}, r"HoveringEnv got .* 'num_env'. Did you mean 'num_envs'\? Choose from: "),
-        ("landing", {"max_episode_step": 3}, r"LandingEnv .* Did you mean 'max_episode_steps'\?"),
         ("racing", {"gate_bonsu": "log"}, r"RacingEnv got an unexpected .* 'gate_bonsu'. Did you mean 'gate_bonus'\?"),
-        ("tracking", {"curves": 1}, r"Did you mean 'curve'\? Choose from: action_delay, camera, compile, control,"),
-        ("hovering", {"xyz": 1}, r"argument 'xyz'. Choose from: action_delay, camera, .* seed, weights, wind.$"),
-    ],
-)
-def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them(task, kwargs, message):
-    with pytest.raises(TypeError, match=message):
-        make_env(task, **kwargs)
+        ("tracking", {"xyz": 1}, r"argument 'xyz'. Choose from: action_delay, camera, .*curve.* weights, wind.$"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            make_env(task, **kwargs)
 
 
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
         ({"num_envs": 2.5}, "num_envs must be a whole number, got 2.5"),
-        ({"num_envs": "4"}, "num_envs must be a whole number, got '4'"),
-        ({"num_envs": -1}, "num_envs must be at least 1, got -1"),
-        ({"max_episode_steps": 2.5}, "max_episode_steps must be a whole number, got 2.5"),
         ({"max_episode_steps": -3}, "max_episode_steps must be at least 1, got -3"),
-        ({"action_delay": 0.5}, "action_delay must be a whole number, got 0.5"),
         ({"dt": "fast"}, "dt must be a number, got 'fast'. The physics step, 1e-6 to 0.1 s"),
-        ({"dt": -0.01}, "dt must be at least 0.000001, got -0.01. The physics step"),
         ({"control_dt": 0.002}, "control_dt must be a whole multiple of dt, .* 0.002 and 0.005. Try control_dt=0.005."),
-        (
-            {"seed": "lucky"},
-            "seed must be a whole number, got 'lucky'. Of the environment's own random generator, from 0; None takes",
-        ),
-        (
-            {"weights": ["velocity"]},
-            r"weights must be a mapping from terms of the reward to numbers, got \['velocity'\]",
-        ),
+        ({"seed": "lucky"}, "seed must be a whole number, got 'lucky'. Of the environment's own random generator"),
+        ({"weights": ["velocity"]}, "weights must be a mapping from terms of the reward to numbers, got .'velocity'"),
         ({"weights": {"velocity": nan}}, "weights: velocity must be a finite number, got nan"),
-        ({"weights": {"velocity": "much"}}, "weights: velocity must be a number, got 'much'"),
         ({"weights": {"velocity": torch.ones(3)}}, "weights: velocity must be a number, got tensor"),
-        ({"weights": {"velocity": torch.tensor(nan)}}, "weights: velocity must be a finite number, got nan"),
         ({"event_discount": 0}, "event_discount must be greater than 0, got 0. The discount per control step"),
-        ({"event_discount": 1.01}, "event_discount must be at most 1, got 1.01"),
-        ({"event_discount": nan}, "event_discount must be a finite number, got nan"),
-        ({"event_discount": True}, "event_discount must be a number, got True"),
         ({"event_discount": "gamma"}, "got 'gamma'. The discount .*; None for no gradient in it."),
         ({"drone": visfly.replace(mass=460.0)}, r"to hover, its rotors would have to turn at .* Check mass \[kg\]"),
         ({"drone": visfly.replace(max_thrust_to_weight=0.8)}, "max_thrust_to_weight .* must be above 1 to hover; got"),
@@ -82,18 +57,10 @@ def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them(task,
             "the four rotors cannot make thrust and torque about each axis on their own",
         ),
         ({"drone": None}, "drone must be the name of a preset, .* or QuadrotorParams, got None"),
-        ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
-        ({"num_envs": 10**8}, "num_envs must be at most 10000000, got 100000000"),
         ({"seed": -1}, "seed must be at least 0, got -1"),
-        ({"seed": True}, "seed must be a whole number, got True"),
         ({"dtype": torch.int32}, "dtype must be torch.float32 or torch.float64"),
         ({"dynamics": "plane"}, r"dynamics must be one of quadrotor, point_mass(, \w+)*, got 'plane'"),
-        ({"control_dt": nan}, "control_dt must be a finite number, got nan"),
-        ({"action_delay": -1}, "action_delay must be at least 0, got -1. Control steps from a command to its effect"),
-        ({"action_delay": 10**6}, "action_delay must be at most 1000, got 1000000"),
         ({"action_delay": 0, "observe_last_action": True}, "with action_delay=0 there are none"),
-        ({"integrator": "heun"}, "integrator must be 'euler', 'semi_implicit_euler' or 'rk4', got 'heun'"),
-        ({"drone": "dji"}, "Unknown drone 'dji'. Choose from"),
     ],
 )
 def test_a_bad_value_is_refused_by_name(kwargs, message):
@@ -101,25 +68,16 @@ def test_a_bad_value_is_refused_by_name(kwargs, message):
         HoveringEnv(**kwargs)
 
 
-@pytest.mark.parametrize("task", ["hover", None, ["hovering"]])
-def test_an_unknown_task_is_refused_with_the_known_ones(task):
-    with pytest.raises(ValueError, match=f"Unknown task .*. Choose from: {', '.join(available_tasks())}."):
-        make_env(task)
-
-
 @pytest.mark.parametrize(
     ("method", "wrong", "message"),
     [
         ("observe", lambda _, s: s["position"][:, 0], r"observe\(state\) must be a tensor \(4, k\), torch.float32"),
-        ("observe", lambda _, s: s["position"].double(), r"got \(4, 3\), torch.float64"),
         ("reward_terms", lambda _, s: {"near": -s["position"]}, r"reward_terms\(state\)\['near'\] must .* keepdim"),
         ("reward_terms", lambda _, s: {"near": -s["position"][:, 0]}, r"\['near'\] must .*; got \(4,\)"),
         ("reward_terms", lambda _, s: -s["position"], r"reward_terms\(state\) must be a mapping .*; got Tensor"),
         ("advance", lambda _, p, s: None, r"advance\(previous, state\) must be a mapping .*; got NoneType"),
-        ("reward_terms", lambda _, s: {"near": 0.1}, r"\['near'\] must be a tensor \(4, 1\), .*; got float"),
         ("metrics", lambda _, s: {"far": s["position"]}, r"metrics\(state\)\['far'\] must be a tensor \(4, 1\)"),
         ("is_crash", lambda _, s: s["position"][:, :1], r"is_crash\(state\) must be a tensor \(4, 1\), torch.bool"),
-        ("is_success", lambda _, s: s["position"] > 0, r"is_success\(state\) must .* got \(4, 3\), torch.bool"),
         ("advance", lambda _, p, s: {"position": s["position"]}, "advance must return the whole state, and 'target'"),
         ("advance", lambda _, p, s: {**s, "target": s["target"].double()}, "float32.; got .* torch.float64"),
         ("events", lambda _, p, s: {"near": 0.5}, r"\['near'\] must be an Event; got float"),
@@ -127,20 +85,12 @@ def test_an_unknown_task_is_refused_with_the_known_ones(task):
         ("events", lambda _, p, s: {"near": near(s, time=s["position"])}, r"\.time must be a tensor \(4, 1\), .* got"),
         ("events", lambda _, p, s: {"near": near(s, amount=None)}, r"\.amount must be a tensor \(4, 1\), .* NoneType"),
         ("events", lambda _, p, s: {"near": near(s, term="gate")}, "term must be one of survival, .*; got 'gate'"),
+        ("initial_state", adding(legs=torch.zeros(4)), r"'legs' must be a tensor \(4, ...\) of at least two .*\(4,\)"),
+        ("initial_state", adding(step=torch.zeros(4, 1)), "entry 'step' is the environment's own; give yours another"),
         (
             "initial_state",
-            lambda self, n: {**HoveringEnv.initial_state(self, n), "legs": torch.zeros(n)},
-            r"initial_state: entry 'legs' must be a tensor \(4, ...\) of at least two dimensions, .* got \(\(4,\)",
-        ),
-        (
-            "initial_state",
-            lambda self, n: {**HoveringEnv.initial_state(self, n), "step": torch.zeros(n, 1)},
-            "initial_state: entry 'step' is the environment's own; give yours another name",
-        ),
-        (
-            "initial_state",
-            lambda self, n: {**HoveringEnv.initial_state(self, n), "legs": torch.zeros(n, 1, dtype=torch.int32)},
-            r"initial_state: entry 'legs' must be .* torch.float32, int64 or bool; got \(\(4, 1\), torch.int32\)",
+            adding(legs=torch.zeros(4, 1).int()),
+            r"'legs' must be .* int64 or bool; got .* torch.int32\)",
         ),
     ],
 )
@@ -158,49 +108,37 @@ def test_an_event_whose_term_has_a_name_that_is_taken_is_refused():
         type("OwnEnv", (HoveringEnv,), methods)(num_envs=4)
 
 
+def test_parameters_that_do_not_fit_are_refused(env):
+    with pytest.raises(TypeError, match="params must be QuadrotorParams, such as env.params.replace.*; got str"):
+        env.params = "visfly"
+
+
 @pytest.mark.parametrize(
-    ("params", "error", "message"),
+    ("action", "message"),
     [
-        ("visfly", TypeError, "params must be QuadrotorParams, such as env.params.replace.*; got str"),
-        (visfly.replace(mass=[[0.4]] * 3), ValueError, "field 'mass' is for 3 environments, and num_envs=4"),
+        *((torch.zeros(shape), r"must have shape \(4, 4\), .* got \(") for shape in ((4,), (4, 1), (4, 5), (4, 4, 1))),
+        *(
+            (
+                torch.zeros(4, 4, dtype=kind),
+                f"is {kind}, and the environment flies in torch.float32. Convert the policy",
+            )
+            for kind in (torch.float16, torch.float64, torch.bool, torch.int64, torch.complex64)
+        ),
     ],
+    ids=lambda x: f"{x.dtype} {tuple(x.shape)}" if isinstance(x, torch.Tensor) else "",
 )
-def test_parameters_that_do_not_fit_are_refused(env, params, error, message):
-    with pytest.raises(error, match=message):
-        env.params = params
-
-
-# -- actions -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("shape", [(4,), (4, 1), (4, 3), (4, 5), (4, 4, 1)])
-def test_an_action_of_another_shape_is_refused_and_not_broadcast(env, shape):
-    message = r"The action must have shape \(4, 4\), named in env.action_units, for each environment; got \("
-    with pytest.raises(ValueError, match=message):
-        env.step(env.reset().set("action", torch.zeros(shape)))
-    policy = TensorDictModule(lambda _: torch.zeros(shape), in_keys=["observation"], out_keys=["action"])
-    with pytest.raises(ValueError, match=message):
-        env.rollout(2, policy, break_when_any_done=False)
-
-
-def test_a_policy_that_writes_no_action_learns_where_to(env):
-    message = 'The action must have shape .* there is none. A policy writes it under "action", as make_actor'
-    with pytest.raises(ValueError, match=message):
-        differentiable_rollout(env, linear(13, 4, out_key="acton"), None, 2)
-    with pytest.raises(ValueError, match=message):
-        env.step(env.reset())
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float64, torch.bool, torch.int64, torch.complex64], ids=str)
-def test_an_action_of_another_kind_is_refused_by_its_name(env, dtype):
-    message = f"The action is {dtype}, and the environment flies in torch.float32. Convert the policy"
-    action = torch.zeros(4, 4, dtype=dtype)
-    with pytest.raises(ValueError, match=message):
+def test_an_action_of_another_shape_or_kind_is_refused_and_not_broadcast(env, action, message):
+    with pytest.raises(ValueError, match=f"The action {message}"):
         env.step(env.reset().set("action", action))
     policy = TensorDictModule(lambda _: action, in_keys=["observation"], out_keys=["action"])
     for break_when_any_done in (False, True):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match=f"The action {message}"):
             env.rollout(2, policy, break_when_any_done=break_when_any_done)
+
+
+def test_a_policy_that_writes_no_action_learns_where_to(env):
+    with pytest.raises(ValueError, match='there is none. A policy writes it under "action", as make_actor.env. does'):
+        differentiable_rollout(env, linear(13, 4, out_key="acton"), None, 2)
 
 
 def test_an_action_on_another_device_is_refused(env):
@@ -237,10 +175,7 @@ def test_an_action_is_not_looked_at_where_nobody_can(env64, transform):
         assert getattr(torch.func, transform)(reward)(action).isfinite().all()
 
 
-# -- rollouts ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("horizon", [0, -1, 2.5, "long"])
+@pytest.mark.parametrize("horizon", [0, 2.5, "long"])
 def test_a_horizon_is_a_number_of_steps(env, horizon):
     with pytest.raises(ValueError, match="horizon must be (at least 1|a whole number), got"):
         differentiable_rollout(env, make_actor(env), None, horizon)
@@ -258,19 +193,11 @@ def test_an_actor_that_reads_what_nobody_writes_is_refused_with_what_there_is(en
         differentiable_rollout(env, make_actor(env), env.reset().select("state"), 2)
 
 
-def test_an_error_inside_the_actor_stays_what_it_is(env):
-    def fail(_):
-        raise KeyError("mine")
-
-    with pytest.raises(KeyError, match="mine"):
-        differentiable_rollout(env, TensorDictModule(fail, in_keys=["observation"], out_keys=["action"]), None, 2)
-
-
-def test_a_carry_is_a_tensordict_of_the_environment(env, flight):
-    actor, (rollout, carry) = make_actor(env), flight
+def test_a_carry_is_a_tensordict_of_the_environment(env):
+    actor = make_actor(env)
+    rollout, carry = differentiable_rollout(env, actor, None, 3)
     with pytest.raises(TypeError, match="carry must be the tensordict to start from, or None .* got Tensor"):
         differentiable_rollout(env, actor, torch.zeros(4), 2)
-    with pytest.raises(ValueError, match=r"carry has batch size \(2,\), and the environment \(4,\)"):
-        differentiable_rollout(env, actor, carry[:2], 2)
-    with pytest.raises(ValueError, match=r"carry has batch size \(4, 3\), and the environment \(4,\)"):
-        differentiable_rollout(env, actor, rollout, 2)
+    for wrong, size in ((carry[:2], r"\(2,\)"), (rollout, r"\(4, 3\)")):
+        with pytest.raises(ValueError, match=rf"carry has batch size {size}, and the environment \(4,\)"):
+            differentiable_rollout(env, actor, wrong, 2)

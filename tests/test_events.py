@@ -16,6 +16,8 @@ GAMMA = 0.97
 STEPS = 8
 PAID = {"racing": "gate", "landing": "success"}  # by the terms that an event pays
 TIMED = {"racing": "gate_time", "landing": "touchdown_time"}
+EVENT_PAYS = {"racing": 5.0, "landing": 20.0}
+each_task = pytest.mark.parametrize("task", PAID)
 
 
 def racers(**options):
@@ -51,10 +53,6 @@ def flight(env, state, actions):
     return fly(env, td, actions.unbind(1))
 
 
-def on_the_way(steps, key, fraction):
-    return steps["state", key] + fraction * (steps["next", "state", key] - steps["state", key])
-
-
 def bisected(env, steps):
     """The fraction of each step (n, STEPS, 1) at which its event happens, by bisection; 0 where none does."""
     if isinstance(env, RacingEnv):
@@ -69,8 +67,10 @@ def bisected(env, steps):
         high = torch.ones_like(steps["next", "reward"])
 
         def inside(fraction):
-            at = {key: on_the_way(steps, key, fraction) for key in ("position", "velocity", "target")}
-            return env.is_success(at)
+            ends = (
+                (key, steps["state", key], steps["next", "state", key]) for key in ("position", "velocity", "target")
+            )
+            return env.is_success({key: torch.lerp(start, end, fraction) for key, start, end in ends})
 
     low, happened = torch.zeros_like(high), inside(high)
     for _ in range(60):
@@ -89,21 +89,12 @@ def counted(steps):
 def rates(env, task, steps):
     """The dense terms at the ends of steps, as they were paid until the event and after it."""
     end = {key: x.flatten(0, 1) for key, x in steps["next", "state"].items()}
-    old = {key: steps["state", key].flatten(0, 1) for key in env.task_entries}
-
-    def dense(state):
-        return sum(x for name, x in env.reward_terms(state).items() if name != PAID[task]).view(-1, STEPS, 1)
-
-    goes_on = ~steps["next", "terminated"]
-    return dense({**end, **old}), dense(end) * goes_on
-
-
-def return_in_events(env, task, steps, before, after):
-    """What the events of a flight pay, and what the dense terms pay in their steps at these rates, (n)."""
-    fraction, happened = bisected(env, steps)
-    bonus = 20.0 if task == "landing" else 5.0
-    paid = bonus * GAMMA**fraction + fraction * before + (1.0 - fraction) * after
-    return (counted(steps) * happened * paid).sum((1, 2))
+    old = {**end, **{key: steps["state", key].flatten(0, 1) for key in env.task_entries}}
+    before, after = (
+        sum(x for name, x in env.reward_terms(state).items() if name != PAID[task]).view(-1, STEPS, 1)
+        for state in (old, end)
+    )
+    return before, after * ~steps["next", "terminated"]
 
 
 def actions_of(env, task):
@@ -113,7 +104,7 @@ def actions_of(env, task):
     return actions
 
 
-@pytest.mark.parametrize("task", STARTS)
+@each_task
 def test_gradients_in_actions_and_start_are_those_of_the_return_in_continuous_time(task):
     env, state = STARTS[task](event_discount=GAMMA)
     names = ("position", "velocity", "angular_velocity")
@@ -130,7 +121,11 @@ def test_gradients_in_actions_and_start_are_those_of_the_return_in_continuous_ti
         """The returns of another flight; all that the task pays is what its events pay, and its dense terms."""
         with torch.no_grad():
             moved = flight(env, state.clone().update(dict(zip(names, values[1:], strict=True))), values[0])
-            events = return_in_events(env, task, moved, before, after)
+            fraction, happened = bisected(
+                env, moved
+            )  # what events pay, and the dense terms at these rates in their steps
+            paid = EVENT_PAYS[task] * GAMMA**fraction + fraction * before + (1.0 - fraction) * after
+            events = (counted(moved) * happened * paid).sum((1, 2))
             terms = moved["next", "reward_terms"].items()
             dense = sum(x for name, x in terms if name not in (PAID[task], TIMED[task]))
             return {"events": events, "all": events + (counted(moved) * dense).sum((1, 2))}
@@ -150,7 +145,7 @@ def test_gradients_in_actions_and_start_are_those_of_the_return_in_continuous_ti
             torch.testing.assert_close(slope, expected, rtol=1e-6, atol=1e-12)
 
 
-@pytest.mark.parametrize("task", STARTS)
+@each_task
 def test_values_and_all_other_terms_and_their_gradients_are_the_same_with_the_option_and_without(task):
     flights, grads = [], []
     for discount in (GAMMA, None):
@@ -171,7 +166,7 @@ def test_values_and_all_other_terms_and_their_gradients_are_the_same_with_the_op
         assert torch.equal(flights[0][key], x), key
 
 
-@pytest.mark.parametrize("task", STARTS)
+@each_task
 def test_the_audit_says_that_a_term_has_a_gradient_in_time_only(task):
     env, state = STARTS[task](event_discount=GAMMA)
     actions = actions_of(env, task).requires_grad_()
@@ -186,7 +181,7 @@ def test_the_audit_says_that_a_term_has_a_gradient_in_time_only(task):
 @pytest.mark.parametrize(
     "options", [{}, {"dynamics": "point_mass"}, {"wind": {"gust": 3.0}, "randomize": {"mass": {"scale": [0.8, 1.2]}}}]
 )
-@pytest.mark.parametrize("task", STARTS)
+@each_task
 def test_tumbling_and_standing_drones_have_finite_gradients_and_specs_hold(task, options):
     check_env_specs(make_env(task, num_envs=2, event_discount=0.99, **options), break_when_any_done="both")
     env, state = STARTS[task](event_discount=0.99, **options)
@@ -198,27 +193,20 @@ def test_tumbling_and_standing_drones_have_finite_gradients_and_specs_hold(task,
     assert all(x.any() and x.isfinite().all() for x in grads)
 
 
-# -- times -------------------------------------------------------------------------------------------------------------
-
-
 def test_times_have_the_derivatives_of_finite_differences():
     start, end = torch.randn(2, 50, 3, dtype=torch.float64)
     centre = start + 0.7 * (end - start) + 0.02 * torch.randn(50, 3, dtype=torch.float64)
-    assert torch.autograd.gradcheck(
-        lambda *x: ball_entry(*x, 0.1), [x.requires_grad_() for x in (start, end, centre)], atol=1e-7, rtol=1e-6
-    )
     high, low = torch.rand(2, 50, 1, dtype=torch.float64) * torch.tensor([1.0, -1.0]).view(2, 1, 1) + 0.2
-    crossed = (high > 0.2) & (low < 0.2)
-    assert crossed.all()
-    ends = [x.requires_grad_() for x in (high, low)]
-    assert torch.autograd.gradcheck(lambda *x: level_crossing(*x, 0.2), ends, atol=1e-7, rtol=1e-6)
+    assert ((high > 0.2) & (low < 0.2)).all()
+    for function, inputs, limit in ((ball_entry, (start, end, centre), 0.1), (level_crossing, (high, low), 0.2)):
+        inputs = [x.requires_grad_() for x in inputs]
+        assert torch.autograd.gradcheck(lambda *x, f=function, y=limit: f(*x, y), inputs, atol=1e-7, rtol=1e-6)
 
 
 def test_the_derivative_of_a_grazing_pass_is_bounded_and_those_who_are_inside_or_stand_have_none_or_a_finite_one():
     angle = torch.linspace(0.0, math.pi / 2, 1000, dtype=torch.float64).unsqueeze(1)
-    aside = torch.cat(
-        (0.0 * angle, angle.sin(), 0.0 * angle), 1
-    )  # the line passes the middle of a ball of 1 so far off
+    # The line passes the middle of a ball of 1 so far off.
+    aside = torch.cat((0.0 * angle, angle.sin(), 0.0 * angle), 1)
     for length in (4.0, 2.5):
         start = (aside - torch.tensor([2.0, 0.0, 0.0])).requires_grad_()
         end = (start.detach() + torch.tensor([length, 0.0, 0.0])).requires_grad_()
@@ -237,9 +225,6 @@ def test_the_derivative_of_a_grazing_pass_is_bounded_and_those_who_are_inside_or
         inside = start[:, 0] <= 1.0
         assert not time[inside].any() and not any(x[inside].any() for x in grads)
         assert ((time >= 0.0) & (time <= 1.0)).all() and all((x.norm(dim=1) <= 1e4).all() for x in grads)
-
-
-# -- what a later event changes ----------------------------------------------------------------------------------------
 
 
 def test_a_later_event_costs_discount_and_changes_when_the_dense_terms_jump():

@@ -10,12 +10,18 @@ import pytest
 
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 BUDGET = re.compile(r"^(STEPS|ITERATIONS) = [\d_]+$", flags=re.MULTILINE)
-EPISODE = re.compile(r"(?<=rollout\()256\b|(?<=actor, None, )256\b")
+LONG = {
+    r"(?<=rollout\()256\b|(?<=actor, None, )256\b": "20",
+    r"\(8, 16, 32, 64\)": "(2, 4)",
+    "max_envs=8": "max_envs=2",
+}
 
 
 def reduced(program):
     """A program on a budget of two, whose final flights are short."""
-    return EPISODE.sub("20", BUDGET.sub(r"\1 = 2", program))
+    for long, short in LONG.items():
+        program = re.sub(long, short, program)
+    return BUDGET.sub(r"\1 = 2", program)
 
 
 @pytest.mark.usefixtures("quick_fits")

@@ -51,11 +51,9 @@ def lock(path):
 
 dangling_link, looping_link = link(lambda path: None), lambda path: path.symlink_to(path)
 NEITHER = [fifo, socket_file, link_to_a_file, link(folder), dangling_link, looping_link]
+FILES = write_a_file, lock, lambda path: write_rows(path, [{"a": 1}]), lambda path: add_rows(path, [{"a": 1}])
 WRITERS = {  # what a path must not be for each
-    write_a_file: [*NEITHER, folder],
-    lock: [*NEITHER, folder],
-    lambda path: write_rows(path, [{"a": 1}]): [*NEITHER, folder],
-    lambda path: add_rows(path, [{"a": 1}]): [*NEITHER, folder],
+    **{write: [*NEITHER, folder] for write in FILES},
     write_a_folder: [*NEITHER, plain_file],
     make_folder: [fifo, socket_file, link_to_a_file, dangling_link, looping_link, plain_file],
 }
@@ -78,15 +76,8 @@ def test_what_is_neither_file_nor_folder_is_refused_and_stays(write, make, tmp_p
 
 @pytest.mark.parametrize("make", [fifo, link_to_a_file])
 def test_what_takes_the_place_while_a_file_is_written_stays_too(make, tmp_path):
-    def write():
-        with replacing(tmp_path / "place") as temporary:
-            temporary.write_text("ours")
-            make(tmp_path / "place")
-
-    with pytest.raises(FileExistsError, match="place is a"):
-        write()
-    with pytest.raises(FileExistsError, match="place is a"), replacing_folder(tmp_path / "place", lambda _: None):
-        pass
+    with pytest.raises(FileExistsError, match="place is a"), replacing(tmp_path / "place"):
+        make(tmp_path / "place")
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
@@ -120,22 +111,6 @@ def test_leftovers_of_dead_processes_go_and_those_of_other_machines_and_the_livi
         other.touch()
     write_a_file(path)
     assert set(tmp_path.iterdir()) == {path, living, theirs}
-
-
-def test_a_folder_that_a_killed_process_had_set_aside_comes_back(tmp_path):
-    place, dead = tmp_path / "policy", 2**22 + 1
-    aside = tmp_path / f"{files._prefix(place)}{dead}.0.old"
-    aside.mkdir()
-    (aside / "file").write_text("old")
-
-    def require(folder):
-        assert (folder / "file").read_text() == "old"
-
-    with pytest.raises(ZeroDivisionError), replacing_folder(place, require):
-        raise ZeroDivisionError
-    assert (place / "file").read_text() == "old" and list(tmp_path.iterdir()) == [place]
-    write_a_folder(place)
-    assert (place / "file").read_text() == "ours" and list(tmp_path.iterdir()) == [place]
 
 
 def test_processes_that_add_to_one_table_lose_no_row(tmp_path):

@@ -1,13 +1,25 @@
-"""What read_log finds in a real flight, and what it says of every fault that a log may have."""
+"""What read_log finds in a real flight and in tables of a known one, and what it says of every fault of a log."""
 
-import gzip
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from log_writers import G, write_csv
+from log_writers import END, OURS, TABLE, G, flight, matrix, own_table, write_csv
 
-from torchrl_quad.identification import Columns, LogError, MissingColumns, NoFlight, UnreadableLog, read_log
+from torchrl_quad.errors import UserError, UserValueError
+from torchrl_quad.identification import (
+    LAYOUTS,
+    Columns,
+    LogError,
+    MissingColumns,
+    NoFlight,
+    UnreadableLog,
+    WrongFrame,
+    WrongQuaternion,
+    WrongUnit,
+    read_log,
+)
 
 FLIGHT = Path(__file__).parent.parent / "examples" / "data" / "figure8.csv.gz"
 GYRO = ("imu_gyro_x", "imu_gyro_y", "imu_gyro_z")
@@ -21,10 +33,8 @@ MOTORS = tuple(f"motor_motor_m{k}" for k in (1, 2, 3, 4))
 @pytest.fixture(scope="module")
 def table():
     """The first nine seconds of the flight, by column; copies of it get faults."""
-    with gzip.open(FLIGHT, "rt") as file:
-        names = file.readline().strip().split(",")
-        rows = np.loadtxt(file, delimiter=",", max_rows=900)
-    return dict(zip(names, rows.T, strict=True))
+    rows = np.genfromtxt(FLIGHT, delimiter=",", names=True, max_rows=900)
+    return {name: rows[name] for name in rows.dtype.names}
 
 
 @pytest.fixture
@@ -64,9 +74,7 @@ def test_a_real_flight_is_read_in_our_units_frames_and_orders(table):
     assert log.setpoint["position"].shape == log.position.shape
     assert log.onboard == ("angular_velocity", "acceleration", "motor_command", "battery_voltage", "setpoint")
 
-
-def test_the_ground_take_off_and_landing_are_cut_out_and_said(table):
-    log = read_log(FLIGHT)
+    # The ground, take-off and landing are cut out, and said.
     ((start, stop),) = log.segments
     ground = np.median(table["pz"][:50])
     assert log.position[start:stop, 2].min() > ground + 0.0995
@@ -83,30 +91,26 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "gyro in milliradians": (lambda t: scaled(t, GYRO, 1e3), "WrongUnit", "imu_gyro_x.*milliradians"),
     "gyro three times too fast": (lambda t: scaled(t, GYRO, 6.0), "WrongUnit", "times the derivative"),
     "gyro of a body with z down": (lambda t: scaled(t, GYRO[1:], -1), "WrongFrame", "y right and z down"),
-    "gyro of another flight": (lambda t: {n: t[n][::-1] for n in GYRO}, "InconsistentRates", "does not follow"),
+    "gyro of another flight": (lambda t: {n: t[n][::-1] for n in GYRO}, "WrongFrame", "does not follow"),
     "world to body": (lambda t: scaled(t, TURN[:3], -1), "WrongQuaternion", "if the quaternion is from world to body"),
-    "scalar first": (
-        lambda t: dict(zip(TURN, [t[n] for n in ("qw", *TURN)], strict=False)),
-        "WrongQuaternion",
-        "first",
-    ),
+    "scalar first": (lambda t: {n: t[k] for n, k in zip(TURN, ("qw", *TURN))}, "WrongQuaternion", "first"),  # noqa: B905
     "not of length 1": (lambda t: scaled(t, TURN, 0.5), "WrongQuaternion", "length 1.*0.5"),
     "millimetres": (lambda t: scaled(t, PLACE + SPEED, 1e3), "WrongUnit", "px, py, pz.*millimetres.*scale=1e-3"),
     "mixed lengths": (lambda t: scaled(t, SPEED, 1e3), "WrongUnit", "vx, vy, vz.*1e\\+03 times"),
     "z down": (lambda t: scaled(t, ("pz", "vz"), -1), "WrongFrame", "z points down.*frames.px4"),
     "accelerometer down": (lambda t: scaled(t, FORCE[2:], -1), "WrongFrame", "imu_acc_z.*frames.px4"),
     "accelerometer in m/s^2": (lambda t: scaled(t, FORCE, G), "WrongUnit", "imu_acc_x.*median length of 9"),
+    "accelerometer in g": (lambda t: scaled(t, FORCE, 1 / G), "WrongUnit", "in g.*scale=9.80665"),
+    "accelerometer in mg": (lambda t: scaled(t, FORCE, 1e3 / G), "WrongUnit", "scale=9.80665e-3"),
+    "motors in percent": (lambda t: scaled(t, MOTORS, 100.0), "WrongUnit", "scale=1 / 100"),
+    "motors in counts": (lambda t: scaled(t, MOTORS, 65535.0), "WrongUnit", "scale=1 / 65535"),
     "motors beyond full": (lambda t: scaled(t, MOTORS, 2.0), "WrongUnit", "motor_motor_m1.*from 0 to 1"),
     "clock in ms": (lambda t: scaled(t, "t", 1e3), "WrongUnit", "milliseconds"),
     "clock jumps back": (lambda t: {"t": t["t"] - (t["t"] > 5.0)}, "ClockJumpsBack", "from 5 to 4.0.* at sample"),
     "no numbers": (lambda t: scaled(t, PLACE[:1], np.nan), "NotFiniteLog", "0 of 900 samples of position"),
     "motors off": (lambda t: scaled(t, MOTORS, 0.0), "NoFlight", "motor command is below"),
     "never in the air": (lambda t: {"pz": 0 * t["pz"], "vz": 0 * t["vz"]}, "NoFlight", "rises 0.000 m at most"),
-    "gaps all over": (
-        lambda t: {"px": np.where(t["t"] % 0.4 < 0.2, t["px"], np.nan)},
-        "GapsTooLarge",
-        "larger max_gap",
-    ),
+    "gaps": (lambda t: {"px": np.where(t["t"] % 0.4 < 0.2, t["px"], np.nan)}, "GapsTooLarge", "larger max_gap"),
 }
 
 
@@ -188,10 +192,6 @@ def test_a_mapping_replaces_entries_of_a_preset_and_nothing_else(table, read):
     log = read(renamed, drop=("pwr_pm_vbat", "sp_ctrltarget_yaw"), columns={"battery_voltage": "volts"})
     np.testing.assert_array_equal(log.battery_voltage, read().battery_voltage)
     assert set(log.setpoint) == {"position"}  # what the preset knows and the file lacks is left out, as ever
-    with pytest.raises(MissingColumns, match="no column vlots, named for battery_voltage.*There are: .*volts"):
-        read(renamed, columns={"battery_voltage": "vlots"})
-    with pytest.raises(MissingColumns, match="no column seconds of the time. There are: t, "):
-        read(columns={"time": "seconds"})
 
 
 def test_the_delay_of_the_on_board_clock_is_seen_and_left_to_the_fit(table, read):
@@ -203,26 +203,162 @@ def test_the_delay_of_the_on_board_clock_is_seen_and_left_to_the_fit(table, read
     np.testing.assert_allclose(shifted.angular_velocity[lag:-lag], plain.angular_velocity[: -2 * lag], atol=1e-9)
 
 
-def test_files_that_are_no_flight_are_refused_by_name(tmp_path, read):
-    cases = {
-        "empty.csv": (b"", "is empty"),
-        "junk.bin": (bytes(range(128, 256)), "not a log of a known kind"),
-        "text.csv": (b"Dear reader,\nthis is a letter.\n", "fewer than two samples"),
-        "ragged.csv": (b"t,x\n1,2\n1,2,3\n", "not a table of numbers"),
-        "cut.csv.gz": (FLIGHT.read_bytes()[:2000], "broken gz"),
-        "cut.ulg": (b"ULog\x01\x12\x35\x01", "not a readable ULog"),
-        "cut.bag": (b"#ROSBAG V2.0\n", "not a readable ROS bag"),
-        "cut.usd": (b"\xbc\x02\x00\x05\x00abc", "header is cut off"),
-        "new.usd": (b"\xbc\x09\x00\x00\x00abcd", "version 9"),
-    }
-    for name, (data, _) in cases.items():
-        (tmp_path / name).write_bytes(data)
-    for name, (_, message) in {**cases, "nowhere.csv": (b"", "does not exist"), ".": (b"", "not a ROS 2 bag")}.items():
-        with pytest.raises(UnreadableLog, match=message):
-            read_log(tmp_path / name)
-    with pytest.raises(MissingColumns, match="Unknown layout 'betaflight'. Choose from: nanobench"):
-        read_log(FLIGHT, "betaflight")
-    with pytest.raises(NoFlight, match="share 0.14 s"):
-        read(rows=slice(0, 15))
-    with pytest.raises(NoFlight, match="never for 60 s"):
-        read(min_duration=60.0)
+def test_what_holds_no_flight_or_not_what_was_asked_for_is_refused_by_name(read):
+    for error, message, options in (
+        (NoFlight, "share 0.14 s", {"rows": slice(0, 15)}),
+        (NoFlight, "never for 60 s", {"min_duration": 60.0}),
+        (MissingColumns, "Unknown layout 'betaflight'. Choose from: nanobench", {"columns": "betaflight"}),
+        (
+            MissingColumns,
+            "no column volts, named for battery_voltage",
+            {"columns": {"battery_voltage": "volts"}},
+        ),
+        (MissingColumns, "no column s of the time. There are: t, ", {"columns": {"time": "s"}}),
+    ):
+        with pytest.raises(error, match=message):
+            read(**options)
+
+
+# -- tables of a flight whose every quantity is known ------------------------------------------------------------------
+
+
+def test_a_mapping_reads_any_table_and_rates_are_matched(tmp_path):
+    t = np.arange(0.0, END, 0.004)  # 250 Hz, with a battery that is measured each 0.2 s
+    columns = own_table(t, battery_voltage=np.where(np.arange(len(t)) % 50, np.nan, flight(t)["battery_voltage"]))
+    mapping = TABLE | {"battery_voltage": "v"}
+    path = write_csv(tmp_path / "own.csv", columns)
+    log = read_log(path, mapping, dt=0.01)
+    start, stop = log.segments[0]
+    inside = np.arange(start, stop)
+    # Where the climb ends and the descent begins, the angular acceleration jumps: a mean over a step differs there.
+    inside = inside[(np.abs(log.time[inside] - 3.0) > 0.015) & (np.abs(log.time[inside] - 7.0) > 0.015)]
+    true = flight(log.time)
+    for name, tolerance in {"position": 1e-4, "velocity": 1e-3, "angular_velocity": 2e-3, "acceleration": 2e-3}.items():
+        np.testing.assert_allclose(getattr(log, name)[inside], true[name][inside], atol=tolerance)
+    np.testing.assert_allclose(log.motor_command[inside], true["motor_command"][inside], atol=1e-3)
+    np.testing.assert_allclose(np.abs((log.quaternion * true["quaternion"]).sum(-1)), 1.0, atol=1e-6)
+    np.testing.assert_allclose(log.battery_voltage[inside], true["battery_voltage"][inside], atol=1e-3)
+    assert log.onboard == ("angular_velocity", "acceleration", "motor_command", "battery_voltage")
+
+    xyzw = replace(LAYOUTS["nanobench"].convention, motors=(0, 1, 2, 3))
+    listed = mapping | {"quaternion": ("qx", "qy", "qz", "qw")}
+    np.testing.assert_allclose(read_log(path, listed, convention=xyzw, dt=0.01).quaternion, log.quaternion)
+    twice = tmp_path / "twice.csv"
+    twice.write_text(path.read_text().replace("wz,", "wy,", 1))
+    without = {k: v for k, v in mapping.items() if k != "motor_command"}
+    twin = mapping | {"angular_velocity": ("wx", "wy", "wx")}
+    nowhere = "no column nowhere, named for velocity.*There are: .*x, y"
+    for error, message, file, columns in (
+        (WrongQuaternion, "scalar last", path, listed),
+        (MissingColumns, "takes 4 column", path, mapping | {"motor_command": ("u0", "u1", "u2")}),
+        (MissingColumns, "Unknown quantity 'speed'", path, mapping | {"speed": ("vx", "vy", "vz")}),
+        (MissingColumns, nowhere, path, mapping | {"velocity": ("vx", "vy", "nowhere")}),
+        (MissingColumns, "No preset knows", path, {"angular_velocity": OURS["angular_velocity"]}),
+        (MissingColumns, "No preset knows.*columns=", path, None),
+        (MissingColumns, "has no motor_command", path, without),
+        (UnreadableLog, "twice.csv has several columns of one name: wy. Rename them", twice, twin),
+    ):
+        with pytest.raises(error, match=message):
+            read_log(file, columns)
+
+
+def test_what_is_faster_than_the_log_does_not_alias(tmp_path):
+    t = np.arange(0.0, END, 0.002)
+    buzz = 2.0 * (-1.0) ** np.arange(len(t))[:, None]  # each fifth sample alone would see it as a bias
+    path = write_csv(tmp_path / "fast.csv", own_table(t, angular_velocity=flight(t)["angular_velocity"] + buzz))
+    log = read_log(path, TABLE, dt=0.01)
+    assert np.abs((log.angular_velocity - flight(log.time)["angular_velocity"])[1:-1].mean(0)).max() < 0.01
+
+
+def test_touching_down_and_landing_on_a_table_are_cut_out(tmp_path):
+    t = np.arange(0.0, 12.0, 0.01)
+    knots = {0: 0, 1: 0, 2: 1, 4: 1, 5: 0.03, 5.5: 0.03, 6.5: 1, 8: 1, 9: 0.6, 12: 0.6}  # it lands 0.6 m higher
+    true = flight(0.0 * t + 0.01)
+    true["position"][:, 2] = 0.05 + np.interp(t, list(knots), list(knots.values()))
+    noise = np.random.default_rng(0).normal(scale=1e-4, size=(2, len(t)))  # a tracker that says the same is frozen
+    true["position"][:, 0], true["quaternion"][:, 1] = noise
+    true["velocity"][:, 2] = np.gradient(true["position"][:, 2], t)
+    true["motor_command"] = np.full((len(t), 4), 0.5) * ((t > 0.8) & (t < 10.0))[:, None]
+    log = read_log(write_csv(tmp_path / "touch.csv", own_table(t, **true)), TABLE)
+    expected = ((1.1, 4 + 0.9 / 0.97), (5.5 + 0.07 / 0.97, 8.75))  # 0.1 m above the ground, and above the table
+    np.testing.assert_allclose(np.array(log.segments) * log.dt, expected, atol=0.02)
+    assert "between take-off and landing are within 0.1 m of the ground" in str(log)
+
+
+def test_euler_angles_and_velocities_of_the_body_become_ours(tmp_path):
+    t = np.arange(0.0, END, 0.01)
+    true = flight(t)
+    r = matrix(true["quaternion"])
+    columns = own_table(t, velocity=np.einsum("nji,nj->ni", r, true["velocity"]))
+    columns["roll"], columns["pitch"] = np.arctan2(r[:, 2, 1], r[:, 2, 2]), -np.arcsin(r[:, 2, 0])
+    columns["yaw"] = np.degrees(np.arctan2(r[:, 1, 0], r[:, 0, 0]))
+    path = write_csv(tmp_path / "own.csv", columns)
+    euler = Columns(("roll", "pitch", "yaw"), scale=(1.0, 1.0, np.pi / 180))
+    turned = {k: v for k, v in TABLE.items() if k not in ("velocity", "quaternion")}
+    log = read_log(path, {**turned, "velocity_body": OURS["velocity"], "euler": euler})
+    np.testing.assert_allclose(log.velocity, true["velocity"], atol=1e-6)
+    np.testing.assert_allclose(np.abs((log.quaternion * true["quaternion"]).sum(-1)), 1.0, atol=1e-7)
+    with pytest.raises(WrongFrame, match='"velocity_body"'):
+        read_log(path, TABLE)
+    rates = np.einsum("nij,nj->ni", r, true["angular_velocity"])
+    with pytest.raises(WrongFrame, match="in the world frame"):
+        read_log(write_csv(path, own_table(t, angular_velocity=rates)), TABLE)
+    write_csv(path, own_table(t, motor_command=2000.0 * true["motor_command"]))
+    with pytest.raises(WrongUnit, match="offset=1000"):
+        read_log(path, TABLE)
+    few = {k: v for k, v in TABLE.items() if k in ("time", "position", "quaternion")}
+    log = read_log(path, few | {"motor_command": Columns(OURS["motor_command"], scale=1 / 2000)})
+    inside = slice(*log.segments[0])
+    np.testing.assert_allclose(log.velocity[inside], true["velocity"][inside], atol=0.02)
+    assert log.acceleration is None and log.setpoint is None
+
+
+HUGE = 10**400  # more than a float holds
+BAD_ARGUMENTS = {
+    **dict.fromkeys(("clearance", "max_gap", "min_duration"), (np.nan, -1, True, "a", HUGE)),
+    "dt": (np.nan, np.inf, 0, 1e-9, 0.5, HUGE, [1.0], np.array([1.0, 2.0])),
+    "columns": (
+        5,
+        b"px4",
+        ["x"],
+        {1: "x"},
+        {"time": 5},
+        {"position": [1, 2, 3]},
+        {"velocity": None},
+        {"euler": {"a": 1}},
+    ),
+    "convention": ("px4", 5, {}),
+    "onboard": ("setpoint", 5, ["speed"], [None], {"position": 1}),
+    "path": (None, 5, b"a.csv", ["a.csv"], "", "a\0b", "a" * 5000, "two\nlines.csv"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_ARGUMENTS)
+def test_arguments_that_make_no_log_are_refused_by_name(name, tmp_path):
+    path = write_csv(tmp_path / "own.csv", own_table(np.arange(0.0, END, 0.01)))
+    for value in BAD_ARGUMENTS[name]:
+        with pytest.raises((UserError, OSError)) as refused:
+            read_log(**{"path": path, "columns": TABLE} | {name: value})
+        assert name in str(refused.value) or name in ("columns", "path")
+        assert "\n" not in str(refused.value)
+
+
+def test_columns_and_layouts_say_which_of_their_fields_is_wrong():
+    for field, values in {
+        "scale": (0, True, "2", None, np.inf, HUGE, (1, 2), 1j),
+        "offset": (np.nan, [], [[1.0] * 3]),
+    }.items():
+        for value in values:
+            with pytest.raises(UserValueError, match=f"Columns: {field} of a, b, c must be a number, or one for each"):
+                Columns(("a", "b", "c"), **{field: value})
+    with pytest.raises(UserValueError, match="names must be the names of columns, got 5"):
+        Columns(5)
+    for changes, message in (
+        ({"columns": {"position": ("x", "y", "z")}}, "position takes 3 column.* got 1: x"),
+        ({"columns": {"position": (5,)}}, "columns: 'position' takes the name of a column"),
+        ({"columns": {"speed": (("v",),)}}, "Unknown quantity 'speed'"),
+        ({"convention": "px4"}, "convention must be one of torchrl_quad.deploy.frames, got 'px4'"),
+        ({"time": Columns(("s", "ns"))}, "time takes 1 column.* got 2: s, ns"),
+    ):
+        with pytest.raises(UserError, match=message):
+            replace(LAYOUTS["nanobench"], **changes)

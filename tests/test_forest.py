@@ -12,10 +12,6 @@ from torchrl_quad.vision.primitives import distances
 POLE = {"ground": True, "cylinders": [{"base": [5.0, 0.0, 0.0], "radius": 0.2, "height": 6.0}]}
 
 
-def column(*values):
-    return torch.tensor(values, dtype=torch.float64).unsqueeze(1)
-
-
 def forest(*positions, **entries):
     """Drones of 4 m/s in a scene of one pole, at these places, and their state with some entries set."""
     env = ForestEnv(num_envs=len(positions), scene=POLE, camera=None, speed=4.0, dtype=torch.float64)
@@ -88,11 +84,12 @@ def test_an_episode_of_the_forest_has_the_mean_speed_and_the_least_clearance_unt
         "crash": crash,
         "success": torch.tensor([[True] * 4, [False, False, False, True]]).unsqueeze(-1),
         "metrics": {
-            "distance": torch.stack((column(1, 2, 3, 0), column(4, 5, 6, 30))),
-            "flown_speed": torch.stack((column(1, 2, 6, 50), column(2, 4, 6, 8))),
-            "clearance": torch.stack((column(0.9, 0.4, 0.7, 0.1), column(0.8, 0.6, 0.5, 0.3))),
+            "distance": [[1, 2, 3, 0], [4, 5, 6, 30]],
+            "flown_speed": [[1, 2, 6, 50], [2, 4, 6, 8]],
+            "clearance": [[0.9, 0.4, 0.7, 0.1], [0.8, 0.6, 0.5, 0.3]],
         },
     }
+    ends["metrics"] = {name: env.tensor(x).unsqueeze(-1) for name, x in ends["metrics"].items()}
     metrics = env.episode_metrics(TensorDict({"next": ends}, [2, 4]))
     expected = {"return": [3, 4], "crash": [1, 0], "solved": [0, 1], "distance": [3, 30]}
     expected |= {"flown_speed": [3.0, 5.0], "clearance": [0.4, 0.3]}

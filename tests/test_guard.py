@@ -46,57 +46,29 @@ def test_a_neighbour_that_breaks_does_not_reach_what_all_share(drone, integrator
         torch.testing.assert_close(found, expected, msg=f"{key} {value}")
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "options"),
-    [
-        ("wind", [1e5, 0.0, 0.0], {"wind": {"gust": 0.5}}),
-        ("mean_wind", nan, {"wind": {"gust": 0.5}}),
-        (("drone", "inertia"), 1e-30, {"randomize": {"inertia": {"scale": [0.9, 1.1]}}}),
-        (("drone", "motor_time_constant"), 0.0, {"randomize": {"motor_time_constant": {"scale": [0.9, 1.1]}}}),
-        (("drone", "thrust_map"), 0.0, {"randomize": {"thrust_map": {"scale": [0.9, 1.1]}}}),
-    ],
-)
-def test_wind_and_drones_beyond_their_bounds_crash_alone(key, value, options):
-    env = HoveringEnv(num_envs=2, action_delay=0, **options)
-    expected, _ = gradients_of_the_first(env)
-    found, crashes = gradients_of_the_first(env, key, value)
-    assert crashes[0] == [False, True]
-    torch.testing.assert_close(found, expected)
+def test_a_drone_whose_numbers_would_overflow_is_refused():
+    tiny = {"mass": 0.0, "inertia": [1e-30] * 3, "motor_time_constant": 1e-9, "gravity": -9.81}
+    for field, value in [("mass", 1e9), *tiny.items()]:
+        with pytest.raises(ValueError, match=f"field '{field}' must be between .*, in SI units; got"):
+            load_drone().replace(**{field: value})
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("mass", 0.0), ("mass", 1e9), ("inertia", [1e-30] * 3), ("motor_time_constant", 1e-9), ("gravity", -9.81)],
-)
-def test_a_drone_whose_numbers_would_overflow_is_refused(field, value):
-    with pytest.raises(ValueError, match=f"field '{field}' must be between .*, in SI units; got"):
-        load_drone().replace(**{field: value})
+BROKEN = {"velocity": [nan, 1e30], "position": [float("inf"), 1e30], "target": [1e30], "angular_velocity": [-1e12]}
+BROKEN |= {"quaternion": [1e30, 0.0], "rotor_speed": [nan, 1e12, -1e9], "wind": [1e5], "mean_wind": [nan]}
+BROKEN |= {("drone", "inertia"): [1e-30], ("drone", "motor_time_constant"): [0.0], ("drone", "thrust_map"): [0.0]}
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("velocity", nan),
-        ("velocity", 1e30),
-        ("position", float("inf")),
-        ("position", 1e30),
-        ("target", 1e30),
-        ("angular_velocity", -1e12),
-        ("quaternion", 1e30),
-        ("quaternion", 0.0),
-        ("rotor_speed", nan),
-        ("rotor_speed", 1e12),
-        ("rotor_speed", -1e9),
-    ],
-)
+@pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in BROKEN.items() for value in values])
 def test_a_broken_state_terminates_and_leaks_nothing_into_the_others(dtype, key, value):
-    env = HoveringEnv(num_envs=4, seed=1, dtype=dtype)
+    drawn = {name: {"scale": [0.9, 1.1]} for name in ("inertia", "motor_time_constant", "thrust_map")}
+    env = HoveringEnv(num_envs=4, seed=1, dtype=dtype, randomize=drawn, wind={"gust": 0.5})
     action = (env.hover_action.expand(4, 4) + 0.1).clone().requires_grad_()
     mass = torch.tensor(0.46, dtype=dtype, requires_grad=True)
     env.params = env.params.replace(mass=mass)
 
     def gradients(td):
+        env.set_seed(0)
         flight = fly(env, td, [action] * 3)
         for entry, x in flight["next"].items(include_nested=True, leaves_only=True):
             assert x.isfinite().all(), entry
@@ -126,49 +98,21 @@ def test_an_action_beyond_all_bounds_terminates_its_own_environment_only(env):
     assert flight["next", "terminated"][:, 0].flatten().tolist() == [False, True, False, False]
     assert flight["next", "observation"].isfinite().all()
     (grad,) = torch.autograd.grad(flight["next", "reward"].sum(), action)
-    assert grad.isfinite().all()
-    assert (grad[1] == 0).all()
-    assert (grad[[0, 2, 3]] != 0).any(-1).all()
-
-
-@pytest.mark.parametrize("value", [nan, float("inf")])
-def test_an_action_that_is_not_finite_is_refused_with_the_name_of_its_environment(env, value):
-    action = env.hover_action.repeat(4, 1)
-    action[[1, 3], 2] = value
-    with pytest.raises(ValueError, match="The action is not finite in environments 1, 3: the weights of the policy"):
-        env.step(env.reset().set("action", action))
-
-
-def test_gradients_stay_finite_after_a_crash(env64):
-    td = env64.reset()
-    td["state", "position"][0] = torch.tensor([9.0, 9.0, -3.0], dtype=torch.float64)
-    action = torch.ones(4, 4, dtype=torch.float64, requires_grad=True)
-    flight = fly(env64, env64.reset(td, set_state=True), [action] * 30)
-    flight["next", "reward"].sum().backward()
-    assert action.grad.isfinite().all()
-
-
-# -- states from outside -----------------------------------------------------------------------------------------------
+    assert grad.isfinite().all() and grad.any(1).tolist() == [True, False, True, True]
 
 
 @pytest.mark.parametrize(
     ("task", "key", "value", "message"),
     [
         ("hovering", ("drone", "mass"), 0.0, r"\('drone', 'mass'\) must be finite and between 0.001 and 1000"),
-        ("hovering", ("drone", "mass"), -1.0, r"\('drone', 'mass'\) must be finite and between"),
         ("hovering", "wind", 1e5, "'wind' must be finite and between -300 and 300"),
         ("hovering", "position", nan, "'position' must be finite and between"),
         ("hovering", "quaternion", 0.9, "'quaternion' must have unit norm"),
         ("hovering", "rotor_speed", -1e5, "'rotor_speed' must be finite and between"),
         ("hovering", "action_queue", nan, "'action_queue' must be finite and between"),
         ("hovering", "step", LARGEST, "'step' must lie between 0 and 2147483648"),
-        ("hovering", "step", -1, "'step' must lie between 0"),
-        ("racing", "gate", 99, "'gate' must lie between 0 and 3"),
         ("racing", "gate", -1, "'gate' must lie between 0 and 3"),
-        ("racing", "gates_passed", -1, "'gates_passed' must lie between 0"),
         ("racing", "pass_step", -2, "'pass_step' must lie between -1"),
-        ("racing", "lap_time", -1.0, "'lap_time' must lie between 0"),
-        ("tracking", "squared_error", -1.0, "'squared_error' must lie between 0"),
         ("tracking", "phase", 100.0, "'phase' must lie between 0 and 6.283"),
     ],
 )
@@ -185,58 +129,38 @@ def test_an_entry_out_of_its_range_is_refused_by_name_and_environment(task, key,
     env.reset(td.copy().set("_reset", others), set_state=True)  # nobody asks for environment 2
 
 
-@pytest.mark.parametrize(
-    ("key", "dtype", "message"),
-    [
-        ("step", torch.float32, "state 'step' must be whole numbers, got torch.float32"),
-        ("gate", torch.float64, "state 'gate' must be whole numbers, got torch.float64"),
-        ("velocity", torch.int64, "state 'velocity' must be floating point, got torch.int64"),
-        ("gate_passed", torch.int64, "state 'gate_passed' must be bool, got torch.int64"),
-        ("velocity", torch.complex64, "state 'velocity' must be floating point, got torch.complex64"),
-    ],
-)
-def test_an_entry_of_another_kind_is_refused(key, dtype, message):
-    env = make_env("racing", num_envs=4)
-    td = env.reset()
-    td["state", key] = td["state", key].to(dtype)
-    with pytest.raises(ValueError, match=message):
-        env.reset(td, set_state=True)
-
-
-def test_a_state_that_was_set_is_a_copy(env):
-    td = env.reset()
-    start = env.reset(td.clone(), set_state=True)
-    source = td["state"].clone()
-    env.set_initial_state_source(lambda n: source)
-    env.reset()["state", "position"][0] = 99.0
-    assert (source["position"] == start["state", "position"]).all()
-
-
-def broken_states(env):
-    td = env.reset()
-    yield td.exclude("state"), r"a state is a tensordict, such as env.reset\(\)\[.state.\]; got NoneType"
-    yield td.exclude(("state", "velocity")), "the state lacks velocity. A state is restored whole"
-    yield TensorDict({**td, "state": torch.zeros(4, 3)}, [4]), "a state is a tensordict, such as .* got Tensor"
-    short = td.clone()
-    short["state", "velocity"] = torch.zeros(4, 2)
-    yield short, r"state 'velocity' has shape \(4, 2\), expected \(4, 3\)"
+def test_an_entry_of_another_kind_is_refused():
+    env, whole, floating = make_env("racing", num_envs=4), "whole numbers", "floating point"
+    wrong = [("step", torch.float32, whole), ("gate", torch.float64, whole), ("velocity", torch.int64, floating)]
+    for key, dtype, kind in [*wrong, ("gate_passed", torch.int64, "bool"), ("velocity", torch.complex64, floating)]:
+        td = env.reset()
+        td["state", key] = td["state", key].to(dtype)
+        with pytest.raises(ValueError, match=f"state '{key}' must be {kind}, got {dtype}"):
+            env.reset(td, set_state=True)
 
 
 def test_a_state_that_is_not_whole_is_refused_by_a_step_a_rollout_and_a_reset(env):
-    actor = make_actor(env)
-    for td, message in broken_states(env):
+    actor, td = make_actor(env), env.reset()
+    short = td.clone()
+    short["state", "velocity"] = torch.zeros(4, 2)
+    for wrong, message in (
+        (td.exclude("state"), r"a state is a tensordict, such as env.reset\(\)\[.state.\]; got NoneType"),
+        (td.exclude(("state", "velocity")), "the state lacks velocity. A state is restored whole"),
+        (TensorDict({**td, "state": torch.zeros(4, 3)}, [4]), "a state is a tensordict, such as .* got Tensor"),
+        (short, r"state 'velocity' has shape \(4, 2\), expected \(4, 3\)"),
+    ):
         with pytest.raises(ValueError, match=message):
-            env.step(td.copy().set("action", torch.zeros(4, 4)))
+            env.step(wrong.copy().set("action", torch.zeros(4, 4)))
         with pytest.raises(ValueError, match=message):
-            differentiable_rollout(env, actor, td, 2)
-        if "state" in td:
+            differentiable_rollout(env, actor, wrong, 2)
+        if "state" in wrong:
             with pytest.raises(ValueError, match=message):
-                env.reset(td.copy(), set_state=True)
+                env.reset(wrong.copy(), set_state=True)
     with pytest.raises(ValueError, match='needs a tensordict with the state to set in "state"; got none'):
         env.reset(set_state=True)
 
 
-def test_a_state_of_another_device_or_precision_is_refused_by_a_step_and_converted_by_a_reset(env):
+def test_a_reset_copies_and_converts_a_state_of_a_precision_or_device_that_a_step_refuses(env):
     td = env.reset()
     state = td["state"].apply(lambda x: x.double() if x.is_floating_point() else x)
     double = TensorDict({"state": state, "action": torch.zeros(4, 4)}, [4])
@@ -247,6 +171,11 @@ def test_a_state_of_another_device_or_precision_is_refused_by_a_step_and_convert
     with pytest.raises(ValueError, match="on meta, and that of the environment torch.float32 on cpu"):
         differentiable_rollout(env, make_actor(env), td.to("meta"), 2)
     assert env.reset(double, set_state=True)["state", "position"].dtype is torch.float32
+    kept = td["state"].clone()
+    env.set_initial_state_source(lambda n: td["state"])
+    env.reset()["state", "position"][0] = 99.0
+    env.reset(td.clone(recurse=False), set_state=True)["state", "position"][0] = 99.0
+    assert (td["state"] == kept).all()
 
 
 def test_starts_come_from_a_function_that_gives_whole_states(env):

@@ -1,5 +1,7 @@
 """The quick rollout against TorchRL's own, and the compiled step against the eager one."""
 
+import copy
+
 import pytest
 import torch
 from flying import Looks, look_at_nothing
@@ -9,7 +11,17 @@ from torch._dynamo.utils import counters
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import ActionSequence, BPTTLoss, HoveringEnv, RacingEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad import (
+    ActionSequence,
+    BPTTLoss,
+    HoveringEnv,
+    RacingEnv,
+    audit_reward,
+    differentiable_rollout,
+    make_actor,
+    make_env,
+)
+from torchrl_quad.dynamics import DYNAMICS, PointMass
 from torchrl_quad.envs import TASKS
 
 EVERYTHING = {
@@ -164,6 +176,12 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
         loss = BPTTLoss(actor, clip_action_gradient=2.0).loss_actor(flight)[0]
         return flight, torch.autograd.grad(loss, list(actor.parameters()))
 
+    def audit():
+        """The gradients in actions."""
+        seeded()
+        flight, _ = differentiable_rollout(env, actor, None, 14)
+        return {name: term.gradient_norm for name, term in audit_reward(flight, flight["action"]).items()}
+
     def all_ways():
         seeded()
         in_torchrls_loop = fly(torchrls_loop(env), env, actor, env.reset(), 12)
@@ -173,10 +191,11 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
         flights = train(actor), train(called), train(explorer), optimise_actions(), train_with_clipped_gradients()
         return *flights, in_torchrls_loop, as_on_an_accelerator
 
-    eager, (broken, broken_grads) = all_ways(), break_drones(env, drag)
+    eager, eager_audit, (broken, broken_grads) = all_ways(), audit(), break_drones(env, drag)
     env.compile()
     assert env.flies_inside(actor) and env.flies_inside(explorer) and not env.flies_inside(called)
     all_ways()
+    assert audit() == pytest.approx(eager_audit, rel=1e-9)
     compiled_so_far = counters["stats"]["unique_graphs"]
     compiled, (end, end_grads) = all_ways(), break_drones(env, drag)
     with torch.no_grad():
@@ -310,8 +329,7 @@ def test_policies_that_somebody_has_changed_are_called():
     compiled, actor = HoveringEnv(num_envs=2).compile(), make_actor(env)
     assert compiled.flies_inside(actor) and not env.flies_inside(actor)
     assert compiled.flies_inside(ActionSequence(torch.zeros(3, 2, 4)))
-    seen = []
-    hook = actor[0].module.mlp[1].register_forward_hook(lambda *_: seen.append(1))
+    hook = actor[0].module.mlp[1].register_forward_hook(lambda *_: None)
     assert not compiled.flies_inside(actor)
     hook.remove()
     with set_exploration_type(ExplorationType.MODE):
@@ -338,3 +356,80 @@ def test_a_sequence_of_actions_is_played_once(env):
     env.rollout(3, sequence, break_when_any_done=False)
     with pytest.raises(ValueError, match="5 actions, 0 of them unplayed, and the flight needs 1 more"):
         env.rollout(3, sequence, break_when_any_done=False)
+
+
+# -- a compiled environment follows every change that an eager one follows ---------------------------------------------
+
+BONUS = 1.0
+LIFT = 1.0
+
+
+def moved(state, dt):
+    return [state[0] + state[2] * (LIFT * dt), *state[1:]]
+
+
+class Gliding(PointMass):
+    """Keeps its velocity; a global and a function of this module move it."""
+
+    def physics_step(self, state, setpoint, plant, controller, wind):
+        return moved(state, self.dt)
+
+
+class Bonus(HoveringEnv):
+    """Pays a global of this module and an attribute of its class."""
+
+    extra = 10.0
+
+    def reward_terms(self, state):
+        return {"paid": torch.full_like(state["position"][:, :1], BONUS + self.extra)}
+
+
+def test_a_compiled_step_sees_changed_attributes_classes_and_globals(monkeypatch):
+    # What is watched does not depend on the backend, and this one generates no code.
+    eager, compiled = Bonus(num_envs=2), Bonus(num_envs=2).compile(backend="eager")
+
+    def step(env):
+        td = env.reset().set("action", env.hover_action.repeat(2, 1))
+        after = env.step(td)["next"]
+        return after["reward"].flatten().tolist(), after["success"].flatten().tolist()
+
+    def both():
+        assert step(compiled) == step(eager)
+        return step(eager)
+
+    assert both() == ([11.0, 11.0], [False, False])
+    for env in (eager, compiled):
+        env.success_radius = 50.0  # an attribute of the class becomes one of the environment
+    monkeypatch.setattr(Bonus, "extra", 20.0)
+    assert both() == ([21.0, 21.0], [True, True])
+    monkeypatch.setitem(globals(), "BONUS", 2.0)
+    assert both()[0] == [22.0, 22.0]
+    before = counters["stats"]["unique_graphs"]
+    both()
+    assert counters["stats"]["unique_graphs"] == before
+    copied = copy.deepcopy(compiled)
+    copied.extra = 30.0  # a copy shares nothing with what it was made of
+    assert step(copied)[0] == [32.0, 32.0] and step(compiled)[0] == [22.0, 22.0]
+
+
+def test_a_compiled_step_sees_changes_of_dynamics_in_a_module_of_ones_own(monkeypatch):
+    monkeypatch.setitem(DYNAMICS, "gliding", Gliding)
+    eager, compiled = (HoveringEnv(num_envs=2, dynamics="gliding") for _ in range(2))
+    compiled.compile(backend="eager")
+    start = eager.reset()
+    start["state", "velocity"] = torch.ones(2, 3)
+
+    def height():
+        ends = [env.step(start.copy().set("action", torch.zeros(2, 4)))["next", "state"] for env in (eager, compiled)]
+        torch.testing.assert_close(ends[0]["position"], ends[1]["position"])
+        return (ends[1]["position"] - start["state", "position"])[0, 2].item()
+
+    step = eager.control_dt
+    assert height() == pytest.approx(step, rel=1e-3)
+    monkeypatch.setitem(globals(), "LIFT", 2.0)
+    assert height() == pytest.approx(2 * step, rel=1e-3)
+    for env in (eager, compiled):
+        env.dynamics.dt *= 2
+    assert height() == pytest.approx(4 * step, rel=1e-3)
+    monkeypatch.setitem(globals(), "moved", lambda state, dt: state)
+    assert height() == 0.0

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks import identification as benchmark
 from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.dynamics import MotorCommand
 from torchrl_quad.errors import UserError
 from torchrl_quad.identification import (
     NoFlight,
-    TooLittleFlight,
     TooShort,
-    UnknownField,
     estimation,
     fitting,
     identify,
@@ -28,23 +27,16 @@ from torchrl_quad.identification.parameters import UNKNOWNS, Model
 
 ROOT = Path(__file__).parents[1]
 REAL = ROOT / "examples/data/figure8.csv.gz"
+BRIEF = {"horizon": 0.2, "past": 0.1}
 pytestmark = pytest.mark.usefixtures("quick_fits")
 
 
 @pytest.fixture(scope="module")
-def benchmark():
-    from benchmarks import identification
-
-    return identification
-
-
-@pytest.fixture(scope="module")
-def simulated(benchmark):
+def simulated():
     """A noisy flight of eight seconds, simulated in steps of half a sample of the log."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(benchmark, "STEP", 0.005)
-        patch.setattr(benchmark, "CONTROL", 1)
-        patch.setattr(benchmark, "SAMPLE", 2)
+        for name, value in {"STEP": 0.005, "CONTROL": 1, "SAMPLE": 2}.items():
+            patch.setattr(benchmark, name, value)
         truth = benchmark.true_drone()
         return benchmark.simulate_flight(0, truth, seconds=8.0, stream_delay=0.015), truth
 
@@ -54,7 +46,7 @@ def real():
     return read_log(REAL)
 
 
-def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(benchmark, simulated, tmp_path, capsys):
+def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(simulated, tmp_path, capsys):
     log, truth = simulated
     start = benchmark.start(0, truth)
     wanted = ["thrust_map", "inertia", "yaw_torque_coefficient", "command_delay", "stream_delay"]
@@ -82,7 +74,7 @@ def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(b
 
     # The pictures show predictions as long as those of the fit: a short flight has room for no longer ones.
     short = dataclasses.replace(log, segments=((log.segments[0][0], log.segments[0][0] + 160),))
-    brief = dataclasses.replace(result, flights=[short], settings={**result.settings, "horizon": 0.2, "past": 0.1})
+    brief = dataclasses.replace(result, flights=[short], settings={**result.settings, **BRIEF})
     assert (brief.save(tmp_path / "brief") / "residuals.png").exists()
 
     folder = result.save(tmp_path / "fit", pictures=False)
@@ -98,7 +90,7 @@ def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(b
 
 def test_a_fit_that_was_stopped_goes_on_as_if_it_had_not(real, tmp_path, monkeypatch, capsys):
     file, write = tmp_path / "checkpoint.json", estimation.Checkpoint.write
-    options = {"fields": ["linear_drag"], "draws": 0, "iterations": 9, "horizon": 0.2, "past": 0.1}
+    options = {"fields": ["linear_drag"], "draws": 0, "iterations": 9} | BRIEF
     short = dataclasses.replace(real, segments=((300, 700),))
     straight = identify(short, **options)
 
@@ -199,63 +191,58 @@ def test_predictions_of_a_drone_that_is_right_are_right_and_of_one_that_drifts_a
     assert prediction_error(real, plain, (0.1,))["position"][0.1] < 0.01
 
 
-def test_bad_input_of_a_fit_is_refused_by_name(real):
+REFUSED = {  # what a fit, or a prediction, says of an argument
+    "identify": [
+        ("past", -1, "past must"), ("horizon", 1e-9, "horizon must"), ("iterations", 1.5, "iterations must"),
+        ("draws", 1, "draws must be 0, for no bootstrap, or at least 2"), ("seed", 10**400, "seed must"),
+        ("fields", [], "fields is empty"), ("fields", ["mass"], "cannot fit 'mass'. Choose from: thrust_map"),
+        ("fields", {"inertia": 1}, "fields"), ("known", 5, "known"), ("known", {1: 2}, "1"),
+        ("known", {"weight": 1.0}, "weight"), ("known", {"command_delay": True}, "delay"),
+        *(("known", {"mass": x}, "mass") for x in (True, "1", [[1], [2]], 10**400)),
+        ("known", {"linear_drag": [0.1, 0.1, 0.1]}, "nothing is left to fit"),
+        *(("drone", x, "drone") for x in (5, None, {})), *(("log", x, "log must be") for x in (5, "a.csv", [None])),
+        ("log", [], "at least one flight"), ("progress", 1, "progress must"), ("checkpoint", 5, "checkpoint must"),
+    ],
+    "prediction_error": [
+        ("past", float("nan"), "past must"), ("every", 0, "every must"), ("drone", 5, "drone"), ("log", None, "log"),
+        *(("horizons", x, "horizons") for x in (0.1, [], [0.0], [-0.1], ["a"], [True], [10**400], None)),
+    ],
+}  # fmt: skip
+
+
+def test_arguments_of_fits_and_predictions_are_refused_in_one_line(real):
     def flown(*segments):
         return dataclasses.replace(real, segments=segments)
 
-    def drone(motor_command):
-        plain = {key: value.squeeze().tolist() for key, value in load_drone("visfly").fields().items()}
-        return load_drone({**plain, "motor_command": motor_command})
-
+    usual = {
+        "identify": {"log": flown((300, 700)), "fields": ["linear_drag"], "iterations": 1, "draws": 0} | BRIEF,
+        "prediction_error": {"log": flown((300, 700)), "drone": "crazyflie", "horizons": (0.1,)},
+    }
+    functions = {"identify": identify, "prediction_error": prediction_error}
+    for function, table in REFUSED.items():
+        for name, value, message in table:
+            with pytest.raises(UserError, match=message) as refused:
+                functions[function](**usual[function] | {name: value})
+            assert "\n" not in str(refused.value) and len(str(refused.value)) < 800, (function, name, value)
     still = dataclasses.replace(real, motor_command=0.0 * real.motor_command)
     no_motors = dataclasses.replace(load_drone("visfly"), motor_command=None)
+    plain = {key: value.squeeze().tolist() for key, value in no_motors.fields().items()}
     for error, message, call, *arguments in (
-        (UnknownField, "cannot fit 'mass'. Choose from: thrust_map", identify, real, "crazyflie", None, ["mass"]),
-        (TooLittleFlight, "at least one flight", identify, []),
-        (TooLittleFlight, "too few", identify, flown((300, 600))),
+        (TooShort, "too few", identify, flown((300, 600))),
         (TooShort, "no piece of the flight is 1.90 s long", prediction_error, flown((300, 420)), "crazyflie"),
         (TooShort, "figure8 has no piece in flight", prediction_error, flown(), "visfly"),
         (NoFlight, "its motor commands are zero", prediction_error, still, no_motors),
-        (ValueError, "motor_command: missing key 'nominal_voltage'", drone, {"speed_per_volt": 500.0}),
-        (ValueError, "command: unknown key 'gain'. Allowed: speed_per_volt, nominal_voltage", drone, {"gain": 1.0}),
-        (ValueError, "command must be a mapping with any of speed_per_volt, .*; got 500.0", drone, 500.0),
-        (ValueError, "speed_per_volt must be", MotorCommand, -1.0, 3.7),
+        (UserError, "missing key 'nominal_voltage'", load_drone, plain | {"motor_command": {"speed_per_volt": 500.0}}),
+        (
+            UserError,
+            "unknown key 'gain'. Allowed: speed",
+            load_drone,
+            plain | {"motor_command": {"gain": 1.0}},
+        ),
+        (UserError, "command must be a mapping .*; got 500.0", load_drone, plain | {"motor_command": 500.0}),
     ):
         with pytest.raises(error, match=message):
             call(*arguments)
-
-
-NUMBERS = (float("nan"), float("inf"), -1, True, "a", 10**400, [0.5], torch.ones(2), None)
-HOSTILE = [
-    *(("identify", name, value) for name in ("past", "horizon", "iterations", "draws", "seed") for value in NUMBERS),
-    *(("identify", name, value) for name, value in (
-        ("horizon", 1e-9), ("horizon", 1e9), ("iterations", 0), ("iterations", 1.5), ("draws", 1), ("fields", []),
-        ("fields", [3]), ("fields", {"inertia": 1}), ("fields", ["mass"]), ("known", 5), ("known", {1: 2}),
-        ("known", {"weight": 1.0}), ("known", {"mass": True}), ("known", {"mass": "1"}),
-        ("known", {"mass": [[1], [2]]}),
-        ("known", {"mass": 10**400}), ("known", {"command_delay": "a"}), ("known", {"command_delay": True}),
-        ("known", {"linear_drag": [0.1, 0.1, 0.1]}), ("drone", 5), ("drone", None), ("drone", {}), ("log", 5),
-        ("log", "a.csv"), ("log", []), ("log", [None]), ("progress", 1), ("checkpoint", 5),
-    )),
-    *(("prediction_error", name, value) for name in ("past", "every") for value in NUMBERS),
-    *(("prediction_error", "horizons", value) for value in (
-        0.1, [], [0.0], [1e-9], [-0.1], ["a"], [True], [10**400], None,
-    )),
-    *(("prediction_error", name, value) for name, value in (("every", 0), ("drone", 5), ("log", None))),
-]  # fmt: skip
-
-
-def test_hostile_arguments_of_fits_and_predictions_are_refused_in_one_line(real):
-    short = dataclasses.replace(real, segments=((300, 700),))
-    usual = {
-        "identify": {"log": short, "fields": ["linear_drag"], "iterations": 1, "draws": 0, "horizon": 0.2, "past": 0.1},
-        "prediction_error": {"log": short, "drone": "crazyflie", "horizons": (0.1,)},
-    }
-    functions = {"identify": identify, "prediction_error": prediction_error}
-    for function, name, value in HOSTILE:
-        with pytest.raises(UserError) as refused:
-            functions[function](**usual[function] | {name: value})
-        assert "\n" not in str(refused.value) and len(str(refused.value)) < 800, (function, name, value)
 
 
 def test_a_flight_of_ones_own_making_must_be_whole(real):
@@ -275,7 +262,7 @@ BROKEN_STAGES = (5, {}, {"free": 5}, DRAG, DRAG | {"x": [0], "streams": [0]})
 
 def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
     file, short = tmp_path / "checkpoint.json", dataclasses.replace(real, segments=((300, 700),))
-    options = {"fields": ["linear_drag"], "draws": 0, "iterations": 1, "horizon": 0.2, "past": 0.1, "checkpoint": file}
+    options = {"fields": ["linear_drag"], "draws": 0, "iterations": 1, "checkpoint": file} | BRIEF
     identify(short, **options)
     whole = json.loads(file.read_text())
     first = next(iter(whole["stages"]))

@@ -1,24 +1,41 @@
-"""One flight, written as every kind of file by writers that share no code with the readers, is one FlightLog."""
+"""One flight as every kind of file is one FlightLog; files that are damaged, or never end, read or are refused."""
+
+import gzip
+import os
+import random
+import shutil
+import socket
+import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
-from log_writers import END, flight, matrix, ned, write_ulog, write_usd
+from log_writers import END, TABLE, ULOG, flight, matrix, ned, own_table, ulog_message, write_csv, write_ulog, write_usd
 
-from torchrl_quad.identification import MissingColumns, UnreadableLog, WrongUnit, read_log
-from torchrl_quad.identification.autopilots import decompress_quaternions
+from torchrl_quad.identification import (
+    GapsTooLarge,
+    LogError,
+    MissingColumns,
+    UnreadableLog,
+    WrongUnit,
+    read_log,
+    sources,
+)
+from torchrl_quad.identification.autopilots import decompress_quaternions, read_ulog
 
+BATTERY = {"battery_voltage": "/drone/battery.x"}
 TOLERANCES = dict.fromkeys(("position", "quaternion", "motor_command", "battery_voltage"), 2e-3)
 TOLERANCES |= {"velocity": 1e-2, "angular_velocity": 2e-2, "acceleration": 2e-2}
 
 
-def times(rate, start=0.0):
-    return start + np.arange(int((END - start) * rate)) / rate
+def times(rate):
+    return np.arange(int(END * rate)) / rate
 
 
-def same(log, begin=0.0, pieces=1, **tolerances):
-    """Whether a log is the flight, in its pieces; it begins at ``begin``."""
+def same(log, pieces=1, **tolerances):
+    """Whether a log is the flight, in its pieces."""
     assert len(log.segments) == pieces
-    true = flight(log.time + begin)
+    true = flight(log.time)
     rows = np.concatenate([np.arange(start, stop) for start, stop in log.segments])
     rows = rows[(np.abs(true["position"][rows, 2] - 1.25) < 0.9)]
     assert len(rows) * log.dt > 5.0
@@ -29,8 +46,8 @@ def same(log, begin=0.0, pieces=1, **tolerances):
 
 def px4_messages():
     rates = {"position": 50, "quaternion": 100, "imu": 250, "motors": 200, "battery": 5, "setpoint": 10}
-    t = {name: times(rate, 0.0) for name, rate in rates.items()}
-    true = {name: flight(times_) for name, times_ in t.items()}
+    t = {name: times(rate) for name, rate in rates.items()}
+    true = {name: flight(x) for name, x in t.items()}
     theirs = {name: ned(x) for name, x in true.items()}
     signal = true["motors"]["motor_command"][:, [3, 1, 0, 2]]  # front right, back left, front left, back right
     control = np.where(signal > 0.0, 0.3 * signal**2 + 0.7 * signal, np.nan)  # a motor that stands is NaN
@@ -110,7 +127,7 @@ def test_a_usd_log_is_read_in_both_versions_and_without_its_end(version, tmp_pat
     with pytest.raises(WrongUnit, match=r"gyro.x.*degrees"):
         read_log(write_usd(path, events, version), {"angular_velocity": ("gyro.x", "gyro.y", "gyro.z")})
     path.write_bytes(whole.replace(b"gyro.x(f)", b"gyro.x(e)"))
-    with pytest.raises(UnreadableLog, match=r"a variable of unknown type, 'gyro.x\(e\)'. Export it as CSV"):
+    with pytest.raises(UnreadableLog, match=r"a variable of unknown type, 'gyro.x\(e\)'.*export it as CSV"):
         read_log(path)
 
 
@@ -118,15 +135,11 @@ def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
     t = times(100)
     true = flight(t)
     q = true["quaternion"][:, [1, 2, 3, 0]]
-    code = np.zeros(len(t), np.uint64)
-    for row, x in enumerate(q):  # the largest component is left out, made positive; the others take ten bits each
-        largest = int(np.argmax(np.abs(x)))
-        word = largest
-        for k in range(4):
-            if k != largest:
-                negative = (x[k] < 0) != (x[largest] < 0)
-                word = word << 10 | int(negative) << 9 | round(abs(x[k]) * 2**0.5 * 511)
-        code[row] = word
+    code = largest = np.abs(q).argmax(1)  # this component is left out, made positive; the others take ten bits each
+    q *= np.sign(np.take_along_axis(q, largest[:, None], 1))
+    for k in range(4):
+        part = (q[:, k] < 0).astype(int) << 9 | np.rint(np.abs(q[:, k]) * 2**0.5 * 511).astype(int)
+        code = np.where(largest == k, code, code << 10 | part)
     back = decompress_quaternions(code)
     assert (1.0 - np.abs((back * q).sum(-1))).max() < 1e-5
     event = usd_events(t, times(10))["fixedFrequency"][1]
@@ -136,7 +149,7 @@ def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
         small[f"stateEstimateZ.v{axis}"] = ("h", np.round(1e3 * true["velocity"][:, k]).astype(int))
     for name, x in zip(("Roll", "Pitch", "Yaw"), (true["angular_velocity"] * (1, -1, 1)).T, strict=True):
         small[f"stateEstimateZ.rate{name}"] = ("h", np.round(1e3 * x).astype(int))
-    small["stateEstimateZ.quat"] = ("I", code.astype(int))
+    small["stateEstimateZ.quat"] = ("I", code)
     log = read_log(write_usd(tmp_path / "log01", {"fixedFrequency": (t, small)}, 2))
     assert log.battery_voltage is None
     log = type(log)(**{**vars(log), "battery_voltage": flight(log.time)["battery_voltage"]})
@@ -150,16 +163,11 @@ def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
 ACTUATORS = "std_msgs/Header header\nfloat64[] angles\nfloat64[] angular_velocities\nfloat64[] normalized\n"
 
 
-def ros_messages(store, stamped=True):
+def ros_messages(store, stamped):
     """Topics of a flight in motion capture: poses of the tracker, an IMU, the motors, odometry, and a battery."""
-    seconds, zeros = 1_700_000_000, np.zeros(9)
-
-    def make(kind, *values, **more):
-        return store.types[kind](*values, **more)
-
-    def geometry(kind, *values):
-        return make(f"geometry_msgs/msg/{kind}", *values)
-
+    make = {kind.rpartition("/")[2]: cls for kind, cls in reversed(store.types.items())}
+    extra = {"seq": 0} if "seq" in make["Header"].__dataclass_fields__ else {}
+    zeros, covariance = np.zeros(9), np.zeros(36)
     for rate, topic, kind in (
         (100, "pose", "geometry_msgs/msg/PoseStamped"),
         (50, "odom", "nav_msgs/msg/Odometry"),
@@ -171,42 +179,34 @@ def ros_messages(store, stamped=True):
         true = flight(t)
         true["body"] = np.einsum("nji,nj->ni", matrix(true["quaternion"]), true["velocity"])
         for i, at in enumerate(t):
-            now = {name: x[i].tolist() for name, x in true.items()}
-            stamp = make("builtin_interfaces/msg/Time", seconds + int(at) if stamped else 0, round(at % 1 * 1e9))
-            extra = {"seq": 0} if "seq" in store.types["std_msgs/msg/Header"].__dataclass_fields__ else {}
-            header = make("std_msgs/msg/Header", stamp=stamp, frame_id="world", **extra)
-            w, *xyz = now["quaternion"]
-            pose = geometry("Pose", geometry("Point", *now["position"]), geometry("Quaternion", *xyz, w))
-            rates, speed, force = (geometry("Vector3", *now[x]) for x in ("angular_velocity", "body", "acceleration"))
+            now = {name: x[i] for name, x in true.items()}
+            stamp = make["Time"](1_700_000_000 + int(at) if stamped else 0, round(at % 1 * 1e9))
+            header = make["Header"](stamp=stamp, frame_id="world", **extra)
+            pose = make["Pose"](make["Point"](*now["position"]), make["Quaternion"](*np.roll(now["quaternion"], -1)))
+            rates, speed, force = (make["Vector3"](*now[x]) for x in ("angular_velocity", "body", "acceleration"))
+            twist = make["TwistWithCovariance"](make["Twist"](speed, rates), covariance)
             values = {
                 "pose": (header, pose),
-                "odom": (
-                    header,
-                    "drone",
-                    geometry("PoseWithCovariance", pose, np.zeros(36)),
-                    geometry("TwistWithCovariance", geometry("Twist", speed, rates), np.zeros(36)),
-                ),
-                "imu": (header, geometry("Quaternion", 0.0, 0.0, 0.0, 1.0), zeros, rates, zeros, force, zeros),
-                "motors": (header, zeros[:0], zeros[:0], true["motor_command"][i]),
+                "odom": (header, "drone", make["PoseWithCovariance"](pose, covariance), twist),
+                "imu": (header, pose.orientation, zeros, rates, zeros, force, zeros),
+                "motors": (header, zeros[:0], zeros[:0], now["motor_command"]),
                 "battery": (now["battery_voltage"], 0.0, 0.0),
             }
-            yield topic, kind, int((seconds + at) * 1e9), make(kind, *values[topic])
+            yield topic, kind, int((1_700_000_000 + at) * 1e9), store.types[kind](*values[topic])
 
 
-def write_bag(path, ros2, storage=None, twin=None, pack=None, **options):
-    """A bag of either version; ``twin`` is a topic that it has twice, and ``pack`` says how it is compressed."""
+def write_bag(path, ros2, storage="MCAP", twin=None, stamped=True):
+    """A bag of either version; ``twin`` is a topic that it has twice."""
     from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(ACTUATORS, "mav_msgs/msg/Actuators"))
-    writer = Writer2(path, version=9, storage_plugin=storage) if ros2 else Writer1(path)
-    if pack:
-        pack(writer)
-    with writer:
-        connections = {}
-        for topic, kind, received, message in ros_messages(store, **options):
+    connections = {}
+    with Writer2(path, version=9, storage_plugin=StoragePlugin[storage]) if ros2 else Writer1(path) as writer:
+        for topic, kind, received, message in ros_messages(store, stamped):
             raw = store.serialize_cdr(message, kind) if ros2 else bytes(store.serialize_ros1(message, kind))
             for name in (topic, *([f"{topic}2"] if topic == twin else [])):
                 if name not in connections:
@@ -216,22 +216,19 @@ def write_bag(path, ros2, storage=None, twin=None, pack=None, **options):
 
 
 def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path):
-    from rosbags.rosbag2 import StoragePlugin
-
-    battery = {"battery_voltage": "/drone/battery.x"}
-    log = read_log(write_bag(tmp_path / "flight.bag", ros2=False), battery)
+    log = read_log(write_bag(tmp_path / "flight.bag", ros2=False), BATTERY)
     same(log)
     assert log.onboard == ("angular_velocity", "acceleration", "motor_command", "battery_voltage")
     assert "messages of /drone/battery carry no stamp" in str(log)
-    folder = write_bag(tmp_path / "ros2", ros2=True, storage=StoragePlugin.MCAP, stamped=False)
-    same(read_log(folder, battery))
+    folder = write_bag(tmp_path / "ros2", ros2=True, stamped=False)
+    same(read_log(folder, BATTERY))
     (file,) = folder.glob("*.mcap")
     odometry = {
-        **{"position": [f"/drone/odom.pose.pose.position.{a}" for a in "xyz"]},
-        **{"quaternion": [f"/drone/odom.pose.pose.orientation.{a}" for a in "xyzw"]},
-        **{"velocity_body": [f"/drone/odom.twist.twist.linear.{a}" for a in "xyz"]},
+        "position": [f"/drone/odom.pose.pose.position.{a}" for a in "xyz"],
+        "quaternion": [f"/drone/odom.pose.pose.orientation.{a}" for a in "xyzw"],
+        "velocity_body": [f"/drone/odom.twist.twist.linear.{a}" for a in "xyz"],
     }
-    log = read_log(file, {**battery, **odometry}, dt=0.01)
+    log = read_log(file, BATTERY | odometry, dt=0.01)
     same(log, velocity=2e-2)
     for columns, message in (
         ({"battery_voltage": "/drone/batt.x"}, "no topic /drone/batt. Name.*/drone/battery"),
@@ -241,4 +238,173 @@ def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path):
             read_log(file, columns)
     twins = write_bag(tmp_path / "twins.bag", ros2=False, twin="imu")
     with pytest.raises(MissingColumns, match="several topics for angular_velocity: /drone/imu, /drone/imu2. Say which"):
-        read_log(twins, battery)
+        read_log(twins, BATTERY)
+
+
+# -- damage ------------------------------------------------------------------------------------------------------------
+
+KINDS = {"a.ulg": None, "v1": None, "v2": None, "a.csv": TABLE, "a.csv.gz": TABLE, "a.bag": BATTERY, "a.db3": BATTERY}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The bytes of a log of each kind."""
+    folder = tmp_path_factory.mktemp("logs")
+    write_ulog(folder / "a.ulg", px4_messages(), {"THR_MDL_FAC": 0.3})
+    for version in (1, 2):
+        write_usd(folder / f"v{version}", usd_events(times(100), times(10)), version)
+    table = write_csv(folder / "a.csv", own_table(times(100))).read_bytes()
+    (folder / "a.csv.gz").write_bytes(gzip.compress(table))
+    write_bag(folder / "a.bag", ros2=False)
+    shutil.copy(write_bag(folder / "a", ros2=True, storage="SQLITE3") / "a.db3", folder)
+    return {name: (folder / name).read_bytes() for name in KINDS}
+
+
+def damaged(data, draw):
+    """The bytes with a few bits turned, cut off, with a piece twice or missing, or with a number of another size."""
+    data, reach = bytearray(data), min(len(data), draw.choice((64, 1000, len(data))))
+    at = draw.randrange(reach)
+    match draw.choice(("turn", "turn", "turn many", "cut", "twice", "lose", "number")):
+        case "turn":
+            data[at] ^= 1 << draw.randrange(8)
+        case "turn many":
+            for _ in range(30):
+                data[draw.randrange(reach)] ^= 1 << draw.randrange(8)
+        case "cut":
+            del data[draw.randrange(len(data)) :]
+        case "twice":
+            data[at:at] = data[at : at + draw.choice((1, 100, 10_000))]
+        case "lose":
+            del data[at : at + draw.choice((1, 100, 10_000))]
+        case "number":
+            data[at : at + 8] = draw.choice((0, 2**31 - 1, 2**32 - 1, 2**64 - 1)).to_bytes(8, "little")
+    return bytes(data)
+
+
+def refused(path, columns=None):
+    """What read_log says of a file that it refuses; None of one that it reads."""
+    said = None
+    try:
+        read_log(path, columns)
+    except LogError as error:
+        said = str(error)
+    assert said is None or ("\n" not in said and path.name in said and len(said) < 4000)
+    return said
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_damaged_log_reads_or_is_refused_in_one_line_that_names_it(kind, whole, tmp_path):
+    draw, path = random.Random(kind), tmp_path / kind
+    path.write_bytes(whole[kind])
+    assert refused(path, KINDS[kind]) is None
+    said = []
+    for _ in range(40):
+        path.write_bytes(damaged(whole[kind], draw))
+        said.append(refused(path, KINDS[kind]))
+    assert any(said)
+    path.write_bytes(whole[kind])
+    assert refused(path, KINDS[kind]) is None  # nothing was left behind
+
+
+def test_a_ulog_is_read_on_behind_what_is_damaged(whole, tmp_path):
+    sync = ulog_message("S", bytes.fromhex("2f731320250cbb12"))
+    data, half = whole["a.ulg"], whole["a.ulg"].index(struct.pack("<H", 14) + b"D", 150_000)
+    (tmp_path / "a.ulg").write_bytes(data[:half] + b"\xff" * 1000 + sync + data[half:])
+    log, plain = read_log(tmp_path / "a.ulg"), read_ulog(data, "a")[0]
+    assert "the ULog is damaged: 1 messages and 0 bytes were not read" in str(log)
+    again = read_ulog((tmp_path / "a.ulg").read_bytes(), "a")[0]
+    assert [len(stream.time) for stream in again] == [len(stream.time) for stream in plain]
+
+
+def ulog_of(*formats, count=100):
+    body = b"".join(ulog_message("F", text.encode()) for text in formats)
+    body += ulog_message("A", b"\0\0\0" + formats[0].split(":")[0].encode()) * count
+    return ULOG + body + ulog_message("D", bytes(20))
+
+
+REFUSED = {  # what is no log, or what no reader should follow to its end: a file, and what its refusal says
+    "empty.csv": (b"", "is empty"),
+    "junk.bin": (bytes(range(128, 256)), "not a log of a known kind"),
+    "text.csv": (b"Dear reader,\nthis is a letter.\n", "fewer than two samples"),
+    "ragged.csv": (b"t,x\n1,2\n1,2,3\n", "not a table of numbers"),
+    "cut.csv.gz": (gzip.compress(random.Random(0).randbytes(2000))[:1000], "broken gz"),
+    "cut.ulg": (ULOG[:8], "not a readable ULog"),
+    "cut.bag": (b"#ROSBAG V2.0\n", "not a readable ROS bag"),
+    "cut.usd": (b"\xbc\x02\x00\x05\x00abc", "header cannot be read: subsection not found"),
+    "new.usd": (b"\xbc\x09\x00\x00\x00abcd", "version 9"),
+    "nested.ulg": (ulog_of(*(f"a{k}:a{k + 1}[65535] x;" for k in range(9)), "a9:uint8_t[65535] x;"), "no sample"),
+    "itself.ulg": (ulog_of("a:uint64_t timestamp;a x;"), "no sample"),
+    "nothing.ulg": (ulog_of("a:uint64_t timestamp;b[65535] x;", "b:c[65535] x;", "c:"), "no sample"),
+    "wide.ulg": (ulog_of(*(f"a{k}:uint64_t timestamp;uint8_t[65000] x;" for k in range(2000))), "no sample"),
+    "zeros.ulg": (ULOG + bytes(10**6), "no sample"),
+    "zeros.mcap": (b"\x89MCAP0\r\n" + bytes(1000), "not a readable ROS bag: Unexpected record"),
+    "zeros.db3": (b"SQLite format 3\0" + bytes(1000), "not a readable ROS bag"),
+    "line.csv": (b"t" * 5_000_000, "line 1 has more than 4,000,000 bytes"),
+    "columns.csv": (b"," * 100_000 + b"\n1\n", "has more than 100,000 columns, the maximum"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_log_or_would_take_for_ever_is_refused_at_once(name, tmp_path):
+    data, message = REFUSED[name]
+    (tmp_path / name).write_bytes(data)
+    assert message in refused(tmp_path / name)
+
+
+def test_limits_of_size_are_named_before_memory_is_full(tmp_path, monkeypatch):
+    path = tmp_path / "a.csv.gz"
+    path.write_bytes(gzip.compress(b"t,px,py,pz\n" + b"0,0,0,0\n" * 200_000))
+    monkeypatch.setattr(sources, "MAX_UNPACKED", 10**6)
+    assert "has more than 1,000,000 bytes when it is unpacked" in refused(path)
+    monkeypatch.undo()
+    monkeypatch.setattr(sources, "MAX_ROWS", 1000)
+    assert "has more than 1,000 lines" in refused(path)
+    with open(tmp_path / "large.csv", "wb") as file:
+        file.truncate(10**11)  # which takes no room on the disk
+    assert "has more than 2,000,000,000 bytes, the maximum" in refused(tmp_path / "large.csv")
+
+
+def test_a_pipe_a_socket_and_a_device_are_refused_unopened(tmp_path, monkeypatch):
+    os.mkfifo(tmp_path / "pipe.csv")
+    (tmp_path / "link.csv").symlink_to("/dev/zero")
+    monitor = socket.socket(socket.AF_UNIX)
+    monitor.bind(str(tmp_path / "socket"))
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    (folder / "metadata.yaml").touch()
+    os.mkfifo(folder / "a.mcap")
+    for path in (tmp_path / "pipe.csv", tmp_path / "link.csv", tmp_path / "socket", folder, Path("/dev/zero")):
+        assert "is not a regular file but a pipe, a socket or a device" in refused(path)
+    monitor.close()
+    (folder / "a.mcap").unlink()
+    assert "bag is not a readable ROS bag" in refused(folder) and "does not exist" in refused(tmp_path / "nowhere.csv")
+    monkeypatch.setattr(Path, "is_file", lambda path: True)  # when it was looked at, before it became a pipe
+    assert "is not a regular file" in refused(tmp_path / "pipe.csv")
+
+
+def test_a_clock_that_jumps_ahead_is_refused_before_it_is_put_on_a_grid(tmp_path):
+    t = times(100)
+    path = write_csv(tmp_path / "a.csv", own_table(t) | {"t": t + 1e7 * (t > 5.0)})
+    with pytest.raises(GapsTooLarge, match=r"1e\+09 steps of 0.01 s; the maximum is 1,000,000. The clock of position"):
+        read_log(path, TABLE)
+    write_csv(path, own_table(t) | {"t": np.where(np.arange(len(t)) == 500, 1e300, t)})
+    assert "1 samples of position (x, y, z) are not finite" in str(read_log(path, TABLE))  # damage, and no jump
+    long = np.linspace(0.0, 9000.0, 20_000)
+    write_csv(path, own_table(t)).write_text("t,x,y,z\n" + "".join(f"{x},0,0,0\n" for x in long))
+    table = own_table(t)
+    path = write_csv(path, {name: np.interp(long % 10.0, t, x) for name, x in table.items()} | {"t": long})
+    with pytest.raises(UnreadableLog, match="Cut it into shorter logs, or give a larger dt"):
+        read_log(path, TABLE, dt=0.001)
+
+
+def test_values_beyond_any_flight_count_as_missing_and_wide_tables_are_read(tmp_path):
+    t = times(100)
+    columns = own_table(t)
+    columns["x"] = np.where(np.arange(len(t)) == 500, 1e38, columns["x"])
+    path = write_csv(tmp_path / "a.csv", columns)
+    log = read_log(path, TABLE)
+    assert np.abs(log.position).max() < 10.0 and "beyond 1e+09" in str(log)
+    head, *rows = path.read_text().splitlines()
+    names = ",".join(f"c{k}" for k in range(20_000))
+    path.write_text("\n".join([f"{head},{names}", *(row + ",text" * 20_000 for row in rows[:300])]))
+    assert len(read_log(path, TABLE, min_duration=0.0).time) == 300

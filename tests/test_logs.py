@@ -137,20 +137,15 @@ def test_a_run_with_diagnostics_learns_the_same_bit_for_bit_and_logs_them(recipe
         assert float(second["grad/variance"]) > 0 and float(second["grad/cosine"]) <= 1
 
 
-def test_the_configuration_goes_along_with_the_results(train, tmp_path):
-    checkpoint = train("bptt", tmp_path, "env.drone=small_racer")
-    saved = yaml.safe_load((tmp_path / "config.yaml").read_text())
-    assert saved["env"]["drone"] == "small_racer"
-    assert OmegaConf.create(checkpoint["config"]) == OmegaConf.create(saved)
-    assert checkpoint["revision"] == json.loads((tmp_path / "summary.json").read_text())["revision"]
-
-
 # -- numbers that are not finite ---------------------------------------------------------------------------------------
 
 
 def test_an_update_that_is_not_finite_is_left_out_and_counted(train, tmp_path, monkeypatch):
     poison(monkeypatch, 0, 3, 4)
-    checkpoint = train("bptt", tmp_path)
+    checkpoint = train("bptt", tmp_path, "env.drone=small_racer")
+    saved = yaml.safe_load((tmp_path / "config.yaml").read_text())  # the configuration goes along with the results
+    assert saved["env"]["drone"] == "small_racer" and OmegaConf.create(checkpoint["config"]) == OmegaConf.create(saved)
+    assert checkpoint["revision"] == json.loads((tmp_path / "summary.json").read_text())["revision"]
     assert [row["grad/skipped"] for row in checkpoint["rows"]] == [1, 2, 3, 3]
     assert all(parameter.isfinite().all() for parameter in checkpoint["best"]["actor"].values())
     assert checkpoint["stateful"][1]["state"][0]["step"] == 8 - 3

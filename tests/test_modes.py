@@ -4,15 +4,23 @@ import math
 
 import pytest
 import torch
+from flying import fly
 from scipy.spatial.transform import Rotation
+from torchrl.envs import check_env_specs
 
-from torchrl_quad import HoveringEnv, available_drones, load_drone
+from torchrl_quad import HoveringEnv, available_drones, load_drone, make_actor, make_env
 from torchrl_quad.adapters.gym import GymVectorEnv
 from torchrl_quad.dynamics import CONTROLS, DYNAMICS, quaternion
+from torchrl_quad.envs import TASKS
 
 F64 = torch.float64
+DT, STEPS = 0.005, 4  # physics step [s], and how many make a control step
 each_mode = pytest.mark.parametrize("control", CONTROLS)
 each_drone = pytest.mark.parametrize("drone", available_drones())
+each_model = pytest.mark.parametrize(
+    ("control", "dynamics"),
+    [(name, model) for name in CONTROLS for model in DYNAMICS if (name, model) != ("rotor_thrusts", "point_mass")],
+)
 each_flight = pytest.mark.parametrize(
     ("drone", "dynamics"), [*((name, "quadrotor") for name in available_drones()), ("visfly", "point_mass")]
 )
@@ -89,11 +97,12 @@ def test_the_hover_action_hovers_and_is_the_command_that_it_stands_for(control, 
     assert (env.reset()["state", "action_queue"] == env.hover_action).all()
 
 
-@each_mode
-def test_flights_have_exact_derivatives_with_delay_and_random_drones(control):
+@each_model
+def test_flights_have_exact_derivatives_with_delay_and_random_drones(control, dynamics):
     options = {"action_delay": 2, "randomize": {"mass": {"scale": [0.8, 1.2]}}, "wind": {"gust": 0.5}}
     start = {"tilt": 0.5, "velocity": 1.0, "angular_velocity": 1.0}
-    env = HoveringEnv(num_envs=2, control=control, dtype=F64, dt=0.01, random_start=start, **options)
+    options |= {"control": control, "dynamics": dynamics, "random_start": start}
+    env = HoveringEnv(num_envs=2, dtype=F64, dt=0.01, **options)
     actions = (env.hover_action + 0.2 * torch.randn(2, 8, 4, dtype=F64)).requires_grad_()
     drag = env.nominal.linear_drag.clone().requires_grad_()
 
@@ -112,10 +121,7 @@ def test_flights_have_exact_derivatives_with_delay_and_random_drones(control):
     assert torch.autograd.gradcheck(outputs, (actions, drag), fast_mode=True, atol=1e-6, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("control", "dynamics"),
-    [*((name, "quadrotor") for name in CONTROLS), ("attitude", "point_mass"), ("velocity", "point_mass")],
-)
+@each_model
 def test_the_step_that_is_compiled_is_the_eager_step(control, dynamics):
     env = HoveringEnv(num_envs=50, control=control, dynamics=dynamics, dtype=F64, dt=0.02)
     model, action = env.dynamics, 1.2 * (2 * torch.rand(50, 4, dtype=F64) - 1)
@@ -138,12 +144,9 @@ def test_drones_of_one_batch_each_have_their_own_controller(control):
 
 
 def test_limits_can_be_chosen_and_gymnasium_takes_them():
-    envs = GymVectorEnv("hovering", 2, control={"mode": "velocity", "max_speed": 5.0, "max_tilt": 0.7})
-    controller = envs.torchrl_env.dynamics.controller
-    assert controller.decode(torch.ones(4)).tolist() == [5.0, 5.0, 5.0, 2.0]
-    assert list(envs.torchrl_env.action_units.values()) == ["m/s", "m/s", "m/s", "rad/s"]
-    envs.reset(seed=0)
-    assert envs.step(envs.action_space.sample())[0].shape == (2, 13)
+    env = GymVectorEnv("hovering", 2, control={"mode": "velocity", "max_speed": 5.0, "max_tilt": 0.7}).torchrl_env
+    assert env.dynamics.controller.decode(torch.ones(4)).tolist() == [5.0, 5.0, 5.0, 2.0]
+    assert list(env.action_units.values()) == ["m/s", "m/s", "m/s", "rad/s"]
 
 
 @pytest.mark.parametrize(
@@ -169,3 +172,50 @@ def test_a_mode_or_a_limit_that_makes_no_sense_or_that_a_model_does_not_have_is_
     monkeypatch.setitem(DYNAMICS, "own", lambda nominal, dt, substeps, integrator: None)
     with pytest.raises(ValueError, match=message):
         HoveringEnv(num_envs=1, **({"control": options} if "mode" in options else options))
+
+
+# -- the point mass ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def point_mass():
+    drone = load_drone("visfly", dtype=F64).replace(linear_drag=[0.0] * 3, quadratic_drag=[0.0] * 3)
+    return HoveringEnv(num_envs=2, drone=drone, dynamics="point_mass", action_delay=0, dtype=F64)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_flies_a_point_mass_with_all_disturbances(task):
+    disturbed = {"randomize": {"mass": {"scale": [0.9, 1.1]}}, "observation_noise": {"position": 0.01}}
+    env = make_env(task, num_envs=3, dynamics="point_mass", dtype=F64, wind={"gust": 0.5}, **disturbed)
+    check_env_specs(env)
+    assert ("state", "rotor_speed") not in env.reset().keys(include_nested=True)
+    actor = make_actor(env)
+    flight = env.rollout(20, actor, break_when_any_done=False)
+    assert flight["next", "reward"].isfinite().all()
+    grads = torch.autograd.grad(flight["next", "reward"].sum(), list(actor.parameters()), allow_unused=True)
+    assert all(g is None or g.isfinite().all() for g in grads)
+
+
+@pytest.mark.parametrize("level", [-1.0, 0.2])
+def test_thrust_straight_up_gives_a_constant_acceleration(point_mass, level):
+    env, action = point_mass, torch.zeros(2, 20, 4, dtype=F64)
+    action[..., 0] = level
+    flight = fly(env, env.reset(), action.unbind(1))
+    # -1 is no thrust, free fall; full thrust is max_thrust_to_weight times the weight.
+    acceleration = 9.81 * ((level + 1) / 2 * env.nominal.max_thrust_to_weight.item() - 1)
+    k = STEPS * torch.arange(1, 21, dtype=F64)
+    height = flight["next", "state", "position"][..., 2] - flight["state", "position"][:, :1, 2]
+    torch.testing.assert_close(flight["next", "state", "velocity"][0, :, 2], acceleration * k * DT)
+    torch.testing.assert_close(height[0], acceleration * DT**2 * k * (k + 1) / 2)
+    assert (flight["next", "state", "velocity"][..., :2] == 0).all()
+
+
+def test_body_rates_follow_at_once_and_turn_by_rate_times_time(point_mass):
+    env, action = point_mass, point_mass.hover_action.repeat(2, 10, 1)
+    action[..., 3] = 0.5
+    state = fly(env, env.reset(), action.unbind(1))["next", "state"]
+    rate = 0.5 * env.nominal.max_body_rate * torch.tensor([0.0, 0.0, 1.0])
+    torch.testing.assert_close(state["angular_velocity"][0, 0], rate)
+    # Each step adds the derivative and normalizes: it turns by 2 atan(rate dt / 2).
+    angle = 2 * torch.atan(rate * DT / 2) * STEPS * 10
+    torch.testing.assert_close(state["quaternion"][0, -1], quaternion.from_axis_angle(angle))

@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis.configuration import set_hypothesis_home_dir
 from hypothesis.extra.numpy import arrays
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 
-from torchrl_quad import VisitedStateBuffer, make_env
+from torchrl_quad import make_env
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs import TASKS
 
@@ -76,6 +75,13 @@ def step(env, td):
     return env.step(td.copy())["next"]
 
 
+def after(env, td, steps=1):
+    """Some steps later, with the same action."""
+    for _ in range(steps):
+        td = td.copy().update({"state": step(env, td)["state"]})
+    return td
+
+
 def leaves(td):
     return dict(td.items(include_nested=True, leaves_only=True))
 
@@ -105,7 +111,7 @@ def test_a_step_from_anywhere_is_finite_and_so_are_its_derivatives(task, dtype, 
 @each_task
 @search
 @given(flight=flights(calm=False))
-def test_rewards_are_the_sum_of_their_terms_and_flags_agree(task, flight):
+def test_rewards_are_the_sum_of_their_terms_and_flags_agree_and_the_specs_contain_what_is_made(task, flight):
     env = env_of(task)
     ends = step(env, start(env, flight))
     torch.testing.assert_close(sum(ends["reward_terms"].values()), ends["reward"])
@@ -113,18 +119,9 @@ def test_rewards_are_the_sum_of_their_terms_and_flags_agree(task, flight):
     assert torch.equal(ends["terminated"], ends["crash"] | (ends["success"] & env.ends_on_success))
     assert torch.equal(ends["truncated"], ends["state", "step"] >= env.max_episode_steps)
     assert not (ends["crash"] & ends["success"] & env.ends_on_success).any()
-
-
-@each_task
-@search
-@given(flight=flights(calm=False))
-def test_the_specs_contain_whatever_a_step_or_a_reset_makes(task, flight):
-    env = env_of(task)
-    end = step(env, start(env, flight))
-    for made in (end, env.reset(end.select("state"), set_state=True)):
-        assert env.observation_spec.is_in(made.select(*env.observation_spec.keys()))
-        assert env.state_spec.is_in(made.select("state"))
-        assert env.done_spec.is_in(made.select(*env.done_spec.keys()))
+    for made in (ends, env.reset(ends.select("state"), set_state=True)):
+        for spec in (env.observation_spec, env.state_spec, env.done_spec):
+            assert spec.is_in(made.select(*spec.keys()))
 
 
 @each_task
@@ -200,23 +197,10 @@ def test_a_world_turned_about_its_vertical_turns_the_flight(flight, angle):
     td = start(env, flight)
     other = td.clone()
     other["state"].update(turned(td["state"]))
-    for _ in range(3):
-        td, other = (x.copy().update({"state": step(env, x)["state"]}) for x in (td, other))
+    td, other = (after(env, x, 3) for x in (td, other))
     expected = td["state"].copy().update(turned(td["state"]))
     for key in DRONE:
         torch.testing.assert_close(other["state", key], expected[key], rtol=1e-9, atol=1e-9)
-
-
-@search
-@given(flight=flights())
-def test_rotors_keep_their_limits(flight):
-    env = env_of("hovering")
-    td = start(env, flight)
-    for _ in range(10):
-        td = td.copy().update({"state": step(env, td)["state"]})
-        speed = td["state", "rotor_speed"]
-        assert (speed >= env.nominal.rotor_speed_min * (1 - 1e-12)).all()
-        assert (speed <= env.nominal.rotor_speed_max * (1 + 1e-12)).all()
 
 
 @search
@@ -227,66 +211,23 @@ def test_body_rates_follow_their_command_and_hardly_exceed_the_limit(flight):
     td["action"][:, 0] = env.hover_action[0]
     command = td["action"][:, 1:] * env.nominal.max_body_rate
     for _ in range(50):
-        td = td.copy().update({"state": step(env, td)["state"]})
+        td = after(env, td)
         assert (td["state", "angular_velocity"].abs() < 1.25 * env.nominal.max_body_rate).all()
     torch.testing.assert_close(td["state", "angular_velocity"], command, atol=1e-6, rtol=0)
 
 
 @search
 @given(flight=flights(calm=False))
-def test_actions_beyond_their_bounds_are_clamped(flight):
+def test_actions_beyond_their_bounds_are_clamped_and_rotors_keep_their_limits(flight):
     env = env_of("hovering")
     td = start(env, {**flight, "action": flight["action"] * 10.0})
     clamped = td.clone()
     clamped["action"] = td["action"].clamp(-1.0, 1.0)
-    for _ in range(3):
-        td, clamped = (x.copy().update({"state": step(env, x)["state"]}) for x in (td, clamped))
+    td, clamped = (after(env, x, 10) for x in (td, clamped))
     assert all(torch.equal(td["state", key], clamped["state", key]) for key in DRONE)
-
-
-@each_task
-@search
-@given(flight=flights(), steps=st.integers(1, 6))
-def test_a_rollout_is_so_many_steps(task, flight, steps):
-    env = env_of(task)
-    td = start(env, flight)
-    again = env.reset()["state"]
-    action = td["action"]
-    policy = TensorDictModule(lambda _: action, in_keys=["observation"], out_keys=["action"])
-    carry = env.reset(td.select("state"), set_state=True)
-    options = {"auto_reset": False, "break_when_any_done": False}
-    env.set_initial_state_source(lambda n: again)
-    try:
-        whole = env.rollout(steps, policy, tensordict=carry.clone(), **options)
-        for t in range(steps):
-            one, carry = env.step_and_maybe_reset(carry.set("action", action))
-            torch.testing.assert_close(leaves(whole[:, t]), leaves(one), rtol=1e-12, atol=1e-12)
-    finally:
-        env.set_initial_state_source(None)
-
-
-@each_task
-@search
-@given(flight=st.one_of(flights(), flights(calm=False)), terminated=arrays("bool", (N, 1)), nan=st.booleans())
-def test_the_visited_state_buffer_gives_back_what_it_was_given(task, flight, terminated, nan):
-    env = env_of(task)
-    td = start(env, flight).set("terminated", torch.as_tensor(terminated))
-    if nan:
-        td["state", "velocity"][0] = torch.nan
-    buffer = VisitedStateBuffer(10)
-    buffer.extend(td)
-    good = ~td["terminated"][:, 0] & torch.tensor([not nan, True, True])
-    assert len(buffer) == good.sum()
-    if len(buffer):
-        sense = has_sense(td)
-        kept = [{key: x[i] for key, x in leaves(td["state"]).items()} for i in (good & sense).nonzero().flatten()]
-        try:
-            given_back = buffer.initial_state(env, 1.0)["state"]
-        except ValueError:
-            assert not sense[good].all()
-            return
-        for i in range(N):
-            assert any(equal({key: x[i] for key, x in leaves(given_back).items()}, state) for state in kept)
+    speed = td["state", "rotor_speed"]
+    assert (speed >= env.nominal.rotor_speed_min * (1 - 1e-12)).all()
+    assert (speed <= env.nominal.rotor_speed_max * (1 + 1e-12)).all()
 
 
 @each_task
@@ -300,7 +241,6 @@ def test_the_hover_action_holds_any_place_and_heading(task, flight):
     state["quaternion"] = quaternion.from_axis_angle(torch.cat((0 * yaw, 0 * yaw, yaw), -1))
     td["state"].update({**state, "action_queue": env.hover_action.expand(N, 1, 4)})
     td["action"] = env.hover_action.expand(N, 4)
-    for _ in range(10):
-        td = td.copy().update({"state": step(env, td)["state"]})
+    td = after(env, td, 10)
     for key in DRONE:
         torch.testing.assert_close(td["state", key], state[key], rtol=1e-9, atol=1e-9)

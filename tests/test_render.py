@@ -11,13 +11,12 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torchrl.envs import RewardSum, TransformedEnv
 
-from torchrl_quad import HoveringEnv, differentiable_rollout, envs, make_actor, make_env
+from torchrl_quad import ActionSequence, HoveringEnv, differentiable_rollout, envs, make_actor, make_env
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric
 from torchrl_quad.render import (
     animate_flight,
     plot_episode,
     plot_flight,
-    plot_from_above,
     plot_learning_curve,
     video,
     write_replay,
@@ -75,21 +74,19 @@ def image(path):
 @pytest.fixture
 def views(monkeypatch):
     """The views of films, and what each frame of them was drawn from."""
+    drawn = []
 
     class Recorded(View):
-        drawn = []
-
         def __init__(self, points, num_drones, size, markers, image=None):
             super().__init__(points, num_drones, size, markers, image)
             self.markers = markers
 
         def draw(self, *args, **options):
-            self.drawn.append((self, args, options))
+            drawn.append((self, args, options))
             return super().draw(*args, **options)
 
     monkeypatch.setattr(video, "View", Recorded)
-    Recorded.drawn.clear()
-    return Recorded.drawn
+    return drawn
 
 
 def lines(axis):
@@ -212,9 +209,8 @@ def test_a_target_that_is_no_position_is_not_drawn(shape, tmp_path):
     write_replay(flight, env=env)
     assert plot_flight(flight, env=env).axes[1].get_ylabel() == "reward"
     assert set(lines(plot_episode(flight, env=env).axes[2])) == {"reward"}
-    td = env.rollout(2)[:, -1]
     before = env.render()
-    env.reset(td.set("_reset", torch.tensor([[True], [False]])), set_state=False)
+    env.reset()
     assert (env.render() != before).any()
 
 
@@ -246,9 +242,9 @@ def test_an_episode_of_every_task_is_drawn_with_what_flew(task, tmp_path):
     first = flight[1, :40]
     first = first[: first["next", "done"][:, 0].tolist().index(True) + 1]
     time = 0.02 * torch.arange(len(first) + 1)
-    path = torch.as_tensor(np.asarray(space.collections[0]._segments3d))
-    torch.testing.assert_close(path[:, 1].float(), first["next", "state", "position"].detach())
     target, position = (first["next", "state", name].detach() for name in ("target", "position"))
+    path = torch.as_tensor(np.asarray(space.collections[0]._segments3d))
+    torch.testing.assert_close(path[:, 1].float(), position)
     low, high = torch.tensor([space.get_xlim(), space.get_ylim(), space.get_zlim()]).T
     assert all(((low - 0.1 <= x) & (x <= high + 0.1)).all() for x in (first["state", "target"], position))
     assert (high - low).max() < (9 if task == "racing" else 8)  # and they fill the view, with all gates in it
@@ -276,8 +272,7 @@ def test_an_episode_of_one_step_is_drawn(task):
 
 
 def test_without_rotors_in_the_state_there_is_no_panel_of_them():
-    flight = HoveringEnv(num_envs=1).rollout(3)
-    flight = flight.exclude(("state", "rotor_speed"), ("next", "state", "rotor_speed"))
+    flight = make_env("hovering", num_envs=1, dynamics="point_mass").rollout(3)
     last = plot_episode(flight).axes[-1]
     assert last.get_ylabel() == "action" and last.get_xlabel() == "time [s]"
 
@@ -288,10 +283,8 @@ def test_the_gates_of_an_episode_are_numbered_and_passing_them_is_marked():
     gate = env.gates[td["state", "gate"][0, 0]]
     td["state", "position"][0] = gate - torch.tensor([1.0, 0.0, 0.0])
     td["state", "velocity"][0] = torch.tensor([5.0, 0.0, 0.0])
-    flight = env.rollout(
-        60, lambda td: td.set("action", env.hover_action.expand(2, 4)), tensordict=env.reset(td, set_state=True),
-        auto_reset=False, break_when_any_done=False,
-    )  # fmt: skip
+    hover = ActionSequence(env.hover_action.expand(60, 2, 4))
+    flight, _ = differentiable_rollout(env, hover, env.reset(td, set_state=True), 60)
     step = flight["next", "state", "gate_passed"][0, :, 0].tolist().index(True)
     space, _, *panels = plot_episode(flight, env=env).axes
     assert [int(text.get_text()) for text in space.texts] == [1, 2, 3, 4]  # also those that it does not reach
@@ -302,8 +295,8 @@ def test_the_gates_of_an_episode_are_numbered_and_passing_them_is_marked():
 
 def test_the_fonts_of_a_figure_are_embedded_as_truetype_and_it_is_as_wide_as_two_columns(tmp_path):
     flight = HoveringEnv(num_envs=1).rollout(10)
-    for suffix in ("pdf", "png"):
-        plot_episode(flight, tmp_path / f"episode.{suffix}")
+    for name in ("episode.pdf", "episode"):  # without a suffix it is a PNG
+        plot_episode(flight, tmp_path / name)
     pdf = (tmp_path / "episode.pdf").read_bytes()
     assert b"/FontFile2" in pdf and b"/Type3" not in pdf
     width, _ = (float(x) / 72 for x in re.search(rb"/MediaBox \[\s*0 0 ([\d.]+) ([\d.]+)", pdf).groups())
@@ -318,18 +311,10 @@ def test_without_a_path_a_figure_is_returned_and_shows_itself_in_a_notebook(tmp_
     monkeypatch.chdir(tmp_path)
     env = make_env("forest", num_envs=2)
     flight = env.rollout(5, break_when_any_done=False)
-    (tmp_path / "metrics.csv").write_text("steps,time/seconds,eval/return\n100,1.0,5.0\n")
-    figures = [draw(flight, env=env) for draw in (plot_flight, plot_episode, plot_from_above)]
-    for figure in (*figures, plot_learning_curve("metrics.csv")):
+    for figure in (plot_flight(flight, env=env), plot_episode(flight, env=env)):
         assert isinstance(figure, Figure) and figure._repr_png_().startswith(b"\x89PNG")
-    assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
-    copied = pickle.loads(pickle.dumps(figure))
-    assert copied._repr_png_() == figure._repr_png_()
-
-
-def test_a_path_without_a_suffix_gets_that_of_a_png(tmp_path):
-    plot_flight(HoveringEnv(num_envs=1).rollout(3), tmp_path / "flight")
-    assert image(tmp_path / "flight.png").shape == (598, 1430, 3)
+    assert not list(tmp_path.iterdir())
+    assert pickle.loads(pickle.dumps(figure))._repr_png_() == figure._repr_png_()
 
 
 # -- learning curves ---------------------------------------------------------------------------------------------------
@@ -352,9 +337,8 @@ def test_metrics_are_drawn_in_their_units_in_the_order_of_the_task(draw):
         "100,1.0,1.0,5.0,3.0,0.0,9.0",
         "200,2.0,0.02,20.0,4.0,1.0,8.0",
     )
-    shown = {
-        axis.get_ylabel(): axis.lines[0].get_xydata().tolist() for axis in draw(*rows, metrics=HoveringEnv.metric_info)
-    }
+    axes = draw(*rows, metrics=HoveringEnv.metric_info)
+    shown = {axis.get_ylabel(): axis.lines[0].get_xydata().tolist() for axis in axes}
     assert list(shown) == ["return", "episodes solved [%]", "position error [cm], median", "top speed"]
     assert shown["episodes solved [%]"] == [[1, 0], [2, 100]]
     assert shown["position error [cm], median"] == [[1, 100], [2, 2]]
@@ -362,32 +346,9 @@ def test_metrics_are_drawn_in_their_units_in_the_order_of_the_task(draw):
     assert labels == ["return", "episodes solved [%]", "position error", "top speed"]
 
 
-@pytest.mark.parametrize("evaluations", [2, 3, 60])
-def test_the_axis_of_steps_is_right_at_every_evaluation_though_the_first_iteration_compiled(draw, evaluations):
-    steps = 1000 * np.arange(1, evaluations + 1)
-    seconds = 30.0 + 0.5 * np.arange(evaluations)  # 30 s for the first, half a second for each other
-    rows = [f"{n},{s},{n / 100}" for n, s in zip(steps, seconds, strict=True)]
-    (axis,) = draw("steps,time/seconds,eval/return", *rows)
-    (upper,) = axis.child_axes
-    # Where a number of steps is on the upper axis, its second is on the lower one, and so at the margins.
-    for count, second in zip((0, *steps, steps[-1] + 1000), (0, *seconds, seconds[-1] + 0.5), strict=True):
-        x, _ = upper.transData.transform((count, 0))
-        assert x == pytest.approx(axis.transData.transform((second, 0))[0], abs=0.5)  # [pixels]
-
-
-def test_rows_before_the_first_step_and_rows_of_one_instant_need_no_axis_of_steps(draw):
-    (axis,) = draw("steps,time/seconds,eval/return", "0,0.0,5.0")
-    assert not axis.child_axes
-    (axis,) = draw("steps,time/seconds,eval/return", "0,0.0,5.0", "100,2.0,6.0", "100,2.0,6.5", "300,3.0,7.0")
-    x, _ = axis.child_axes[0].transData.transform((200, 0))
-    assert x == pytest.approx(axis.transData.transform((2.5, 0))[0], abs=0.5)
-
-
-@pytest.mark.parametrize("rows", [["0,0.0,5.0,,"], ["0,0.0,5.0,,none", "100,1.0,6.0,0.5,none"]])
-def test_a_learning_curve_has_gaps_where_cells_are_empty(draw, rows):
-    axes = draw("steps,time/seconds,eval/return,eval/solved,note", *rows)
-    shown = axes[1].lines[0].get_ydata()
-    assert len(shown) == len(rows) and np.isnan(shown[0])
+def test_a_learning_curve_has_gaps_where_cells_are_empty(draw):
+    axes = draw("steps,time/seconds,eval/return,eval/solved,note", "0,0.0,5.0,,none", "100,1.0,6.0,0.5,none")
+    assert np.isnan(axes[1].lines[0].get_ydata()).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,12 @@ import torch
 from browsing import TIMEOUT
 from torchrl.envs import RewardSum, TransformedEnv
 
-from torchrl_quad import HoveringEnv, RacingEnv, TrackingEnv, differentiable_rollout, make_actor, make_env
+from torchrl_quad import HoveringEnv, RacingEnv, differentiable_rollout, make_actor, make_env
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs.metrics import first_episode
 from torchrl_quad.render import write_replay
 
-NUM_ENVS, STEPS = 3, 1000
+NUM_ENVS, STEPS = 3, 600
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def opened(open_page, folder, env, rollout, goal="target"):
     replay = open_page(folder / "replay.html")
     assert type(env).__name__ in replay.page.title()
     np.testing.assert_allclose(replay.bodies()[:, 0], rollout["state", "position"][:, 0], atol=1e-6)
-    success = "  dashed: success below it" if isinstance(env, HoveringEnv | TrackingEnv) else ""
+    success = "  dashed: success below it" if isinstance(env, HoveringEnv) else ""
     panels = ["reward, sum", "action [-1, 1], thrust", "speed [m/s]", f"distance to the {goal} [m]{success}"]
     assert replay.series()[1] == panels
     assert replay.layout("yaxis4.type") == ("linear" if goal == "next gate" else "log")
@@ -61,24 +61,6 @@ def opened(open_page, folder, env, rollout, goal="target"):
         low, high = replay.layout("yaxis4.range")
         assert low < -1 < high and replay.layout("shapes.0.y0") == pytest.approx(0.1)
     return replay
-
-
-@pytest.mark.parametrize("task", ["landing", "tracking"])  # other tests open pages of hovering and racing
-def test_a_flight_of_every_task_opens_offline_without_errors(task, open_page, tmp_path):
-    env = make_env(task, num_envs=2)
-    opened(open_page, tmp_path, env, env.rollout(12, break_when_any_done=False)).close()
-
-
-def test_a_flight_without_target_reward_terms_and_environment_opens(open_page, tmp_path):
-    rollout = HoveringEnv(num_envs=2, action_delay=0).rollout(12, break_when_any_done=False)
-    rollout = rollout.exclude(("state", "target"), ("next", "state", "target"), ("next", "reward_terms"))
-    write_replay(rollout, tmp_path / "replay.html")
-    replay = open_page(tmp_path / "replay.html")
-    assert replay.series()[1] == ["reward", "action [-1, 1], thrust", "speed [m/s]", "height [m]"]
-    replay.scrub(12)
-    np.testing.assert_allclose(replay.bodies()[:, 0], rollout["next", "state", "position"][:, -1], atol=1e-6)
-    assert "guess" in replay.page.inner_text("#note")
-    replay.close()
 
 
 def test_positions_and_attitudes_are_all_a_replay_needs(open_page, tmp_path):
@@ -89,13 +71,16 @@ def test_positions_and_attitudes_are_all_a_replay_needs(open_page, tmp_path):
     replay.scrub(4)
     np.testing.assert_allclose(replay.bodies()[:, 0], rollout["next", "state", "position"][:, 4], atol=1e-6)
     assert replay.page.inner_text("#clock") == "0.50 s of 1.20 s"
-    assert replay.series()[1] == ["height [m]"]
+    assert replay.series()[1] == ["height [m]"] and "guess" in replay.page.inner_text("#note")
     replay.close()
 
 
 def test_a_notebook_shows_a_replay_below_its_cell(browser, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    replay = write_replay(HoveringEnv(num_envs=2).rollout(12, break_when_any_done=False))
+    rollout = HoveringEnv(num_envs=2).rollout(12, break_when_any_done=False)
+    for position in (rollout["state", "position"], rollout["next", "state", "position"]):
+        position[:] = torch.nan  # the page opens nevertheless
+    replay = write_replay(rollout)
     assert not list(tmp_path.iterdir()) and repr(replay) == f"Replay({len(replay.html) / 1e6:.1f} MB)"
     (tmp_path / "notebook.html").write_text(f"<!doctype html><div>{replay._repr_html_()}</div>")
     page = browser.new_context(offline=True).new_page()
@@ -110,7 +95,7 @@ def test_play_moves_the_drones_and_pause_stops_them(replay):
     before, picture = replay.bodies(), replay.picture()
     assert replay.picture() == picture
     replay.page.click("#play")
-    replay.wait("step >= 10")
+    replay.wait(lambda step: step >= 10)
     replay.page.click("#play")
     paused, step = replay.bodies(), replay.step()
     assert (np.abs(paused[:, 0] - before[:, 0]).max(-1) > 1e-3).all()
@@ -139,7 +124,7 @@ def test_the_slider_scrubs_to_the_state_of_the_rollout(replay, flight):
         np.testing.assert_allclose(lengths, 3 * 0.075 * thrust / hover, rtol=1e-3)
 
 
-@pytest.mark.parametrize("speed", ["0.25", "1", "4"])
+@pytest.mark.parametrize("speed", ["0.25", "4"])
 def test_it_plays_in_real_time_times_the_speed(replay, flight, speed):
     env, _ = flight
     replay.page.select_option("#speed", speed)
@@ -192,25 +177,24 @@ def ticks(replay):
 
 def test_the_cursor_is_in_step_and_a_click_goes_to_a_time(replay):
     times, pixels = ticks(replay)
-    for frame in (120, 800):
+    for frame in (120, 500):
         replay.scrub(frame)
         box = replay.page.locator("#cursor").bounding_box()
         centre = box["x"] + box["width"] / 2
         assert centre == pytest.approx(np.interp(0.02 * frame, times, pixels), abs=1.5)
-    for axis, part in zip(
-        ("yaxis", "yaxis2", "yaxis3", "yaxis4"), replay.page.locator("#cursor div").all(), strict=True
-    ):
+    axes = ("yaxis", "yaxis2", "yaxis3", "yaxis4")
+    for axis, part in zip(axes, replay.page.locator("#cursor div").all(), strict=True):
         top, height = (replay.layout(f"{axis}.{name}") for name in ("_offset", "_length"))
         part, around = part.bounding_box(), replay.page.locator("#series").bounding_box()
         assert (part["y"] - around["y"], part["height"]) == pytest.approx((top, height), abs=1.5)  # not on the labels
     box = replay.page.locator("#series").bounding_box()
-    x, y = np.interp(8.0, times, pixels), box["y"] + 0.6 * box["height"]
+    x, y = np.interp(6.0, times, pixels), box["y"] + 0.6 * box["height"]
     replay.page.mouse.move(x - 5, y)
     replay.page.wait_for_selector("#series .hoverlayer > *", state="attached")
     replay.page.mouse.move(x, y)
     replay.page.mouse.click(x, y)
-    replay.wait("step !== 800")
-    assert replay.step() == pytest.approx(400, abs=3)
+    replay.wait(lambda step: step != 500)
+    assert replay.step() == pytest.approx(300, abs=3)
 
 
 def test_the_keyboard_plays_steps_and_chooses(replay):
@@ -223,7 +207,7 @@ def test_the_keyboard_plays_steps_and_chooses(replay):
     keyboard.press("ArrowUp")
     assert replay.page.input_value("#environment") == "all"
     keyboard.press(" ")
-    replay.wait("step > 3")
+    replay.wait(lambda step: step > 3)
     keyboard.press(" ")
     assert replay.page.inner_text("#play") == "Play"
 
@@ -244,37 +228,24 @@ def test_keys_of_the_browser_are_left_to_it_and_those_of_the_page_work_after_a_c
     assert replay.page.inner_text("#play") == "Pause"
 
 
-def test_everything_that_the_markers_of_a_task_name_is_drawn(open_page, own_markers, tmp_path):
+def test_everything_that_the_markers_name_is_drawn_and_a_drone_until_its_position_is_not_finite(
+    open_page, own_markers, tmp_path
+):
     env = own_markers(num_envs=2)
-    write_replay(env.rollout(6, break_when_any_done=False), tmp_path / "replay.html", env=env)
-    replay, markers = open_page(tmp_path / "replay.html"), env.markers()
-    np.testing.assert_allclose(replay.trace("gates")[:33], markers.rings()[0], atol=1e-6)
-    np.testing.assert_allclose(replay.trace("places"), markers.places, atol=1e-6)
-    np.testing.assert_allclose(replay.trace("path"), markers.curve, atol=1e-6)
-    for shape in markers.shapes:
-        np.testing.assert_allclose(replay.trace(shape.name), shape.points, atol=1e-6)
-    target = replay.trace("target")  # which is no gate
-    np.testing.assert_allclose(target, np.tile(env.target, (2, 1)), atol=1e-6)
-    replay.page.select_option("#environment", "1")
-    assert replay.page.locator("#size option").first.inner_text() == "to scale"
-    replay.close()
-
-
-def test_a_drone_is_seen_until_its_position_is_no_longer_finite(open_page, tmp_path):
-    rollout = HoveringEnv(num_envs=2).rollout(6, break_when_any_done=False)
+    rollout, markers = env.rollout(6, break_when_any_done=False), env.markers()
     position = rollout["next", "state", "position"]
-    last = position[0, 2].clone()
     position[0, 3:] = torch.nan
-    write_replay(rollout, tmp_path / "replay.html")
-    position[:], rollout["state", "position"][:] = torch.nan, torch.nan
-    write_replay(rollout, tmp_path / "nowhere.html")
+    write_replay(rollout, tmp_path / "replay.html", env=env)
     replay = open_page(tmp_path / "replay.html")
+    shown = {"places": markers.places, "path": markers.curve, "target": np.tile(env.target, (2, 1))}
+    for name, points in (shown | {shape.name: shape.points for shape in markers.shapes}).items():
+        np.testing.assert_allclose(replay.trace(name), points, atol=1e-6, err_msg=name)
+    np.testing.assert_allclose(replay.trace("gates")[:33], markers.rings()[0], atol=1e-6)
     replay.scrub(3)
-    np.testing.assert_allclose(replay.bodies()[0, 0], last, atol=1e-6)
+    np.testing.assert_allclose(replay.bodies()[0, 0], position[0, 2], atol=1e-6)
     replay.scrub(4)
     assert np.isfinite(replay.bodies()[:, 0]).all(1).tolist() == [False, True]
     replay.close()
-    open_page(tmp_path / "nowhere.html").close()
 
 
 def test_the_next_gate_stands_out(replay, flight):
@@ -318,12 +289,15 @@ def written(rollout, **options):
     return content, numbers
 
 
-def test_what_is_not_known_of_the_start_is_left_out_there():
-    rollout = HoveringEnv(num_envs=2).rollout(3)
+def test_what_is_not_known_is_left_out():
+    rollout = HoveringEnv(num_envs=2, action_delay=0).rollout(3)
     _, numbers = written(rollout.exclude(("state", "target"), ("state", "velocity")))
     target = numbers("target", 2, 4, 3)
     assert target[:, 0].isnan().all() and torch.equal(target[:, 1:], rollout["next", "state", "target"])
     torch.testing.assert_close(numbers("position", 2, 4, 3)[:, 0], rollout["state", "position"][:, 0])
+    content, _ = written(rollout.exclude(("state", "target"), ("next", "state", "target"), ("next", "reward_terms")))
+    assert content["target"] is None and not content["knows_drone"]
+    assert [panel["label"] for panel in content["panels"]] == ["reward", "action [-1, 1]", "speed [m/s]", "height [m]"]
 
 
 def test_drones_of_other_environments_than_those_shown_are_refused():
@@ -378,24 +352,7 @@ def test_a_page_of_twelve_long_flights_is_small():
     assert content["environments"] == 12 and len(json.dumps(content)) < 1_500_000
 
 
-def test_a_page_that_cannot_be_finished_leaves_the_old_one(tmp_path, monkeypatch):
-    rollout = HoveringEnv(num_envs=1).rollout(2)
-    path = tmp_path / "replay.html"
-    path.write_text("old")
-
-    def full(*_):
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr("torchrl_quad.files.os.replace", full)
-    with pytest.raises(OSError, match="No space"):
-        write_replay(rollout, path)
-    assert [file.name for file in tmp_path.iterdir()] == ["replay.html"] and path.read_text() == "old"
-
-
-def test_a_rollout_without_attitudes_and_a_machine_without_plotly_are_refused(monkeypatch):
-    rollout = HoveringEnv(num_envs=2).rollout(3)
-    with pytest.raises(ValueError, match=r"write_replay: the rollout lacks .*'quaternion'"):
-        write_replay(rollout.exclude(("next", "state", "quaternion")))
+def test_a_machine_without_plotly_is_told_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     with pytest.raises(ImportError, match=r"pip install '.\[render\]'"):
-        write_replay(rollout)
+        write_replay(HoveringEnv(num_envs=2).rollout(3))

@@ -11,11 +11,13 @@ import time
 
 import numpy as np
 import pytest
+import torch
 from scipy.stats import mannwhitneyu
 
-from benchmarks.paper import flights, matrix, reproduce, results, running, tables
+from benchmarks.paper import elsewhere, flights, gradients, matrix, reproduce, results, running, tables
 from benchmarks.paper.evidence import Starts, best_learning_rate, probability
 from benchmarks.paper.matrix import Job
+from torchrl_quad import BPTTLoss, differentiable_rollout, make_actor, make_env
 from torchrl_quad.files import read_rows, write_rows
 
 
@@ -296,3 +298,83 @@ def test_a_task_of_your_own_is_flown_with_all_that_the_paper_flies_on_each_of_it
     assert {"abpt", "ppo", "bptt-episode", "abpt-no-0-step"} <= {job.variant for job in jobs}
     cfg = reproduce.configuration(jobs[0], 1e-2)
     assert (cfg.task, cfg.total_steps, cfg.env.reach) == ("own_task.CornerEnv", 491_520, 0.5)
+
+
+# -- other environments, and gradients ---------------------------------------------------------------------------------
+
+RANGE = {"pendulum": (-4 * 16.3, 0.0), "balance": (-20.0, 20.0)}  # returns that four steps can have
+
+
+@pytest.mark.parametrize(
+    ("environment", "losses"), [("pendulum", elsewhere.NAMES), ("balance", ("shac", "hybrid", "ppo"))]
+)
+def test_a_loss_trains_on_another_environment_once_and_has_a_row_in_the_table(
+    environment, losses, monkeypatch, tmp_path
+):
+    for name, value in {"ENVS": 2, "HORIZON": 4, "EPISODE": 4, "EPISODES": 2, "STEPS": 1}.items():
+        monkeypatch.setattr(elsewhere, name, value)
+    arguments = [f"elsewhere --environments {environment} --losses {' '.join(losses)} --seeds 0 --data", tmp_path]
+    run_main(monkeypatch, reproduce, *arguments)
+    rows = read_rows(tmp_path / "elsewhere.csv")
+    assert [(row["environment"], row["loss"], row["seed"]) for row in rows] == [(environment, x, "0") for x in losses]
+    low, high = RANGE[environment]
+    assert low < float(rows[0]["before"]) < high
+    table = tables.elsewhere_table(tmp_path)
+    assert [row["loss"] for row in table] == list(losses)
+    assert all(environment in row for row in table)
+    monkeypatch.setattr(elsewhere, "learn", lambda *_: pytest.fail("It has been trained."))
+    run_main(monkeypatch, reproduce, *arguments)
+
+
+def test_balance_cuts_the_graph_between_horizons_and_lets_some_go_on():
+    torch.manual_seed(0)
+    place = elsewhere.Balance(0, 16)
+    actions = torch.zeros(16, 6, requires_grad=True)
+    end = place.env.step(place.starts().set("action", actions))["next"]
+    gradient = torch.autograd.grad(end["observation"].sum(), actions, retain_graph=True)[0]
+    assert (gradient != 0).any(0).all(), "each agent is moved by its own action"
+    start = place.go_on(end.detach())
+    assert not any(entry.requires_grad for entry in start.values(True, True))
+    kept = (start["observation"] == end["observation"]).all(-1)
+    assert 0 < kept.sum() < 16
+
+
+def test_a_reset_at_the_end_of_a_horizon_leaves_no_graph_in_the_carry():
+    place = elsewhere.Balance(0, 4)
+    carry, scenario = place.starts(), place.env.base_env.scenario
+    scenario.package.set_pos(torch.tensor([0.0, -2.0]), batch_index=0)  # one ball lies on the floor
+    rollout, carry = differentiable_rollout(place.env, make_actor(place.env), carry, 1)
+    assert rollout["next", "done"].flatten().tolist() == [True, False, False, False]
+    assert rollout["next", "observation"].requires_grad
+    assert not any(entry.requires_grad for entry in carry.values(True, True))
+
+
+def test_the_gradients_of_every_method_are_compared_with_the_simulator(launch, no_pictures, monkeypatch, tmp_path):
+    quick = [*running.QUICK, "total_steps=16", "env.max_episode_steps=8"]
+    folders = {"abpt": "hovering/abpt-critic/seed0", "shac": "hovering/shac/seed0", "bptt": "elsewhere"}
+    for algorithm, folder in folders.items():
+        launch(algorithm, *quick, f"hydra.run.dir={tmp_path / folder}")
+    checkpoints = [tmp_path / folder / "checkpoint.pt" for folder in folders.values()]
+    ascent = "ascent --states 2 --repeats 2 --steps 4 --data", tmp_path
+    for some in (checkpoints[:1], checkpoints):
+        run_main(monkeypatch, reproduce, *ascent, *some)
+    rows = read_rows(tmp_path / "ascent.csv")
+    assert [row["variant"] for row in rows] == ["abpt-critic", "shac", "bptt"]  # by the folder, or by the method
+    assert all(-1.0 <= float(row["objective"]) <= 1.0 for row in rows)
+    assert [bool(row["zero_step_return"]) for row in rows] == [True, False, False]
+    launch("ppo", *quick, "batch_size=8", f"hydra.run.dir={tmp_path}/ppo")
+    with pytest.raises(SystemExit, match="was trained with ppo; choose runs of bptt, abpt, shac"):
+        run_main(monkeypatch, reproduce, *ascent, tmp_path / "ppo/checkpoint.pt")
+
+
+def test_backpropagation_through_all_steps_knows_the_true_slopes():
+    weights = {"velocity": 0.0, "angular_velocity": 0.0}  # norms that have a kink where the drone rests
+    smooth = make_env("hovering", num_envs=16, seed=0, dtype=torch.float64, weights=weights)
+    loss = BPTTLoss(make_actor(smooth, scale_init=1e-4)).make_value_estimator(gamma=0.9)
+    start = smooth.reset()
+    rollout, _ = differentiable_rollout(smooth, loss.actor_network, start, 20)
+    estimated = gradients.estimates(loss, rollout)["objective"]
+    action = rollout["action"][:, 0].detach()
+    true = gradients.slopes(smooth, loss, start, action, steps=20, size=1e-3)
+    assert torch.nn.functional.cosine_similarity(estimated, true, dim=-1).min() > 0.99
+    torch.testing.assert_close(estimated.norm(), true.norm(), rtol=0.02, atol=0.0)

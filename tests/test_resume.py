@@ -1,6 +1,7 @@
 """A run that was stopped goes on as if it had not been."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -14,8 +15,6 @@ from torchrl_quad.training import loop
 from torchrl_quad.training.checkpoints import read_checkpoint
 
 ROOT = Path(__file__).parent.parent
-
-
 ENTROPY = ["loss.alpha=auto", "loss.clip_action_gradient=3"]
 SEEING = [  # and remembering: a memory, images on their way, and noise that goes on
     *("task=forest", "env.density=0.02", "env.camera.width=6", "env.camera.height=4", "+env.camera.rate=2"),
@@ -26,15 +25,10 @@ SEEING = [  # and remembering: a memory, images on their way, and noise that goe
 @pytest.mark.parametrize(
     ("recipe", "options"),
     [
-        ("abpt", [*EVERYTHING, *ENTROPY]),
-        ("hybrid", EVERYTHING),
-        ("ppo", EVERYTHING),
-        ("ahac", [*EVERYTHING, *ENTROPY]),
-        ("shac", [*EVERYTHING, *ENTROPY]),
-        ("sapo", [*EVERYTHING, *ENTROPY]),
+        *((recipe, [*EVERYTHING, *ENTROPY]) for recipe in ("abpt", "ahac", "shac", "sapo")),
+        *((recipe, EVERYTHING) for recipe in ("hybrid", "ppo")),
         ("bptt", [*SEEING, *ENTROPY]),
     ],
-    ids=["abpt", "hybrid", "ppo", "ahac", "shac", "sapo", "bptt, seeing"],
 )
 def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(recipe, options, train, refused, tmp_path, monkeypatch):
     short = "total_steps=96"
@@ -55,14 +49,8 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(recipe, options, train,
     for summary in summaries:
         assert summary.pop("seconds") > 0 and summary.pop("revision")
     assert summaries[0] == summaries[1]
-
-
-def test_equal_runs_have_equal_checkpoints_which_hold_no_memory_that_was_never_written(train, tmp_path):
-    one, other = (train("abpt", tmp_path / name, "total_steps=96", *EVERYTHING, *ENTROPY) for name in ("one", "other"))
-    assert_equal(one, other)
-    assert {len(x) for x in one["processes"][0]["buffer"]["states"].values()} == {96}
-    sizes = [(tmp_path / name / "checkpoint.pt").stat().st_size for name in ("one", "other")]
-    assert sizes[0] == sizes[1]
+    if recipe == "abpt":  # no memory that was never written
+        assert {len(x) for x in straight["processes"][0]["buffer"]["states"].values()} == {96}
 
 
 KILLED = """
@@ -71,7 +59,7 @@ from torchrl_quad.training.loop import Run
 
 def save(self, path, save=Run._save, saves=[]):
     saves.append(path)
-    if len(saves) == 3:  # metrics.csv has the row already
+    if len(saves) == 2:  # metrics.csv has the row already
         os.kill(os.getpid(), signal.SIGKILL)
     save(self, path)
 
@@ -81,19 +69,20 @@ runpy.run_path("recipes/abpt.py", run_name="__main__")
 
 
 def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint_although_it_left_its_lock(train, tmp_path):
-    straight = train("abpt", tmp_path / "straight", "buffer.capacity=24")
+    options = ["buffer.capacity=24", "total_steps=72", "eval.interval=1"]
+    straight = train("abpt", tmp_path / "straight", *options)
     folder = tmp_path / "killed"
-    command = [sys.executable, "-c", KILLED, *SMALL, "buffer.capacity=24", f"hydra.run.dir={folder}"]
+    command = [sys.executable, "-c", KILLED, *SMALL, *options, f"hydra.run.dir={folder}"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         try:
             said = process.communicate(timeout=120)[1]
         finally:
             process.kill()
     assert process.returncode == -signal.SIGKILL, said
-    assert read_checkpoint(folder / "checkpoint.pt")["iteration"] == 4
-    assert [row["iteration"] for row in rows(folder)] == ["2", "4", "6"]
+    assert read_checkpoint(folder / "checkpoint.pt")["iteration"] == 1
+    assert [row["iteration"] for row in rows(folder)] == ["1", "2"]
     assert f"process {process.pid} on" in (folder / "run.lock").read_text()
-    assert_equal(straight, train("abpt", folder, "buffer.capacity=24", "resume=auto"))
+    assert_equal(straight, train("abpt", folder, *options, "resume=auto"))
     assert rows(folder) == rows(tmp_path / "straight")
     assert not (folder / "run.lock").exists()
 
@@ -125,21 +114,20 @@ def test_what_the_command_line_says_must_agree_with_the_checkpoint(train, refuse
     small = [*SMALL, f"hydra.run.dir={tmp_path}"]
     said = refused("bptt", *small)
     assert f"{tmp_path} holds another run. Continue with it, resume={tmp_path}/checkpoint.pt, or choose another" in said
-    said = refused("bptt", *small, "resume=auto", "env.drone=small_racer")
-    assert "env.drone=small_racer contradicts the checkpoint" in said and "trained with env.drone=visfly" in said
-    said = refused("bptt", *small, "resume=auto", "tuned=bptt_racing")
-    assert " contradicts the checkpoint" in said and "num_envs=" in said
-    said = refused("bptt", *small, "resume=auto", "algorithm=shac")
-    assert "algorithm=shac: this recipe is bptt" in said
-    said = refused("shac", *small, "resume=auto")
-    assert "algorithm=shac contradicts the checkpoint" in said and "trained with algorithm=bptt" in said
+    for words, message in {
+        "bptt env.drone=small_racer": "env.drone=small_racer contradicts the checkpoint .*trained with env.drone=visf",
+        "bptt tuned=bptt_racing": "num_envs=.* contradicts the checkpoint",
+        "bptt algorithm=shac": "algorithm=shac: this recipe is bptt",
+        "shac": "algorithm=shac contradicts the checkpoint .*trained with algorithm=bptt",
+    }.items():
+        recipe, *changes = words.split()
+        assert re.search(message, refused(recipe, *small, "resume=auto", *changes))
 
 
 def test_a_run_that_is_resumed_by_path_goes_on_in_the_folder_of_its_checkpoint(train, launch, refused, tmp_path):
-    train("bptt", tmp_path / "first")
-    path = tmp_path / "first/checkpoint.pt"
+    saved, path = train("bptt", tmp_path / "first"), tmp_path / "first/checkpoint.pt"
     said = refused("bptt", f"resume={path}", "total_steps=240", f"hydra.run.dir={tmp_path}/elsewhere")
     assert f"hydra.run.dir={tmp_path}/elsewhere has no effect: resume={path} continues in the folder of that" in said
     launch("bptt", f"resume={path}", "total_steps=240")
-    assert read_checkpoint(path)["iteration"] == 10
+    assert (saved["iteration"], read_checkpoint(path)["iteration"]) == (8, 10)
     assert not (tmp_path / "elsewhere").exists()

@@ -9,8 +9,6 @@ from torchrl.envs import check_env_specs
 
 from torchrl_quad import LandingEnv, RacingEnv, TrackingEnv, load_track
 
-# -- tracking ----------------------------------------------------------------------------------------------------------
-
 
 def test_the_point_moves_along_the_circle_and_the_next_ten_are_observed():
     env = TrackingEnv(num_envs=4, dtype=torch.float64)
@@ -76,9 +74,7 @@ def test_a_large_curve_gets_a_box_that_holds_it():
     [
         ({"curve": "square"}, "curve must be one of slow_circle, fast_circle, lemniscate, or a .* got 'square'"),
         ({"curve": lambda p: p}, "needs a period in seconds"),
-        ({"curve": "slow_circle", "period": -1.0}, "period must be at least 0.1, got -1.0"),
         ({"curve": lambda p: p, "period": 5.0}, r"from shape \(2, 257\) it made \(2, 257\), torch.float32"),
-        ({"curve": lambda p: torch.stack((p, p, p), 1), "period": 5.0}, r"it made \(2, 3, 257\)"),
         ({"curve": lambda p: torch.stack((p, p, p), -1).double(), "period": 5.0}, "both torch.float32.* torch.float64"),
         ({"curve": lambda p: [math.cos(p), 0, 1], "period": 5.0}, "it failed: "),
         ({"curve": lambda p: [p, p, p], "period": 5.0}, "it made a list"),
@@ -92,24 +88,19 @@ def test_a_curve_that_cannot_be_flown_is_refused(kwargs, message):
         TrackingEnv(num_envs=1, **kwargs)
 
 
-# -- landing -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("height", "descent", "distance"),
-    [(2.0, 0.5, 0.0), (2.0, 1.0, 0.3), (2.0, 1.4, 1.0), (0.5, 0.4, 2.0), (0.5, -3.0, 0.5), (0.01, 2.0, 0.4)],
-)
-def test_the_landing_reward_is_the_published_formula(height, descent, distance):
-    env = LandingEnv(num_envs=1, dtype=torch.float64)
+def test_the_landing_reward_is_the_published_formula():
+    height = torch.tensor([2.0, 2.0, 2.0, 0.5, 0.5, 0.01], dtype=torch.float64)
+    descent = torch.tensor([0.5, 1.0, 1.4, 0.4, -3.0, 2.0], dtype=torch.float64)
+    distance = torch.tensor([0.0, 0.3, 1.0, 2.0, 0.5, 0.4], dtype=torch.float64)
+    env, zero = LandingEnv(num_envs=6, dtype=torch.float64), torch.zeros(6)
     state = env.reset()["state"]
-    state["position"] = torch.tensor([[2.0 + distance, 0.0, height]], dtype=torch.float64)
-    state["velocity"] = torch.tensor([[0.0, 0.0, -descent]], dtype=torch.float64)
-    best, e = min(max(height, 0.05), 1.0), 1.2
-    x = descent / best
-    expected = 0.1 * (e ** (x if descent <= best else 5 - 4 * x) - 1) / (e - 1)
+    state["position"] = torch.stack((2.0 + distance, zero, height), -1)
+    state["velocity"] = torch.stack((zero, zero, -descent), -1)
+    best, e = height.clamp(0.05, 1.0), 1.2
+    x = torch.where(descent <= best, descent / best, 5 - 4 * descent / best)
     terms = env.reward_terms(state)
-    assert terms["descent"].item() == pytest.approx(expected)
-    assert terms["approach"].item() == pytest.approx(0.1 * (e ** (1 - distance / (2 * best)) - 1) / (e - 1))
+    torch.testing.assert_close(terms["descent"][:, 0], 0.1 * (e**x - 1) / (e - 1))
+    torch.testing.assert_close(terms["approach"][:, 0], 0.1 * (e ** (1 - distance / (2 * best)) - 1) / (e - 1))
 
 
 def test_the_height_that_scales_the_landing_reward_carries_no_gradient():
@@ -129,52 +120,27 @@ def test_the_height_that_scales_the_landing_reward_carries_no_gradient():
     falling = [(shaped(place, velocity + h) - shaped(place, velocity - h)).item() / 2e-6 for h in steps]
     assert by_place.flatten().tolist() == pytest.approx([*sideways, 0.0], abs=1e-8)
     assert by_velocity.flatten().tolist() == pytest.approx(falling, abs=1e-8)
-    assert by_place[0, 0].item() == pytest.approx(-0.1036, abs=1e-4)
-    assert by_velocity[0, 2].item() == pytest.approx(-0.2110, abs=1e-4)
-    assert by_place[0, 2] == 0.0
+    assert (by_place[0, 0].item(), by_velocity[0, 2].item()) == pytest.approx((-0.1036, -0.2110), abs=1e-4)
 
 
 def test_a_landing_succeeds_crashes_or_does_neither():
-    env = LandingEnv(num_envs=6)
+    env = LandingEnv(num_envs=9)
     positions = [(2.0, 0.0, 0.15), (2.29, -0.29, 0.19), (2.4, 0.0, 0.1), (2.0, 0.0, 0.1), (2.4, 0.0, -0.01), (2, 0, 3)]
-    velocities = [(0.0, 0.0, -0.2), (0.1, 0.0, 0.0), (0, 0, 0), (0.0, 0.0, -0.5), (0, 0, 0), (0, 0, 0)]
+    positions += [(8.0, 0.0, 2.0), (2.0, -5.1, 2.0), (2.0, 0.0, 6.1)]  # beyond its bounds
+    velocities = [(0.0, 0.0, -0.2), (0.1, 0.0, 0.0), (0, 0, 0), (0.0, 0.0, -0.5), *5 * [(0, 0, 0)]]
     td = start(env, position=torch.tensor(positions), velocity=torch.tensor(velocities))
-    ends = fly(env, td, hold(env, 1))["next"]
-    assert ends["success"].flatten().tolist() == [True, True, False, False, False, False]
-    assert ends["crash"].flatten().tolist() == [False, False, False, False, True, False]
-    assert ends["terminated"].flatten().tolist() == [True, True, False, False, True, False]
-    assert ends["reward_terms", "success"].flatten().tolist() == [20.0, 20.0, 0.0, 0.0, 0.0, 0.0]
-    assert ends["reward_terms", "crash"].flatten().tolist() == pytest.approx([0.0, 0.0, 0.0, 0.0, -0.1, 0.0])
-    metrics = env.episode_metrics(fly(env, td, hold(env, 1)))
-    assert metrics["solved"].tolist() == [1.0, 1.0, 0.0, 0.0, 0.0, 0.0]
-    assert metrics["crash"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
-    assert metrics["landing_speed"].isnan().tolist() == [False] * 5 + [True]
+    flight = fly(env, td, hold(env, 1))
+    ends, success = flight["next"], torch.tensor([True, True] + 7 * [False])
+    crash = torch.tensor([False, False, False, False, True, False, True, True, True])
+    assert torch.equal(ends["success"].flatten(), success) and torch.equal(ends["crash"].flatten(), crash)
+    assert torch.equal(ends["terminated"].flatten(), success | crash)
+    torch.testing.assert_close(ends["reward_terms", "success"].flatten(), 20.0 * success)
+    torch.testing.assert_close(ends["reward_terms", "crash"].flatten(), -0.1 * crash)
+    metrics = env.episode_metrics(flight)
+    assert torch.equal(metrics["solved"], success.float()) and torch.equal(metrics["crash"], crash.float())
+    assert metrics["landing_speed"].isnan().tolist() == [False] * 5 + [True] * 4
     assert metrics["landing_speed"][3].item() == pytest.approx(0.5, abs=0.05)
     assert metrics["position_error"][2].item() == pytest.approx(0.4, abs=0.01)
-
-
-def test_a_landing_beyond_its_bounds_pays_the_crash_term_like_any_crash():
-    env = LandingEnv(num_envs=4)
-    positions = torch.tensor([[8.0, 0.0, 2.0], [2.0, -5.1, 2.0], [2.0, 0.0, 6.1], [2.0, 0.0, 2.0]])
-    ends = fly(env, start(env, position=positions), hold(env, 1))["next"]
-    assert ends["crash"].flatten().tolist() == [True, True, True, False]
-    assert ends["reward_terms", "crash"].flatten().tolist() == pytest.approx([-0.1, -0.1, -0.1, 0.0])
-
-
-def test_the_landing_gradient_is_finite_however_fast_the_fall():
-    env = LandingEnv(num_envs=4)
-    td = start(env, velocity=torch.tensor([[0.0, 0.0, v] for v in (-299.0, -50.0, 0.0, 299.0)]))
-    action = env.hover_action.expand(4, 4).clone().requires_grad_()
-    reward = env.step(td.set("action", action))["next", "reward"]
-    state = {key: value.clone() for key, value in td["state"].items()}
-    state["velocity"].requires_grad_()
-    state["position"].requires_grad_()
-    terms = sum(env.reward_terms(state).values()).sum()
-    assert reward.isfinite().all()
-    assert all(g.isfinite().all() for g in torch.autograd.grad(terms, (state["velocity"], state["position"])))
-
-
-# -- racing ------------------------------------------------------------------------------------------------------------
 
 
 def test_gates_are_passed_in_order_along_the_straight_line_of_a_step():
@@ -209,14 +175,7 @@ def test_a_lap_is_timed_from_a_gate_to_the_same_gate_and_eight_gates_succeed():
     assert env.episode_metrics(flight[:, :2])["lap_time"].isnan().all()
 
 
-def test_a_racer_that_crashes_after_eight_gates_has_no_success():
-    env = RacingEnv(num_envs=1)
-    td = start(env, gates_passed=[[9]], position=[[5.0, 0.0, 0.01]], velocity=[[0.0, 0.0, -5.0]])
-    metrics = env.episode_metrics(fly(env, td, hold(env, 1)))
-    assert (metrics["solved"].item(), metrics["crash"].item(), metrics["gates_passed"].item()) == (0.0, 1.0, 9.0)
-
-
-def test_a_racer_that_breaks_keeps_what_it_has_passed():
+def test_a_racer_that_breaks_or_crashes_keeps_what_it_has_passed():
     env = RacingEnv(num_envs=2)
     td = start(env, gates_passed=3, step=100, pass_step=[[5, 6, 7, -1]], lap_time=4.0)
     td["action"] = env.hover_action.expand(2, 4).clone()
@@ -227,9 +186,13 @@ def test_a_racer_that_breaks_keeps_what_it_has_passed():
     assert ends["metrics", "lap_time"].flatten().tolist() == [4.0, 4.0]
     assert ends["state", "step"].flatten().tolist() == [101, 101]
     assert ends["state", "pass_step"].tolist() == [[5, 6, 7, -1]] * 2
+    low = start(env, gates_passed=9, position=[5.0, 0.0, 0.01], velocity=[0.0, 0.0, -5.0])
+    metrics = env.episode_metrics(fly(env, low, hold(env, 1)))  # after eight gates, and without success
+    found = {name: metrics[name].tolist() for name in ("solved", "crash", "gates_passed")}
+    assert found == {"solved": [0, 0], "crash": [1, 1], "gates_passed": [9, 9]}
 
 
-def test_starts_face_each_gate_in_turn():
+def test_starts_face_each_gate_in_turn_and_two_gates_are_observed():
     env = RacingEnv(num_envs=400, seed=1)
     state = env.reset()["state"]
     track = load_track()
@@ -241,15 +204,9 @@ def test_starts_face_each_gate_in_turn():
     lap = sum(math.dist(track["gates"][i - 1], track["gates"][i]) for i in range(4))
     assert lap == pytest.approx(21.67, abs=0.01)
     assert not env.is_crash(state).any()
-
-
-def test_two_gates_are_observed():
-    env = RacingEnv(num_envs=5, dtype=torch.float64)
-    td = env.reset()
-    gates = env.gates[torch.cat((td["state", "gate"], (td["state", "gate"] + 1) % 4), -1)]
-    relative = gates - td["state", "position"].unsqueeze(1)
-    torch.testing.assert_close(td["observation"][:, :6], relative.flatten(1))
-    assert td["observation"].shape == (5, 16)
+    gates = env.gates[torch.cat((state["gate"], (state["gate"] + 1) % 4), -1)]
+    torch.testing.assert_close(env.observe(state)[:, :6], (gates - state["position"].unsqueeze(1)).flatten(1))
+    assert env.observe(state).shape == (400, 16)
 
 
 @pytest.mark.parametrize("gate_bonus", ["binary", "log", "reciprocal"])
@@ -275,14 +232,10 @@ def test_the_racing_reward_is_the_published_formula(reward, gate_bonus):
 def test_only_the_relaxed_bonus_has_a_gradient():
     for gate_bonus, differentiable in (("binary", False), ("log", True), ("reciprocal", True)):
         env = RacingEnv(num_envs=1, reward="position", gate_bonus=gate_bonus)
-        td = env.reset()
         action = env.hover_action.expand(1, 4).clone().requires_grad_()
-        for _ in range(3):
-            td = env.step_mdp(step := env.step(td.set("action", action)))
-        bonus = step["next", "reward_terms", "gate"]
+        bonus = fly(env, env.reset(), [action] * 3)["next", "reward_terms", "gate"][:, -1]
         assert bonus.requires_grad == differentiable
-        if differentiable:
-            assert (torch.autograd.grad(bonus.sum(), action)[0] != 0).any()
+        assert not differentiable or (torch.autograd.grad(bonus.sum(), action)[0] != 0).any()
 
 
 def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):
@@ -300,22 +253,14 @@ def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):
         ({"gates": [[0, 0, 1]]}, "track: a track has 2 to 1000 gates, got 1"),
         ({"gate": []}, "unknown key 'gate'. Allowed: gates, starts, gate_radius"),
         ({}, "gates must be a list of points"),
-        ({"gates": [[0, 0], [1, 1]]}, "gates must be a list of points"),
         ({"gates": [[0, 0, 1], [1, 1, -1]]}, "in metres above ground"),
         ({"gates": [[0, 0, 1], [1, 1, float("nan")]]}, "gates must be a list of points"),
         ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1]]}, "one start before each gate, got 1 for 2"),
         ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1], [9, 9, 1]]}, r"within 0.2 m of \[9.0, 9.0, 1.0\]"),
         ({"gates": [[0, 0, 0.1], [1, 1, 0.1]]}, "not all inside the box"),
         ({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": 0}, "gate_radius must be at least 0.01, got 0. Of all gates"),
-        ({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": math.inf}, "gate_radius must be a finite number, got inf"),
     ],
 )
 def test_a_track_that_nobody_can_fly_is_refused(track, message):
     with pytest.raises(ValueError, match=message):
         RacingEnv(num_envs=1, track=track)
-
-
-@pytest.mark.parametrize("option", ["reward", "gate_bonus"])
-def test_unknown_rewards_are_refused(option):
-    with pytest.raises(ValueError, match=f"{option} must be .* or .*, got 'fast'"):
-        RacingEnv(num_envs=1, **{option: "fast"})

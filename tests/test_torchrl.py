@@ -1,78 +1,46 @@
 """The environment in TorchRL's own hands: under its transforms, losses and collectors, and in several processes."""
 
+import multiprocessing
 import signal
 from functools import partial
 
 import pytest
 import torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
-from torchrl.collectors import Collector, MultiCollector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import (
-    CatFrames,
-    CatTensors,
-    Compose,
-    DoubleToFloat,
-    DTypeCastTransform,
-    ObservationNorm,
-    ParallelEnv,
-    RewardScaling,
-    RewardSum,
-    SerialEnv,
-    StepCounter,
-    TransformedEnv,
-    check_env_specs,
-)
+from torchrl.collectors import MultiCollector
+from torchrl.envs import Compose, ParallelEnv, RewardSum, SerialEnv, StepCounter, TransformedEnv, check_env_specs
+from torchrl.envs import transforms as of_torchrl
 from torchrl.envs.utils import ExplorationType
-from torchrl.objectives import ClipPPOLoss, SACLoss, SoftUpdate
-from torchrl.objectives.value import GAE
+from torchrl.objectives import SoftUpdate
 
-from torchrl_quad import (
-    ABPTLoss,
-    BPTTLoss,
-    HoveringEnv,
-    ObservationNormalizer,
-    SHACLoss,
-    VisitedStateBuffer,
-    differentiable_rollout,
-    make_actor,
-    make_env,
-    make_qvalue,
-    make_value,
-)
-from torchrl_quad.envs import TASKS
+from torchrl_quad import HoveringEnv, ObservationNormalizer, VisitedStateBuffer, differentiable_rollout
+from torchrl_quad.envs import TASKS, make_env
+from torchrl_quad.modules import make_actor, make_qvalue, make_value
+from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss
 
 FEATURES = ["observation", ("state", "velocity")]
 
 
-def norm(scale=2.0):
-    return ObservationNorm(loc=0.1, scale=scale, in_keys=["observation"], standard_normal=True)
+def norm():
+    return of_torchrl.ObservationNorm(loc=0.1, scale=2.0, in_keys=["observation"], standard_normal=True)
 
 
 def frames(**kwargs):
-    return CatFrames(N=3, dim=-1, in_keys=["observation"], **kwargs)
+    return of_torchrl.CatFrames(N=3, dim=-1, in_keys=["observation"], **kwargs)
 
 
 def tensors():
-    return CatTensors(FEATURES, "observation", del_keys=False)
+    return of_torchrl.CatTensors(FEATURES, "observation", del_keys=False)
 
 
-# By name: what leaves the policy's input alone, with the factor on the reward, and what does not.
-BESIDE_THE_POLICY = {
-    "step counter": (lambda: [StepCounter()], 1.0),
-    "reward sum": (lambda: [RewardSum()], 1.0),
-    "reward scaling": (lambda: [RewardScaling(0.5, 2.0)], 2.0),
-    "all": (lambda: [StepCounter(max_steps=50), RewardScaling(0.5, 2.0), RewardSum()], 2.0),
-}
 BEFORE_THE_POLICY = {
     "normalised": lambda: [norm()],
     "frames": lambda: [frames()],
     "frames after zeros": lambda: [frames(padding="constant")],
     "tensors": lambda: [tensors()],
-    "all": lambda: [StepCounter(), norm(), tensors(), frames(), RewardScaling(0.5, 2.0), RewardSum()],
+    "all": lambda: [StepCounter(), norm(), tensors(), frames(), of_torchrl.RewardScaling(0.5, 2.0), RewardSum()],
 }
-STACKS = {**{name: make for name, (make, _) in BESIDE_THE_POLICY.items()}, **BEFORE_THE_POLICY}
-PRECISION = {"double to float": lambda: [DoubleToFloat()]}
+PRECISION = {"double to float": lambda: [of_torchrl.DoubleToFloat()]}
 
 
 def make(transforms, **kwargs):
@@ -115,38 +83,37 @@ def gradient(env, actor):
 
 
 @pytest.fixture
-def deadline():
-    """Processes that do not answer fail the test."""
+def processes():
+    """Other processes begin as copies of one that has imported everything; those that do not answer fail the test."""
 
     def give_up(*_):
         raise TimeoutError("no answer from the other processes in 100 s")
 
+    multiprocessing.set_forkserver_preload(["torchrl.collectors", "torchrl_quad.envs"])
+    multiprocessing.set_start_method("forkserver", force=True)
     signal.signal(signal.SIGALRM, give_up)
     signal.alarm(100)
     yield
     signal.alarm(0)
-
-
-# -- transforms --------------------------------------------------------------------------------------------------------
+    multiprocessing.set_start_method(None, force=True)
 
 
 @pytest.mark.parametrize(
-    ("task", "name"), [("hovering", x) for x in (*STACKS, *PRECISION)] + [(x, "all") for x in TASKS]
+    ("task", "name"), [("hovering", x) for x in (*BEFORE_THE_POLICY, *PRECISION)] + [(x, "all") for x in TASKS]
 )
 def test_specs_hold_under_transforms(task, name):
-    transforms = {**STACKS, **PRECISION}[name]()
+    transforms = {**BEFORE_THE_POLICY, **PRECISION}[name]()
     env = TransformedEnv(make_env(task, num_envs=2, dtype=torch.float64), Compose(*transforms))
     check_env_specs(env, break_when_any_done="both")
 
 
-@pytest.mark.parametrize("name", BESIDE_THE_POLICY)
-def test_transforms_that_the_policy_does_not_see_leave_its_gradient_as_it_is(name):
-    transforms, factor = BESIDE_THE_POLICY[name]
+def test_transforms_that_the_policy_does_not_see_leave_its_gradient_as_it_is():
     plain = make([], seed=1)
     actor = lively(make_actor(plain))
-    expected = factor * gradient(plain, actor)
+    expected = 2.0 * gradient(plain, actor)
     assert expected.norm() > 1e-3
-    torch.testing.assert_close(gradient(make(transforms(), seed=1), actor), expected, rtol=1e-9, atol=1e-12)
+    beside = make([StepCounter(max_steps=50), of_torchrl.RewardScaling(0.5, 2.0), RewardSum()], seed=1)
+    torch.testing.assert_close(gradient(beside, actor), expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", BEFORE_THE_POLICY)
@@ -171,8 +138,8 @@ def test_gradients_through_a_change_of_precision_are_those_of_either():
     actor = lively(make_actor(exact))
     expected = gradient(exact, actor)
     start = exact.reset()["state"]
-    up = DTypeCastTransform(torch.float32, torch.float64)
-    for env in (make([DoubleToFloat()]), make([up], dtype=torch.float32)):
+    up = of_torchrl.DTypeCastTransform(torch.float32, torch.float64)
+    for env in (make([of_torchrl.DoubleToFloat()]), make([up], dtype=torch.float32)):
         env.set_initial_state_source(lambda n: start)
         same = make_actor(env)
         same.load_state_dict(actor.state_dict())
@@ -193,7 +160,7 @@ def test_frames_of_one_horizon_are_remembered_in_the_next_without_their_graph():
 
 
 def test_a_transform_that_deletes_the_state_is_refused():
-    env = TransformedEnv(HoveringEnv(num_envs=2), CatTensors(FEATURES, "features"))
+    env = TransformedEnv(HoveringEnv(num_envs=2), of_torchrl.CatTensors(FEATURES, "features"))
     with pytest.raises(ValueError, match="step: the state lacks velocity. A state is restored whole"):
         env.rollout(2)
 
@@ -232,54 +199,7 @@ def test_visited_states_restart_what_transforms_remember():
     assert (carry["step_count"] == 0).all() and (carry["episode_reward"] == 0).all()
 
 
-# -- losses and collectors ---------------------------------------------------------------------------------------------
-
-
-def test_a_collector_and_the_ppo_loss_of_torchrl_train_on_it():
-    env = TransformedEnv(HoveringEnv(num_envs=4, max_episode_steps=8), Compose(StepCounter(), RewardSum()))
-    actor, value = make_actor(env, return_log_prob=True), make_value(env)
-    before = [p.clone() for p in actor.parameters()]
-    loss = ClipPPOLoss(actor, value, entropy_bonus=False)
-    optimizer = torch.optim.Adam(loss.parameters(), 1e-3)
-    collector = Collector(env, actor, frames_per_batch=40, total_frames=80, auto_register_policy_transforms=True)
-    for data in collector:
-        assert data.batch_size == (4, 10)
-        assert not data["next", "reward"].requires_grad
-        GAE(gamma=0.99, lmbda=0.95, value_network=value, vectorized=False)(data)
-        out = loss(data)
-        optimizer.zero_grad()
-        (out["loss_objective"] + out["loss_critic"]).backward()
-        assert out["loss_objective"].isfinite() and out["loss_critic"].isfinite()
-        optimizer.step()
-    collector.shutdown()
-    assert any(not torch.equal(p, q) for p, q in zip(actor.parameters(), before, strict=True))
-
-
-def test_a_collector_and_the_sac_loss_of_torchrl_train_on_it():
-    env = TransformedEnv(HoveringEnv(num_envs=4, max_episode_steps=8), Compose(StepCounter(), RewardSum()))
-    actor = make_actor(env)
-    loss = SACLoss(actor, make_qvalue(env), action_spec=env.action_spec_unbatched)
-    loss.make_value_estimator(gamma=0.99)
-    updater = SoftUpdate(loss, tau=0.05)
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=32)
-    optimizer = torch.optim.Adam(loss.parameters(), 1e-3)
-    before = [p.detach().clone() for p in loss.parameters()]
-    sizes = {"frames_per_batch": 40, "total_frames": 80, "init_random_frames": 40}
-    collector = Collector(env, actor, **sizes, auto_register_policy_transforms=True)
-    for data in collector:
-        replay.extend(data.reshape(-1))
-        for _ in range(3):
-            loss_now = total(loss(replay.sample()))
-            optimizer.zero_grad()
-            loss_now.backward()
-            assert loss_now.isfinite()
-            optimizer.step()
-            updater.step()
-    collector.shutdown()
-    assert all(not torch.equal(p, q) for p, q in zip(loss.parameters(), before, strict=True))
-
-
-def test_a_collector_of_several_processes_flies_it(deadline):
+def test_a_collector_of_several_processes_flies_it(processes):
     makers = [partial(HoveringEnv, num_envs=3, max_episode_steps=6, seed=seed) for seed in (0, 1)]
     sizes = {"frames_per_batch": 24, "total_frames": 48}
     collector = MultiCollector(makers, make_actor(makers[0]()), sync=True, **sizes)
@@ -292,9 +212,6 @@ def test_a_collector_of_several_processes_flies_it(deadline):
     assert steps[..., 0].tolist() == [[[0, 1, 2, 3, 4, 5, 0, 1]] * 3] * 2
     position = batches[0].reshape(2, 3, 4)["state", "position"]
     assert not torch.equal(position[0, :, 0], position[1, :, 0])
-
-
-# -- several environments, each with several drones --------------------------------------------------------------------
 
 
 def check_a_batch_of_environments(env):
@@ -330,19 +247,13 @@ def test_environments_in_one_process_keep_their_gradients():
         BPTTLoss(actor)(rollout)["loss_actor"].backward()
 
 
-def test_environments_in_several_processes_fly_and_the_loss_says_that_they_cut_the_gradient(deadline):
+def test_environments_in_several_processes_fly_and_the_loss_says_that_they_cut_the_gradient(processes):
     env = ParallelEnv(2, partial(HoveringEnv, num_envs=3, max_episode_steps=6))
+    assert make_actor(env)(env.fake_tensordict())["action"].shape == (2, 3, 4)
+    assert ObservationNormalizer(env).loc.shape == (13,) and env.is_closed  # networks need no process
     try:
         actor, rollout = check_a_batch_of_environments(env)
     finally:
         env.close(raise_if_closed=False)
     with pytest.raises(RuntimeError, match="carries no gradient. Collectors, ParallelEnv, .* cut it"):
         BPTTLoss(actor)(rollout)
-
-
-def test_networks_are_made_for_environments_that_have_not_started_and_for_others():
-    env = ParallelEnv(2, partial(HoveringEnv, num_envs=3))
-    assert make_actor(env)(env.fake_tensordict())["action"].shape == (2, 3, 4)
-    assert env.is_closed
-    normalizer = ObservationNormalizer(env)
-    assert normalizer.loc.shape == (13,)

@@ -3,7 +3,6 @@
 import copy
 import csv
 import re
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +13,7 @@ import torch
 from deploying import pilot
 
 from torchrl_quad import load_drone, make_env
-from torchrl_quad.deploy import export_policy, load_bundle
+from torchrl_quad.deploy import load_bundle
 from torchrl_quad.deploy.judging import Judge, judge
 from torchrl_quad.deploy.simulators import make_simulator
 from torchrl_quad.deploy.simulators.vehicle import ContractLoop, Drone
@@ -27,15 +26,18 @@ STEPS = 110
 ROOT = Path(__file__).parent.parent
 
 
-@pytest.fixture(scope="module")
-def hovering(tmp_path_factory):
+def turned(name):
     """Drones that begin turned and moving, two steps of delay, and another drone than the nominal one."""
-    torch.set_num_threads(1)
     start = {"yaw": 0.7, "tilt": 0.2, "velocity": 0.1}
     env = make_env("hovering", num_envs=8, max_episode_steps=STEPS, seed=0, random_start=start, action_delay=2)
     env.start_range = (0.2, 0.2, 0.1)
     env.set_params(env.params.replace(mass=0.47, motor_time_constant=0.03))
-    return export_policy(pilot(env), env, tmp_path_factory.mktemp("hovering") / "policy")
+    return env, pilot(env)
+
+
+@pytest.fixture
+def hovering(export_once):
+    return export_once("turned", turned)[2]
 
 
 # -- physics -----------------------------------------------------------------------------------------------------------
@@ -75,15 +77,18 @@ def wobble(simulator, contract, steps=400, **options):
     return world.state()
 
 
+def in_small_steps(folder):
+    contract = load_bundle(folder).contract
+    return {**contract, "control_dt": 0.001, "simulator": {**contract["simulator"], "dt": 0.001}}
+
+
 def test_mujoco_moves_a_drone_as_our_simulator_does(hovering):
     """At the same small step. The drone that flies is not the one that the rate loop believes in."""
-    contract = load_bundle(hovering).contract
-    contract = {**contract, "control_dt": 0.001, "simulator": {**contract["simulator"], "dt": 0.001}}
+    contract = in_small_steps(hovering)
     assert contract["plant"] == {"mass": 0.47, "motor_time_constant": 0.03}
     expected, found = wobble("torchrl_quad", contract), wobble("mujoco", contract)
-    assert (
-        np.linalg.norm(expected["velocity"], axis=1).min() > 1.0 and np.abs(expected["quaternion"][:, 0]).min() < 0.95
-    )
+    assert np.linalg.norm(expected["velocity"], axis=1).min() > 1.0
+    assert np.abs(expected["quaternion"][:, 0]).min() < 0.95
     for name in expected:
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-5, atol=1e-4, err_msg=name)
     shifted = wobble("mujoco", {**contract, "plant": {**contract["plant"], "mass": 0.46}})  # the tolerance is not wide
@@ -101,8 +106,7 @@ def test_mujoco_moves_a_drone_as_our_simulator_does(hovering):
 )
 def test_other_simulators_move_a_drone_as_ours_does_where_their_models_agree(hovering, simulator, changes):
     pytest.importorskip(simulator)
-    contract = load_bundle(hovering).contract
-    contract = {**contract, "control_dt": 0.001, "simulator": {**contract["simulator"], "dt": 0.001}}
+    contract = in_small_steps(hovering)
     contract |= {"drone": {**contract["drone"], **changes}, "plant": {"mass": 0.47, "motor_time_constant": 0.03}}
     expected, found = wobble("torchrl_quad", contract), wobble(simulator, contract)
     for name, tolerance in {"position": 5e-3, "quaternion": 1e-3, "velocity": 5e-3, "angular_velocity": 1e-2}.items():
@@ -163,14 +167,11 @@ def test_a_drone_that_no_simulator_can_fly_is_refused_with_the_name_of_its_bundl
         with pytest.raises(UserValueError, match=f"^{hovering}: {why}"):
             fly(bundle, simulator)
     monkeypatch.setitem(bundle.contract["simulator"], "dynamics", "balloon")
-    with pytest.raises(
-        UserValueError, match=f"^{hovering}: The simulator lacks the dynamics 'balloon'. Known are quad"
-    ):
+    with pytest.raises(UserValueError, match=f"^{hovering}: The simulator lacks the dynamics 'balloon'. Known are qu"):
         fly(bundle, "torchrl_quad")
     for options, why in (
-        ({"late": True}, "late must be a whole number from 0 to 1000, got True"),
-        ({"episodes": 0}, "episodes must be a whole number from 1 to 10000000, got 0"),
-        ({"scale": [1]}, "scale must be a mapping"),
+        ({"late": True}, "late must be a whole number, at least 0, got True"),
+        ({"episodes": 0}, "episodes must be a whole number, at least 1, got 0"),
         ({"scale": {"mass": "2"}}, "scale: mass must be a number from 0 to 1000, got '2'"),
         ({"mutant": "yaw"}, "mutant must be one of MUTANTS.values.., got 'yaw'"),
         ({"loop": ["pid"]}, "mujoco has no rate loop"),
@@ -237,57 +238,34 @@ def test_the_recipe_films_a_flight_beside_ours(hovering, tmp_path, launch, monke
     assert "from the same starts: MuJoCo" in (tmp_path / "transfer_mujoco.html").read_text()
 
 
-def test_what_was_flown_is_printed_where_it_cannot_be_written(hovering, tmp_path, monkeypatch, capsys):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("torchrl_quad.files.write_rows", full)
-    settings = [f"bundle={hovering}", f"folder={tmp_path}", "loop=contract", "episodes=1"]
-    with pytest.raises(SystemExit) as exit:
-        runpy.run_path(*argv(monkeypatch, *settings), run_name="__main__")
-    printed = capsys.readouterr()
-    assert exit.value.code == 2 and printed.err == "Error: [Errno 28] No space left on device\n"
-    first, *lines = printed.out.splitlines()
-    (row,) = csv.DictReader(lines)
-    assert first == f"Flown, and not written to {tmp_path}/transfer.csv:" and row["solved"] == "1.0000"
-
-
-def test_a_mistake_of_ours_keeps_its_traceback(hovering, tmp_path, monkeypatch):
+def test_a_mistake_of_ours_keeps_its_traceback(hovering, tmp_path, monkeypatch, launch):
     def mistake(*_):
         raise ValueError("of ours")
 
-    monkeypatch.setattr("torchrl_quad.deploy.table.summary", mistake)
+    monkeypatch.setattr("torchrl_quad.deploy.transfer.machine", mistake)
     with pytest.raises(ValueError, match="^of ours$"):
-        runpy.run_path(*argv(monkeypatch, f"bundle={hovering}", f"folder={tmp_path}"), run_name="__main__")
-
-
-def argv(monkeypatch, *settings):
-    monkeypatch.setattr(sys, "argv", ["recipes/transfer.py", *settings])
-    return [str(ROOT / "recipes/transfer.py")]
+        launch("transfer", f"bundle={hovering}", f"folder={tmp_path}")
 
 
 WRONG_SETTINGS = {
     "episodes=all": "episodes must be a whole number, at least 1, got 'all'",
-    "episodes=true": "episodes must be a whole number",
     "episodes=0": "episodes must be a whole number, at least 1",
     "late=-1": "late must be a whole number, at least 0, got '-1'",
-    "late=1e999": "late must be a whole number",
-    f"late={'9' * 5000}": "late must be a whole number",
-    "late=9999 ; loop=pd": "policy: late must be a whole number from 0 to 1000, got 9999",
     "mutants=maybe": "mutants must be true or false, got 'maybe'",
     "scale=[": r"scale must look like {mass: 1.2, inertia: 1.5}, got '\['",
-    f"scale={'{a: ' * 5000}": "scale must look like {mass: 1.2, inertia: 1.5}, got",
     "scale={mass: [1]}": "scale must look like",
-    "scale={mass: 1, mass: 2}": "scale must look like",
-    "scale={mass: 1e999}": "policy: scale: mass must be a number from 0 to 1000, got inf",
+    "scale={mass: 1e999}": "turned: scale: mass must be a number from 0 to 1000, got inf",
     "scale={mass: nan}": "scale: mass must be a number from 0 to 1000, got nan",
-    "scale={mass: 0}": "policy: scale: plant.mass is 0.0, and must be at least 0.001. Choose other factors",
-    "scale={rate_gain: 2}": "policy: scale: the drone has no 'rate_gain' to scale. Choose from: mass, ",
+    "scale={mass: 0}": "turned: scale: plant.mass: 0.0 is less than the minimum of 0.001. Choose other factors",
+    "scale={rate_gain: 2}": "turned: scale: the drone has no 'rate_gain' to scale. Choose from: mass, ",
     "late=1 ; late=2": "late is given twice",
-    "scale={inertia: 1.0, rotor_positions: 0}": "policy: scale: plant.rotor_positions and rotor_spin cannot make",
-    "simulator=torchrl_quad ; loop=pid": "policy: torchrl_quad has no rate loop 'pid'. Choose from: contract",
-    "simulator=torchrl_quad ; mutants=true ; scale={inertia: 9}": "policy: torchrl_quad flies motors as they are",
+    "scale={inertia: 1.0, rotor_positions: 0}": "turned: scale: plant.rotor_positions and rotor_spin cannot make",
+    "simulator=torchrl_quad ; loop=pid": "turned: torchrl_quad has no rate loop 'pid'. Choose from: contract",
+    "simulator=torchrl_quad ; mutants=true ; scale={inertia: 9}": "turned: torchrl_quad flies motors as they are",
     "hello": "unknown setting 'hello'. Choose from: bundle=...",
+    "bundel=x": "unknown setting 'bundel=x'. Choose from: bundle=...",
+    "simulator=gazebo": "Unknown simulator 'gazebo'. Choose from: torchrl_quad, mujoco",
+    "loop=own": "turned: mujoco has no rate loop 'own'. Choose from: contract, pid, pd.",
 }
 
 
@@ -295,13 +273,6 @@ def test_the_recipe_says_in_one_line_what_is_wrong(hovering, refused, monkeypatc
     bundle = f"bundle={hovering}"
     assert "bundle is missing: write bundle=FOLDER" in refused("transfer")
     assert "No bundle at nowhere" in refused("transfer", "bundle=nowhere")
-    assert "Unknown simulator 'gazebo'. Choose from: torchrl_quad, mujoco" in refused(
-        "transfer", bundle, "simulator=gazebo"
-    )
-    assert "mujoco has no rate loop 'own'. Choose from: contract, pid, pd." in refused("transfer", bundle, "loop=own")
-    assert "unknown setting 'bundel=x'. Choose from: bundle=..." in refused("transfer", "bundel=x")
-    for folder in ("[", "x" * 5000, "a\nb", "/dev/null"):
-        assert refused("transfer", f"bundle={folder}").startswith("Error: ")
     assert "/dev/null is a device, and no folder" in refused("transfer", bundle, "folder=/dev/null")
     for wrong, said in WRONG_SETTINGS.items():
         line = refused("transfer", bundle, f"folder={tmp_path}", *wrong.split(" ; "))

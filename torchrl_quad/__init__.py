@@ -1,7 +1,6 @@
 """Differentiable quadrotor tasks and first-order policy losses for TorchRL."""
 
 import importlib
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -106,12 +105,12 @@ def register_envs(*tasks: str) -> None:
     Your own task, ``register_task("fly_through", ...)``, is ``torchrl_quad/FlyThrough-v0``.
 
     Args:
-        *tasks: their names; by default those of this package, and those of installed packages.
+        *tasks: their names; by default those of this package.
     """
     import gymnasium
 
     module = "torchrl_quad.adapters.gym"
-    for task in tasks or (*_TASKS, *(point.name for point in entry_points(group="torchrl_quad.tasks"))):
+    for task in tasks or _TASKS:
         name = f"torchrl_quad/{task.title().replace('_', '')}-v0"
         if name not in gymnasium.registry:
             classes = {"entry_point": f"{module}:GymEnv", "vector_entry_point": f"{module}:GymVectorEnv"}

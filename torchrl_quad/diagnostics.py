@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
-from typing import Any, cast
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -16,10 +16,10 @@ from torchrl.envs import EnvBase
 
 from torchrl_quad.data import differentiable_rollout
 from torchrl_quad.data.unwrap import check_env, check_tensordict, group, leaf
-from torchrl_quad.errors import UserTypeError, UserValueError, WrongState, shown
+from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
 from torchrl_quad.objectives.calls import discounts, sources_of_steps, total
 from torchrl_quad.objectives.pathwise import PathwiseLoss
-from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, check_value, checked
+from torchrl_quad.options import Entry, Fraction, Horizon, NonNegative, Size, checked, entries
 
 Inputs = nn.Module | Tensor | Iterable[Tensor]
 
@@ -28,10 +28,9 @@ class _Row:
     """Numbers that are shown as a table of one row."""
 
     def __repr__(self) -> str:
-        cells = {name: f"{value:.4g}" for name, value in asdict(cast(Any, self)).items()}
-        widths = [max(len(name), len(value)) for name, value in cells.items()]
-        rows = (list(cells), list(cells.values()))
-        return "\n".join("  ".join(f"{x:>{n}}" for x, n in zip(row, widths, strict=True)) for row in rows)
+        cells = [(name, f"{value:.4g}") for name, value in vars(self).items()]
+        columns = [[f"{x:>{max(map(len, cell))}}" for x in cell] for cell in cells]
+        return "\n".join(map("  ".join, zip(*columns, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -71,14 +70,13 @@ class RewardAudit(dict[str, TermAudit]):
         return {f"{name}_{share}": getattr(term, share) for name, term in self.items() for share in shares}
 
     def __repr__(self) -> str:
-        width = max(map(len, self), default=0)
+        width, lost = max(map(len, self), default=0), self.without_gradient
         lines = [f"{'term':{width}}     return  share   gradient  share  verdict"]
-        lines += [
-            f"{name:{width}} {term.mean_return:10.4g} {term.return_share:6.1%} {term.gradient_norm:10.4g} "
-            f"{term.gradient_share:6.1%}  {term.verdict}"
-            for name, term in self.items()
-        ]
-        lost = self.without_gradient
+        for name, x in self.items():
+            lines.append(
+                f"{name:{width}} {x.mean_return:10.4g} {x.return_share:6.1%} {x.gradient_norm:10.4g} "
+                f"{x.gradient_share:6.1%}  {x.verdict}"
+            )
         share = sum(self[name].return_share for name in lost)
         partially = f"partially differentiable: all but {', '.join(lost)}, {share:.1%} of the return"
         return "\n".join([*lines, partially if lost else "fully differentiable"])
@@ -116,22 +114,32 @@ def audit_reward(
         RuntimeError: the rollout has lost its graph.
     """
     check_tensordict("audit_reward", rollout)
-    for key in (terms_key, reward_key, done_key):
-        if key not in rollout:
-            raise UserValueError(
-                f"audit_reward reads {key!r}, which is not in the rollout. Name the terms, the reward and the ends of "
-                "episodes as the rollout does: terms_key, reward_key, done_key."
-            )
+    if missing := [key for key in (terms_key, reward_key, done_key) if key not in rollout]:
+        raise UserValueError(
+            f"audit_reward reads {missing[0]!r}, which is not in the rollout. Name the terms, the reward and the ends "
+            "of episodes as the rollout does: terms_key, reward_key, done_key."
+        )
     reward, done = leaf(rollout, reward_key), leaf(rollout, done_key)
     if not (isinstance(reward, Tensor) and reward.numel() and reward.is_floating_point() and reward.ndim > 1):
         raise UserValueError(f"{reward_key!r} must be floating-point numbers (*, horizon, 1) of at least one step.")
-    if not (isinstance(done, Tensor) and done.dtype == torch.bool and done.shape == reward.shape):
-        raise UserValueError(f"{done_key!r} must be the ends of episodes, bool {tuple(reward.shape)}.")
+    shape = tuple(reward.shape)
+    if not (isinstance(done, Tensor) and done.dtype == torch.bool and done.shape == shape):
+        raise UserValueError(f"{done_key!r} must be the ends of episodes, bool {shape}.")
     if isinstance(entry := rollout.get(terms_key), Tensor):
         terms: dict[str, Tensor] = {terms_key if isinstance(terms_key, str) else terms_key[-1]: entry}
     else:
         terms = dict(cast(Any, group(rollout, terms_key).flatten_keys("/").items()))
-    _check_sum(terms, reward, terms_key, tolerance)
+    for name, term in terms.items():
+        if term.shape != shape:
+            raise UserValueError(f"The term {name!r} has shape {tuple(term.shape)}, and the reward {shape}.")
+    gap = (total(terms.values()) - reward).detach().abs()
+    worst = (gap / (1.0 + total(term.detach().abs() for term in terms.values()))).max().item()
+    if not worst <= tolerance:
+        raise UserValueError(
+            f"The terms under {terms_key!r}, {', '.join(terms)}, do not add up to the reward: they are off by up to "
+            f"{gap.max().item():.3g}. Either a term is missing or not weighted, or a transform has changed the reward: "
+            "name the one before it, reward_key=..."
+        )
     if not reward.requires_grad:
         raise WrongState(
             f"{reward_key!r} carries no gradient. Collectors, ParallelEnv, replay buffers, .detach() and "
@@ -147,18 +155,13 @@ def audit_reward(
     returns = {name: (discount * term).sum((-2, -1)) for name, term in terms.items()}
     sizes = {name: x.detach().abs().mean().item() for name, x in returns.items()}
     norms = {name: _gradient(x.mean(), sources).norm().item() for name, x in returns.items()}
-    return RewardAudit(
-        {
-            name: TermAudit(
-                mean_return=returns[name].mean().item(),
-                return_share=_share(sizes, name),
-                gradient_norm=norms[name],
-                gradient_share=_share(norms, name),
-                verdict=_verdict(term, norms[name]),
-            )
-            for name, term in terms.items()
-        }
-    )
+    all_sizes, all_norms = (sum(x.values()) or 1.0 for x in (sizes, norms))
+    audit = RewardAudit()
+    for name, term in terms.items():
+        shares = sizes[name] / all_sizes, norms[name] / all_norms
+        verdict = _verdict(term, norms[name])
+        audit[name] = TermAudit(returns[name].mean().item(), shares[0], norms[name], shares[1], verdict)
+    return audit
 
 
 @dataclass(frozen=True, repr=False)
@@ -175,19 +178,16 @@ def compare_gradients(loss: PathwiseLoss, rollout: TensorDictBase) -> GradientCo
     """Compare the first-order and the value gradient of an objective in the actor's parameters (paper, section IV-B).
 
     With ABPT they are the gradients of the N-step and of the 0-step return, with SHAC those of the rewards of the
-    horizon and of the terminal value. Both carry their weights in the objective, so that their sum is its gradient, and
-    both are means over environments. Without one of them, as with BPTT, its norm and the cosine are NaN. ABPT samples
-    actions for this, as its loss does. ``clip_action_gradient`` is not applied. No ``.grad`` changes.
-
-    Raises:
-        RuntimeError: the rollout has lost its graph.
+    horizon and of the terminal value; their sum, a mean over environments, is the gradient of the objective. Without
+    one of them, as with BPTT, its norm and the cosine are NaN. ABPT samples actions for this, as its loss does.
+    ``clip_action_gradient`` is not applied. No ``.grad`` changes.
     """
     _check_loss(loss)
     parts, sources = loss.objective_parts(rollout), _sources(loss)
     value = [parts.pop(loss.value_part)] if loss.value_part in parts else []
+    nothing = torch.tensor([math.nan], dtype=torch.float64)
     first_order, value = (
-        _gradient(total(part).mean(), sources) if part else torch.full((1,), math.nan, dtype=torch.float64)
-        for part in (parts.values(), value)
+        _gradient(total(part).mean(), sources) if part else nothing for part in (parts.values(), value)
     )
     norms = first_order.norm().item(), value.norm().item()
     cosine = (first_order * value.to(first_order)).sum().item() / (math.prod(norms) or math.nan)
@@ -208,11 +208,7 @@ class GradientStatistics(_Row):
 def gradient_statistics(loss: PathwiseLoss, rollout: TensorDictBase, *, max_envs: Size = 16) -> GradientStatistics:
     """Mean and spread of the policy gradients of single environments, without the entropy bonus.
 
-    Each of the first ``max_envs`` takes a backward pass through the whole rollout. No ``.grad`` changes.
-
-    Raises:
-        ValueError: there are fewer than two environments.
-        RuntimeError: the rollout has lost its graph.
+    Each of the first ``max_envs``, at least two, takes a backward pass through the whole rollout. No ``.grad`` changes.
     """
     _check_loss(loss)
     objectives = total(loss.objective_parts(rollout).values()).flatten()[:max_envs]
@@ -232,7 +228,7 @@ def gradient_by_horizon(
     env: EnvBase,
     actor: TensorDictModuleBase,
     loss: PathwiseLoss,
-    horizons: Iterable[int],
+    horizons: Annotated[Sequence[Horizon], entries(1, 1000)],
     *,
     start: TensorDictBase | None = None,
     max_envs: Size = 16,
@@ -247,13 +243,11 @@ def gradient_by_horizon(
         start: a reset tensordict of at least two environments; ``env.reset()`` by default.
         max_envs: as for :func:`gradient_statistics`, whose errors it raises.
     """
-    listed = _listed(horizons, "horizons must be numbers of control steps, such as (8, 32)")
-    steps = [check_value("horizons", x, Horizon, "They are numbers of control steps.") for x in listed]
     check_env(env)
     start = env.reset() if start is None else start
     return {
         horizon: gradient_statistics(loss, differentiable_rollout(env, actor, start, horizon)[0], max_envs=max_envs)
-        for horizon in dict.fromkeys(steps)
+        for horizon in dict.fromkeys(horizons)
     }
 
 
@@ -264,22 +258,16 @@ def _check_loss(loss: PathwiseLoss) -> None:
         )
 
 
-def _listed(values: Iterable[Any], must: str) -> list[Any]:
-    try:
-        return list(values)
-    except (TypeError, RuntimeError):  # numpy, torch and tensordict raise either
-        raise UserTypeError(f"{must}; got {shown(values)}.") from None
-
-
 def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
     """The tensors to differentiate with respect to; of a loss or an actor, the actor's parameters."""
     if isinstance(inputs, nn.Module):
         inputs = [p for p in getattr(inputs, "actor_network_params", inputs).parameters() if p.requires_grad]
-    steps = sources_of_steps(inputs) if isinstance(inputs, Tensor) else None
-    if steps is not None:
-        return [steps] if isinstance(steps, Tensor) else [*steps]
-    inputs = [inputs] if isinstance(inputs, Tensor) else inputs
-    sources = _listed(inputs, "inputs must be the actor, its loss, or tensors")
+    elif isinstance(inputs, Tensor):
+        steps = sources_of_steps(inputs)
+        if steps is not None and not isinstance(steps, Tensor):
+            return [*steps]
+        inputs = [inputs if steps is None else steps]
+    sources: list[Any] = [*inputs] if isinstance(inputs, Sequence | Iterator) else []
     if not sources or not all(isinstance(x, Tensor) and x.requires_grad for x in sources):
         raise UserValueError(
             "There is nothing to differentiate with respect to: give the actor or its loss with parameters that "
@@ -288,47 +276,25 @@ def _sources(inputs: Inputs) -> list[Tensor | GradientEdge]:
     return sources
 
 
-def _gradients(value: Tensor, sources: list[Tensor | GradientEdge]) -> list[Tensor | None]:
+def _gradients(value: Tensor, sources: list[Tensor | GradientEdge]) -> Sequence[Tensor | None]:
     if not value.requires_grad:
         return [None] * len(sources)
-    return [*torch.autograd.grad(value, cast(Any, sources), retain_graph=True, allow_unused=True)]
+    return torch.autograd.grad(value, cast(Any, sources), retain_graph=True, allow_unused=True)
 
 
 def _gradient(value: Tensor, sources: list[Tensor | GradientEdge]) -> Tensor:
     """The gradient of a scalar as one vector, in double precision: squares of small numbers are not lost."""
-    grads = [
-        torch.zeros_like(x) if g is None and isinstance(x, Tensor) else g
-        for g, x in zip(_gradients(value, sources), sources, strict=True)
-    ]
+    pairs = zip(_gradients(value, sources), sources, strict=True)
+    grads = [torch.zeros_like(x) if g is None and isinstance(x, Tensor) else g for g, x in pairs]
     known = [g.flatten().double() for g in grads if g is not None]
     return torch.cat(known) if known else value.new_zeros(1, dtype=torch.float64)
-
-
-def _share(sizes: dict[str, float], name: str) -> float:
-    return sizes[name] / (sum(sizes.values()) or 1.0)
 
 
 def _verdict(term: Tensor, gradient_norm: float) -> str:
     if not math.isfinite(gradient_norm):
         return "not finite"
-    if gradient_norm > 0.0:
-        return "differentiable" if term.any() else "gradient in time only"
     if not term.any():
-        return "not seen"
+        return "gradient in time only" if gradient_norm else "not seen"
+    if gradient_norm:
+        return "differentiable"
     return "constant" if term.min() == term.max() else "no gradient"
-
-
-def _check_sum(terms: dict[str, Tensor], reward: Tensor, terms_key: Entry, tolerance: float) -> None:
-    for name, term in terms.items():
-        if term.shape != reward.shape:
-            raise UserValueError(
-                f"The term {name!r} has shape {tuple(term.shape)}, and the reward {tuple(reward.shape)}."
-            )
-    gap = (total(terms.values()) - reward).detach().abs()
-    worst = (gap / (1.0 + total(term.detach().abs() for term in terms.values()))).max().item()
-    if not worst <= tolerance:
-        raise UserValueError(
-            f"The terms under {terms_key!r}, {', '.join(terms)}, do not add up to the reward: they are off by up to "
-            f"{gap.max().item():.3g}. Either a term is missing or not weighted, or a transform has changed the reward: "
-            "name the one before it, reward_key=..."
-        )

@@ -31,19 +31,13 @@ _WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EINVAL)  # wh
 def replacing(path: str | Path) -> Iterator[Path]:
     """Write a file atomically: ``with replacing(path) as temporary: temporary.write_text(...)``.
 
-    The temporary file is in the same folder, named after this process, with the same suffix. It replaces ``path`` when
-    the block ends, and disappears when the block raises. What a killed process of this machine left behind is deleted
-    by the next one that writes the same path.
-
-    Raises:
-        FileExistsError: ``path`` is a folder, a link, or anything else but a plain file.
-        OSError: the folder does not exist, is read-only or is full; ``path`` is then as it was.
+    The temporary file is in the same folder, with the same suffix. It replaces ``path`` when the block ends, unless
+    that is a folder, a link, or anything else but a plain file (FileExistsError), and disappears when the block raises.
     """
     path = Path(path)
     check_place(path)
-    _clean(path)
     temporary = _temporary(path)
-    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+    temporary.touch(exist_ok=False)
     try:
         yield temporary
         with open(temporary, "rb") as file:
@@ -56,21 +50,15 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def replacing_folder(folder: Path, check: Callable[[Path], None]) -> Iterator[Path]:
-    """Replace a folder as a whole by what the block writes into a temporary one, which disappears when it raises.
+    """Replace a folder as a whole, or make it, by what the block writes into a temporary one.
 
-    Args:
-        folder: which may be missing, and its parents too.
-        check: raises for a folder that must not be replaced; called before the block and after it.
-
-    Raises:
-        FileExistsError: ``folder`` is anything else but a folder.
+    ``check`` raises for a folder that must not be replaced, before the block and after it; so does what is no folder.
     """
     make_folder(folder.parent)
     check_place(folder, "folder")
-    _clean(folder)
-    check(folder)
     temporary = _temporary(folder)
-    old = temporary.with_name(f"{temporary.name}.old")
+    check(folder)
+    old = temporary.with_name(f"{temporary.name}.old")  # from which the next writer brings it back, if need be
     temporary.mkdir()
     try:
         yield temporary
@@ -79,14 +67,9 @@ def replacing_folder(folder: Path, check: Callable[[Path], None]) -> Iterator[Pa
         if folder.exists():
             os.replace(folder, old)
         os.replace(temporary, folder)
-    except BaseException:
-        if old.exists() and not folder.exists():
-            os.replace(old, folder)
-        raise
+        shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-        if folder.exists():
-            shutil.rmtree(old, ignore_errors=True)
 
 
 def make_folder(path: str | Path) -> Path:
@@ -106,17 +89,10 @@ def check_place(path: Path, wanted: str = "file") -> None:
 
 @contextlib.contextmanager
 def locked(path: Path, *, wait: bool = True) -> Iterator[Path]:
-    """Hold a lock file, which is deleted at the end. The system frees the lock of a process that dies.
+    """Hold a lock file, into which the holder may write, and which is deleted at the end.
 
-    Where a file system has no locks, the block runs without.
-
-    Args:
-        path: of the lock file, which the holder may write into.
-        wait: for another holder.
-
-    Raises:
-        FileExistsError: ``path`` is anything else but a plain file.
-        filelock.Timeout: another process or thread holds it, and ``wait`` is false.
+    The system frees the lock of a process that dies. Where a file system has no locks, the block runs without. Without
+    ``wait``, filelock.Timeout says that another process or thread holds it.
     """
     check_place(path)
     lock = FileLock(path, timeout=-1 if wait else 0, fallback_to_soft=False, thread_local=False)
@@ -135,16 +111,14 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[Path]:
 def machine() -> str:
     """Name the processor, such as "AMD EPYC (25-17)", for results whose seconds depend on it.
 
-    Linux says it in /proc/cpuinfo; family and model, in brackets, tell the generations of a make apart. Elsewhere it is
-    what Python knows, at least the architecture, such as "arm64".
+    Linux knows its family and model, in brackets; elsewhere it is what Python knows, such as "arm64".
     """
-    try:
-        lines = [line.split(":", 1) for line in Path("/proc/cpuinfo").read_text().splitlines() if ":" in line]
-        said = {key.strip(): value.strip() for key, value in reversed(lines)}
-        generation = "-".join(said[key] for key in ("cpu family", "model") if key in said)
-        return f"{said['model name']} ({generation})" if generation else said["model name"]
-    except (OSError, KeyError):
-        return platform.processor() or platform.machine()
+    with contextlib.suppress(OSError, KeyError):
+        lines = re.findall(r"^(.+?)\s*: *(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        said = dict(reversed(lines))  # of the first processor
+        generation = f" ({said['cpu family']}-{said['model']})" if "cpu family" in said else ""
+        return said["model name"] + generation
+    return platform.processor() or platform.machine()
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------
@@ -173,12 +147,9 @@ def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]], missing: obj
 
 
 def add_rows(path: str | Path, rows: Sequence[Mapping[str, Any]], same: Sequence[str] = ()) -> None:
-    """Add rows to a CSV file to which other processes add at the same time.
+    """Add rows to a CSV file, or make it, while other processes add to it, too.
 
-    Args:
-        path: of the file, which may be missing.
-        rows: to add.
-        same: columns; rows that agree in all of them with one that is added give way to it.
+    Rows that agree with one that is added in all of the columns ``same`` give way to it.
     """
     path = Path(path)
     make_folder(path.parent)
@@ -193,57 +164,42 @@ def add_rows(path: str | Path, rows: Sequence[Mapping[str, Any]], same: Sequence
 
 
 def _temporary(path: Path) -> Path:
-    """A name in the folder of a path that no other process, thread or machine uses."""
+    """A name in the folder of a path that nobody uses; what dead processes of this machine left behind for it goes.
+
+    A folder that was set aside and not replaced comes back.
+    """
+    name = re.compile(rf"{re.escape(_prefix(path))}(\d+)\.\d+{re.escape(path.suffix)}(\.old)?")
+    for other, match in [(other, match) for other in path.parent.glob(".*") if (match := name.fullmatch(other.name))]:
+        with contextlib.suppress(OSError):  # another process has deleted it just now
+            if match[2] and not any(path.glob("*")):
+                os.replace(other, path)
+            elif _is_dead(int(match[1])):
+                shutil.rmtree(other) if other.is_dir() else other.unlink()
     return path.with_name(f"{_prefix(path)}{os.getpid()}.{next(_NUMBERS)}{path.suffix}")
 
 
 def _prefix(path: Path) -> str:
     """How this machine's temporaries of a path begin. Containers count as machines: their pids overlap."""
-    try:
+    space = ""
+    with contextlib.suppress(OSError):
         space = os.readlink("/proc/self/ns/pid")
-    except OSError:
-        space = ""
     here = hashlib.sha256(f"{socket.gethostname()} {space}".encode()).hexdigest()[:8]
     return f".{path.stem[:40]}.{here}."
 
 
-def _left_behind(path: Path) -> Iterator[tuple[Path, bool]]:
-    """Temporaries that processes of this machine have made for a path, and whether those have died."""
-    name = re.compile(rf"{re.escape(_prefix(path))}(\d+)\.\d+{re.escape(path.suffix)}(\.old)?")
-    for other in path.parent.glob(".*"):
-        if match := name.fullmatch(other.name):
-            yield other, not _is_running(int(match[1]))
-
-
-def _clean(path: Path) -> None:
-    """Delete what dead processes left behind, and bring back a folder that was set aside and not replaced."""
-    for other, abandoned in _left_behind(path):
-        with contextlib.suppress(OSError):  # another process has deleted it just now
-            if other.name.endswith(".old") and not any(path.glob("*")):
-                os.replace(other, path)
-            elif abandoned and other.is_dir():
-                shutil.rmtree(other, ignore_errors=True)
-            elif abandoned:
-                other.unlink()
-
-
-def _is_running(pid: int) -> bool:
+def _is_dead(pid: int) -> bool:
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):  # it belongs to another user, or is no process of this system
-        return True
-    return True
+    except (OSError, OverflowError) as error:  # others: it belongs to another user, or is no process of this system
+        return isinstance(error, ProcessLookupError)
+    return False
 
 
 def _kind(path: Path) -> str | None:
     """What a path is, in words; None where there is nothing."""
     try:
-        mode = os.lstat(path).st_mode
+        letter = stat.filemode(os.lstat(path).st_mode)[0]
     except (FileNotFoundError, NotADirectoryError):
         return None
-    if stat.S_ISLNK(mode):
-        return "a link"
-    kinds = {"a folder": stat.S_ISDIR, "a file": stat.S_ISREG, "a pipe": stat.S_ISFIFO, "a socket": stat.S_ISSOCK}
-    return next((name for name, holds in kinds.items() if holds(mode)), "a device")
+    kinds = {"d": "a folder", "-": "a file", "l": "a link", "p": "a pipe", "s": "a socket"}
+    return kinds.get(letter, "a device")

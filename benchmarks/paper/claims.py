@@ -1,8 +1,5 @@
 """The paper's claims as statistics over the results, each with its threshold and its rule, fixed before the first run.
 
-A claim is supported when all its parts are, refuted when one of them is, and undecided otherwise. With fewer than five
-seeds of any run that it needs it is preliminary, with fewer than three it has no verdict.
-
 In hovering and tracking most of the return is paid for staying in the air, and 2 % of it are about 20 cm: two methods
 are equal there when they are within 2 %. Two methods are compared in speed by when they first reach a level: 98 % of
 the lower one of their two ends in hovering and tracking, 90 % in landing and racing. Seconds are steps at the pace of
@@ -55,9 +52,6 @@ class Verdict:
     dynamics: str
 
 
-# -- claims ------------------------------------------------------------------------------------------------------------
-
-
 def higher_end(
     r: Results, tasks: Iterable[str], best: str, others: Iterable[str], name: str = "return"
 ) -> Iterable[Part]:
@@ -80,7 +74,6 @@ def sooner(
 
 
 def others(of: str) -> list[str]:
-    """List the other methods."""
     return [method for method in METHODS if method != of]
 
 
@@ -239,7 +232,6 @@ AS_PUBLISHED = ("C1", "C2", "C3", "C4", "C5", "C8", "C9", "C10", "C11", "C12", "
 
 
 def try_claim(claim: Claim, results: Results) -> Verdict:
-    """Reach the verdict on one claim, or say that its runs are missing."""
     results.used.clear()
     try:
         parts = list(claim.parts(results))

@@ -1,24 +1,18 @@
 """Train the losses on two environments that are independent of this package: are they what they say?
 
-The pendulum is TorchRL's, with the task of gymnasium's Pendulum-v1: 200 steps from a random angle, under a torque too
-weak to lift the pendulum at once. Random actions reach about -1200, and a policy that swings it up about -150.
+The pendulum is TorchRL's, for 200 steps; random actions reach about -1200, and a policy that swings it up about -150.
+Balance is a task of VMAS (Bettini et al. 2022, arXiv:2207.03530; ``pip install vmas``): three agents carry a bar with a
+ball on it to a goal, by contact; the reward is a hundred times the way that the ball comes closer, and -10 if it falls.
 
-Balance is a task of VMAS (Bettini et al. 2022, arXiv:2207.03530; ``pip install vmas``), in TorchRL's wrapper: three
-agents carry a bar with a ball on it against gravity, and have to bring the ball to a goal. The reward is a hundred
-times the way that the ball comes closer, and -10 if it falls, which ends the episode, as the goal does. An episode
-lasts 200 steps at most. All forces between bar, ball and agents act by contact.
-
-The return is the mean over 256 episodes without exploration noise. All losses have the same networks, rates and number
-of steps. The hybrid has the settings of its recipe instead. PPO has those of its recipe for racing, and the horizons
-and minibatches of the hybrid.
+All losses have the same networks, rates and number of steps; the hybrid and PPO have the settings of their recipes.
 """
 
 from __future__ import annotations
 
 import time
 from argparse import Namespace
-from collections.abc import Callable
-from itertools import count, product
+from collections.abc import Callable, Iterable
+from itertools import product
 
 import torch
 from omegaconf import DictConfig
@@ -63,7 +57,6 @@ class CosSin(Transform):
         return self._call(tensordict_reset)
 
     def transform_observation_spec(self, spec: Composite) -> Composite:
-        """Add the observation."""
         return spec.set("observation", Unbounded((*spec.shape, 3)))
 
 
@@ -77,7 +70,6 @@ class Pendulum:
         self.env = TransformedEnv(PendulumEnv(seed=seed), Compose(CosSin(), RewardScaling(0.0, self.reward)))
 
     def starts(self, count: int | None = None) -> TensorDictBase:
-        """Random angles and speeds, as the environment draws them."""
         return self.env.reset(PendulumEnv.gen_params(batch_size=[count or self.count]), set_state=False)
 
     def go_on(self, carry: TensorDictBase) -> TensorDictBase:
@@ -104,12 +96,10 @@ class OneBody(Transform):
         return action.unflatten(-1, (self.agents, -1))
 
     def transform_observation_spec(self, spec: Composite) -> Composite:
-        """Add the observation of all agents."""
         each = spec["agents", "observation"]
         return spec.set("observation", Unbounded((*each.shape[:-2], each.shape[-2:].numel())))
 
     def transform_input_spec(self, spec: Composite) -> Composite:
-        """Put the action of all agents in the place of theirs."""
         actions = spec["full_action_spec"]
         each = actions["agents", "action"].shape
         del actions["agents"]
@@ -117,7 +107,6 @@ class OneBody(Transform):
         return spec
 
     def transform_reward_spec(self, spec: Composite) -> Composite:
-        """Put one reward in the place of theirs."""
         each = spec["agents", "reward"].shape
         del spec["agents"]
         spec["reward"] = Unbounded((*each[:-2], 1))
@@ -134,7 +123,6 @@ class Balance:
         self.env = TransformedEnv(env, Compose(OneBody(env.n_agents), RewardScaling(0.0, self.reward)))
 
     def starts(self) -> TensorDictBase:
-        """The bar with the ball on the agents, at rest, and the goal at a random point above."""
         return self.env.reset()
 
     def go_on(self, carry: TensorDictBase) -> TensorDictBase:
@@ -151,10 +139,9 @@ ENVIRONMENTS = {"pendulum": Pendulum, "balance": Balance}
 
 
 def mean_return(environment: str, actor: torch.nn.Module) -> float:
-    """Fly fresh episodes without exploration noise."""
     place = ENVIRONMENTS[environment](10_000, EPISODES)
+    mode = ExplorationType.DETERMINISTIC
     with torch.no_grad():
-        mode = ExplorationType.DETERMINISTIC
         flight, _ = differentiable_rollout(place.env, actor, place.starts(), EPISODE, exploration_type=mode)
     done = flight["next", "done"].int()
     first = done.cumsum(1) - done == 0  # an episode that ends early is followed by another
@@ -165,27 +152,26 @@ def learn(
     environment: str,
     place: Pendulum | Balance,
     actor: torch.nn.Module,
-    iterate: Callable[[int, float, TensorDictBase], tuple[TensorDictBase, TensorDictBase]],
+    iterate: Callable[[float, TensorDictBase], tuple[TensorDictBase, TensorDictBase]],
+    optimizers: Iterable[Optimizer] = (),
 ) -> tuple[float, float, float]:
     """Train by iterations: the mean returns before and after, and the seconds.
 
-    Args:
-        iterate: takes the number of the iteration, the share of all steps that have been flown, and where the next
-            horizon starts; flies and learns, and gives the rollout and where it ended.
+    ``iterate`` takes the share of all steps that have been flown, and where the next horizon starts; flies and learns,
+    and gives the rollout and where it ended. The optimizers take their rates by the number of the iteration.
     """
-    before, start, steps = mean_return(environment, actor), time.process_time(), 0
-    carry = place.starts()
-    for iteration in count():
-        if steps >= STEPS:
-            break
-        rollout, carry = iterate(iteration, steps / STEPS, carry)
-        steps += rollout.numel()
+    before, start = mean_return(environment, actor), time.process_time()
+    carry, iteration, steps = place.starts(), 0, 0
+    while steps < STEPS:
+        for optimizer in optimizers:
+            optimizer.anneal(iteration)
+        rollout, carry = iterate(steps / STEPS, carry)
+        iteration, steps = iteration + 1, steps + rollout.numel()
         carry = place.go_on(carry)
     return before, mean_return(environment, actor), time.process_time() - start
 
 
 def train(name: str, environment: str, seed: int) -> tuple[float, float, float]:
-    """Train with a pathwise loss."""
     torch.manual_seed(seed)
     place = ENVIRONMENTS[environment](seed, ENVS)
     actor = make_actor(place.env, scale_init=0.3, return_log_prob=name == "sapo")
@@ -197,10 +183,9 @@ def train(name: str, environment: str, seed: int) -> tuple[float, float, float]:
     critic = [] if name == "bptt" else list(getattr(loss, f"{loss.critic_name}_params").parameters())
     critic_optimizer = torch.optim.Adam(critic, betas=(0.7, 0.95)) if critic else None
 
-    def iterate(_: int, share: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        for optimizer in (actor_optimizer, critic_optimizer):
-            if optimizer:
-                optimizer.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - 0.98 * share)
+    def iterate(share: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        for optimizer in filter(None, (actor_optimizer, critic_optimizer)):
+            optimizer.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - 0.98 * share)
         rollout, carry = differentiable_rollout(place.env, actor, carry, getattr(loss, "horizon", HORIZON))
         loss_actor, metadata = loss.loss_actor(rollout)
         actor_optimizer.zero_grad()
@@ -223,7 +208,6 @@ def train(name: str, environment: str, seed: int) -> tuple[float, float, float]:
 
 
 def optimise(optimizer: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
-    """Take a step down the gradient of a loss, of bounded norm."""
     backward(loss, optimizer, max_grad_norm)
     optimizer.step()
 
@@ -245,9 +229,7 @@ def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
     loss.make_value_estimator(gamma=cfg.gamma, lmbda=cfg.critic.lmbda)
     actor_optimizer, critic_optimizer = AdaptiveOptimizer(cfg, "actor", loss), Optimizer(cfg, "critic", loss)
 
-    def iterate(iteration: int, _: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        for optimizer in (actor_optimizer, critic_optimizer):
-            optimizer.anneal(iteration)
+    def iterate(_: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         rollout, carry = differentiable_rollout(place.env, actor, carry, cfg.horizon)
         moved = 0.0
         for batch in shuffled(loss.write_targets(rollout).exclude("next"), cfg.batch_size, cfg.epochs):
@@ -259,7 +241,7 @@ def train_hybrid(environment: str, seed: int) -> tuple[float, float, float]:
         actor_optimizer.adapt(moved)
         return rollout, carry
 
-    return learn(environment, place, actor, iterate)
+    return learn(environment, place, actor, iterate, (actor_optimizer, critic_optimizer))
 
 
 def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
@@ -269,9 +251,7 @@ def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
     loss = ClipPPOLoss(actor, value, **cfg.loss)
     actor_optimizer, critic_optimizer = Optimizer(cfg, "actor", actor), Optimizer(cfg, "critic", value)
 
-    def iterate(iteration: int, _: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        for optimizer in (actor_optimizer, critic_optimizer):
-            optimizer.anneal(iteration)
+    def iterate(_: float, carry: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         with torch.no_grad():
             rollout, carry = differentiable_rollout(place.env, actor, carry, cfg.horizon)
             advantage(rollout)
@@ -285,7 +265,7 @@ def train_ppo(environment: str, seed: int) -> tuple[float, float, float]:
             optimise(critic_optimizer, losses["loss_critic"], cfg.critic.max_grad_norm)
         return rollout, carry
 
-    return learn(environment, place, actor, iterate)
+    return learn(environment, place, actor, iterate, (actor_optimizer, critic_optimizer))
 
 
 OWN_LOOPS = {"hybrid": train_hybrid, "ppo": train_ppo}

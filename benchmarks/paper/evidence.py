@@ -1,15 +1,8 @@
 """The results of the runs as arrays over seeds, and the statistics that claims are tested with.
 
-Three statistics carry most claims:
-
-- P(a > b): how often a seed of a beats a seed of b, ties counted half; compared with 0.5.
-- gap(a, b): (mean a - mean b) / max(|mean a|, |mean b|); compared with a share.
-- the end of a curve: the mean of its last tenth of evaluations. A run that diverged ends where it began.
-
-Each is a ``Part`` with a bootstrap over seeds and over sets of starts. All runs are judged from the same starts, so
-seeds alone cannot tell what other starts would give. ``reproduce starts`` flies policies from many sets. A draw of the
-bootstrap takes one set for all methods, and shifts each by as much as its policy returned more from that set than from
-all of them. A shift that two methods share does not change their difference.
+All runs are judged from the same starts, so seeds alone cannot tell what other starts would give. A draw of the
+bootstrap takes one set of starts for all methods, and shifts each by as much as its policy returned more from that set
+than from all of them (``reproduce starts``). A shift that two methods share does not change their difference.
 """
 
 from __future__ import annotations
@@ -38,7 +31,6 @@ def column(rows: Sequence[Row], name: str) -> list[float]:
 
 
 def grouped(rows: Sequence[Row], *names: str) -> dict[tuple[str, ...], list[Row]]:
-    """Group the rows by columns."""
     groups: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[name] for name in names), []).append(row)
@@ -52,7 +44,6 @@ class Judged(np.ndarray):
 
 
 def judged(values: np.ndarray, shift: Shift | None) -> np.ndarray:
-    """Note on values over seeds how far another set of starts would shift them."""
     values = np.asarray(values, dtype=float).view(Judged)
     values.shift = shift
     return values
@@ -65,12 +56,9 @@ class Starts:
         self.rows = read_rows(data / "starts.csv")
 
     def shift(self, task: str, algorithm: str, name: str, starts: int = 256) -> Shift | None:
-        """How far each set of so many starts shifts a column: that of a policy of the method, drawn from those flown.
-
-        If none of the method was flown it is that of any other method; None if the column of the task is unknown.
-        """
+        """How far each set of so many starts shifts a column, drawn from the policies flown; None if unknown."""
         rows = [row for row in self.rows if row["task"] == task and row.get(name)]
-        rows = [row for row in rows if row["algorithm"] == algorithm] or rows
+        rows = [row for row in rows if row["algorithm"] == algorithm] or rows  # if none is of the method, of any other
         runs = [column(x, name) for x in grouped(rows, "algorithm", "seed").values()]
         if not runs:
             return None
@@ -106,23 +94,16 @@ class Part:
         return float(self.draws[cut]), float(self.draws[len(self.draws) - 1 - cut])
 
     def verdict(self, parts: int = 1) -> str:
-        """Decide: supported, refuted or undecided, as one of several parts.
-
-        Of many parts one looks refuted by chance: so that takes an interval which is wider the more there are.
-        """
+        """Decide: supported, refuted or undecided, as one of several parts."""
         least, most = self.interval()
         if self.low < least and most < self.high:
             return "supported"
-        least, most = self.interval(parts)
+        least, most = self.interval(parts)  # wider: of many parts one looks refuted by chance
         return "refuted" if most < self.low or least > self.high else "undecided"
 
 
 def best_learning_rate(task: str, variant: str, data: Path, rates: tuple[float, ...]) -> float | None:
-    """Find the rate whose run in the search ended highest, by the mean of its last tenth of evaluations.
-
-    Returns:
-        the rate, or None while the search is not complete. A run that diverged counts as the lowest.
-    """
+    """Find the rate whose run in the search ended highest; None while the search is not complete."""
     ends = {}
     for lr in rates:
         rows = [x for x in read_rows(data / f"search/{task}.csv") if x["variant"] == variant and x["lr"] == f"{lr:g}"]
@@ -133,12 +114,7 @@ def best_learning_rate(task: str, variant: str, data: Path, rates: tuple[float, 
 
 
 class Results:
-    """The CSV files by task and variant, as arrays over seeds.
-
-    Args:
-        data: the folder of the CSV files.
-        alias: for a task and a variant, the variant to read instead, such as ``claims.PUBLISHED``.
-    """
+    """The CSV files by task and variant, as arrays over seeds; ``alias`` names variants to read instead of others."""
 
     def __init__(self, data: Path, alias: dict[tuple[str, str], str] | None = None) -> None:
         self.data, self.alias = data, alias or {}
@@ -200,11 +176,9 @@ class Results:
         return lowest - (1.0 - LEVEL[task]) * abs(lowest)
 
     def seeds(self, runs: Iterable[tuple[str, str]]) -> int:
-        """Count the seeds of the run that has the fewest; 0 where there are no runs."""
         return min((len(self.curves.get(run, {})) for run in runs), default=0)
 
     def dynamics(self, runs: Iterable[tuple[str, str]]) -> str:
-        """Name the dynamics under which these runs were flown, or "both"."""
         runs = set(runs)
         found = {row.get("dynamics") or "" for row in self.finals if (row["task"], row["variant"]) in runs}
         return "both" if len(found) > 1 else "".join(found)
@@ -213,11 +187,7 @@ class Results:
 def bootstrap(
     what: str, statistic: Callable[..., np.ndarray], *samples: np.ndarray, low=-math.inf, high=math.inf
 ) -> Part:
-    """Compute a statistic of samples over seeds, and its bootstrap, which draws each sample separately.
-
-    The statistic takes samples (*, seeds) and gives numbers (*). A draw takes one set of starts for all
-    samples that are ``judged``.
-    """
+    """Compute a statistic, from samples (*, seeds) to numbers (*), and its bootstrap, which draws each sample apart."""
     rng = np.random.default_rng(0)
     drawn = [rng.choice(np.asarray(x), (RESAMPLES, len(x))) for x in samples]
     sets = rng.integers(0, 2**32, RESAMPLES)
@@ -230,7 +200,6 @@ def bootstrap(
 
 
 def mean(x: np.ndarray) -> np.ndarray:
-    """Average over seeds."""
     return x.mean(-1)
 
 
@@ -247,12 +216,10 @@ def gap(a: np.ndarray, *b: np.ndarray) -> np.ndarray:
 
 
 def beats(what: str, a: np.ndarray, b: np.ndarray) -> Part:
-    """Make the part that a is higher than b."""
     return bootstrap(f"P({what})", probability, a, b, low=0.5)
 
 
 def deviation(x: np.ndarray) -> np.ndarray:
-    """Measure how far each seed is from the mean over seeds."""
     return np.abs(x - x.mean())
 
 

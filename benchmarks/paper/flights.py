@@ -1,7 +1,4 @@
-"""Flights of the recipes with the settings that ship, and with one of them changed, and of policies with a camera.
-
-Each function flies what its file of results lacks.
-"""
+"""Flights of the recipes as they ship, with one setting changed, and with a camera: what a file of results lacks."""
 
 from __future__ import annotations
 
@@ -11,6 +8,7 @@ import math
 from argparse import Namespace
 from collections.abc import Iterable, Sequence
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import torch
@@ -54,8 +52,6 @@ CURVE = {  # columns of a curve, and their names in metrics.csv
 }
 RUN = ("task", "algorithm", "seed")  # what tells one run from another
 
-# -- the recipes with the settings that ship ---------------------------------------------------------------------------
-
 
 def overrides(task: str, method: str) -> list[str]:
     """Name the task to a recipe; a variant of a task may have tuned values of its own."""
@@ -65,7 +61,6 @@ def overrides(task: str, method: str) -> list[str]:
 
 
 def about() -> dict[str, str]:
-    """Where and when a row was measured."""
     return {"machine": machine(), "flown": datetime.date.today().isoformat()}
 
 
@@ -81,6 +76,13 @@ def train(task: str, method: str, seed: int, folder: Path, quick: bool, changes:
     return own | {k: v for k, v in summary.items() if k not in own}
 
 
+def missing(args: Namespace, path: Path) -> list[tuple[str, str, int]]:
+    """The tasks, methods and seeds that were asked for and that a file of results lacks."""
+    done = kept(path, *RUN)
+    jobs = product(args.seeds, args.tasks, args.methods)
+    return [(task, method, seed) for seed, task, method in jobs if (task, method, str(seed)) not in done]
+
+
 def shipped(args: Namespace) -> None:
     """Every recipe on every task, over ten seeds; also on a task of your own, or on a track it was not tuned on."""
 
@@ -91,9 +93,7 @@ def shipped(args: Namespace) -> None:
         add_rows(args.data / "shipped_curves.csv", curve, same=RUN)
         add_rows(args.data / "shipped.csv", [row])
 
-    done = kept(args.data / "shipped.csv", *RUN)
-    jobs = [(task, method, seed) for seed in args.seeds for task in args.tasks for method in args.methods]
-    side_by_side(args.cores, [(fly, *job) for job in jobs if tuple(map(str, job)) not in done])
+    side_by_side(args.cores, [(fly, *job) for job in missing(args, args.data / "shipped.csv")])
 
 
 def thinned(folder: Path) -> list[dict[str, str]]:
@@ -104,8 +104,6 @@ def thinned(folder: Path) -> list[dict[str, str]]:
     names = ("steps", "seconds", "return", "solved")
     return [{name: f"{float(point[CURVE[name]]):.6g}" for name in names} for point in some]
 
-
-# -- one setting changed -----------------------------------------------------------------------------------------------
 
 OPTIONS = {  # with it, and without it
     "event times": ("env.event_discount", "${gamma}", "null"),
@@ -123,14 +121,12 @@ FACTORS = ("0.5", "1", "2")  # of the learning rate that ships
 
 
 def is_change(task: str, method: str, change: str) -> bool:
-    """Whether it differs from what ships."""
     cfg = shipped_configuration(task, method)
     return OmegaConf.merge(cfg, OmegaConf.from_dotlist([CHANGES[change]])) != cfg
 
 
 @cache
 def shipped_configuration(task: str, method: str) -> DictConfig:
-    """The configuration of a recipe as it ships."""
     return composed(method, overrides(task, method))
 
 
@@ -165,17 +161,12 @@ def _fly_changed(args: Namespace, column: str, jobs: Iterable[tuple[str, str, st
     side_by_side(args.cores, [(fly, *job) for job in jobs if tuple(map(str, job[:4])) not in done])
 
 
-# -- policies from many sets of starts ---------------------------------------------------------------------------------
-
 SETS, STARTS, FIRST = 16, 256, 2_000_000  # sets, starts in each, and the seed of the first, that of evaluate.py
 MEASURED = ("return", "solved", "gates_passed")
 
 
 def starts(args: Namespace) -> None:
-    """Policies from many sets of starts, to see how much of a mean over 256 starts is due to the starts.
-
-    A policy is judged on one set, the same for all, and no interval over seeds can tell what other starts would give.
-    """
+    """Policies from many sets of starts, to see how much of a mean over 256 starts is due to the starts."""
     torch.set_num_threads(1)
 
     def fly(task: str, method: str, seed: int) -> None:
@@ -183,9 +174,7 @@ def starts(args: Namespace) -> None:
         if not (folder / "summary.json").exists():
             train(task, method, seed, folder, args.quick)
         cfg, actor, normalizer = load_policy(folder / "checkpoint.pt")
-        env = build_env(cfg, STARTS, FIRST)
-        if normalizer is not None:
-            env.transform.load_state_dict(normalizer)
+        env = build_env(cfg, STARTS, FIRST, normalizer=normalizer)
         own, rows = {"task": task, "algorithm": method, "seed": seed, "starts": STARTS} | about(), []
         for first in range(FIRST, FIRST + SETS):
             with drawing_from(env, first):
@@ -194,12 +183,8 @@ def starts(args: Namespace) -> None:
             rows.append(own | {"starts_seed": first} | reached)
         add_rows(args.data / "starts.csv", rows)
 
-    done = kept(args.data / "starts.csv", *RUN)
-    jobs = [(task, method, seed) for seed in args.seeds for task in args.tasks for method in args.methods]
-    side_by_side(args.cores, [(fly, *job) for job in jobs if tuple(map(str, job)) not in done])
+    side_by_side(args.cores, [(fly, *job) for job in missing(args, args.data / "starts.csv")])
 
-
-# -- the forest --------------------------------------------------------------------------------------------------------
 
 HALF = "total_steps=2_048_000"  # of what BPTT ships with
 POLICIES = {  # recipe, and what differs from what it ships with
@@ -234,9 +219,7 @@ def forest(args: Namespace) -> None:
         cfg, actor, normalizer = load_policy(folder / "checkpoint.pt")
         for difficulty, speed in todo:
             cfg.env.difficulty, cfg.env.speed = difficulty, speed
-            env = build_env(cfg, args.forests, FIRST_FOREST, compile=not args.quick)
-            if normalizer is not None:
-                env.transform.load_state_dict(normalizer)
+            env = build_env(cfg, args.forests, FIRST_FOREST, compile=not args.quick, normalizer=normalizer)
             steps = round(PATIENCE * (env.length + max(env.run_up)) / speed / env.control_dt)
             reached = success_rates(env, actor, min(steps, cfg.env.max_episode_steps))
             row = {"policy": policy, "seed": seed, "difficulty": difficulty, "speed": speed, "forests": args.forests}
@@ -245,8 +228,8 @@ def forest(args: Namespace) -> None:
             add_rows(path, [row])
 
     jobs = []
-    for seed, policy in ((seed, policy) for seed in args.seeds for policy in args.policies):
-        wanted = [(difficulty, speed) for difficulty in args.difficulties for speed in args.speeds]
+    for seed, policy in product(args.seeds, args.policies):
+        wanted = product(args.difficulties, args.speeds)
         if todo := [x for x in wanted if (policy, str(seed), *map(str, x)) not in done]:
             jobs.append((fly, policy, seed, todo))
     side_by_side(args.cores, jobs)
@@ -255,12 +238,10 @@ def forest(args: Namespace) -> None:
 def success_rates(env: EnvBase, actor: TensorDictModuleBase, steps: int) -> dict[str, float]:
     """Fly one episode in every environment: the shares that reach the other side, and that crash, of all episodes."""
     flies, solved, crashed = (torch.full((env.num_envs,), x) for x in (True, False, False))
-    carry = None
+    carry, mode = None, ExplorationType.DETERMINISTIC
     for _ in range(0, steps, CHUNK):
         with torch.no_grad():
-            flight, carry = differentiable_rollout(
-                env, actor, carry, CHUNK, exploration_type=ExplorationType.DETERMINISTIC
-            )
+            flight, carry = differentiable_rollout(env, actor, carry, CHUNK, exploration_type=mode)
         done, success, crash = (flight["next", name].squeeze(-1) for name in ("done", "success", "crash"))
         ends = flies & done.any(1)
         last = done.int().argmax(1, keepdim=True)

@@ -102,7 +102,6 @@ VARIANTS = {
 
 
 def on(tasks: tuple[str, ...], *variants: str) -> dict[str, tuple[str, ...]]:
-    """Put several variants on the same tasks."""
     return dict.fromkeys(variants, tasks)
 
 
@@ -133,7 +132,6 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Its folder, inside the folder of all runs."""
         search = "" if self.lr is None else f"/lr{self.lr:g}"
         return f"{self.task}/{self.variant}{search}/seed{self.seed}"
 
@@ -175,20 +173,13 @@ class Job:
 
 def search_jobs(tasks: tuple[str, ...], variants: set[str], rates: tuple[float, ...] = LEARNING_RATES) -> list[Job]:
     """List the search for the learning rates of these variants: every rate, on every task."""
-    searched = [(task, name) for task in tasks for name in VARIANTS if name in variants and VARIANTS[name].searched]
-    return [
-        Job(task, name, SEARCH_SEED, lr)
-        for task, name in searched
-        if name in METHODS or task == "racing"
-        for lr in rates
-    ]
+    searched = [name for name in VARIANTS if name in variants and VARIANTS[name].searched]
+    runs = [(task, name) for task in tasks for name in searched if name in METHODS or task == "racing"]
+    return [Job(task, name, SEARCH_SEED, lr) for task, name in runs for lr in rates]
 
 
 def jobs(experiments: tuple[str, ...], tasks: tuple[str, ...], seeds: tuple[int, ...]) -> list[Job]:
-    """List the runs to report: three seeds of everything, before the others of anything.
-
-    A task of your own gets what all the paper's tasks get.
-    """
+    """List the runs to report: three seeds of everything first; a task of your own gets what all the paper's get."""
     return [
         Job(task, variant, seed)
         for some in (seeds[:3], seeds[3:])

@@ -1,11 +1,9 @@
 """Fly what the results of the paper's trial and of the recipes lack, several runs at a time.
 
 python -m benchmarks.paper.reproduce trial --cores 2     # the paper's methods and their variants, of matrix.py
-python -m benchmarks.paper.reproduce shipped --cores 2   # the recipes with the settings that ship
 python -m benchmarks.paper.reproduce shipped --tasks mypackage.WindowEnv --data FOLDER   # on a task of your own
 
-It may be stopped at any moment. Started again, it skips what is in the results, and resumes what was cut off. The
-results are CSV files in a folder; benchmarks/paper/results.py makes tables, figures and verdicts of them.
+It may be stopped at any moment. Started again, it skips what is in the results, and resumes what was cut off.
 """
 
 from __future__ import annotations
@@ -31,8 +29,6 @@ from torchrl_quad.files import add_rows, machine, read_rows, write_rows
 OWN = "of the paper, or of your own: a registered name or the path of a class, such as mypackage.WindowEnv"
 KEY = ("variant", "lr", "seed")  # what tells one run on a task from another
 
-# -- the trial ---------------------------------------------------------------------------------------------------------
-
 
 def trial(args: Namespace) -> None:
     """The paper's methods and their variants, after a search for their learning rates; and an audit of the rewards."""
@@ -56,7 +52,6 @@ def trial(args: Namespace) -> None:
 
 
 def configuration(job: Job, lr: float) -> DictConfig:
-    """Compose the configuration of a job's recipe, with its overrides."""
     return composed(VARIANTS[job.variant].algorithm, job.overrides(lr))
 
 
@@ -91,21 +86,13 @@ def keep(job: Job, folder: Path, data: Path) -> None:
     add_rows(data / "final.csv", [about | {k: v for k, v in summary.items() if k not in about}])
 
 
-# -- the command line --------------------------------------------------------------------------------------------------
-
-
 def known_task(name: str) -> str:
-    """Refuse a task that no recipe would find."""
     try:
-        task_class(name)
+        if name not in flights.VARIANTS:
+            task_class(name)
     except (ValueError, TypeError) as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return name
-
-
-def known_variant(name: str) -> str:
-    """Refuse what is neither a task nor a variant of one."""
-    return name if name in flights.VARIANTS else known_task(name)
 
 
 def command_line() -> argparse.ArgumentParser:
@@ -116,7 +103,6 @@ def command_line() -> argparse.ArgumentParser:
     def add(
         fly: Callable[[Namespace], None], seeds: Iterable[int], **choices: Iterable[str]
     ) -> argparse.ArgumentParser:
-        """Add what can be flown, with the seeds and choices that fly if none are named."""
         name, doc = fly.__name__, fly.__doc__ or ""
         own = programs.add_parser(name, description=doc, help=doc.splitlines()[0])
         for option, known in choices.items():
@@ -130,16 +116,10 @@ def command_line() -> argparse.ArgumentParser:
         own.set_defaults(fly=fly)
         return own
 
-    def measures(own: argparse.ArgumentParser, states: int, repeats: int) -> None:
-        own.add_argument("--states", type=int, default=states, help="visited states in which gradients are compared")
-        own.add_argument("--repeats", type=even, default=repeats, help="flights from each, each with its own noise")
-        own.add_argument("--steps", type=int, default=256, help="control steps whose rewards count")
-        own.add_argument("--size", type=float, default=0.1, help="change of an action, in its range of -1 to 1")
-
     own = add(trial, SEEDS, experiments=EXPERIMENTS)
     own.add_argument("--tasks", nargs="+", default=list(TASKS), type=known_task, help=OWN)
     own = add(flights.shipped, range(10), methods=flights.METHODS)
-    own.add_argument("--tasks", nargs="+", default=list(flights.TASKS), type=known_variant, help=OWN)
+    own.add_argument("--tasks", nargs="+", default=list(flights.TASKS), type=known_task, help=OWN)
     of = {"tasks": flights.CHANGED_TASKS, "methods": flights.CHANGED_METHODS, "changes": flights.CHANGES}
     add(flights.ablations, range(5), **of)
     add(flights.rates, (101, 102, 103), tasks=flights.TASKS, methods=flights.METHODS, factors=flights.FACTORS)
@@ -150,13 +130,14 @@ def command_line() -> argparse.ArgumentParser:
     add(elsewhere.elsewhere, range(5), environments=elsewhere.ENVIRONMENTS, losses=elsewhere.NAMES)
     own = add(gradients.ascent, ())
     own.add_argument("checkpoints", nargs="+", type=Path)
-    measures(own, states=128, repeats=4)
-    measures(add(gradients.phases, (100,), tasks=("racing", "racing_position")), states=1024, repeats=8)
+    own.add_argument("--states", type=int, default=128, help="visited states in which gradients are compared")
+    own.add_argument("--repeats", type=even, default=4, help="flights from each, each with its own noise")
+    own.add_argument("--steps", type=int, default=256, help="control steps whose rewards count")
+    own.add_argument("--size", type=float, default=0.1, help="change of an action, in its range of -1 to 1")
     return parser
 
 
 def even(text: str) -> int:
-    """Refuse an odd number: two halves are compared."""
     if int(text) % 2:
         raise argparse.ArgumentTypeError(f"{text} must be even: two halves of them are compared")
     return int(text)

@@ -30,7 +30,6 @@ COMPOSING = threading.Lock()  # hydra holds one folder at a time
 
 
 def ships(data: Path) -> bool:
-    """Whether a folder of results is that of the repository."""
     return data.resolve() == DATA.resolve()
 
 
@@ -40,15 +39,8 @@ def kept(path: Path, *names: str) -> set[tuple[str, ...]]:
 
 
 def composed(algorithm: str, overrides: list[str]) -> DictConfig:
-    """Compose the configuration of a recipe, in any thread."""
     with COMPOSING:
         return compose(algorithm, overrides)
-
-
-def end_runs_with_this() -> None:
-    """Let a signal end the runs, too: otherwise they write into folders that the next program takes over."""
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, _stop)
 
 
 def _stop(number: int, _: object) -> None:
@@ -59,17 +51,15 @@ def _stop(number: int, _: object) -> None:
 
 
 def run(recipe: str, overrides: Iterable[str], folder: Path) -> None:
-    """Run a recipe in a folder, or resume it there. A run that diverged left failure.pt, and counts as a result.
-
-    Raises:
-        RuntimeError: it failed otherwise; with the last error in its log.
-    """
+    """Run a recipe in a folder, or resume it there. A run that diverged left failure.pt, and counts as a result."""
     script = str(RECIPES / f"{recipe}.py")
     command([sys.executable, script, *overrides, "resume=auto", f"hydra.run.dir={folder}"], folder)
 
 
 def command(words: list[str], folder: Path) -> None:
     """Run a command in a process of its own, with its log in a folder; see :func:`run`."""
+    if STOPPED.is_set():
+        return
     folder.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "RL_LOGGING_LEVEL": "WARNING"}
     with (
@@ -87,16 +77,12 @@ def command(words: list[str], folder: Path) -> None:
 
 
 def side_by_side(cores: int, *stages: Iterable[tuple[Callable[..., None], ...]]) -> None:
-    """Call functions with their arguments, several at once. A failure is printed, and stops no other.
+    """Call functions with their arguments, several at once; a stage begins when the previous one has ended.
 
-    Args:
-        cores: calls at the same time.
-        *stages: calls; those of a stage begin when the previous stage has ended.
-
-    Raises:
-        SystemExit: at the end, if one has failed, or at once, by a signal.
+    A failure is printed, stops no other, and ends the program when all are over; a signal does so at once.
     """
-    end_runs_with_this()
+    for number in (signal.SIGTERM, signal.SIGINT):  # ends the runs, too, which write into folders to be resumed
+        signal.signal(number, _stop)
     calls = failed = 0
     with ThreadPoolExecutor(cores) as pool:
         for jobs in stages:

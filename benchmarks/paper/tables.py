@@ -1,9 +1,7 @@
 """Tables of the results, each a list of rows: CSV files in full, and those of the pages in Markdown.
 
-The conventions are those of Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical
-precipice": interquartile means, percentile intervals of the bootstrap, and the probability that one method improves on
-another. The bootstrap draws seeds and a set of starts (evidence.py); of tasks that were not flown from many sets, only
-seeds.
+Interquartile means, percentile intervals and probabilities of improvement are those of Agarwal et al. 2021. The
+bootstrap draws seeds and a set of starts (evidence.py); of tasks not flown from many sets, only seeds.
 """
 
 from __future__ import annotations
@@ -20,7 +18,6 @@ from scipy.stats import trim_mean
 from benchmarks.paper import elsewhere, flights
 from benchmarks.paper.claims import METHODS, Verdict, try_all
 from benchmarks.paper.evidence import NotRunError, Results, Row, Starts, bootstrap, column, grouped, judged, probability
-from benchmarks.paper.gradients import GRADIENTS
 from benchmarks.paper.matrix import EXPERIMENTS, TASKS, VARIANTS
 from torchrl_quad.envs import task_class
 from torchrl_quad.envs.metrics import EPISODE_METRICS
@@ -29,23 +26,21 @@ from torchrl_quad.files import read_rows
 Table = list[dict[str, str]]
 RELIABLE = 0.99  # of the episodes, solved by the worst seed
 ENOUGH, WANTED = 3, 10  # seeds: for an interval, and of each method
-LABELS = {  # of variants of a task
-    "racing_position": "racing, position",
-    "six_gates": "six gates",
-    "six_gates_back": "six gates, backwards",
-}
+LABELS = {"racing_position": "racing, position", "six_gates": "six gates", "six_gates_back": "six gates, backwards"}
 
 
 def make(data: Path) -> dict[str, Table]:
-    """Make all tables of which there are results, by name."""
-    results = Results(data)
-    made = shipped_tables(data) | {
+    results, starts, runs = Results(data), Starts(data), read_rows(data / "shipped.csv")
+    made = reached_tables(runs, starts) | {
+        "summary": summary_table(runs),
+        "choice": choice_table(runs, starts),
+        "improvement": improvement_table(runs),
+        "speed": speed_table([*runs, *read_rows(data / "rates.csv")]),
         "ablations": ablations_table(data),
         "rates": rates_table(data),
         "forest": forest_table(data),
-        "phases": phases_table(data),
         "elsewhere": elsewhere_table(data),
-        "tracks": reached_tables(read_rows(data / "tracks.csv"), Starts(data))["reached"],
+        "tracks": reached_tables(read_rows(data / "tracks.csv"), starts)["reached"],
     }
     if results.all_finals or results.curves:
         own, published = try_all(data)
@@ -60,24 +55,18 @@ def make(data: Path) -> dict[str, Table]:
 
 
 def markdown(table: Table) -> str:
-    """Write a table in Markdown."""
     head = list(dict.fromkeys(name for row in table for name in row))
     lines = [head, ["---" for _ in head], *([row.get(name, "") for name in head] for row in table)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def spread(values: Iterable[float]) -> str:
-    """Write the mean over seeds, and the least and the greatest."""
     values = [x for x in values if np.isfinite(x)]
     return f"{np.mean(values):.4g} ({min(values):.4g} to {max(values):.4g})" if values else ""
 
 
 def seeds(count: int) -> str:
-    """Write a number of seeds."""
     return f"{count} seed{'s' * (count > 1)}"
-
-
-# -- the trial ---------------------------------------------------------------------------------------------------------
 
 
 def claims_table(own: list[Verdict], published: list[Verdict]) -> Table:
@@ -124,18 +113,14 @@ def methods_table(results: Results) -> Table:
 
 
 def ends_table(results: Results, experiment: str) -> Table:
-    """Show where the curves of an experiment end, means over seeds, and when they converge, medians.
-
-    That is nearly at the highest of the methods' mean ends.
-    """
+    """Show where the curves of an experiment end, means over seeds, and when they converge, medians."""
     rows = []
     for task, variant in product(TASKS, EXPERIMENTS[experiment]):
         row = {"experiment": experiment, "task": task, "method": VARIANTS[variant].label}
         try:
+            row["seeds"] = str(len(results.end(task, variant)))
             for name in ("return", "solved", "gates_passed", "position_error"):
-                row |= {"seeds": str(len(results.end(task, variant)))} | {
-                    name: spread(results.end(task, variant, name))
-                }
+                row[name] = spread(results.end(task, variant, name))
             if experiment not in ("reward", "relaxation"):  # whose returns are of another kind
                 level = results.level(task, max((results.end(task, x) for x in METHODS), key=np.mean))
                 for axis in ("steps", "seconds"):
@@ -158,9 +143,6 @@ def ascent_table(data: Path) -> Table:
     ]
 
 
-# -- the recipes with the settings that ship ---------------------------------------------------------------------------
-
-
 def interquartile_mean(values: ArrayLike) -> NDArray[np.float64]:
     """The mean (*) of the middle half of values (*, seeds), without the quarter below and the quarter above it."""
     return trim_mean(values, 0.25, axis=-1)
@@ -178,12 +160,10 @@ def is_level(one: np.ndarray, best: np.ndarray) -> bool:
 
 
 def returns_of(rows: Sequence[Row], starts: Starts) -> np.ndarray:
-    """The returns of a method's seeds on a task, with what another set of starts would change."""
     return judged(np.array(column(rows, "return")), starts.shift(rows[0]["task"], rows[0]["algorithm"], "return"))
 
 
 def in_order(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
-    """The rows by task and method, in the order of the tables."""
     groups, tasks = grouped(rows, "task", "algorithm"), dict.fromkeys(row["task"] for row in rows)
     return {
         task: {x: groups[task, x] for x in flights.METHODS if (task, x) in groups}
@@ -199,14 +179,6 @@ def metric_of(task: str) -> tuple[str, float, int, str]:
     own = [x for x in task_class(name).metric_info.items() if x[0] not in EPISODE_METRICS]
     name, metric = own[0] if own else ("return", EPISODE_METRICS["return"])
     return name, metric.scale, 2, metric.unit or metric.label
-
-
-def shipped_tables(data: Path) -> dict[str, Table]:
-    """Show what the recipes reach with the settings that ship."""
-    runs, starts = read_rows(data / "shipped.csv"), Starts(data)
-    made = {"summary": summary_table(runs), "choice": choice_table(runs, starts)}
-    made |= reached_tables(runs, starts) | {"improvement": improvement_table(runs)}
-    return made | {"speed": speed_table([*runs, *read_rows(data / "rates.csv")])}
 
 
 def summary_table(rows: Sequence[Row]) -> Table:
@@ -247,11 +219,7 @@ def reached_tables(rows: Sequence[Row], starts: Starts) -> dict[str, Table]:
 
 
 def choice_table(rows: Sequence[Row], starts: Starts) -> Table:
-    """Show for each task the quickest method that works with every seed, and the one of the highest return.
-
-    They are chosen among the methods that have flown with the most seeds. Those that :func:`is_level` finds are level
-    with the highest return.
-    """
+    """Show for each task the quickest method that works with every seed, and the one of the highest return."""
     lines = []
     for task, flown in in_order(rows).items():
         worst = {x: min(column(own, "solved")) for x, own in flown.items()}
@@ -297,14 +265,8 @@ def improvement_table(rows: Sequence[Row]) -> Table:
     return [{"": flights.METHODS[x]} | {flights.METHODS[y]: cell(x, y) for y in enough} for x in enough]
 
 
-# -- one setting changed, and other environments -----------------------------------------------------------------------
-
-
 def ablations_table(data: Path) -> Table:
-    """Show what each option adds to the return, over the seeds that have flown with it and without it.
-
-    A cell also has the episodes that the worst seed solves with the option, and without it, and the number of seeds.
-    """
+    """Show what each option adds to the return, and what the worst seed solves with it, and without it."""
     shipped = grouped(read_rows(data / "shipped.csv"), "task", "algorithm")
     changed = grouped(read_rows(data / "ablations.csv"), "task", "algorithm", "change")
     rows = []
@@ -349,16 +311,6 @@ def forest_table(data: Path) -> Table:
         million, cost = (np.median(column(own, name)) if own else math.nan for name in ("steps", "seconds"))
         row = {"": policy, "million steps": f"{million / 1e6:.1f}", "processor seconds": f"{cost:.0f}"}
         lines.append(row | {f"{x:g} m/s": cell([r for r in own if float(r["speed"]) == x]) for x in speeds})
-    return lines
-
-
-def phases_table(data: Path) -> Table:
-    """Show which of the hybrid's gradients points along the measured one in each phase of training: cosines."""
-    names = GRADIENTS | {"weight": "weight b", "explained_variance": "explained variance of V"}
-    lines = []
-    for (task, _), own in grouped(read_rows(data / "phases.csv"), "task", "share").items():
-        row = {"task": LABELS.get(task, task), "million steps": f"{np.mean(column(own, 'steps')) / 1e6:.1f}"}
-        lines.append(row | {head: f"{np.mean(column(own, name)):.2f}" for name, head in names.items()})
     return lines
 
 

@@ -1,16 +1,4 @@
-"""The tasks for other frameworks; each adapter imports its framework when you ask for it.
-
-==================  ==============================  ==================================
-adapter             wraps                           for
-==================  ==============================  ==================================
-``GymVectorEnv``    a task, by its name             gymnasium: many drones
-``GymEnv``          a task, by its name             gymnasium: one drone
-``TorchVectorEnv``  a TorchRL environment           loops in plain torch, as CleanRL's
-``RslRlVecEnv``     a TorchRL environment           rsl-rl's ``OnPolicyRunner``
-``SkrlEnv``         a TorchRL environment           skrl's agents and trainers
-``DronesVecEnv``    gymnasium's vector environment  stable-baselines3
-==================  ==============================  ==================================
-"""
+"""The tasks for other frameworks; each adapter imports its framework when you ask for it."""
 
 from __future__ import annotations
 

@@ -1,15 +1,13 @@
 """The tasks as gymnasium environments: numpy arrays in and out, no gradient.
 
 Importing ``torchrl_quad`` registers them, and so does ``gymnasium.make("torchrl_quad:torchrl_quad/Hovering-v0")``.
-
-``AsyncVectorEnv`` and ``vectorization_mode="async"`` start processes that import your program again: torchrl sets
-multiprocessing's start method to "spawn". Put what starts them under ``if __name__ == "__main__":``. A plain
-``make_vec`` flies all drones in one batch, and needs no processes.
+``AsyncVectorEnv`` starts processes that import your program again (torchrl sets multiprocessing's start method to
+"spawn"): put what starts them under ``if __name__ == "__main__":``, or use a plain ``make_vec``, which needs none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, cast
 
 import gymnasium
@@ -22,11 +20,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_quad.envs import QuadrotorEnv, make_env
-from torchrl_quad.errors import UserTypeError, UserValueError, WrongState
+from torchrl_quad.errors import UserTypeError, UserValueError, WrongState, shown
 from torchrl_quad.options import Seed, check_value
 
-# An episode ends before an entry of the state exceeds this, where a task does not know better.
-_LIMIT = 1e6
+_LIMIT = 1e6  # of an observation, where a task does not know better: before, the episode ends
 _NO_LIMIT = 10_000_000  # control steps, as many as a task takes: gymnasium.make has a time limit of its own
 INFO = "success", "crash", "reward_terms", "metrics"
 Mode = Literal["NextStep", "SameStep", "Disabled"]
@@ -49,26 +46,21 @@ class GymVectorEnv(VectorEnv):
     Actions are floats (num_envs, 4), clipped to [-1, 1], rewards float64 (num_envs). ``info`` holds ``success``,
     ``crash``, ``reward_terms`` and ``metrics`` by name, each (num_envs), with a mask ``_name`` for every name.
 
-    The time limit is the task's ``max_episode_steps``. With "NextStep" an episode that has ended resets at the next
-    step, which ignores the action and has no reward; with "SameStep" in the same step, with ``final_obs`` and
-    ``final_info`` in ``info``; with "Disabled", when ``reset(options={"reset_mask": mask})`` is called with a bool mask
-    (num_envs).
-
-    ``reset(seed=...)`` seeds the one generator of all drones; without a seed it continues to draw. ``torchrl_env`` is
-    the TorchRL environment, to be read: its ``params``, ``hover_action`` and so on.
+    The time limit is the task's ``max_episode_steps``. ``reset(seed=...)`` seeds the one generator of all drones;
+    without a seed it continues to draw. ``torchrl_env`` is the TorchRL environment, to be read.
 
     Args:
         task: "forest", "hovering", "landing", "racing" or "tracking".
         num_envs: number of drones.
-        autoreset_mode: "NextStep", "SameStep" or "Disabled", or the ``AutoresetMode``.
+        autoreset_mode: how an episode that has ended resets. "NextStep": at the next step, which ignores the action and
+            has no reward; "SameStep": in the same step, with ``final_obs`` and ``final_info`` in ``info``; "Disabled":
+            by ``reset(options={"reset_mask": mask})`` with a bool mask (num_envs).
         render_mode: "rgb_array" for pictures, which need matplotlib; None for none.
         **kwargs: of the task's environment. Without ``seed`` the first starts differ from run to run, as is usual in
             gymnasium.
 
     Raises:
-        TypeError: an argument is unknown, or an action or the options have another type.
-        ValueError: an argument is out of its range, or an action has another shape or is not finite. A call that is
-            refused leaves the flight as it was.
+        TypeError, ValueError: as in other environments; a call that is refused leaves the flight as it was.
         ResetNeeded: a step or a picture before the first reset; a step, with "Disabled", after an episode's end.
         ClosedEnvironmentError: a call after ``close()``, which may be called twice.
     """
@@ -103,35 +95,33 @@ class GymVectorEnv(VectorEnv):
         self.single_action_space = Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._now: TensorDictBase | None = None  # the tensordict to step from
+        self.now: TensorDictBase | None = None  # the tensordict to step from
         self._over = np.zeros(self.num_envs, dtype=bool)  # whose episode has ended, and has not been reset
 
     @torch.no_grad()
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode with all drones, or with those of the bool ``options["reset_mask"]`` (num_envs)."""
         seed, mask = check_value("seed", seed, Seed | None), self._check_mask(check_options(options, "reset_mask"))
-        self._check_open()
+        check_open(self)
         super().reset(seed=seed)
         if seed is not None:
             self.torchrl_env.set_seed(seed)
-        now = self._restart(self._now, mask)
-        return self._observe(now), _info(now.select(*INFO, strict=False), mask)
+        now = self._restart(self.now, mask)
+        return self._observe(now), _info(now, mask)
 
     @torch.no_grad()
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Fly one control step with actions (num_envs, 4)."""
         env, over, info = self.torchrl_env, self._over, {}
         actions = check_action(actions, self.action_space)
-        self._check_open()
-        if self._now is None:
-            raise ResetNeeded("A step needs an episode: call reset() first.")
+        now = check_open(self, needed_by="A step")
         if self.autoreset_mode is AutoresetMode.DISABLED and over.any():
             raise ResetNeeded(
                 f"The episodes of drones {np.flatnonzero(over).tolist()} have ended. Call reset() before the next "
                 'step or, to leave the others alone, reset(options={"reset_mask": terminated | truncated}).'
             )
-        after = env.step(self._now.set("action", torch.tensor(actions, dtype=env.dtype, device=env.device)))["next"]
-        self._now = now = after.exclude("reward")
+        after = env.step(now.set("action", torch.tensor(actions, dtype=env.dtype, device=env.device)))["next"]
+        self.now = now = after.exclude("reward")
         reward, terminated, truncated = (_array(after[name]) for name in ("reward", "terminated", "truncated"))
         if over.any():
             now = self._restart(now, over)
@@ -142,9 +132,9 @@ class GymVectorEnv(VectorEnv):
             for i in np.flatnonzero(over):
                 observations[i] = _row(last, int(i))
             info = {"final_obs": observations, "_final_obs": over.copy()}
-            info |= {"final_info": _info(after.select(*INFO, strict=False), over), "_final_info": over.copy()}
+            info |= {"final_info": _info(after, over), "_final_info": over.copy()}
             now = self._restart(now, over)
-        info |= _info(now.select(*INFO, strict=False), np.ones(self.num_envs, dtype=bool))
+        info |= _info(now, np.ones(self.num_envs, dtype=bool))
         return self._observe(now), reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -152,21 +142,16 @@ class GymVectorEnv(VectorEnv):
 
         With "SameStep" it shows the start of the next episode after the end of one, as gymnasium's own do.
         """
-        self._check_open()
+        check_open(self)
         if self.render_mode is None:
             gymnasium.logger.warn('render() draws nothing without render_mode="rgb_array", an argument of make_vec.')
             return None
-        if self._now is None:
-            raise ResetNeeded("A picture needs an episode to show: call reset() first.")
+        check_open(self, needed_by="A picture")
         return tuple(self.torchrl_env.render([i]) for i in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the TorchRL environment."""
         self.torchrl_env.close()
-
-    def _check_open(self) -> None:
-        if self.closed:
-            raise Closed("The environment has been closed: make another one, gymnasium.make_vec(...).")
 
     def _check_mask(self, options: Mapping[str, Any]) -> np.ndarray:
         """Whose episodes ``reset`` begins, bool (num_envs)."""
@@ -174,12 +159,11 @@ class GymVectorEnv(VectorEnv):
             return np.ones(self.num_envs, dtype=bool)
         mask = _as_array(options["reset_mask"])
         if mask is None or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            got = type(options["reset_mask"]).__name__ if mask is None else f"shape {mask.shape}, dtype {mask.dtype}"
             raise UserValueError(
                 f"reset_mask must be a bool array of shape ({self.num_envs},) that marks at least one drone, got "
-                f"{got}. To reset all drones, leave it out."
+                f"{shown(options['reset_mask'])}. To reset all drones, leave it out."
             )
-        if self._now is None and not mask.all():
+        if self.now is None and not mask.all():
             raise ResetNeeded("The first episodes begin together: call reset() without reset_mask first.")
         return mask.copy()
 
@@ -188,7 +172,7 @@ class GymVectorEnv(VectorEnv):
         if now is not None:
             chosen = torch.as_tensor(mask, device=self.torchrl_env.device).unsqueeze(-1)
             now = now.exclude("action").set("_reset", chosen)
-        self._now = now = self.torchrl_env.reset(now, set_state=False)
+        self.now = now = self.torchrl_env.reset(now, set_state=False)
         self._over = self._over & ~mask
         return now
 
@@ -207,11 +191,7 @@ class GymEnv(gymnasium.Env):
 
     To train, fly a batch, ``gymnasium.make_vec``: it makes hundreds of times as many steps per second. The time limit
     is gymnasium's: ``gymnasium.make`` adds that of the task. ``GymEnv("hovering")`` flies until ``max_episode_steps``,
-    by default ten million. Errors are those of :class:`GymVectorEnv` with "Disabled".
-
-    Args:
-        task: "forest", "hovering", "landing", "racing" or "tracking".
-        **kwargs: as for :class:`GymVectorEnv`, but ``num_envs`` and ``autoreset_mode``.
+    by default ten million. Arguments and errors are those of :class:`GymVectorEnv` with "Disabled".
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
@@ -251,6 +231,15 @@ class GymEnv(gymnasium.Env):
         self._drones.close()
 
 
+def check_open(env: Any, needed_by: str | None = None) -> TensorDictBase:
+    """What the next step of an adapter starts from; an error if it was closed, or has none and something needs one."""
+    if env.closed:
+        raise Closed("The environment has been closed: make another one.")
+    if needed_by and env.now is None:
+        raise ResetNeeded(f"{needed_by} needs an episode: call reset() first.")
+    return env.now
+
+
 def check_action(action: Any, space: Space) -> np.ndarray:
     """A finite action of floats as a float64 array of the shape of its space, a copy, clipped to the bounds."""
     given, space = _as_array(action), cast("Box", space)
@@ -280,13 +269,9 @@ def check_numbers(action: np.ndarray | Tensor, shape: Sequence[int]) -> None:
 
 def check_options(options: Any, *known: str) -> Mapping[str, Any]:
     """The options of a reset, a mapping of those that are known; none for None."""
-    if options is None:
-        return {}
-    choice = f"Choose from: {', '.join(known)}." if known else "There are none: leave options out."
-    if not isinstance(options, Mapping):
-        raise UserTypeError(f"options must be a dictionary or None; got {type(options).__name__}. {choice}")
-    if unknown := [str(name) for name in options if name not in known]:
-        raise UserValueError(f"Unknown options {', '.join(unknown[:10])}. {choice}")
+    options = {} if options is None else options
+    if not isinstance(options, Mapping) or not set(options) <= set(known):
+        raise UserValueError(f"options: a dictionary may hold {', '.join(known) or 'nothing'}; got {shown(options)}.")
     return options
 
 
@@ -318,11 +303,11 @@ def _array(x: Tensor) -> np.ndarray:
     return np.array(x.squeeze(-1).numpy(force=True), dtype=bool if x.dtype is torch.bool else np.float64)
 
 
-def _info(entries: Any, mask: np.ndarray) -> dict[str, Any]:
+def _info(entries: Any, mask: np.ndarray, names: Iterable[str] = INFO) -> dict[str, Any]:
     """Gymnasium's info of the drones under the mask (n), of others zeros."""
     info: dict[str, Any] = {}
-    for name, x in entries.items():
-        info[name] = np.where(mask, _array(x), False) if isinstance(x, Tensor) else _info(x, mask)
+    for name, x in entries.select(*names, strict=False).items():
+        info[name] = np.where(mask, _array(x), False) if isinstance(x, Tensor) else _info(x, mask, x.keys())
         info[f"_{name}"] = mask.copy()
     return info
 

@@ -30,10 +30,6 @@ class RslRlVecEnv(VecEnv):
 
     Args:
         env: as for :class:`~torchrl_quad.adapters.TorchVectorEnv`; a task, or transforms around one.
-
-    Raises:
-        ImportError: rsl-rl is missing.
-        TypeError, ValueError: the environment is no task; or as :class:`~torchrl_quad.adapters.TorchVectorEnv`.
     """
 
     def __init__(self, env: EnvBase) -> None:
@@ -50,31 +46,24 @@ class RslRlVecEnv(VecEnv):
         self.drones.reset()
 
     @property
-    def _now(self) -> Any:  # a tensordict, since the drones have been reset
-        return self.drones.now
-
-    @property
     def episode_length_buf(self) -> Tensor:
         """Control steps since the start of each episode (num_envs)."""
-        return self._now["state", "step"].squeeze(-1)
+        return cast("Any", self.drones.now)["state", "step"].squeeze(-1)
 
     @episode_length_buf.setter
     def episode_length_buf(self, steps: Tensor) -> None:
         now, limit = self.episode_length_buf, self.max_episode_length
-        if not isinstance(steps, Tensor) or steps.dtype not in (torch.int32, torch.int64):
-            got = steps.dtype if isinstance(steps, Tensor) else type(steps).__name__
-            raise UserTypeError(f"episode_length_buf must be a tensor of whole numbers, torch.int64; got {got}.")
-        fits = steps.layout is torch.strided and steps.shape == now.shape and steps.device == now.device
-        if not fits or not ((steps >= 0) & (steps < limit)).all():
+        fits = isinstance(steps, Tensor) and steps.dtype in (torch.int32, torch.int64) and steps.device == now.device
+        if not fits or steps.shape != now.shape or not ((steps >= 0) & (steps < limit)).all():
             raise UserValueError(
-                f"episode_length_buf must have shape ({self.num_envs},), on {now.device}, with steps from 0 to "
+                f"episode_length_buf must be whole numbers ({self.num_envs},) on {now.device}, with steps from 0 to "
                 f"{limit - 1}. Write torch.randint_like(env.episode_length_buf, high={limit})."
             )
-        self._now["state", "step"] = steps.unsqueeze(-1).to(now.dtype, copy=True)
+        cast("Any", self.drones.now)["state", "step"] = steps.unsqueeze(-1).to(now.dtype, copy=True)
 
     def get_observations(self) -> TensorDict:
         """The present observations: ``policy`` (num_envs, k)."""
-        return self._grouped(self._now["observation"])
+        return self._grouped(cast("Any", self.drones.now)["observation"])
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """Fly one control step with actions (num_envs, 4): observations, rewards and ends (num_envs), extras."""

@@ -25,9 +25,6 @@ class SkrlEnv(Wrapper):
 
     Args:
         env: as for :class:`~torchrl_quad.adapters.TorchVectorEnv`; a task, or transforms around one.
-
-    Raises:
-        ImportError: skrl is missing.
     """
 
     def __init__(self, env: EnvBase) -> None:

@@ -31,11 +31,6 @@ class DronesVecEnv(VecEnv):
 
     Args:
         env: a vector environment of gymnasium whose autoreset mode is "SameStep".
-
-    Raises:
-        ImportError: stable-baselines3 is missing.
-        TypeError: it is no vector environment with actions of floats.
-        ValueError: the autoreset mode is another. Of a call: as :class:`~torchrl_quad.adapters.gym.GymVectorEnv`.
     """
 
     def __init__(self, env: VectorEnv) -> None:
@@ -73,8 +68,6 @@ class DronesVecEnv(VecEnv):
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions (num_envs, 4) for :meth:`step_wait`."""
-        if self.actions is not None:
-            raise WrongState("Actions are waiting to be flown: call step_wait() before the next step_async().")
         self.actions = check_action(actions, self.env.action_space)
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
@@ -101,15 +94,6 @@ class DronesVecEnv(VecEnv):
         """A picture of each drone; None without a render mode."""
         pictures = cast("tuple[np.ndarray, ...] | None", self.env.render())
         return [None] * self.num_envs if pictures is None else pictures
-
-    def render(self, mode: str | None = None) -> np.ndarray | None:
-        """All pictures as one; the mode "human" shows it in a window, with OpenCV."""
-        try:
-            return super().render(mode)
-        except ModuleNotFoundError as error:
-            raise MissingPackage(
-                'render("human") needs OpenCV: pip install opencv-python, or write render("rgb_array").'
-            ) from error
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """An attribute of the vector environment, once for each drone of the indices."""

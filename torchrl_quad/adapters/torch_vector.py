@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_quad.adapters.gym import INFO, Closed, ResetNeeded, check_numbers, check_options
+from torchrl_quad.adapters.gym import INFO, check_numbers, check_open, check_options
 from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.options import Seed, check_value
 
@@ -23,9 +23,8 @@ _FLOATS = torch.float16, torch.bfloat16, torch.float32, torch.float64
 class TorchVectorEnv:
     """Tensors in and out, in the manner of gymnasium's vector environments; all stay on the environment's device.
 
-    An episode that ends resets in the same step: ``step`` returns the first observation of the next episode, and
-    ``info["final_obs"]`` has the last of the one before. There is no gradient: for gradients fly the TorchRL
-    environment itself, with :func:`~torchrl_quad.differentiable_rollout`.
+    An episode that ends resets in the same step: ``step`` returns the first observation of the next episode. There is
+    no gradient: for gradients fly the TorchRL environment itself, with :func:`~torchrl_quad.differentiable_rollout`.
 
     ``info`` tells how the step ended, before any reset: ``success`` and ``crash``, bool (num_envs); ``reward_terms``
     and ``metrics``, floats (num_envs) by name; ``final_obs`` (num_envs, k), all observations.
@@ -33,10 +32,6 @@ class TorchVectorEnv:
     Args:
         env: a task, ``HoveringEnv(num_envs=512, compile=True)``, or any TorchRL environment of batch size (num_envs)
             with one ``observation`` and one ``action``; transforms around a task work, too.
-
-    Raises:
-        TypeError: it is no such environment.
-        ValueError: the environment has another batch size.
     """
 
     metadata = {"autoreset_mode": "SameStep"}
@@ -50,8 +45,8 @@ class TorchVectorEnv:
         batch, action, shown = (cast("Any", x) for x in (env.batch_size, env.action_spec, env.observation_spec))
         if len(batch) != 1:
             raise UserValueError(
-                f"The environment has the batch size {tuple(batch)}, and must have one dimension. Build it "
-                "with the number of its drones, HoveringEnv(num_envs=512)."
+                f"The environment has the batch size {tuple(batch)}; build it with a number of drones, "
+                "HoveringEnv(num_envs=512)."
             )
         observation = shown.get("observation", None)
         if not (isinstance(action, Bounded | Unbounded) and action.dtype in _FLOATS) or observation is None:
@@ -70,16 +65,11 @@ class TorchVectorEnv:
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.now: TensorDictBase | None = None  # what the next step starts from
 
-    @property
-    def unwrapped(self) -> TorchVectorEnv:
-        """This environment itself."""
-        return self
-
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Tensor, dict[str, Any]]:
         """Begin an episode with all drones: observations (num_envs, k), and an empty ``info``; there are no options."""
         seed = check_value("seed", seed, Seed | None)
         check_options(options)
-        self._check_open()
+        check_open(self)
         with torch.inference_mode(False), torch.no_grad():
             if seed is not None:
                 self.torchrl_env.set_seed(seed)
@@ -89,19 +79,14 @@ class TorchVectorEnv:
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Fly one control step with actions (num_envs, 4), clipped to the bounds of the action.
 
-        Returns:
-            observations (num_envs, k); rewards, and bool ``terminated`` and ``truncated``, each (num_envs); ``info``.
-
-        Raises as :class:`~torchrl_quad.adapters.GymVectorEnv`; actions must be on the environment's device.
+        Returns observations (num_envs, k); rewards, bool ``terminated`` and ``truncated``, each (num_envs); ``info``.
         """
-        self._check_open()
-        if self.now is None:
-            raise ResetNeeded("A step needs an episode: call reset() first.")
+        now = check_open(self, needed_by="A step")
         self._check_action(action)
         # Frameworks act in inference mode, whose tensors could not be differentiated later.
         with torch.inference_mode(False), torch.no_grad():
             action = action.to(self._low).clamp(self._low, self._high)
-            flown, self.now = self.torchrl_env.step_and_maybe_reset(self.now.set("action", action))
+            flown, self.now = self.torchrl_env.step_and_maybe_reset(now.set("action", action))
         end = cast("Any", flown["next"])
         reward, terminated, truncated = (end[name].squeeze(-1) for name in ("reward", "terminated", "truncated"))
         info = {**_squeezed(end.select(*INFO, strict=False)), "final_obs": end["observation"]}
@@ -113,24 +98,15 @@ class TorchVectorEnv:
             self.torchrl_env.close()
         self.closed = True
 
-    def _check_open(self) -> None:
-        if self.closed:
-            raise Closed("The environment has been closed: build the task and its adapter again.")
-
     def _check_action(self, action: Any) -> None:
         """Refuse actions that cannot be flown."""
         shape, device, dtype = tuple(self._low.shape), self._low.device, self._low.dtype
-        if not isinstance(action, Tensor) or action.is_nested or action.layout is not torch.strided:
-            layout = f" of layout {action.layout}" if isinstance(action, Tensor) else ""
+        is_dense = isinstance(action, Tensor) and not action.is_nested and action.layout is torch.strided
+        if not is_dense or action.dtype not in _FLOATS:
+            got = action.dtype if is_dense else type(action).__name__
             raise UserTypeError(
-                f"The actions must be a dense tensor of floats of shape {shape}, one row per drone; got "
-                f"{type(action).__name__}{layout}. Arrays become one by torch.as_tensor(action, dtype={dtype}, "
-                f"device={str(device)!r})."
-            )
-        if action.dtype not in _FLOATS:
-            raise UserTypeError(
-                f"The actions are {action.dtype}, and must be floats in the bounds of env.action_space. If these are "
-                f"meant, write action.to({dtype})."
+                f"The actions must be a dense tensor of floats of shape {shape}, one row per drone; got {got}. Others "
+                f"become one by torch.as_tensor(action, dtype={dtype}, device={str(device)!r})."
             )
         if action.device != device:
             raise UserValueError(

@@ -13,7 +13,7 @@ from torch.nn.functional import normalize, pad
 from torchrl_quad.controllers.policy import Controller, Reference, State, follow
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import Tilt
-from torchrl_quad.options import between
+from torchrl_quad.options import between, checked
 
 LEAST_LIFT = 0.3  # vertical part of the thrust, in weights: the drone never turns over to dive
 GREATEST_LIFT = 0.9  # of the greatest thrust: there is always some left to go sideways
@@ -21,6 +21,7 @@ GREATEST_LIFT = 0.9  # of the greatest thrust: there is always some left to go s
 Gain = Annotated[float, between(1e-3, 1e3)]
 
 
+@checked
 class GeometricController(Controller):
     r"""Geometric tracking control (Lee, Leok and McClamroch 2010) for thrust and body rates.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import torch
@@ -14,7 +14,7 @@ from torch.nn.functional import normalize, pad
 from torchrl_quad.controllers.policy import Controller, Reference, State, follow
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import between
+from torchrl_quad.options import between, checked
 
 # Of the squared residuals: each is the square of what one unit of it weighs, and half of it counts.
 WEIGHTS = {
@@ -29,6 +29,7 @@ SHORTENED = (1.0, 0.5, 0.2, 0.05)  # shares of a step of Gauss-Newton that are t
 ROWS = 4096  # states whose derivatives are taken at once: what fits into the cache of a processor
 
 
+@checked
 class MPC(Controller):
     r"""Model predictive control: at each step, plan actions through the physics of the environment, and fly the first.
 
@@ -117,15 +118,10 @@ class MPC(Controller):
 
     def improve(self, states: Tensor, actions: Tensor, goal: Tensor, neutral: Tensor) -> tuple[Tensor, Tensor]:
         """One step of Gauss-Newton from a trajectory (H + 1, n, 17) and its actions (H, n, 4); never to a worse one."""
-        steps, gains = feedback(
-            self.linearise(states[:-1], actions),
-            self.state_cost,
-            self.state_cost.unsqueeze(1) * (states[1:] - goal),
-            self.action_cost,
-            self.action_cost * (actions - neutral),
-            -1.0 - actions,
-            1.0 - actions,
-        )
+        of_states = self.state_cost, self.state_cost.unsqueeze(1) * (states[1:] - goal)
+        of_actions = self.action_cost, self.action_cost * (actions - neutral)
+        transition, bounds = self.linearise(states[:-1], actions), (-1.0 - actions, 1.0 - actions)
+        steps, gains = feedback(transition, of_states, of_actions, bounds)
         state = states[0].expand(len(SHORTENED), -1, -1)
         tried, acted = [], []
         for t in range(self.horizon):
@@ -178,13 +174,7 @@ class MPC(Controller):
 
 
 def feedback(
-    transition: Tensor,
-    state_cost: Tensor,
-    state_slope: Tensor,
-    action_cost: Tensor,
-    action_slope: Tensor,
-    low: Tensor,
-    high: Tensor,
+    transition: Tensor, states: Sequence[Tensor], actions: Sequence[Tensor], bounds: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor]:
     """The actions u_t = k_t + K_t x_t that minimise a quadratic cost, by Riccati's recursion, for a batch of drones.
 
@@ -192,10 +182,11 @@ def feedback(
     where x_{t+1} = A_t x_t + B_t u_t. Where k_t would leave its bounds, it stops there, and the gains of that entry are
     zero; the other entries are optimal given that (control-limited DDP, with one round of its active set).
 
-    ``transition`` (T, n, s, s + m) holds A_t and B_t side by side, ``state_cost`` (T, s) and ``action_cost`` (m) the
-    diagonals of Q and R, and ``state_slope`` (T, n, s) and ``action_slope`` (T, n, m) q and r. ``low`` and ``high``
-    (T, n, m) are the bounds of k. Returns k (T, n, m) and K (T, n, m, s).
+    ``transition`` (T, n, s, s + m) holds A_t and B_t side by side, ``states`` the diagonal of Q (T, s), and q
+    (T, n, s), ``actions`` that of R (m), and r (T, n, m). The two bounds of k are (T, n, m). Returns k (T, n, m) and
+    K (T, n, m, s).
     """
+    (state_cost, state_slope), (action_cost, action_slope), (low, high) = states, actions, bounds
     s = transition.shape[-2]
     eye, penalty = torch.eye(len(action_cost)).to(transition), torch.diag(action_cost)
     value, slope = torch.diag(state_cost[-1]), state_slope[-1]

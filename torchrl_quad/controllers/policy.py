@@ -13,8 +13,7 @@ from torch import Tensor
 from torchrl_quad.data.unwrap import base_env, leaf
 from torchrl_quad.dynamics import FlightController, Quadrotor
 from torchrl_quad.envs import HoveringEnv, LandingEnv, QuadrotorEnv, TrackingEnv
-from torchrl_quad.errors import UserTypeError, UserValueError, shown
-from torchrl_quad.options import checked
+from torchrl_quad.errors import UserTypeError, UserValueError
 
 State = dict[Any, Tensor]
 Reference = Callable[[State, Tensor], Tensor]
@@ -42,28 +41,17 @@ class Controller(TensorDictModuleBase):
         ValueError: its dynamics or its actions are others, or its task has no reference.
     """
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        if "__init__" in vars(cls):
-            checked(cls)
-
     def __init__(self, env: Any, reference: Reference | None = None) -> None:
         env = base_env(env)
         name: Any = type(self).__name__
         if not isinstance(env, QuadrotorEnv):
-            raise UserTypeError(
-                f"{name} flies a QuadrotorEnv, such as HoveringEnv(num_envs=64); got {type(env).__name__}."
-            )
+            raise UserTypeError(f"{name} flies a QuadrotorEnv, such as HoveringEnv(); got {type(env).__name__}.")
         if type(env.dynamics) is not Quadrotor:
-            raise UserValueError(
-                f"{name} needs a body with attitude and rotors, and this environment flies "
-                f"{type(env.dynamics).__name__}. Build it with dynamics='quadrotor'."
-            )
+            model = type(env.dynamics).__name__
+            raise UserValueError(f"{name} flies a Quadrotor, not a {model}: build the env with dynamics='quadrotor'.")
         if type(env.dynamics.controller) is not FlightController:
-            raise UserValueError(
-                f"{name} commands thrust and body rates, and actions here are {', '.join(env.action_units)}. Build the "
-                "environment with control='rates'."
-            )
+            units = ", ".join(env.action_units)
+            raise UserValueError(f"{name} commands body rates, not {units}: build the env with control='rates'.")
         names = [key if isinstance(key, tuple) else (key,) for key in env.control_step.safe_state]
         self.in_keys, self.out_keys = cast(list[Any], [("state", *key) for key in names]), cast(list[Any], ["action"])
         super().__init__()
@@ -115,9 +103,20 @@ def follow(reference: Reference, state: dict[Any, Tensor], times: Tensor) -> Mot
 
 def task_reference(env: QuadrotorEnv, lead: float, name: str) -> Reference:
     """The reference of a task; the action takes effect ``lead`` [s] from now, and the state is the drone's then."""
-    for task, make in REFERENCES.items():
-        if isinstance(env, task):
-            return make(env, lead)
+    if isinstance(env, HoveringEnv):
+        return lambda state, t: state["target"].unsqueeze(1).expand(-1, len(t), 3)
+    if isinstance(env, TrackingEnv):  # the point that runs along the curve
+        curve, rate = env.curve, env.phase_rate
+        return lambda state, t: curve(state["phase"] + rate * t)
+    if isinstance(env, LandingEnv):  # above the target, and from the height of the drone down, ever more slowly
+        bottom = LANDING_HEIGHT - LANDING_SPEED / LANDING_RATE
+
+        def come_down(state: State, t: Tensor) -> Tensor:
+            above = (state["position"][:, 2:] - bottom).clamp_min(0.0)
+            height = bottom + above * (-LANDING_RATE * (t - lead)).exp()
+            return torch.cat((state["target"][:, None, :2].expand(-1, len(t), 2), height.unsqueeze(-1)), -1)
+
+        return come_down
     raise UserValueError(
         f"{name} has no reference for {type(env).__name__}. Write {name}(env, reference=function), with a function "
         "from the state and times (T) [s] to positions (num_envs, T, 3) [m], such as "
@@ -128,8 +127,6 @@ def task_reference(env: QuadrotorEnv, lead: float, name: str) -> Reference:
 def check_reference(reference: Any, env: QuadrotorEnv) -> None:
     """Raise a ValueError for what is no reference: it must give the positions at two times in a safe state."""
     rule = "reference is a function from the state and times (T) [s] to positions (num_envs, T, 3) [m]"
-    if not callable(reference):
-        raise UserValueError(f"{rule}; got {shown(reference)}.")
     state = {key: x.clone() for key, x in env.control_step.safe_state.items()}
     like = state["position"]
     try:
@@ -139,29 +136,3 @@ def check_reference(reference: Any, env: QuadrotorEnv) -> None:
     if not isinstance(points, Tensor) or points.shape != (len(like), 2, 3) or points.dtype != like.dtype:
         got = f"{tuple(points.shape)}, {points.dtype}" if isinstance(points, Tensor) else type(points).__name__
         raise UserValueError(f"{rule}, here ({len(like)}, 2, 3), {like.dtype}; it made {got}.")
-
-
-def hovering(env: HoveringEnv, lead: float) -> Reference:
-    """The target."""
-    return lambda state, t: state["target"].unsqueeze(1).expand(-1, len(t), 3)
-
-
-def tracking(env: TrackingEnv, lead: float) -> Reference:
-    """The point that runs along the curve."""
-    curve, rate = env.curve, env.phase_rate
-    return lambda state, t: curve(state["phase"] + rate * t)
-
-
-def landing(env: LandingEnv, lead: float) -> Reference:
-    """Above the target, and from the height of the drone down, ever more slowly."""
-    bottom = LANDING_HEIGHT - LANDING_SPEED / LANDING_RATE
-
-    def reference(state: dict[Any, Tensor], t: Tensor) -> Tensor:
-        above = (state["position"][:, 2:] - bottom).clamp_min(0.0)
-        height = bottom + above * (-LANDING_RATE * (t - lead)).exp()
-        return torch.cat((state["target"][:, None, :2].expand(-1, len(t), 2), height.unsqueeze(-1)), -1)
-
-    return reference
-
-
-REFERENCES: dict[Any, Any] = {HoveringEnv: hovering, LandingEnv: landing, TrackingEnv: tracking}

@@ -20,8 +20,7 @@ class ObservationNormalizer(ObservationNorm):
     """Subtracts the mean and divides by the standard deviation of all observations seen, fixed within a horizon.
 
     TorchRL's VecNorm changes its statistics in place at every step, which breaks backward through a rollout. Here
-    :meth:`update` changes them between horizons, and a graph that is not differentiated yet keeps its values. The
-    statistics are buffers and therefore part of ``state_dict``.
+    :meth:`update` changes them between horizons, and a graph that is not differentiated yet keeps its values.
 
     .. code-block:: python
 
@@ -36,9 +35,6 @@ class ObservationNormalizer(ObservationNorm):
         env: the environment to wrap, for size, device and floating-point type of the observation.
         key: the entry (*, k) to normalise, which is overwritten.
         min_scale: the least standard deviation to divide by, in the observation's unit.
-
-    Raises:
-        ValueError: the environment does not observe the key, or its state holds the key.
     """
 
     def __init__(self, env: EnvBase, key: Entry = "observation", *, min_scale: Positive = 0.01) -> None:

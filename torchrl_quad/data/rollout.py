@@ -43,10 +43,9 @@ def differentiable_rollout(
 ) -> tuple[TensorDictBase, TensorDictBase]:
     """Fly a horizon, and keep the graph from every reward back to every action.
 
-    Environments that finish are reset on the way: the gradient is cut exactly there, and ``"next"`` keeps the true last
-    state. The rollout is the environment's own ``rollout``, so this works for any differentiable TorchRL environment
-    and any stack of transforms. The gradient also goes through the memory of a recurrent actor, which is cleared, and
-    the gradient cut, at the start of an episode.
+    Environments that finish are reset on the way: the gradient is cut exactly there, also in the memory of a recurrent
+    actor, which is cleared, and ``"next"`` keeps the true last state. The rollout is the environment's own ``rollout``,
+    so this works for any differentiable TorchRL environment and any stack of transforms.
 
     Args:
         env: the environment.
@@ -141,10 +140,9 @@ def _rollout(env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, h
 class DifferentiableCollector(BaseCollector):
     """Horizons with their graph, for ``torchrl.trainers.Trainer`` and for loops written around collectors.
 
-    Each batch is what :func:`differentiable_rollout` returns, (*env.batch_size, horizon), and begins where the one
-    before it has ended, or at a fresh start. TorchRL's own collectors cut the graph. Take one step of the optimizer for
-    each batch (``optim_steps_per_batch=1``): ``backward`` frees its graph. The policy is not copied: a step of the
-    optimizer affects the next batch.
+    Each batch is a :func:`differentiable_rollout` that begins where the one before has ended, or at a fresh start. Take
+    one step of the optimizer for each (``optim_steps_per_batch=1``): ``backward`` frees its graph. The policy is not
+    copied: a step of the optimizer affects the next batch.
 
     Args:
         env: any differentiable environment, also under transforms; or a function that builds it.

@@ -71,10 +71,7 @@ def base_env(env: EnvBase) -> EnvBase:
 
 
 def check_whole_state(env: EnvBase) -> None:
-    """Raise a UserValueError for transforms that change the state from which the next step starts.
-
-    No transform may leave out a part of it, or overwrite one without undoing that before the step.
-    """
+    """Raise a UserValueError for transforms that drop or overwrite a part of the state, without undoing that."""
     base = base_env(env)
     state = set(map(unravel_key, state_keys(base)))
     lost = state & {*observed(base).keys(True, True)} - {*observed(env).keys(True, True)}

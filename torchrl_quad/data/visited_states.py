@@ -44,8 +44,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         capacity: visited states kept; the oldest go first.
         env: the environment whose Markov state is kept; see :mod:`torchrl_quad.data`.
         state_keys: the entries that make up the Markov state. By default those of ``env``, and "state" without one.
-        actor: a recurrent policy, whose memory is kept with the state. Without it, and in :meth:`source`, a visited
-            state has an empty memory.
+        actor: a recurrent policy, whose memory is kept with the state, but for :meth:`source`.
         device: where the states are stored.
         seed: of the buffer's own random generator.
     """
@@ -65,9 +64,7 @@ class VisitedStateBuffer(TensorDictReplayBuffer):
         if actor is not None:
             check_actor(actor, "actor")
         generator = torch.Generator(device=device).manual_seed(seed)
-        if state_keys is None:
-            state_keys = ("state",) if env is None else _state_keys(env)
-        self.state_keys = tuple(state_keys)
+        self.state_keys = tuple(state_keys or (("state",) if env is None else _state_keys(env)))
         self.memory_keys = () if actor is None else memory_keys(actor)
         self.names = (*self.state_keys, *self.memory_keys)
         known: Any = TensorDict() if env is None else observed(env).zero().reshape(-1)

@@ -1,8 +1,9 @@
-"""Describe an environment as a contract: what its policy reads and writes, the drone, and its task."""
+"""Describe an environment: as a contract, and as the page of a bundle for people who write firmware."""
 
 from __future__ import annotations
 
 import contextlib
+import inspect
 import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,8 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from torchrl_quad.data.unwrap import leaf
-from torchrl_quad.deploy.contract import GRAPHS, MEASURED, Contract, Fields
+from torchrl_quad.deploy.contract import GRAPHS, MEASURED, Contract, Fields, schema_table
+from torchrl_quad.deploy.network import fill_in
 from torchrl_quad.deploy.simulators.vehicle import bandwidth, damping_ratio
 from torchrl_quad.deploy.tracing import Rules
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
@@ -54,18 +56,7 @@ def numbers(x: Any) -> Any:
 
 
 def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, ModelProto], memory: int, visual: bool) -> Fields:
-    """What a contract says of an environment, before anything has flown.
-
-    Args:
-        env: the environment.
-        rules: of its task.
-        models: the ONNX of all graphs by name.
-        memory: numbers that the policy keeps.
-        visual: whether the policy reads the images of its camera.
-
-    Raises:
-        ValueError: it flies what a contract cannot say yet.
-    """
+    """What a contract says of an environment whose policy keeps ``memory`` numbers, before anything has flown."""
     camera = env.camera if visual else None
     nominal, delay = _fields(env.nominal), getattr(env.disturbances.get("sensors"), "delay", 0)
     weight = nominal["mass"] * nominal["gravity"]
@@ -120,12 +111,8 @@ def _task(env: QuadrotorEnv, rules: Rules) -> Fields:
         x, ends = env.control_step.safe_state[key], bounds.get(key, (-math.inf, math.inf))
         # In the precision of the entry: in float32 a phase may be a little above 2 pi.
         low, high = (torch.tensor(end, dtype=x.dtype).item() if math.isfinite(end) else None for end in ends)
-        entries[name] = {
-            "shape": [*x.shape[1:]],
-            "dtype": str(x.dtype).removeprefix("torch."),
-            "low": low,
-            "high": high,
-        }
+        kind = str(x.dtype).removeprefix("torch.")
+        entries[name] = {"shape": [*x.shape[1:]], "dtype": kind, "low": low, "high": high}
     metrics = {}
     for x in rules.graphs["episode"].graph.output if "episode" in rules.graphs else ():
         about = describe_metric(x.name, env.metric_info)
@@ -165,9 +152,7 @@ def _single(name: str, value: Tensor, dim: int) -> Tensor:
     if value.dim() == dim:
         return value
     if not (value == value[:1]).all():
-        raise UserValueError(
-            f"export_policy: {name} differs between environments; a contract is for one nominal drone."
-        )
+        raise UserValueError(f"export_policy: {name} differs between environments; a contract is for one drone.")
     return value[0]
 
 
@@ -180,9 +165,9 @@ def _fields(params: QuadrotorParams) -> Fields:
 
 
 def _randomized(env: QuadrotorEnv) -> Fields:
-    found = [x for x in env.disturbances.values() if isinstance(x, DroneRandomization)]
-    spec = {name: value for x in found for name, value in x.spec.items()}
-    return {name: {kind: list(map(float, pair)) for kind, pair in spec[name].items()} for name in spec}
+    specs = [x.spec for x in env.disturbances.values() if isinstance(x, DroneRandomization)]
+    found = [(name, ranges) for spec in specs for name, ranges in spec.items()]
+    return {name: {kind: list(map(float, pair)) for kind, pair in ranges.items()} for name, ranges in found}
 
 
 def _disturbances(env: QuadrotorEnv) -> Fields:
@@ -241,13 +226,63 @@ def results(env: QuadrotorEnv, flight: TensorDictBase) -> Fields:
 
 def envelope(flight: TensorDictBase) -> Fields:
     """Where a flight has been: the range of its positions, its greatest speed, body rate and tilt."""
-    position, quaternion, *rates = (leaf(flight, ("state", name)).flatten(0, 1) for name in MEASURED)
-    velocity, angular_velocity = rates
+    position, quaternion, velocity, rates = (leaf(flight, ("state", name)).flatten(0, 1) for name in MEASURED)
     _, x, y, _ = quaternion.unbind(-1)
     return {
         "low": numbers(position.amin(0)),
         "high": numbers(position.amax(0)),
         "max_speed": numbers(vector_norm(velocity, dim=-1).max()),
-        "max_body_rate": numbers(vector_norm(angular_velocity, dim=-1).max()),
+        "max_body_rate": numbers(vector_norm(rates, dim=-1).max()),
         "max_tilt": numbers(torch.acos((1.0 - 2.0 * (x * x + y * y)).clamp(-1.0, 1.0)).max()),
     }
+
+
+# -- the page of a bundle ----------------------------------------------------------------------------------------------
+
+
+def write_page(contract: Contract, documentation: str | None) -> bytes:
+    """The content of ``README.md``, with the documentation of the class of the task."""
+    task, output, graphs = contract["task"], contract["output"], contract["graphs"]
+    reads = [(name, f"{x['shape']} {x.get('unit', '')}") for name, x in graphs["policy"]["reads"].items()]
+    columns = ("dtype", "unit", "frame")
+    tensors = [
+        f"| `{graph}.onnx` | {side} | `{name}` | {'x'.join(map(str, x['shape'])) or '1'} | "
+        + " | ".join(x.get(column, "") for column in columns)
+        + " |"
+        for graph, sides in graphs.items()
+        for side in ("reads", "writes")
+        for name, x in sides[side].items()
+    ]
+    camera = contract["camera"]
+    lines = inspect.cleandoc(documentation or "There is none.").splitlines()
+    values = {
+        "task": task["name"],
+        "reads": " and ".join(f"`{name}` {about.strip()}" for name, about in reads),
+        "documentation": "\n".join(f"    {line}".rstrip() for line in lines),
+        "tensors": "\n".join(tensors),
+        "entries": ", ".join(f"`{name}`" for name in task["entries"]) or "none",
+        "starts": ", ".join(f"`{name}`" for name in (*MEASURED, *task["entries"])),
+        "memory": contract["memory"],
+        "sign": contract["quaternion"]["sign"],
+        "max_thrust": f"{output['thrust']['range'][1]:.6g}",
+        "weight": f"{output['thrust']['weight']:.6g}",
+        "rates": ", ".join(f"{high:g}" for _, high in output["body_rate"]["range"]),
+        "hover": ", ".join(f"{x:.6g}" for x in output["hover_action"]),
+        "control_dt": f"{contract['control_dt']:g}",
+        "delay": contract["action_delay"],
+        "delay_seconds": f"{contract['action_delay'] * contract['control_dt']:g}",
+        "age": f"{contract['limits']['max_state_age']:g}",
+        "fields": schema_table(),
+        "package": contract["origin"]["package"],
+    }
+    if camera:
+        values |= {f"camera_{name}": f"{x:g}" for name, x in camera.items() if isinstance(x, int | float)}
+        values |= {f"camera_{name}": ", ".join(f"{x:.6g}" for x in camera[name]) for name in ("position", "quaternion")}
+        values["camera_angle"] = f"{math.degrees(camera['field_of_view']):g}"
+        values["camera_age"] = f"{contract['limits']['max_depth_age']:g}"
+        ray, axis = "the length of its ray to", "the depth, along the optical axis, of"
+        values["camera_pixel"] = ray if camera["along_ray"] else axis
+    features = [name for name in ("camera", "memory") if contract[name]]
+    features += ["advance"] if "advance" in graphs else []
+    features += [] if task["unjudged"] else ["judged"]
+    return fill_in("README.md", values, features).encode()

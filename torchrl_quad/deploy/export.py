@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -27,12 +27,10 @@ from torchrl_quad.data.unwrap import leaf, memory_keys, observed
 from torchrl_quad.deploy import contract as contracts
 from torchrl_quad.deploy.bundle import load_bundle
 from torchrl_quad.deploy.contract import MEASURED
-from torchrl_quad.deploy.describe import describe, envelope, results, seen_ranges
+from torchrl_quad.deploy.describe import describe, envelope, results, seen_ranges, write_page
 from torchrl_quad.deploy.folding import fold
 from torchrl_quad.deploy.judging import judge
 from torchrl_quad.deploy.network import write_c, write_onnx
-from torchrl_quad.deploy.page import write_page
-from torchrl_quad.deploy.reading import MOST_BYTES
 from torchrl_quad.deploy.tracing import Rules, trace
 from torchrl_quad.engine.packing import Key
 from torchrl_quad.envs import QuadrotorEnv
@@ -65,20 +63,7 @@ def export_policy(
     1024 observations; the contract takes its ranges and results from there. Then the bundle repeats two episodes from
     what a drone measures. It must observe and judge as the environment does, and act and remember as the policy does.
     The same policy and environment give the same bytes. The environment then draws as if nothing had been exported.
-
-    ==================  ================================================================================================
-    file                holds
-    ==================  ================================================================================================
-    ``policy.onnx``     ``observation`` (batch, k) to ``action`` (batch, 4), float32, with normaliser and scaling in it;
-                        of a visual policy also ``depth`` (batch, 1, height, width), of one that remembers ``memory``
-                        (batch, m) to ``next_memory``
-    ``policy.h, .c``    the same in C99, with a self-test
-    ``observe.onnx``    from the state to the observation; ``advance``, ``judge``, ``episode``: the task's other rules
-    ``contract.json``   what each number means; :func:`~torchrl_quad.deploy.contract.schema` is its JSON schema
-    ``starts.npz``      the states (num_envs, ...) in which these episodes began, with the task's entries
-    ``vectors.npz``     what the policy read in 1024 visited steps (256 with images), and what it answered
-    ``README.md``       how to fly it
-    ==================  ================================================================================================
+    ``README.md`` in the folder says what its files hold, and how to fly it.
 
     Args:
         actor: of :func:`~torchrl_quad.make_actor` or :func:`~torchrl_quad.make_visual_actor`; it may only read the
@@ -98,7 +83,7 @@ def export_policy(
         ImportError: onnx, onnxruntime or onnxscript is missing.
     """
     try:  # before anything flies
-        import onnx
+        import onnx  # noqa: F401
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401, which torch.onnx needs
     except ImportError as error:
@@ -116,30 +101,31 @@ def export_policy(
         raise UserValueError(f"export_policy: the policy reads {width} numbers, the environment observes {size}.")
     policy = actor if normalizer is None else NormalizedPolicy(actor, normalizer)
     count, self_test = (IMAGES, SELF_TEST_IMAGES) if "depth" in reads else (VECTORS, SELF_TEST_VECTORS)
-    flight = _fly(task, policy, count)
-    vectors = _vectors(policy, task, flight.chosen)
+    whole, replayed, chosen = _fly(task, policy, count)
+    vectors = _vectors(policy, task, chosen)
     n = 3 if task.num_envs != 3 else 4  # rules that only work for the environment's own number do not trace
-    states = {
-        key: leaf(flight.replayed, _below("state", key)).flatten(0, 1)[:n] for key in task.control_step.safe_state
-    }
-    rules, written = trace(task, states), write_onnx(network)
-    models = {"policy": onnx.load_from_string(written), **rules.graphs}
+    states = {key: leaf(replayed, _below("state", key)).flatten(0, 1)[:n] for key in task.control_step.safe_state}
+    rules = trace(task, states)
+    models = {"policy": write_onnx(network), **rules.graphs}
+    package = "torchrl_quad"
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        package += f" {metadata.version(package)}"
     contract = {
         "version": contracts.VERSION,
         **describe(task, rules, models, memory=reads.get("memory", (0,))[0], visual="depth" in reads),
-        "observation": seen_ranges(_array(leaf(flight.whole, "observation").flatten(0, 1).float())),
-        "envelope": envelope(flight.whole),
-        "results": results(task, flight.whole),
+        "observation": seen_ranges(_array(leaf(whole, "observation").flatten(0, 1).float())),
+        "envelope": envelope(whole),
+        "results": results(task, whole),
         "origin": {
-            "package": _version(),
+            "package": package,
             "weights_sha256": contracts.sha256(b"".join(x.tobytes() for x in network.weights())),
             **(origin or {}),
         },
     }
     keys = {name: name for name in MEASURED} | rules.entries
-    starts = {name: _array(leaf(flight.whole, _below("state", key))[:, 0]) for name, key in keys.items()}
-    files = {f"{name}.onnx": x.SerializeToString(deterministic=True) for name, x in rules.graphs.items()}
-    files |= {"policy.onnx": written, "vectors.npz": _npz(vectors), "starts.npz": _npz(starts)}
+    starts = {name: _array(leaf(whole, _below("state", key))[:, 0]) for name, key in keys.items()}
+    files = {f"{name}.onnx": x.SerializeToString(deterministic=True) for name, x in models.items()}
+    files |= {"vectors.npz": _npz(vectors), "starts.npz": _npz(starts)}
     files["README.md"] = write_page(contract, type(task).__doc__)
     files |= write_c(network, contract, {name: x[:: count // self_test] for name, x in vectors.items()})
     contract["sha256"] = {name: contracts.sha256(content) for name, content in files.items()}
@@ -155,7 +141,7 @@ def export_policy(
             with open(temporary / name, "wb") as file:
                 file.write(content)
                 os.fsync(file.fileno())
-        _check_the_flight(temporary, task, policy, flight.replayed, rules)
+        _check_the_flight(temporary, task, policy, replayed, rules)
     return Path(folder)
 
 
@@ -174,25 +160,16 @@ def _unwrapped(
     if not isinstance(base, QuadrotorEnv):
         raise UserValueError(f"export_policy needs an environment of this package, got {type(env).__name__}.")
     if base.control != "rates":
-        raise UserValueError(
-            f'export_policy exports only thrust and body rates, control="rates"; got {base.control!r}.'
-        )
+        raise UserValueError(f'export_policy exports thrust and body rates, control="rates"; got {base.control!r}.')
     if normalizer is not None and list(normalizer.in_keys) != ["observation"]:
         raise UserValueError(f'export_policy: the normalizer must be that of "observation", got {normalizer.in_keys}.')
     return base, normalizer
 
 
-class _Flight(NamedTuple):
-    """A deterministic flight from fresh starts."""
-
-    whole: TensorDictBase  #: (num_envs, time), without what is never judged
-    replayed: TensorDictBase  #: (REPLAYED, time), everything
-    chosen: TensorDictBase  #: (n), what the policy reads in single steps
-
-
 @torch.no_grad()
-def _fly(env: QuadrotorEnv, policy: TensorDictModuleBase, count: int) -> _Flight:
-    """Fly, and choose single steps; the environment then continues as if there was no flight."""
+def _fly(env: QuadrotorEnv, policy: TensorDictModuleBase, count: int) -> tuple[TensorDict, TensorDict, TensorDict]:
+    """A deterministic flight from fresh starts: (num_envs, time) without what is never judged, (REPLAYED, time) with
+    everything, and (count), what the policy reads in single steps. The environment then continues as if not flown."""
     steps = max(env.max_episode_steps, -(-VECTORS // env.num_envs))
     at = torch.linspace(0, env.num_envs * steps - 1, count).long()
     drone, step = at // steps, at % steps
@@ -218,7 +195,7 @@ def _fly(env: QuadrotorEnv, policy: TensorDictModuleBase, count: int) -> _Flight
         env.set_initial_state_source(source)
         env.set_random_state(random)
     all_of_it, again, chosen = (cast(TensorDict, torch.cat(x, i)) for i, x in ((1, whole), (1, replayed), (0, read)))
-    return _Flight(all_of_it, again, cast(TensorDict, chosen[leaf(chosen, "place").argsort()]))
+    return all_of_it, again, cast(TensorDict, chosen[leaf(chosen, "place").argsort()])
 
 
 @torch.no_grad()
@@ -248,11 +225,8 @@ def _vectors(policy: TensorDictModuleBase, env: QuadrotorEnv, chosen: TensorDict
 def _check_the_flight(
     folder: Path, env: QuadrotorEnv, policy: TensorDictModuleBase, flights: TensorDictBase, rules: Rules
 ) -> None:
-    """Fly the bundle through the first episodes of flights, from what a drone measures.
-
-    Compare what it observes with what the environment did, what it then does and remembers with what the policy does,
-    in the same order, with the same observations, and what it makes of the episodes with the environment's metrics.
-    """
+    """Fly the bundle through the first episodes of flights, from what a drone measures; compare what it observes and
+    makes of them with the environment, and what it does and remembers with the policy."""
     bundle, task = load_bundle(folder), type(env).__name__
     bundle.check(TOLERANCE)
     how = "must depend on the state and on constants, and change nothing."
@@ -287,9 +261,7 @@ def _check_the_flight(
         acted = _act(policy, env, read | {"observation": torch.from_numpy(observation)[None]})
         gap = np.abs(np.stack(actions) - _array(leaf(acted, "action")[0].float())).max()
         if not gap <= MEMORY_TOLERANCE:
-            raise UserValueError(
-                f"export_policy: the bundle acts differently from the policy, by {gap:.3g} within an episode."
-            )
+            raise UserValueError(f"export_policy: the bundle acts differently from the policy, by {gap:.3g}.")
     if rules.unjudged:
         return
     flown = {"action": _array(leaf(flights, "action"))}
@@ -321,20 +293,13 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
     return buffer.getvalue()
 
 
-def _version() -> str:
-    with contextlib.suppress(metadata.PackageNotFoundError):
-        return f"torchrl_quad {metadata.version('torchrl_quad')}"
-    return "torchrl_quad"
-
-
 def check_bundle_only(folder: Path) -> None:
     """Raise FileExistsError for a folder that holds something else than a bundle, or files beside one."""
-    found = list(folder.iterdir()) if folder.is_dir() else []
-    plain = {path.name for path in found if path.is_file() and not path.is_symlink()}
-    names = {path.name for path in found}
-    if names and not (folder / "contract.json").is_file():
+    found = [*folder.iterdir()] if folder.is_dir() else []
+    if found and not (folder / "contract.json").is_file():
         raise FileExistsError(f"{folder} exists and is no bundle. Choose another folder, or empty this one.")
-    if others := sorted(names - (plain & {*MOST_BYTES})):
+    own = {"contract.json", *contracts.OTHERS, *(f"{name}.onnx" for name in contracts.GRAPHS)}
+    if others := sorted(x.name for x in found if x.name not in own or not x.is_file() or x.is_symlink()):
         raise FileExistsError(
             f"{folder} also holds {', '.join(others)}: an export replaces the folder, and would delete that. Move it "
             "away, or choose another folder."

@@ -24,14 +24,8 @@ def fold(
 ) -> Network:
     """The network of a policy's mean action, in float32, with the normaliser and the input's scale in its weights.
 
-    Args:
-        actor: the policy.
-        normalizer: of the observation that it reads.
-        image: height and width of the camera's image; None where there is no camera.
-
-    Raises:
-        ValueError: the policy is not one that :func:`~torchrl_quad.make_actor` or
-            :func:`~torchrl_quad.make_visual_actor` builds, or reads what a drone cannot give it.
+    ``image`` is the height and width of the camera's image, where there is a camera. ValueError for a policy that
+    another function has built, or that reads what a drone cannot give it.
     """
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         plain, parts = (
@@ -39,8 +33,7 @@ def fold(
             for name in ("plain", "parts")
         )
     if plain is not None:
-        _check_keys(plain.in_keys, ["observation"])
-        _check_bounds(plain.low, plain.high)
+        _check_ends(plain.in_keys, ["observation"], plain.low, plain.high)
         linear = zip(plain.weights[::2], plain.weights[1::2], [*plain.activations, nn.Tanh()], strict=True)
         layers = _layers(linear, plain.size, np.repeat(plain.scales, plain.widths), normalizer)
         network = Network(layers, max_loc=plain.head.max_loc)
@@ -59,25 +52,21 @@ def fold(
 
 def _visual(actor: Any, parts: Any, normalizer: ObservationNormalizer | None, image: Sequence[int] | None) -> Network:
     """The network of a visual policy, from the parts that it names."""
-    _check_keys(list(actor[0][0].in_keys), ["depth", "observation"])
     bounds = actor[1].distribution_kwargs
-    _check_bounds(bounds.get("low"), bounds.get("high"))
+    _check_ends([*actor[0][0].in_keys], ["depth", "observation"], bounds.get("low"), bounds.get("high"))
     convolutions, trunk = (
         [(layer.weight, layer.bias, activation) for layer, activation in zip(x[::2], x[1::2], strict=True)]
         for x in (parts.convolutions, parts.trunk)
     )
-    memory = parts.memory and Memory(*(_float32(_numbers(getattr(parts.memory, name))) for name in GRU))
+    memory = parts.memory and Memory(*(_numbers(getattr(parts.memory, name)).astype(np.float32) for name in GRU))
     height, width = image or (0, 0)
     network = Network([], _layers(convolutions), (height, width), parts.nearest, memory, parts.max_loc)
     if image is None or network.features != parts.widths[0] or network.convolutions[0].weight.shape[1] != 1:
         camera = "has no camera" if image is None else f"shows it {image[1]} x {image[0]} pixels"
-        raise UserValueError(
-            f"export_policy: the policy was built for images of another size; the environment {camera}."
-        )
+        raise UserValueError(f"export_policy: the policy is for images of another size; the environment {camera}.")
     last = parts.head.weight, parts.head.bias, nn.Tanh()
-    return network._replace(
-        layers=_layers([*trunk, last], parts.size, np.repeat(parts.scales, parts.widths), normalizer)
-    )
+    layers = _layers([*trunk, last], parts.size, np.repeat(parts.scales, parts.widths), normalizer)
+    return network._replace(layers=layers)
 
 
 def _layers(
@@ -86,17 +75,8 @@ def _layers(
     columns: NDArray[np.float64] | None = None,
     normalizer: ObservationNormalizer | None = None,
 ) -> list[Layer]:
-    """Layers from weights, biases and activations.
-
-    Args:
-        parts: these, for each layer.
-        size: how many outputs of the last one to keep; by default all.
-        columns: what multiplies each input of the first one.
-        normalizer: of its last inputs, the observation.
-
-    Raises:
-        ValueError: an activation is one that this package cannot write.
-    """
+    """Layers from weights, biases and activations: the first one's inputs times ``columns``, of which the last are
+    normalised, and of the last one's outputs the first ``size``, or all."""
     weights, biases, activations = zip(*parts, strict=True)
     for activation in activations:
         if type(activation).__name__ not in ACTIVATIONS or repr(activation) != repr(type(activation)()):
@@ -114,25 +94,19 @@ def _layers(
         weights[0], biases[0] = np.concatenate((others, own), 1), biases[0] - own @ loc
     weights[-1], biases[-1] = weights[-1][:size], biases[-1][:size]  # the rest is the noise's
     names = [type(activation).__name__ for activation in activations]
-    return [Layer(_float32(w), _float32(b), name) for w, b, name in zip(weights, biases, names, strict=True)]
+    weights, biases = ([x.astype(np.float32) for x in values] for values in (weights, biases))
+    return [Layer(*parts) for parts in zip(weights, biases, names, strict=True)]
 
 
-def _check_keys(found: Sequence[Any], known: list[str]) -> None:
+def _check_ends(found: Sequence[Any], known: list[str], low: Any, high: Any) -> None:
     if found != known:
         raise UserValueError(
             f'export_policy: the policy reads {found}. A drone only has the "observation": train it with '
             'in_keys=[\'observation\']. A visual policy may also read "depth", with image_key="depth".'
         )
-
-
-def _check_bounds(low: Any, high: Any) -> None:
     if low is not None:
         raise UserValueError(f"export_policy: actions must lie from -1 to 1, got {low} to {high}.")
 
 
 def _numbers(x: Tensor) -> NDArray[np.float64]:
     return x.detach().double().cpu().numpy()
-
-
-def _float32(x: NDArray[np.float64]) -> NDArray[np.float32]:
-    return x.astype(np.float32)

@@ -72,11 +72,11 @@ class Convention:
         Raises:
             ValueError: a quantity is unknown, has another size, or the target has no fixed order of motors.
         """
-        return {name: self._translate(name, self._checked(name, x), False) for name, x in quantities.items()}
+        return {name: self._translate(name, x, False) for name, x in quantities.items()}
 
     def back(self, quantities: Mapping[str, ArrayLike]) -> dict[str, Array]:
         """Their quantities as ours; see :meth:`to`."""
-        return {name: self._translate(name, self._checked(name, x), True) for name, x in quantities.items()}
+        return {name: self._translate(name, x, True) for name, x in quantities.items()}
 
     def thrust(self, newtons: ArrayLike, full_thrust: float | None = None, model_factor: float = 0.0) -> Array:
         """Their command for a collective thrust [N].
@@ -119,7 +119,7 @@ class Convention:
             )
         return value
 
-    def _checked(self, name: str, value: ArrayLike) -> Array:
+    def _translate(self, name: str, value: ArrayLike, back: bool) -> Array:
         if name not in _SIZES:
             raise UserValueError(f"Unknown quantity {name!r}. Choose from: {', '.join(_SIZES)}.")
         if name == "motors" and not self.motors:
@@ -127,9 +127,6 @@ class Convention:
         x = np.asarray(value, float)
         if x.shape[-1:] != (_SIZES[name],):
             raise UserValueError(f"{name} must have shape (..., {_SIZES[name]}), got {x.shape}.")
-        return x
-
-    def _translate(self, name: str, x: Array, back: bool) -> Array:
         if name in ("position", "velocity", "angular_velocity"):
             turn = np.round(rotate(self.body if name == "angular_velocity" else self.world, np.eye(3)))  # 0, 1 and -1
             return x @ (turn.T if back else turn)
@@ -150,13 +147,13 @@ _SIZES = {"position": 3, "velocity": 3, "quaternion": 4, "angular_velocity": 3, 
 def px4(world: str = "enu") -> Convention:
     """PX4: NED and FRD, w x y z. Thrust is ``thrust_body[2]``, from 0 down to -1, of VehicleRatesSetpoint or
     VehicleAttitudeSetpoint; ``MPC_THR_HOVER`` is the hover command without its sign. Motors of the quad X."""
-    return Convention("PX4", _to_ned(world), FLU_TO_FRD, False, (3, 1, 0, 2), (1.0, -1.0, -1.0), (0.0, -1.0))
+    return _aerospace("PX4", world, (0.0, -1.0))
 
 
 def ardupilot(world: str = "enu") -> Convention:
     """ArduPilot Copter: NED and FRD, w x y z. SET_ATTITUDE_TARGET's thrust is one, from 0 to 1, only with 8 in
     ``GUID_OPTIONS``, and a climb rate otherwise; ``MOT_THST_HOVER`` is the hover command. Motors of the quad X."""
-    return Convention("ArduPilot", _to_ned(world), FLU_TO_FRD, False, (3, 1, 0, 2), (1.0, -1.0, -1.0), (0.0, 1.0))
+    return _aerospace("ArduPilot", world, (0.0, 1.0))
 
 
 def betaflight(sitl: bool = False) -> Convention:
@@ -187,8 +184,8 @@ def mavros(world: str = "enu", thrust_scaling: float = 1.0) -> Convention:
             f"thrust_scaling must be above 0, got {thrust_scaling!r}: mavros multiplies the thrust by it. Write its "
             "parameter setpoint_raw/thrust_scaling."
         )
-    turn = {"enu": SAME, "nwu": NWU_TO_ENU}
-    return Convention("mavros", _choose(turn, world), xyzw=True, thrust_range=(0.0, 1.0 / thrust_scaling))
+    to_enu = _world(world, SAME, NWU_TO_ENU)
+    return Convention("mavros", to_enu, xyzw=True, thrust_range=(0.0, 1.0 / thrust_scaling))
 
 
 def mujoco() -> Convention:
@@ -234,13 +231,14 @@ def _model_factor(value: float) -> float:
     return value
 
 
-def _to_ned(world: str) -> Quaternion:
-    return _choose({"enu": ENU_TO_NED, "nwu": NWU_TO_NED}, world)
+def _aerospace(name: str, world: str, thrust_range: tuple[float, float]) -> Convention:
+    to_ned = _world(world, ENU_TO_NED, NWU_TO_NED)
+    return Convention(name, to_ned, FLU_TO_FRD, False, (3, 1, 0, 2), (1.0, -1.0, -1.0), thrust_range)
 
 
-def _choose(turns: Mapping[str, Quaternion], world: str) -> Quaternion:
-    if world not in turns:
+def _world(name: str, enu: Quaternion, nwu: Quaternion) -> Quaternion:
+    if name not in ("enu", "nwu"):
         raise UserValueError(
-            f'Unknown world {world!r}. Choose from: "enu", x east and y north; "nwu", x north and y west.'
+            f'Unknown world {name!r}. Choose from: "enu", x east and y north; "nwu", x north and y west.'
         )
-    return turns[world]
+    return enu if name == "enu" else nwu

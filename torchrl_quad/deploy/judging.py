@@ -8,19 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.bundle import Bundle
-from torchrl_quad.deploy.contract import ENDS, MEASURED, Arrays, Contract
+from torchrl_quad.deploy.contract import ENDS, MEASURED, Arrays
 from torchrl_quad.errors import UserValueError
 
 
 class Judge:
     """Follows the flights of n drones, step by step, and judges their first episodes.
 
-    Args:
-        bundle: whose task they fly.
-        starts: the states (n, ...) in which they begin: the drone's quantities, and the task's entries.
-
-    Raises:
-        ValueError: the task cannot be judged without what a bundle lacks, such as obstacles.
+    They begin in the states ``starts`` (n, ...): the drone's quantities, and the task's entries. ValueError where the
+    task of the bundle cannot be judged without what a bundle lacks, such as obstacles.
     """
 
     def __init__(self, bundle: Bundle, starts: Arrays) -> None:
@@ -73,25 +69,10 @@ class Judge:
 
 
 def judge(bundle: Bundle, flight: Arrays) -> Arrays:
-    """Judge the first episodes of a flight.
-
-    Args:
-        bundle: whose task it flies.
-        flight: by name ``action`` (n, time, 4), the drone's quantities (n, time + 1, ...), of which the first are the
-            start, and the task's entries (n, ...) that it starts with.
-    """
+    """Judge the first episodes of a flight: by name ``action`` (n, time, 4), the drone's quantities (n, time + 1, ...),
+    of which the first are the start, and the task's entries (n, ...) that it starts with."""
     first = {name: flight[name][:, 0] for name in MEASURED}
-    found = Judge(bundle, {name: flight[name] for name in bundle.contract["task"]["entries"]} | first)
-    for t, action in enumerate(np.moveaxis(np.asarray(flight["action"]), 1, 0)):
-        found.step(action, {name: flight[name][:, t + 1] for name in MEASURED})
+    found = Judge(bundle, flight | first)
+    for t in range(flight["action"].shape[1]):
+        found.step(flight["action"][:, t], {name: flight[name][:, t + 1] for name in MEASURED})
     return found.metrics()
-
-
-def summary(metrics: Contract, values: Arrays) -> dict[str, str]:
-    """The metrics of a contract summed up over episodes (n), as print shows them."""
-    shown = {}
-    for name, about in metrics.items():
-        known = values[name][~np.isnan(values[name])]
-        total = (np.median if about["median"] else np.mean)(known) if len(known) else None
-        shown[name] = "none" if total is None else f"{about['scale'] * total:.3g} {about['unit']}".rstrip()
-    return shown

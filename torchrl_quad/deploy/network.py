@@ -8,15 +8,18 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from importlib import resources
 from string import Template
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.contract import Contract
-from torchrl_quad.deploy.graphs import IR_VERSION, OPSET
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
 
 Array = NDArray[np.float32]
+OPSET, IR_VERSION = 20, 10  # onnxruntime reads both since 1.18
 
 # By the name of a torch.nn activation with its default arguments: the ONNX operator (with those of its attributes that
 # are not ONNX's defaults), and the C expression of x.
@@ -101,14 +104,13 @@ class Network(NamedTuple):
 # -- ONNX --------------------------------------------------------------------------------------------------------------
 
 
-def write_onnx(network: Network) -> bytes:
+def write_onnx(network: Network) -> ModelProto:
     """The network as ONNX, all float32, with a free batch axis. The same weights give the same bytes.
 
     It reads ``observation`` (batch, k), ``depth`` (batch, 1, height, width) and ``memory`` (batch, m), of those that
     there are, and returns ``action`` (batch, 4) and ``next_memory``.
     """
-    import onnx  # only who exports needs it
-    from onnx import TensorProto, helper, numpy_helper
+    from onnx import TensorProto, helper, numpy_helper  # only who exports needs it
 
     nodes: list[Any] = []
     constants: list[Any] = []
@@ -142,7 +144,9 @@ def write_onnx(network: Network) -> bytes:
         x = run(layer, x, f"{i}")
     if network.memory:
         at = constant("axis", [0], np.int64)
-        weight, bias, own_weight, own_bias = map(_update_first, network.memory)
+        weight, bias, own_weight, own_bias = (  # of the update gate, the reset gate, and the new value
+            np.concatenate([np.split(x, 3)[i] for i in (1, 0, 2)]) for x in network.memory
+        )
         parts = {"memory_weight": weight, "memory_own_weight": own_weight, "memory_bias": np.append(bias, own_bias)}
         sequence, before = add("Unsqueeze", [x, at], "sequence"), add("Unsqueeze", ["memory", at], "before")
         reads = [sequence, *(constant(name, value[None]) for name, value in parts.items()), "", before]
@@ -158,35 +162,33 @@ def write_onnx(network: Network) -> bytes:
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape]) for name, shape in side.items()]
         for side in (shapes, written)
     )
-    graph = helper.make_graph(nodes, "policy", begin, end, constants)
+    return onnx_model("policy", nodes, begin, end, constants)
+
+
+def onnx_model(name: str, nodes: list[Any], reads: list[Any], writes: list[Any], constants: list[Any]) -> ModelProto:
+    """An ONNX model of one graph, checked."""
+    import onnx
+    from onnx import helper
+
+    graph = helper.make_graph(nodes, name, reads, writes, constants)
     opset = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(graph, producer_name="torchrl_quad", ir_version=IR_VERSION, opset_imports=opset)
     onnx.checker.check_model(model, full_check=True)
-    return model.SerializeToString(deterministic=True)
-
-
-def _update_first(rows: Array) -> Array:
-    """The rows of a recurrent unit in the order of ONNX: update gate, reset gate, new value."""
-    reset, update, new = np.split(rows, 3)
-    return np.concatenate((update, reset, new))
+    return model
 
 
 # -- C -----------------------------------------------------------------------------------------------------------------
 
 
 def write_c(network: Network, contract: Contract, vectors: Mapping[str, Array]) -> dict[str, bytes]:
-    """The network as C99: the files ``policy.h`` and ``policy.c``.
-
-    Args:
-        network: the policy.
-        contract: of its bundle.
-        vectors: for the self-test, (n, ...) by name: what the ONNX of the network reads and writes.
-    """
+    """The network as C99: the files ``policy.h`` and ``policy.c``; vectors (n, ...) by name are for the self-test."""
     output, reads = contract["output"], network.reads
     names = sorted({layer.activation for layer in (*network.convolutions, *network.layers)})
     tests = {f"test_{name}": _rows(x.reshape(len(x), -1)) for name, x in vectors.items()}
     others = [name for name in reads if name != "observation"]
     parameters = {"depth": " const float depth[POLICY_DEPTH],", "memory": f"\n{18 * ' '}float memory[POLICY_MEMORY],"}
+    between = [len(layer.weight) for layer in network.layers]
+    between += [math.prod(image) for image in network.images] if network.convolutions else []
     arguments = {"depth": "test_depth + n * POLICY_DEPTH", "memory": "memory"}
     values = {
         "task": contract["task"]["name"],
@@ -198,7 +200,7 @@ def write_c(network: Network, contract: Contract, vectors: Mapping[str, Array]) 
         "max_rates": _floats(high for _, high in output["body_rate"]["range"]),
         "limit": _float(network.limit),
         "activations": "\n".join(
-            f"static float {_function(name)}(float x) {{ return {ACTIVATIONS[name][1]}; }}" for name in names
+            f"static float {name.lower()}_of(float x) {{ return {ACTIVATIONS[name][1]}; }}" for name in names
         ),
         "weights": "\n".join(_constants(network)),
         "vectors": len(vectors["action"]),
@@ -206,7 +208,10 @@ def write_c(network: Network, contract: Contract, vectors: Mapping[str, Array]) 
         "arguments": "".join(f", {arguments[name]}" for name in others),
         **{name: math.prod(shape) for name, shape in reads.items()},
         **tests,
-        **_sizes(network),
+        **dict(zip(("rows", "columns"), network.image, strict=True)),
+        "width": max(between),  # floats between the steps
+        "features": network.features,
+        "recalled": network.layers[-1].weight.shape[1],
         "layers": "\n".join(f"    {line}" for line in _steps(network)),
     }
     return {name: fill_in(name, values, others).encode() for name in ("policy.h", "policy.c")}
@@ -220,14 +225,6 @@ def fill_in(template: str, values: Mapping[str, Any], features: Collection[str])
         if marked is None or marked[1] in features:
             lines.append(line[marked.end() if marked else 0 :])
     return Template("".join(lines)).substitute(values)
-
-
-def _sizes(network: Network) -> dict[str, int]:
-    """Of the image, and how many floats the C code needs between its steps."""
-    between = [layer.weight.shape[0] for layer in network.layers]
-    between += [math.prod(image) for image in network.images] if network.convolutions else []
-    (rows, columns), recalled = network.image, network.layers[-1].weight.shape[1]
-    return {"rows": rows, "columns": columns, "width": max(between), "features": network.features, "recalled": recalled}
 
 
 def _steps(network: Network) -> Iterator[str]:
@@ -262,7 +259,7 @@ def _steps(network: Network) -> Iterator[str]:
 
 
 def _activate(layer: Layer, x: str, size: int) -> str:
-    return f"for (int i = 0; i < {size}; ++i) {x}[i] = {_function(layer.activation)}({x}[i]);"
+    return f"for (int i = 0; i < {size}; ++i) {x}[i] = {layer.activation.lower()}_of({x}[i]);"
 
 
 def _constants(network: Network) -> Iterator[str]:
@@ -282,10 +279,6 @@ def _constant(name: str, value: Array) -> str:
     return f"static const float {name}[{value.size}] = {text};"
 
 
-def _function(activation: str) -> str:
-    return f"{activation.lower()}_of"
-
-
 def _rows(values: Array) -> str:
     return ",\n".join(f"    {_floats(row)}" for row in values)
 
@@ -296,5 +289,4 @@ def _floats(values: Any) -> str:
 
 def _float(value: Any) -> str:
     """A float32 as C writes it, without loss."""
-    text = repr(float(str(np.float32(value))))
-    return f"{text}f"
+    return f"{float(str(np.float32(value)))!r}f"

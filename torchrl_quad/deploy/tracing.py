@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.export import ExportedProgram
 
 from torchrl_quad.deploy.contract import ENDS, MEASURED
-from torchrl_quad.deploy.graphs import IR_VERSION, NOT_IN_TASKS, OPSET
+from torchrl_quad.deploy.network import OPSET, onnx_model
 from torchrl_quad.engine.packing import Key
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import QuadrotorEnv
@@ -38,9 +38,8 @@ METHODS = {"observe": "observe", "judge": "is_crash and is_success", "measure": 
 class Rules(NamedTuple):
     """What a task computes outside the network."""
 
-    graphs: dict[
-        str, ModelProto
-    ]  #: ONNX models by name, "observe" and those that there are of "advance", "judge", "episode"
+    #: ONNX models by name, "observe" and those that there are of "advance", "judge", "episode"
+    graphs: dict[str, ModelProto]
     entries: dict[str, Key]  #: the keys in the state of the task's own entries that these read, by name
     unjudged: str | None  #: why there are no graphs "judge" and "episode", or None
 
@@ -57,7 +56,7 @@ def trace(env: QuadrotorEnv, state: State) -> Rules:
             values in a way that cannot be traced.
     """
     rules = _Methods(env, state)
-    with _quietly(), _without_randomness(env), torch.no_grad():
+    with _quietly_without_randomness(env), torch.no_grad():
         program, outputs = _exported(rules)
         try:
             found: Any = torch.onnx.export(program, (), dynamo=True, opset_version=OPSET, verbose=False)
@@ -111,7 +110,6 @@ class _Methods:
             self.inputs[name] = torch.stack(STEPS * [value], 1)
 
     def state(self, x: Tensors) -> State:
-        """The state, by its own keys."""
         return {key: x[name] for name, key in (self.known | self.hidden).items()}
 
     def observe(self, x: Tensors) -> Tensors:
@@ -138,7 +136,6 @@ class _Methods:
         return {f"judge.{name}": ends[name] for name in ENDS}
 
     def measure(self, x: Tensors) -> Tensors:
-        """The metrics of a state."""
         return {f"judge.metrics.{name}": value for name, value in self.env.metrics(self.state(x)).items()}
 
     def sum_up(self, x: Tensors) -> Tensors:
@@ -158,19 +155,17 @@ class _Methods:
 
 
 class _Whole(nn.Module):
-    """Some methods together, as torch.export takes them."""
+    """Some methods together, as torch.export takes them: of tensors in the order of the names."""
 
     def __init__(self, names: Iterable[str], methods: Iterable[Method]) -> None:
         super().__init__()
         self.names, self.methods = [*names], [*methods]
 
     def found(self, *tensors: Tensor) -> Tensors:
-        """What the methods make of tensors in the order of the names."""
         given = dict(zip(self.names, tensors, strict=True))
         return {name: x for method in self.methods for name, x in method(given).items()}
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """The same, without names."""
         return tuple(self.found(*tensors).values())
 
 
@@ -212,22 +207,9 @@ def _refusal(env: QuadrotorEnv, what: str, why: Exception) -> UserValueError:
 
 
 @contextlib.contextmanager
-def _quietly() -> Iterator[None]:
-    """torch.onnx tells of packages that are not installed, and of its own future."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    try:
-        logger.setLevel(logging.CRITICAL)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)
-
-
-@contextlib.contextmanager
-def _without_randomness(env: QuadrotorEnv) -> Iterator[None]:
-    """Refuse random numbers while rules are traced; they would be the same ones for ever."""
+def _quietly_without_randomness(env: QuadrotorEnv) -> Iterator[None]:
+    """Refuse random numbers while rules are traced, which would be the same ones for ever; and silence torch.onnx,
+    which tells of missing packages and of its own future."""
 
     class Refusing:
         tensor = env.randomness.tensor
@@ -235,26 +217,23 @@ def _without_randomness(env: QuadrotorEnv) -> Iterator[None]:
         def __getattr__(self, name: str) -> Any:
             raise UserValueError(RANDOM.format(name))
 
-    randomness = env.randomness
+    logger, randomness = logging.getLogger("torch.onnx"), env.randomness
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    env.randomness = cast(Randomness, Refusing())
     try:
-        env.randomness = cast(Randomness, Refusing())
-        yield
+        with warnings.catch_warnings(action="ignore"):
+            yield
     finally:
         env.randomness = randomness
+        logger.setLevel(level)
 
 
 # -- from one model to a graph for each file ---------------------------------------------------------------------------
 
 
 class _Cut:
-    """The one model, from which graphs are cut.
-
-    Args:
-        model: ONNX.
-        inputs: names of its inputs, in their order.
-        outputs: names of its outputs.
-        entries: names of the task's own entries.
-    """
+    """The one model, from which graphs are cut, with names of its inputs and outputs, and of the task's entries."""
 
     def __init__(self, model: ModelProto, inputs: list[str], outputs: list[str], entries: Iterable[str]) -> None:
         graph = model.graph
@@ -329,7 +308,6 @@ class _Cut:
 
     def _graph(self, task: str, name: str, wanted: list[str]) -> ModelProto:
         """The ONNX with only these outputs. Values are numbered, so that the same rules give the same bytes."""
-        import onnx
         from onnx import helper, numpy_helper
 
         used = set().union(*(self._behind(output) for output in wanted))
@@ -348,7 +326,7 @@ class _Cut:
         for node in self.nodes:
             if used.isdisjoint(node.output):
                 continue
-            if node.op_type in NOT_IN_TASKS or node.domain:
+            if node.op_type in ("If", "Loop", "Scan") or node.domain:  # loops might never end
                 raise UserValueError(
                     f"export_policy: {task}: {name}.onnx would compute {node.domain}{node.op_type}, which bundles do "
                     "not. Write it with other operations of torch."
@@ -358,11 +336,7 @@ class _Cut:
             nodes[-1].attribute.extend(node.attribute)
         for output, end in zip(wanted, writes, strict=True):
             nodes.append(helper.make_node("Identity", [names[self.outputs[output]]], [end.name]))
-        graph = helper.make_graph(nodes, name, reads, writes, constants)
-        opset = [helper.make_opsetid("", OPSET)]
-        model = helper.make_model(graph, producer_name="torchrl_quad", ir_version=IR_VERSION, opset_imports=opset)
-        onnx.checker.check_model(model, full_check=True)
-        return model
+        return onnx_model(name, nodes, reads, writes, constants)
 
     def _end(self, name: str, source: str) -> ValueInfoProto:
         """An input or output of a graph: its axes of batch and time are free."""

@@ -1,4 +1,4 @@
-"""Fly a bundle in a simulator, through its contract and without torch, and judge the flights.
+"""Fly a bundle in a simulator, through its contract and without torch, judge the flights, and keep a table of them.
 
 .. code-block:: python
 
@@ -9,6 +9,9 @@
 from __future__ import annotations
 
 import copy
+import csv
+import json
+import time
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,22 +19,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrl_quad.deploy.bundle import Bundle, load_bundle
 from torchrl_quad.deploy.contract import ENDS, MEASURED, Arrays, Contract, Fields, drone_problem, naming
 from torchrl_quad.deploy.judging import Judge
-from torchrl_quad.deploy.simulators import make_simulator
+from torchrl_quad.deploy.simulators import Array, Simulator, make_simulator
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
+from torchrl_quad.files import add_rows, machine, read_rows
 
-Array = NDArray[np.float64]
-# Fields of the rate loop, which does not know the true drone.
 if TYPE_CHECKING:
     from tensordict import TensorDict
 
-OF_THE_LOOP = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")
-MOST_LATE, MOST_SCALE = 1000, 1000.0
-MOST_STATES = 10_000_000  # of a flight, which take 2 GB
+OF_THE_LOOP = ("rate_gain", "rate_damping", "max_body_rate", "max_thrust_to_weight")  # it does not know the true drone
+MOST_SCALE = 1000.0
+KEY = ("bundle", "simulator", "loop", "mutant", "drone", "episodes")  # of a row; the others are its results
+SHOWN = ("task", *KEY[1:], "solved", "crash", "metrics", "seconds")
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,8 @@ def fly(
 ) -> Fields:
     """Fly a bundle from its fresh starts, one episode each, in a simulator.
 
-    The simulator applies the contract's ``action_delay``: the hover command is on its way at the start. It reports
-    states as late as the contract's ``observation_delay``, but exactly.
+    The contract's ``action_delay`` holds: the hover command is on its way at the start. States are reported as late as
+    its ``observation_delay``, but exactly.
 
     Args:
         folder: a bundle.
@@ -96,29 +98,27 @@ def fly(
     """
     bundle = folder if isinstance(folder, Bundle) else load_bundle(folder, on_fault="hover")
     with naming(bundle.folder), np.errstate(all="ignore"):  # what a simulator cannot fly becomes NaN, and a crash
-        mutant, scale = Mutant("none") if mutant is None else mutant, {} if scale is None else scale
-        return _fly(bundle, simulator, loop, mutant, scale, late, MOST_STATES if episodes is None else episodes)
+        for name, value, least in (("late", late, 0), ("episodes", 1 if episodes is None else episodes, 1)):
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise UserValueError(f"{name} must be a whole number, at least {least}, got {shown(value)}.")
+        mutant = Mutant("none") if mutant is None else mutant
+        if not isinstance(mutant, Mutant):
+            raise UserTypeError(f"mutant must be one of MUTANTS.values(), got {shown(mutant)}.")
+        contract = other_drone(bundle.contract, scale or {})
+        starts = {name: x[:episodes] for name, x in bundle.starts().items()}
+        world, judge = make_simulator(simulator, contract, loop, mutant.motors), Judge(bundle, starts)
+        delay = late + (contract["action_delay"] if mutant.delay is None else mutant.delay)
+        return _fly(bundle, world, judge, starts, delay, mutant)
 
 
-def _fly(bundle: Bundle, simulator: str, loop: str, mutant: Mutant, scale: Any, late: Any, episodes: Any) -> Fields:
-    for name, value, least, most in (("late", late, 0, MOST_LATE), ("episodes", episodes, 1, MOST_STATES)):
-        if not (isinstance(value, int) and not isinstance(value, bool) and least <= value <= most):
-            raise UserValueError(f"{name} must be a whole number from {least} to {most}, got {shown(value)}.")
-    if not isinstance(mutant, Mutant):
-        raise UserTypeError(f"mutant must be one of MUTANTS.values(), got {shown(mutant)}.")
-    contract = other_drone(bundle.contract, scale)
-    starts = {name: x[:episodes] for name, x in bundle.starts().items()}
-    n, steps = len(starts["position"]), contract["task"]["max_episode_steps"]
-    if n * steps > MOST_STATES:
-        raise UserValueError(f"{n} episodes of {steps} control steps do not fit into memory: give fewer, episodes=...")
-    world, judge = make_simulator(simulator, contract, loop, mutant.motors), Judge(bundle, starts)
+def _fly(bundle: Bundle, world: Simulator, judge: Judge, starts: Arrays, delay: int, mutant: Mutant) -> Fields:
+    n, steps = len(starts["position"]), bundle.contract["task"]["max_episode_steps"]
     world.reset({name: starts[name] for name in MEASURED})
     pilots = [_pilot(bundle, {k: x[i] for k, x in starts.items()}) for i in range(n)]
-    delay = late + (contract["action_delay"] if mutant.delay is None else mutant.delay)
     thrust, rates = bundle.command(bundle._hover)
     queue = deque([np.tile([thrust, *rates], (n, 1))] * delay)
-    state = world.state()
-    seen = deque([state] * (contract["observation_delay"] + 1), contract["observation_delay"] + 1)
+    state, memory = world.state(), bundle.contract["observation_delay"] + 1
+    seen = deque([state] * memory, memory)
     flight = {name: np.repeat(x[:, None], steps + 1, 1) for name, x in state.items()}
     flight["action"] = np.tile(bundle.action.astype(float), (n, steps, 1))
     alive = np.arange(n)
@@ -153,8 +153,6 @@ def other_drone(contract: Contract, scale: Mapping[str, float]) -> Fields:
         ValueError: a field is unknown, or belongs to the rate loop, or its factor makes no drone.
     """
     drone, plant = contract["drone"] | contract["plant"], dict(contract["plant"])
-    if not isinstance(scale, Mapping):
-        raise UserTypeError(f"scale must be a mapping of fields of the drone to factors, got {shown(scale)}.")
     fields = [name for name in drone if name not in OF_THE_LOOP]
     for name, factor in scale.items():
         if name not in fields:
@@ -202,3 +200,74 @@ def as_rollout(flight: Contract) -> TensorDict:
     rollout |= {("next", "state", name): x[:, 1:] for name, x in states.items()}
     rollout |= {("next", name): x for name, x in ends.items()}
     return TensorDict(cast(Any, rollout), [n, time])
+
+
+# -- a table of flights -----------------------------------------------------------------------------------------------
+
+
+def measure(
+    bundle: Bundle,
+    path: Path,
+    simulator: str,
+    loop: str,
+    mutant: str = "none",
+    *,
+    scale: Mapping[str, float] | None = None,
+    late: int = 0,
+    episodes: int | None = None,
+) -> None:
+    """Fly once, and add the result to a table, unless it is there; the arguments are those of :func:`fly`."""
+    task = bundle.contract["task"]
+    drone = {**(scale or {}), **({"late": late} if late else {})}
+    starts = len(bundle.starts()["position"])
+    with naming(bundle.folder):
+        version = make_simulator(simulator, bundle.contract, loop).version
+    flown = {
+        "bundle": bundle.contract["digest"][:12],
+        "simulator": version,
+        "loop": loop,
+        "mutant": mutant,
+        "drone": json.dumps(drone, sort_keys=True) if drone else "nominal",
+        "episodes": str(min(starts, episodes or starts)),
+    }
+    if any(all(row[name] == flown[name] for name in KEY) for row in _rows(path)):
+        return
+    begin, ends = time.perf_counter(), ("solved", "crash")
+    flight = fly(bundle, simulator, loop, MUTANTS.get(mutant), scale=scale, late=late, episodes=episodes)
+    totals = []
+    for name, about in task["metrics"].items():
+        known = flight["metrics"][name][~np.isnan(flight["metrics"][name])]
+        total = (np.median if about["median"] else np.mean)(known) if len(known) else None
+        text = "none" if total is None else f"{about['scale'] * total:.3g} {about['unit']}".rstrip()
+        totals += [] if name in ends else [f"{about['label']} {text}"]
+    row = {
+        "task": task["name"],
+        **flown,
+        **{name: f"{flight['metrics'][name].mean():.4f}" for name in ends},
+        "metrics": "; ".join(totals),
+        "seconds": f"{time.perf_counter() - begin:.1f}",
+        "faults": sum(flight["faults"].values()),
+        "machine": machine(),
+    }
+    add_rows(path, [row])
+
+
+def table(path: Path, bundle: Bundle) -> str:
+    """The flights of a bundle as a table, and the path of the file."""
+    own = [row for row in _rows(path) if row["bundle"] == bundle.contract["digest"][:12]]
+    rows = [dict(zip(SHOWN, SHOWN, strict=True)), *own]
+    widths = {name: max(len(row[name]) for row in rows) for name in SHOWN}
+    lines = ["  ".join(row[name].rjust(widths[name]) for name in SHOWN) for row in rows]
+    return "\n".join((*lines, "", str(path)))
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    try:
+        rows = read_rows(path)
+        whole = all(isinstance(row.get(name), str) for row in rows for name in (*KEY, *SHOWN))
+        why = "" if whole else f"a row lacks one of {', '.join(KEY)} or its results"
+    except (UnicodeDecodeError, csv.Error) as error:
+        rows, why = [], str(error)
+    if why:
+        raise UserValueError(f"{path} is no table of flights: {why}. Move it away, or choose another folder=...")
+    return rows

@@ -6,7 +6,6 @@ Loops in such a row are well damped, whatever their number (the damping optimum,
 
 from __future__ import annotations
 
-import copy
 import inspect
 import math
 from collections.abc import Mapping
@@ -30,7 +29,7 @@ from torchrl_quad.dynamics.vector import (
     smaller,
     soft_limit,
     unbind,
-    unbind_rows,
+    unbind_all,
     where_positive,
     where_same,
 )
@@ -52,18 +51,14 @@ class Setpoint(NamedTuple):
 
 @checked
 class FlightController:
-    """Rate controller and mixer with the nominal parameters of the drone: ``control="rates"``.
-
-    The drone that flies may differ (randomised, fitted): the controller keeps a copy of what it was built with, and no
-    gradient flows into that.
+    """Rate controller and mixer, with a copy of the parameters of the nominal drone: ``control="rates"``.
 
     Raises:
         ValueError: the rotor layout cannot make thrust and torque about each axis, or the drone cannot hover.
     """
 
+    #: What the four entries of an action command, and in which unit.
     action_units = {"thrust": "N", "roll rate": "rad/s", "pitch rate": "rad/s", "yaw rate": "rad/s"}
-    """What the four entries of an action command, and in which unit."""
-
     setpoint_type: type[Any] = Setpoint
     setpoint_sizes: tuple[int, ...] = (1, 3)
 
@@ -93,13 +88,9 @@ class FlightController:
 
     def unbind(self) -> FlightController:
         """The same on components: its numbers become constants of the code that is compiled with it."""
-        apart = copy.copy(self)
-        for name, value in vars(self).items():
-            if isinstance(value, Tensor):
-                setattr(apart, name, unbind(value, constant=True))
+        apart = unbind_all(self, matrices=["mixer"])
         fields = {k: unbind(x, constant=True) for k, x in self.nominal.fields().items() if k != "rotor_positions"}
-        apart.nominal = RawParams(**fields)
-        apart.rotors, apart.mixer = self.rotors.unbind(), unbind_rows(self.mixer)
+        apart.nominal, apart.rotors = RawParams(**fields), unbind_all(self.rotors, matrices=["allocation"])
         return apart
 
     def decode(self, action: Tensor) -> Tensor:
@@ -132,9 +123,8 @@ class FlightController:
         """Commanded rotor speed (*, 4) [rad/s] for a setpoint, the body rates (*, 3), and the present wrench (*, 4).
 
         Torque = J K (desired rate - rate) - D (angular acceleration) + w x J w, where the angular acceleration follows
-        from the wrench that nominal rotors exert. The paper prints a derivative of the desired rate as well; a setpoint
-        that is held for a control step has none. The rotors also hold against the moment (*, 3) of a drag above the
-        centre of mass, which firmware leaves to an integral.
+        from the wrench that nominal rotors exert; the setpoint is held, so that the paper's derivative of the desired
+        rate is zero. The rotors also hold against the moment (*, 3) of a drag above the centre of mass.
         """
         held = gyroscopic_torque(angular_velocity, self.nominal.inertia)
         held = held if moment is None else held - moment

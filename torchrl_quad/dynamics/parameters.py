@@ -35,11 +35,10 @@ class MotorCommand:
     """The rotor speed that a motor command asks for: ``speed_at_zero + speed_per_volt * command * voltage``.
 
     The command is 0 to 1 of what the electronics can give. It is needed to replay flights
-    (:func:`~torchrl_quad.identification.prediction_error`); environments command rotor speeds or thrusts.
+    (:func:`~torchrl_quad.identification.prediction_error`).
 
     Args:
-        speed_per_volt: of command times battery voltage, which is what the motor gets on average, 0.001 to 1e5 rad/s
-            per V.
+        speed_per_volt: of command times battery voltage, what the motor gets on average, 0.001 to 1e5 rad/s per V.
         nominal_voltage: where a log has no battery voltage, 0.1 to 1000 V.
         speed_at_zero: -1e4 to 1e4 rad/s.
         delay: from the command to the motor, -0.1 to 0.5 s.
@@ -112,10 +111,7 @@ class QuadrotorParams:
         return {name: getattr(self, name) for name in _FIELDS}
 
     def replace(self, **changes: Any) -> QuadrotorParams:
-        """A copy with some fields changed, to tensors, numbers or lists: ``params.replace(mass=0.5)``.
-
-        A tensor keeps its graph, so that a parameter can be fitted through the simulator.
-        """
+        """A copy with some fields changed, to tensors, with their graph, numbers or lists: ``replace(mass=0.5)``."""
         for unknown in (name for name in changes if name not in _FIELDS):
             raise UserValueError(f"QuadrotorParams has no field {unknown!r}. Choose from: {', '.join(_FIELDS)}.")
         changed = {k: _tensor(k, v, self.mass, "QuadrotorParams").to(self.mass) for k, v in changes.items()}

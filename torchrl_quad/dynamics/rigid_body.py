@@ -7,7 +7,6 @@ held over each physics step.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
@@ -16,17 +15,7 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.parameters import QuadrotorParams
-from torchrl_quad.dynamics.vector import (
-    Components,
-    Vector,
-    along_z,
-    cat,
-    cross,
-    matvec,
-    unbind,
-    unbind_rows,
-    where_positive,
-)
+from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, cross, matvec, where_positive
 
 
 class Rotors:
@@ -43,13 +32,6 @@ class Rotors:
         self.least_root = (params.rotor_speed_max - self.vertex_speed).square() * 1e-6
         self.time_constant = params.motor_time_constant
         self.allocation = allocation_matrix(params)
-
-    def unbind(self) -> Rotors:
-        """The same on components."""
-        apart = copy.copy(self)
-        for name, value in vars(self).items():
-            setattr(apart, name, unbind_rows(value) if name == "allocation" else unbind(value, constant=True))
-        return apart
 
     def thrust(self, speed: Vector) -> Vector:
         """Rotor thrust (*, 4) [N] at the rotor speed (*, 4) [rad/s]."""

@@ -6,12 +6,13 @@ fuses everything into one loop over drones and keeps its numbers in registers.
 
 from __future__ import annotations
 
+import copy
 import functools
 import itertools
 import math
 import operator
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -108,9 +109,15 @@ def unbind(vector: Tensor, constant: bool = False) -> Components:
     return Components(vector.flatten().tolist() if shared else vector.unbind(-1))
 
 
-def unbind_rows(matrix: Tensor) -> Components:
-    """The rows of a constant matrix (*, k, k), each as components."""
-    return Components([unbind(row, constant=True) for row in matrix.unbind(-2)])
+def unbind_all(owner: Any, matrices: Sequence[str]) -> Any:
+    """A copy whose tensors, all of them constants, are components; those of matrices (*, k, k) are their rows."""
+    apart = copy.copy(owner)
+    for name, value in vars(owner).items():
+        if name in matrices:
+            setattr(apart, name, Components([unbind(row, constant=True) for row in value.unbind(-2)]))
+        elif isinstance(value, Tensor):
+            setattr(apart, name, unbind(value, constant=True))
+    return apart
 
 
 def parts(vector: Vector) -> tuple[Tensor, ...]:

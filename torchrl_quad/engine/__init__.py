@@ -1,8 +1,4 @@
-"""The engine: a pure control step becomes a fast horizon with its graph. It is independent of quadrotors.
-
-It takes a :class:`Simulation`, packs its entries into rows, compiles it and its derivative where asked to, and loops it
-through the ends of episodes.
-"""
+"""The engine: a pure control step, a :class:`Simulation` of anything, becomes a fast horizon with its graph."""
 
 from torchrl_quad.engine.horizon import can_fly, flies_inside, fly
 from torchrl_quad.engine.packing import flat, looks_are_free, nested

@@ -146,17 +146,11 @@ def _is_watched(name: str, kind: str) -> bool:
 class StepProgram:
     """A compiled control step and its adjoint, on flat lists of tensors.
 
-    ======== ======================================================================================================
-    start    the rows of the state (floats, integers, flags), valid (n), the action (n, k)
-    others   the parameters that gradients may reach, then the noise of each disturbance
-    end      the rows of the state and of the outputs, and the observation (n, k)
-    ======== ======================================================================================================
-
-    ``forward(*start, *others)`` returns the state after each substep, each (rows, n), and the end.
+    ``forward(*start, *others)`` takes the rows of the state (floats, integers, flags), valid (n) and the action (n, k);
+    then the parameters that gradients may reach, and the noise of each disturbance. It returns the state after each
+    substep, each (rows, n), and the end: the rows of the state and of the outputs, and the observation (n, k).
     ``adjoint(*start, *others, *states, *grads)`` takes the gradients in the floats of the end (state, outputs,
     observation), and returns those in the floats of the start (state, action), and in the parameters.
-
-    ``options`` are keywords of ``torch.compile``.
     """
 
     def __init__(self, simulation: Simulation, layout: Layout, output_layout: Layout, options: dict[str, Any]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -23,26 +23,11 @@ from torchrl_quad.envs.scenes import MountedCamera
 from torchrl_quad.envs.step import ControlStep, sample_state
 from torchrl_quad.envs.task import Task, check_task
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, accepted, between, check_value, checked
-
-FloatType = Annotated[
-    Any, accepted(lambda x: x is torch.float32 or x is torch.float64, "torch.float32 or torch.float64")
-]
-ControlPeriod = Annotated[float, between(1e-6, 1.0)]
-
-
-class _Built(type(EnvBase)):
-    """How an environment is built: TorchRL takes ``compile`` before it asks the class."""
-
-    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
-        if "compile" in kwargs:
-            kwargs["compile"] = check_value("compile", kwargs["compile"], bool | dict[str, Any] | None)
-            config.check_compilation(kwargs["compile"] if isinstance(kwargs["compile"], dict) else {})
-        return super().__call__(*args, **kwargs)
+from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, check_value, checked
 
 
 @checked
-class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
+class QuadrotorEnv(Task, EnvBase):
     """Base of all tasks: a batch of quadrotors, stateless and differentiable.
 
     A step is a pure function of its tensordict. The complete Markov state is in ``"state"``, and gradients flow from
@@ -99,13 +84,13 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         num_envs: Size = 64,
         *,
         device: Device = "cpu",
-        dtype: FloatType = torch.float32,
+        dtype: config.FloatType = torch.float32,
         seed: Seed | None = 0,
         drone: config.DroneOption = "visfly",
         dynamics: config.DynamicsOption = "quadrotor",
         control: config.ControlOption = "rates",
         dt: PhysicsStep = 0.005,
-        control_dt: ControlPeriod = 0.02,
+        control_dt: config.ControlPeriod = 0.02,
         action_delay: Delay = 1,
         integrator: Integrator = "semi_implicit_euler",
         max_episode_steps: Size = 256,
@@ -121,12 +106,15 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         scene: config.SceneOption = None,
         camera: config.CameraOption = None,
     ) -> None:
-        self.config = config.EnvConfig(
-            dynamics=dynamics, control=control, dt=dt, control_dt=control_dt, action_delay=action_delay,
-            integrator=integrator, observe_last_action=observe_last_action, random_start=random_start,
-            randomize=randomize, wind=wind, observation_noise=observation_noise, observation_delay=observation_delay,
-            disturbances=config.as_disturbances(disturbances), scene=scene, camera=camera,
-        )  # fmt: skip
+        if action_delay == 0 and observe_last_action:
+            raise UserValueError("observe_last_action shows commands on their way; with action_delay=0 there are none.")
+        # What is built of these is built again on another device.
+        self._options: dict[str, Any] = {
+            "dynamics": dynamics, "control": control, "dt": dt, "control_dt": control_dt, "integrator": integrator,
+            "random_start": random_start, "randomize": randomize, "wind": wind, "observation_noise": observation_noise,
+            "observation_delay": observation_delay, "disturbances": config.as_disturbances(disturbances),
+            "scene": scene, "camera": camera,
+        }  # fmt: skip
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.num_envs, self.dtype, self.control_dt, self.action_delay = num_envs, dtype, control_dt, action_delay
         self.max_episode_steps, self.observe_last_action = max_episode_steps, observe_last_action
@@ -135,10 +123,9 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone, dtype)
         params = params.to(device=self.device, dtype=dtype)
         config.check_params(params, num_envs)
-        self.weights = config.check_weights({**self.weights, **(weights or {})}, self.weights)
+        self.weights = config.known_weights(self.weights, weights or {})
         self._place(params)
         self._params = params if params.requires_grad else self.nominal
-        config.check_memory(self)
         self.randomness.seed(seed)
         self.set_up()
         self.task_entries = [key for key in self.initial_state(num_envs) if key not in self.dynamics.sizes]
@@ -156,8 +143,6 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         cls.__signature__ = config.full_signature(cls, EnvBase)
 
     def __repr__(self) -> str:
-        if not hasattr(self, "control_step"):
-            return f"{type(self).__name__}(not built)"
         changed = "" if self.params is self.nominal else " with other parameters"
         more = f", disturbances={'+'.join(self.disturbances)}" if self.disturbances else ""
         return (
@@ -165,8 +150,6 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
             f"control_dt={self.control_dt:g} s, max_episode_steps={self.max_episode_steps}{more}, "
             f"device={self.device}, dtype={self.dtype}, compiled={self.is_compiled})"
         )
-
-    # -- what its users may set and ask --------------------------------------------------------------------------------
 
     @property
     def params(self) -> QuadrotorParams:
@@ -215,7 +198,6 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
     def compile(self, **kwargs: Any) -> QuadrotorEnv:
         """Compile the control step and its derivative; the keywords go to torch.compile. Under transforms, compile the
         environment inside, ``TransformedEnv(HoveringEnv(compile=True), ...)``: TransformedEnv's own takes minutes."""
-        config.check_compilation(kwargs)
         kwargs.pop("warmup", None)  # TorchRL's option for steps whose input changes its layout: ours never does
         return self._run(kwargs if has_compiler() else None)
 
@@ -244,32 +226,22 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         return self
 
     def render(self, drones: Sequence[int] | None = None, *, size: int = 336) -> Any:
-        """Draw the drones as the last reset, step or rollout left them; TorchRL's ``PixelRenderTransform`` calls it.
+        """Draw drones as the last reset, step or rollout left them; TorchRL's ``PixelRenderTransform`` calls it.
 
-        Args:
-            drones: indices of those to draw; by default the first six.
-            size: width and height [pixels] of the picture, a numpy array (size, size, 3) of uint8.
-
-        Raises:
-            ValueError: there is no state yet, as before the first reset; or an argument is out of its range.
+        The indices are by default the first six. The picture is a numpy array (size, size, 3) of uint8.
         """
         from torchrl_quad.render.video import draw_frame  # matplotlib is needed only here
 
         return draw_frame(self, drones, size)
 
-    # -- TorchRL's side ------------------------------------------------------------------------------------------------
-
     def _place(self, nominal: QuadrotorParams) -> None:
         """Build what holds tensors on the device and in the precision of the environment."""
-        for name, x in self.weights.items():
-            if isinstance(x, Tensor):
-                self.weights = {**self.weights, name: x.reshape(()).to(self.device, self.dtype)}
-        self.dynamics = self.config.build_dynamics(nominal)
-        self.disturbances = self.config.build_disturbances(self.dynamics)
+        self.dynamics = config.build_dynamics(nominal, self._options)
+        self.disturbances = config.build_disturbances(self.dynamics, self._options)
         self.randomness = Randomness(self.device, self.dtype)
 
     def _connect(self, safe_state: State, options: dict[str, Any] | None = None) -> None:
-        """Join what belongs together on one device: the step, what runs it, and its random numbers."""
+        """Join what belongs together on one device."""
         self.control_step = ControlStep(self, safe_state)
         self._run(options)
         sizes = {name: x.noise_size for name, x in self.disturbances.items()}
@@ -286,9 +258,9 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
 
     def reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool | None = None, **options: Any) -> Any:
         """As TorchRL's; of a mask and a state in one tensordict, ``set_state`` says which of them counts."""
-        is_said = set_state is not None or options.get("select_reset_only") or tensordict is None
+        is_said = set_state is not None or options.get("select_reset_only")
         # Of the two TorchRL 0.14 takes the state, and 0.15 the mask.
-        if not is_said and "_reset" in tensordict and "state" in tensordict:
+        if not is_said and tensordict is not None and {"_reset", "state"} <= set(tensordict.keys()):
             raise UserValueError(
                 'reset: the tensordict has a mask in "_reset" and a state. For fresh starts in the environments of the '
                 "mask write env.reset(tensordict, set_state=False); to set them to this state, set_state=True."
@@ -310,8 +282,8 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
             entries = self.control_step.reset(self.control_step.restore(tensordict.get("state"), source, mask))
         else:
             entries = self.randomness.starts(None if mask is None else mask.reshape(-1))
-        self._keep_for_render(entries["state"], mask)
-        return self._tensordict(entries)
+        self.render_state = merge_reset(self.render_state, visible_state(entries["state"]), mask)
+        return TensorDict(cast(Any, entries), [self.num_envs], self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action, step = cast(Tensor, tensordict.get("action", None)), self.control_step
@@ -319,8 +291,8 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
         state, valid = step.guard(guard.read_state(tensordict.get("state", None), step.safe_state, "step"))
         state, outputs = self._stepper.step(state, valid, action, self.randomness.noise())
         guard.check_finite(action)
-        self._keep_for_render(state)
-        return self._tensordict({"state": nested(state), **outputs})
+        self.render_state = visible_state(state)
+        return TensorDict(cast(Any, {"state": nested(state), **outputs}), [self.num_envs], self.device)
 
     def rollout(self, max_steps: int, policy: Any = None, callback: Any = None, **options: Any) -> TensorDictBase:
         """As TorchRL's, with the same numbers; several times faster with ``break_when_any_done=False``, no other option
@@ -336,17 +308,10 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Built):
                 state = guard.read_state(start.get("state"), self.control_step.safe_state, "rollout")
                 rollout = fly(self._stepper, self.randomness, policy, state, start, max_steps)
                 guard.check_finite(cast(Tensor, rollout["action"]))
-                self._keep_for_render(cast(TensorDict, rollout["next", "state"])[:, -1].clone())
+                self.render_state = visible_state(cast(TensorDict, rollout["next", "state"])[:, -1].clone())
                 return rollout
             options |= {"tensordict": start, "auto_reset": False}
         return super().rollout(max_steps, policy, callback, **options)
-
-    def _tensordict(self, entries: dict[str, Any]) -> TensorDict:
-        return TensorDict(cast(Any, entries), torch.Size([self.num_envs]), self.device)
-
-    def _keep_for_render(self, state: Any, mask: Tensor | None = None) -> None:
-        """Keep what render() draws, detached; with a mask, of the environments in it."""
-        self.render_state = merge_reset(self.render_state, visible_state(state), mask)
 
 
 QuadrotorEnv.__signature__ = config.full_signature(QuadrotorEnv, EnvBase)

@@ -29,12 +29,7 @@ MAX_WIND = 100.0  # [m/s]
 Speed = Annotated[float, between(0.0, MAX_SPEED)]
 BodyRate = Annotated[float, between(0.0, MAX_ANGULAR_VELOCITY)]
 Angle = Annotated[float, between(0.0, math.pi)]
-PositionNoise = Annotated[float, between(0.0, 100.0)]
-Speeds = Annotated[Sequence[Annotated[float, between(-MAX_WIND, MAX_WIND)]], entries(3, 3)]
-Spreads = Annotated[Sequence[Annotated[float, between(0.0, MAX_WIND)]], entries(3, 3)]
 _PAIR = Annotated[Sequence[Annotated[float, between(-1e6, 1e6)]], entries(2, 2)]
-Gust = Annotated[float, between(0.0, 0.2 * MAX_WIND)]
-GustTime = Annotated[float, between(1e-3, 1e6)]
 
 
 class Disturbance:
@@ -96,9 +91,9 @@ class DroneRandomization(Disturbance):
                     f"{source}: {name!r} belongs to the flight controller, which keeps the nominal drone; a random one "
                     "would change nothing. Give another drone instead."
                 )
-            if name not in plant_fields or name == "rotor_spin":
-                allowed = ", ".join(field for field in plant_fields if field != "rotor_spin")
-                raise UserValueError(f"{source}: unknown field {shown(name)}. Choose from: {allowed}.")
+            allowed = [field for field in plant_fields if field != "rotor_spin"]
+            if name not in allowed:
+                raise UserValueError(f"{source}: unknown field {shown(name)}. Choose from: {', '.join(allowed)}.")
             is_one = isinstance(distribution, Mapping) and len(distribution) == 1
             if not (is_one and set(distribution) <= set(_DISTRIBUTIONS)):
                 choices = "; ".join(f"{key}: {numbers}" for key, numbers in _DISTRIBUTIONS.items())
@@ -123,7 +118,6 @@ class DroneRandomization(Disturbance):
                 raise UserValueError(f"{source}: the drones that may be drawn are not all possible: {error}") from error
 
     def start(self, random: Randomness, state: State) -> State:
-        """Draw a drone for each start."""
         drawn = {}
         for name, nominal in self.nominal.items():
             shape = (len(state["position"]), *nominal.shape[-QuadrotorParams.dim(name) :])
@@ -156,10 +150,10 @@ class Wind(Disturbance):
         gust_time: the time after which a gust has decayed to 1/e, 0.001 to 1e6 s.
     """
 
-    mean: Speeds = (0.0, 0.0, 0.0)
-    spread: Spreads = (0.0, 0.0, 0.0)
-    gust: Gust = 0.0
-    gust_time: GustTime = 1.0
+    mean: Annotated[Sequence[Annotated[float, between(-MAX_WIND, MAX_WIND)]], entries(3, 3)] = (0.0, 0.0, 0.0)
+    spread: Annotated[Sequence[Annotated[float, between(0.0, MAX_WIND)]], entries(3, 3)] = (0.0, 0.0, 0.0)
+    gust: Annotated[float, between(0.0, 0.2 * MAX_WIND)] = 0.0
+    gust_time: Annotated[float, between(1e-3, 1e6)] = 1.0
 
     def __post_init__(self) -> None:
         strongest = max(abs(m) + s for m, s in zip(self.mean, self.spread, strict=True)) + 5.0 * self.gust
@@ -171,17 +165,14 @@ class Wind(Disturbance):
 
     @property
     def noise_size(self) -> int:
-        """Gusts need one number for each axis."""
         return 3 if self.gust else 0
 
     def start(self, random: Randomness, state: State) -> State:
-        """Draw mean winds, and gusts in their steady state."""
         n = len(state["position"])
         mean = random.tensor(self.mean) + random.tensor(self.spread) * random.uniform(n, 3)
         return {"mean_wind": mean, "wind": mean + self.gust * random.normal(n, 3) if self.gust else mean.clone()}
 
     def advance(self, state: State, noise: Tensor | None, dt: float) -> State:
-        """The wind a time dt [s] later."""
         if noise is None:
             return {}
         decay = math.exp(-dt / self.gust_time)
@@ -205,7 +196,7 @@ class Sensors(Disturbance):
         delay: control steps by which the readings lag behind, 0 to 1000.
     """
 
-    position: PositionNoise = 0.0
+    position: Annotated[float, between(0.0, 100.0)] = 0.0
     attitude: Angle = 0.0
     velocity: Speed = 0.0
     angular_velocity: BodyRate = 0.0
@@ -213,20 +204,16 @@ class Sensors(Disturbance):
 
     @property
     def noise_size(self) -> int:
-        """Three numbers for each of the four measurements."""
         return 12 if any((self.position, self.attitude, self.velocity, self.angular_velocity)) else 0
 
     def start(self, random: Randomness, state: State) -> State:
-        """A queue full of the first measurement."""
         noise = random.normal(len(state["position"]), 12) if self.noise_size else None
         return {"measurements": self._measure(state, noise).expand(-1, self.delay + 1, -1).clone()}
 
     def advance(self, state: State, noise: Tensor | None, dt: float) -> State:
-        """Measure once more, and forget the oldest measurement."""
         return {"measurements": torch.cat((state["measurements"][:, 1:], self._measure(state, noise)), 1)}
 
     def observe(self, state: State) -> State:
-        """The state with the oldest measurement instead of the truth."""
         position, attitude, velocity, angular_velocity = state["measurements"][:, 0].split((3, 4, 3, 3), -1)
         measured = {"position": position, "quaternion": attitude}
         return {**state, **measured, "velocity": velocity, "angular_velocity": angular_velocity}
@@ -265,7 +252,6 @@ class RandomStart(Disturbance):
     angular_velocity: BodyRate = 0.0
 
     def start(self, random: Randomness, state: State) -> State:
-        """Turn and push the starts of a task."""
         n = len(state["position"])
         heading, tilt = math.pi * random.uniform(n, 1), 0.5 * self.tilt * (random.uniform(n, 1) + 1.0)
         zero = torch.zeros_like(tilt)

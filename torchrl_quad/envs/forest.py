@@ -20,8 +20,7 @@ from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenes import ELSEWHERE, MAX_OBSTACLES, Scene, left_out
 from torchrl_quad.envs.terms import norm, outside
 from torchrl_quad.errors import UserTypeError, UserValueError
-from torchrl_quad.options import Size, between, entries
-from torchrl_quad.vision import has_way
+from torchrl_quad.options import Size, between, checked, entries
 
 #: Trees per square metre, and the least gap between two of them [m].
 DIFFICULTIES = {"easy": (0.04, 1.5), "middle": (0.08, 1.2), "hard": (0.12, 0.9)}
@@ -30,8 +29,6 @@ PLACES = 12  # that are tried for a tree before it is left out
 Density = Annotated[float, between(0.0, 2.0)]
 Gap = Annotated[float, between(0.1, 10.0)]
 Length = Annotated[float, between(1.0, 1_000.0)]
-Radii = Annotated[Sequence[Annotated[float, between(0.01, 10.0)]], entries(2, 2)]
-Height = Annotated[float, between(0.1, 100.0)]
 Speed = Annotated[float, between(0.1, 30.0)]
 Speeds = Annotated[Sequence[Speed], entries(2, 2)]
 
@@ -80,11 +77,8 @@ class ForestEnv(QuadrotorEnv):
         observe_velocity: whether the policy observes its velocity.
         camera: as for :class:`~torchrl_quad.envs.QuadrotorEnv`; a mapping changes the camera of 16 x 12 pixels, 90
             degrees and 10 m. None flies without one.
-        scene: replaces the random forest, as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
+        scene: replaces the random forest, as for :class:`~torchrl_quad.envs.QuadrotorEnv`; see that it leaves a way.
         **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
-
-    Raises:
-        ValueError: the scene leaves no way through.
     """
 
     length, half_width, ceiling = 30.0, 8.0, 4.0  # [m]
@@ -131,19 +125,6 @@ class ForestEnv(QuadrotorEnv):
     def set_up(self) -> None:
         self.centre = self.tensor([0.5 * (self.length - self.before), 0.0, 0.0])
         self.extent = self.tensor([0.5 * (self.length + self.before) + 1.0, self.half_width])
-        fixed, radius, top = self.scene.touchable, self.scene.radius, self.ceiling
-        if not fixed.total:
-            return
-        start = self.tensor([-self.run_up[0], 0.0, self.cruise_height])
-        goal = self.tensor([self.length, 0.0, self.cruise_height])
-        low = self.tensor([-self.before, -self.half_width, radius])
-        high = self.tensor([self.length + 1.0, self.half_width, top])
-        if not has_way(fixed, start, goal, low, high, radius):
-            raise UserValueError(
-                f"{self.scene.source}: the obstacles leave no way from (x, y, z) = (-1, 0, 1.5) to (30, 0, 1.5) m, "
-                f"within {self.half_width:g} m to both sides and below {top:g} m, for a drone of radius {radius:.3g} m."
-                " Take some away, or open a gap."
-            )
 
     def initial_state(self, n: int) -> State:
         across, along, up = self.uniform(3, n, 1)
@@ -229,6 +210,7 @@ class ForestEnv(QuadrotorEnv):
         return Markers(progress="distance", success=self.length)
 
 
+@checked
 class Forest(Scene):
     """A random forest on flat ground: a new one in each episode, whose trees keep a gap between each other.
 
@@ -237,19 +219,13 @@ class Forest(Scene):
     so enclose nothing: there is a way through.
 
     Args:
-        density: trees per square metre, 0 to 2.
-        gap: the least distance between the surfaces of two trees, 0.1 to 10 m.
-        length: of the forest, along x from 0, 1 to 1000 m.
-        half_width: to both sides of y = 0, 1 to 1000 m.
+        density: trees per square metre, 0 to 2; at most 1000 in all.
+        gap: the least distance between the surfaces of two trees, 0.1 to 10 m, more than the drone's diameter.
+        length, half_width: of the forest, along x from 0, and to both sides of y = 0, 1 to 1000 m.
         radius: the least and the greatest radius of a tree, 0.01 to 10 m.
         height: of all trees, 0.1 to 100 m.
         **options: as for :class:`~torchrl_quad.Scene`, but for ground and source.
-
-    Raises:
-        ValueError: there are more than 1000 trees; (in use) the drone is as wide as the gap.
     """
-
-    is_drawn_elsewhere = True
 
     def __init__(
         self,
@@ -258,8 +234,8 @@ class Forest(Scene):
         length: Length = 30.0,
         half_width: Length = 8.0,
         *,
-        radius: Radii = (0.1, 0.4),
-        height: Height = 6.0,
+        radius: Annotated[Sequence[Annotated[float, between(0.01, 10.0)]], entries(2, 2)] = (0.1, 0.4),
+        height: Annotated[float, between(0.1, 100.0)] = 6.0,
         **options: Any,
     ) -> None:
         if radius[0] > radius[1]:

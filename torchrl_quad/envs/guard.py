@@ -27,15 +27,10 @@ MAX_STEPS = 2**31  # since the start of an episode
 
 
 class Guard:
-    """Replaces meaningless states: what is not finite, or beyond the bounds of the model.
+    """Replaces meaningless states, not finite or beyond the model, by a safe one, which names and shapes are read from.
 
     The task's own entries are replaced only where they are out of bounds. Selecting before the physics keeps
     gradients clean: a gradient of zero never meets an infinite derivative.
-
-    Args:
-        safe_state: takes over where a state is meaningless; names and shapes are read from it, too.
-        dynamics: has the bounds of its own entries.
-        task_entries: the names of the task's own entries.
     """
 
     def __init__(self, safe_state: State, dynamics: Dynamics, task_entries: list[Key]) -> None:
@@ -105,30 +100,23 @@ class Containment:
         self, state: State, action: Tensor, params: QuadrotorParams
     ) -> tuple[State, Tensor, QuadrotorParams | RawParams]:
         """The same values, whose gradients come back only from meaningful environments."""
-        keys = [key for key, x in state.items() if x.requires_grad]
-        if not (keys or action.requires_grad or params.requires_grad):
-            return state, action, params
-        action, *values = _Contain.apply(self, action, *(state[key] for key in keys))
-        state = {**state, **dict(zip(keys, values, strict=True))}
+        state = {key: self._contained(x) for key, x in state.items()}
         fields = {name: x for name, x in params.fields().items() if x.requires_grad}
-        if not fields:
-            return state, action, params
-        each = (x if x.dim() > params.dim(name) else x.unsqueeze(0) for name, x in fields.items())
-        each = _Contain.apply(self, *(x.expand(len(action), *x.shape[1:]) for x in each))
-        return state, action, RawParams(**{**params.fields(), **dict(zip(fields, each, strict=True))})
+        for name, x in fields.items():
+            each = x if x.dim() > params.dim(name) else x.unsqueeze(0)
+            fields[name] = self._contained(each.expand(len(action), *each.shape[1:]))
+        flown = RawParams(**{**params.fields(), **fields}) if fields else params
+        return state, self._contained(action), flown
 
+    def _contained(self, x: Tensor) -> Tensor:
+        if not x.requires_grad:
+            return x
+        x = x.view_as(x)
+        x.register_hook(self._kept)
+        return x
 
-class _Contain(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, containment: Containment, *values: Tensor) -> tuple[Tensor, ...]:
-        ctx.containment = containment
-        ctx.set_materialize_grads(False)
-        return tuple(x.view_as(x) for x in values)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        keep = ctx.containment.valid.unsqueeze(1)
-        return None, *(None if g is None else torch.where(like(keep, g), g, 0.0) for g in grads)
+    def _kept(self, grad: Tensor | None) -> Tensor | None:
+        return None if grad is None else torch.where(like(self.valid.unsqueeze(1), grad), grad, 0.0)
 
 
 def is_true(flags: Tensor) -> bool:
@@ -136,33 +124,39 @@ def is_true(flags: Tensor) -> bool:
     return looks_are_free(flags.device) and not is_traced() and bool(flags.all())
 
 
-# -- checks of states and actions --------------------------------------------------------------------------------------
+def read_state(state: Any, safe_state: State, source: str, convert: bool = False) -> State:
+    """The entries of a state (a tensordict), if all are there with the right shape, precision and device.
 
-
-def read_state(state: Any, safe_state: State, source: str) -> State:
-    """The entries of a state (a tensordict), if all are there with the right shape, precision and device."""
-    given = dict(as_tensordict(state, source).items())  # reading all names at once is quicker than one by one
+    With ``convert`` the kind of their numbers must be right, and they become copies of the right precision and device.
+    """
+    if not isinstance(state, TensorDictBase):
+        got = type(state).__name__
+        raise UserValueError(f'{source}: a state is a tensordict, such as env.reset()["state"]; got {got}.')
+    given: Any = dict(state.items())  # reading all names at once is quicker than one by one
     entries: dict[Any, Any] = {
         key: state.get(key, None) if isinstance(key, tuple) else given.get(key) for key in safe_state
     }
     for key, x in entries.items():
         expected = safe_state[key]
-        if x is None or x.shape != expected.shape or x.dtype != expected.dtype or x.device != expected.device:
+        fits = x is not None and x.shape == expected.shape
+        if convert and fits and kind_of(x) == kind_of(expected):
+            entries[key] = x.to(expected, copy=True)
+        elif convert or not fits or x.dtype != expected.dtype or x.device != expected.device:
             raise entry_error(entries, key, safe_state, source)
     return entries
 
 
 def check_action(action: Tensor | None, example: Tensor) -> None:
     """Check that an action is (n, 4), of the precision and on the device of an example (n, ...)."""
-    n, dtype, device = len(example), example.dtype, example.device
+    n, dtype = len(example), example.dtype
     if action is None or action.shape != (n, 4):
         got = "there is none" if action is None else f"got {tuple(action.shape)}"
         raise UserValueError(
-            f"The action must have shape ({n}, 4), named in env.action_units, for each environment; {got}. A "
-            'policy writes it under "action", as make_actor(env) does.'
+            f"The action must have shape ({n}, 4), named in env.action_units, for each environment; {got}. A policy "
+            'writes it under "action", as make_actor(env) does.'
         )
-    if action.device != device:
-        raise UserValueError(f"The action is on {action.device}, and the environment on {device}.")
+    if action.device != example.device:
+        raise UserValueError(f"The action is on {action.device}, and the environment on {example.device}.")
     if action.dtype != dtype:
         raise UserValueError(
             f"The action is {action.dtype}, and the environment flies in {dtype}. Convert the policy, "
@@ -171,15 +165,8 @@ def check_action(action: Tensor | None, example: Tensor) -> None:
 
 
 def check_finite(action: Tensor) -> None:
-    """Check that actions (n, 4), or (n, time, 4) of a horizon, are finite.
-
-    Raises:
-        ValueError: some are not, with their environments and the first step.
-    """
-    if is_traced():
-        return
-    finite = action.isfinite().all(-1)
-    if finite.all():
+    """Check that actions (n, 4), or (n, time, 4) of a horizon, are finite."""
+    if is_traced() or (finite := action.isfinite().all(-1)).all():
         return
     broken = ~finite if action.dim() == 3 else ~finite.unsqueeze(1)
     at = f", first at step {broken.any(0).nonzero()[0].item()} of the rollout" if action.dim() == 3 else ""
@@ -194,14 +181,6 @@ def first_ten(flags: Tensor) -> str:
     """The indices of the first flags (n) that are set, for a message."""
     who = flags.nonzero().flatten().tolist()
     return ", ".join(map(str, who[:10])) + (", ..." if len(who) > 10 else "")
-
-
-def as_tensordict(state: object, source: str) -> Any:
-    """The state, if it is a tensordict."""
-    if isinstance(state, TensorDictBase):
-        return state
-    got = type(state).__name__
-    raise UserValueError(f'{source}: a state is a tensordict, such as env.reset()["state"]; got {got}.')
 
 
 def kind_of(x: Tensor) -> str:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -19,7 +18,6 @@ from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import Real, Share, accepted, between, checked
 from torchrl_quad.vision.primitives import SIZES
 
-MAX_POINTS = 1_000_000  # of an object; no picture shows more
 Length = Annotated[float, between(1e-6, 1e6)]  # [m]
 _COLOR = "written as #rrggbb, such as #c8452f"
 Color = Annotated[Any, accepted(lambda x: isinstance(x, str) and bool(re.fullmatch("#[0-9a-fA-F]{6}", x)), _COLOR)]
@@ -32,34 +30,22 @@ class Shape:
     """An object that does not move: an obstacle, a wall, a path. Figures, films and replays draw it.
 
     The class methods make the usual ones. ``Shape(points, faces)`` takes any mesh, such as
-    ``Shape(mesh.vertices, mesh.faces)`` of trimesh.
-
-    Args:
-        points: (n, 3) [m], world frame; a line has a gap where a point is NaN.
-        faces: the corners of triangles, as indices of points (m, 3); None for a line.
-        name: of the object in the legend.
-        color: of lines and surfaces.
-        opacity: of a surface, above 0, at most 1.
+    ``Shape(mesh.vertices, mesh.faces)`` of trimesh. The opacity is that of a surface, above 0, at most 1.
     """
 
-    points: Any  # a tensor, once it is built
-    faces: Any = None
-    name: str = ""
-    color: Color = "#6b7a90"
-    opacity: Share = 0.35
+    points: Any  #: (n, 3) [m], world frame; a line has a gap where a point is NaN
+    faces: Any = None  #: the corners of triangles, as indices of points (m, 3); None for a line
+    name: str = ""  #: in the legend
+    color: Color = "#6b7a90"  # of lines and surfaces
+    opacity: Share = 0.35  # of a surface, above 0, at most 1
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", as_points("Shape: points", self.points))
-        if self.faces is None:
-            return
-        faces, n = as_numbers(self.faces), len(self.points)
-        is_triangles = faces is not None and faces.dim() == 2 and faces.shape[1] == 3
-        if faces is None or not (is_triangles and ((faces >= 0) & (faces < n) & (faces == faces.floor())).all()):
-            got = type(self.faces).__name__ if faces is None else f"shape {tuple(faces.shape)}"
-            raise UserValueError(
-                f"Shape: faces must be indices (m, 3) of its {n} points, three for each triangle; got {got}."
-            )
-        object.__setattr__(self, "faces", faces.long())
+        if self.faces is not None:
+            faces = as_numbers(self.faces)
+            if faces is None or faces.dim() != 2 or faces.shape[1] != 3 or not 0 <= faces.max() < len(self.points):
+                raise UserValueError(f"Shape: faces must be indices (m, 3) of its {len(self.points)} points.")
+            object.__setattr__(self, "faces", faces.long())
 
     @classmethod
     def line(cls, points: object, **style: Any) -> Shape:
@@ -110,29 +96,20 @@ class Shape:
 def as_points(what: str, points: object) -> Tensor:
     """Points (n, 3) as pictures take them: on the CPU, in single precision, without gradient."""
     found = as_numbers(points)
-    if found is None:
-        raise UserValueError(f"{what} must be points (n, 3) [m], got {shown(points)}.")
-    if found.dim() != 2 or found.shape[1] != 3 or not len(found):
-        raise UserValueError(f"{what} must be points (n, 3) [m], got shape {tuple(found.shape)}.")
+    if found is None or found.dim() != 2 or found.shape[1] != 3 or not len(found):
+        got = shown(points) if found is None else f"shape {tuple(found.shape)}"
+        raise UserValueError(f"{what} must be points (n, 3) [m], got {got}.")
     return found
 
 
 def as_numbers(values: Any) -> Tensor | None:
     """A tensor, an array, or a list of numbers, or of any of these, on the CPU, in single precision; None if none."""
-    parts = values[:MAX_POINTS] if isinstance(values, list | tuple) else ()
-    if not all(map(_is_few, (values, *parts))):
-        return None
     try:
-        if parts:
-            values = torch.stack([torch.as_tensor(x).detach().cpu().float() for x in parts])
+        if isinstance(values, list | tuple) and values:
+            values = torch.stack([torch.as_tensor(x).detach().cpu().float() for x in values])
         return torch.as_tensor(values).detach().cpu().float()
     except (TypeError, ValueError, RuntimeError, OverflowError):
         return None
-
-
-def _is_few(values: Any) -> bool:
-    is_one = isinstance(values, Tensor | np.ndarray) or not hasattr(values, "__len__")
-    return is_one or len(values) <= MAX_POINTS
 
 
 def along_the_course(gates: Tensor) -> Tensor:
@@ -161,29 +138,19 @@ class Markers:
     """What pictures show in addition to the drones; positions are in m, in the world frame.
 
     Without places, a curve, or gates that are the targets, pictures also show where the entry ``target`` (num_envs, 3)
-    of the state has been in the flight.
-
-    Args:
-        target: the name of the target, as in "distance to the target".
-        places: targets that do not move (k, 3).
-        curve: a line (m, 3) along which the target moves.
-        gates: centres of gates (k, 3), in the order of flight.
-        gate_radius: of all gates, or of each (k) [m].
-        gate_axes: the direction (k, 3) in which each gate is flown; by default along the course.
-        shapes: other objects.
-        progress: the metric that best shows how a flight goes; by default the distance to the target.
-        success: the value of the progress, in SI units, from which a state fulfils the task.
+    of the state has been in the flight. ``success`` is the value of the progress, in SI units, from which a state
+    fulfils the task.
     """
 
-    target: str = "target"
-    places: Tensor | None = None
-    curve: Tensor | None = None
-    gates: Tensor | None = None
-    gate_radius: float | Tensor = 0.3
-    gate_axes: Tensor | None = None
-    shapes: Sequence[Shape] = ()
-    progress: str | None = None
-    success: Real | None = None
+    target: str = "target"  #: the name of the target, as in "distance to the target"
+    places: Tensor | None = None  #: targets that do not move (k, 3)
+    curve: Tensor | None = None  #: a line (m, 3) along which the target moves
+    gates: Tensor | None = None  #: centres of gates (k, 3), in the order of flight
+    gate_radius: float | Tensor = 0.3  #: of all gates, or of each (k) [m]
+    gate_axes: Tensor | None = None  #: the direction (k, 3) in which each gate is flown; by default along the course
+    shapes: Sequence[Shape] = ()  #: other objects
+    progress: str | None = None  #: the metric that best shows how a flight goes; None for the distance to the target
+    success: Real | None = None  # the value of the progress, in SI units, from which a state fulfils the task
 
     def __post_init__(self) -> None:
         for name in ("places", "curve", "gates", "gate_axes"):
@@ -213,7 +180,7 @@ class Markers:
         return [x for x in everything if x is not None]
 
 
-def visible_state(state: Mapping[Any, Any]) -> State:
+def visible_state(state: Any) -> State:
     """The entries of a state, nested or not, that pictures show: ``position``, ``quaternion``, ``target`` if it is a
     position, and the random obstacles of a scene."""
     shown: State = {key: state[key] for key in ("position", "quaternion")}

@@ -10,7 +10,6 @@ from typing import Literal, cast
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import Scale, checked
 
 
@@ -19,23 +18,16 @@ from torchrl_quad.options import Scale, checked
 class Metric:
     """How a metric is averaged over episodes, printed, and drawn.
 
-    Values themselves are in SI units everywhere; only print and pictures use ``scale`` and ``unit``.
-
-    Args:
-        label: its name in prose, such as "position error".
-        unit: in print, such as "cm".
-        scale: how many of these units make one SI unit, 100 for cm.
-        median: whether its average is the median instead of the mean, which a few crashes would dominate.
-        log: whether it is drawn on a logarithmic axis.
-        goal: "max" if more is better, "min" if less is; wandb keeps the best value of such a metric.
+    Values themselves are in SI units everywhere; only print and pictures use ``unit``, and ``scale``, how many
+    of these units make one SI unit.
     """
 
-    label: str
-    unit: str = ""
-    scale: Scale = 1.0
-    median: bool = False
-    log: bool = False
-    goal: Literal["max", "min"] | None = None
+    label: str  #: its name in prose, such as "position error"
+    unit: str = ""  #: in print, such as "cm"
+    scale: Scale = 1.0  # how many of these units make one SI unit, 100 for cm
+    median: bool = False  #: whether its average is the median instead of the mean, which a few crashes would dominate
+    log: bool = False  #: whether it is drawn on a logarithmic axis
+    goal: Literal["max", "min"] | None = None  #: whether more or less is better; wandb keeps the best value
 
     @property
     def is_length(self) -> bool:
@@ -88,21 +80,3 @@ def at_episode_end(rollout: TensorDictBase, value: Tensor) -> Tensor:
     """A value (num_envs, time, 1) at the last step of the first episode of each environment, (num_envs)."""
     last = first_episode(rollout).sum(1, keepdim=True) - 1
     return value.gather(1, last).flatten()
-
-
-def summarise_episodes(rollout: TensorDictBase) -> dict[str, Tensor]:
-    """Judge the first episode of each environment; see ``QuadrotorEnv.episode_metrics``."""
-    missing = [name for name in ("crash", "success", "reward", "done") if ("next", name) not in rollout]
-    if missing:
-        raise UserValueError(
-            f'episode_metrics reads ("next", {missing[0]!r}), which is not in the rollout. Judge a rollout before you '
-            "leave out entries, and evaluate without the transform that drops this one."
-        )
-    reward, measured = read(rollout, "reward"), cast(Mapping, rollout.get(("next", "metrics"), {}))
-    crash, success = (at_episode_end(rollout, read(rollout, name)) for name in ("crash", "success"))
-    return {
-        "return": (reward * first_episode(rollout)).sum(1).squeeze(-1),
-        "crash": crash.to(reward.dtype),
-        "solved": (success & ~crash).to(reward.dtype),
-        **{name: at_episode_end(rollout, value) for name, value in measured.items()},
-    }

@@ -133,8 +133,12 @@ class RacingEnv(QuadrotorEnv):
 
     def advance(self, previous: State, state: State) -> State:
         gate, step = previous["gate"], state["step"]
-        centre = self.gates[gate[:, 0]]
-        passed = self.miss(previous["position"], state["position"], centre) < self.track["gate_radius"]
+        with torch.no_grad():  # how close to the gate the straight line between the two positions comes
+            start, centre = previous["position"], self.gates[gate[:, 0]]
+            line = state["position"] - start
+            along = ((centre - start) * line).sum(-1, keepdim=True)
+            fraction = (along / line.square().sum(-1, keepdim=True).clamp_min(1e-12)).clamp(0.0, 1.0)
+            passed = terms.norm(start + fraction * line - centre) < self.track["gate_radius"]
         this_gate = passed & (gate == self.gate_indices)
         last_pass = previous["pass_step"].gather(1, gate)
         lap = (step - last_pass).to(self.dtype) * self.control_dt
@@ -148,15 +152,6 @@ class RacingEnv(QuadrotorEnv):
             "pass_step": torch.where(this_gate, step, previous["pass_step"]),
             "lap_time": torch.where(passed & (last_pass >= 0), lap, previous["lap_time"]),
         }
-
-    @staticmethod
-    def miss(start: Tensor, end: Tensor, point: Tensor) -> Tensor:
-        """How close to a point (*, 3) the straight line between two positions (*, 3) comes, (*, 1) [m]."""
-        with torch.no_grad():
-            line = end - start
-            along = ((point - start) * line).sum(-1, keepdim=True)
-            fraction = (along / line.square().sum(-1, keepdim=True).clamp_min(1e-12)).clamp(0.0, 1.0)
-            return terms.norm(start + fraction * line - point)
 
     def events(self, previous: State, state: State) -> dict[str, terms.Event]:
         """``gate``: the drone enters the sphere of the gate that it passes in this step."""
@@ -188,12 +183,9 @@ class RacingEnv(QuadrotorEnv):
                 "across": -self.weights["across"] * across / (gap + 1.0),
                 "angular_velocity": -self.weights["angular_velocity"] * terms.norm(state["angular_velocity"]),
             }
-        if self.gate_bonus == "log":
-            bonus = -torch.log(gap + 0.01)
-        elif self.gate_bonus == "reciprocal":
-            bonus = 1.0 / (gap + 0.05)
-        else:
-            bonus = state["gate_passed"].to(self.dtype)
+        bonus = state["gate_passed"].to(self.dtype)
+        if self.gate_bonus != "binary":
+            bonus = -torch.log(gap + 0.01) if self.gate_bonus == "log" else 1.0 / (gap + 0.05)
         return {**rewards, "gate": self.weights["gate"] * bonus}
 
     def is_crash(self, state: State) -> Tensor:

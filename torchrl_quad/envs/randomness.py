@@ -23,10 +23,6 @@ class Randomness:
 
     On an accelerator, reading who needs a start would need a synchronisation. There the 32 steps have one draw of
     starts, made with their noise, and an episode that ends again takes the start of the environment after its own.
-
-    Args:
-        device: of the generator and of all it draws.
-        dtype: floating-point type of what it draws.
     """
 
     def __init__(self, device: torch.device, dtype: torch.dtype) -> None:

@@ -1,11 +1,9 @@
-"""The tasks by name: those of this package, those that programs register, and those of installed packages."""
+"""The tasks by name: those of this package, and those that programs register."""
 
 from __future__ import annotations
 
-import functools
 import inspect
 import re
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from torchrl_quad.envs.base import QuadrotorEnv
@@ -17,7 +15,6 @@ from torchrl_quad.envs.tracking import TrackingEnv
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.options import imported
 
-GROUP = "torchrl_quad.tasks"  # the group of entry points by which an installed package offers its tasks
 # The tasks of this package, and those that register_task has added.
 TASKS: dict[str, type[QuadrotorEnv]] = {
     "forest": ForestEnv,
@@ -32,13 +29,11 @@ def register_task(name: str, cls: type[QuadrotorEnv]) -> None:
     """Name your own task, for ``make_env``, gymnasium, and a recipe in the same program.
 
     After ``register_task("window", WindowEnv)`` you can write ``make_env("window")`` and
-    ``gymnasium.make("torchrl_quad/Window-v0")``. An installed package offers its tasks to every program by an entry
-    point of the group "torchrl_quad.tasks": ``window = "mypackage:WindowEnv"``. A class that Python can import needs no
-    name: ``make_env("mypackage.WindowEnv")``.
+    ``gymnasium.make("torchrl_quad/Window-v0")``. A class that Python can import needs no name:
+    ``make_env("mypackage.WindowEnv")``.
 
-    Args:
-        name: in small letters, digits and underscores, such as "window" or "fly_through".
-        cls: the class, which defines all that :class:`~torchrl_quad.envs.Task` asks for.
+    The name is in small letters, digits and underscores; the class defines all that :class:`~torchrl_quad.envs.Task`
+    asks for.
 
     Raises:
         ValueError: the name is not of this form, or another class has it.
@@ -49,9 +44,9 @@ def register_task(name: str, cls: type[QuadrotorEnv]) -> None:
             f"A task's name is in small letters, digits and underscores, such as 'window'; got {shown(name)}."
         )
     _checked_class(cls, f"register_task({name!r}, ...)")
-    taken = TASKS.get(name)
-    if taken is not None and _path(taken) != _path(cls):  # a module that runs again, as in a notebook, may
-        raise UserValueError(f"The task {name!r} is {_path(taken)} already. Choose another name for {_path(cls)}.")
+    taken, own = (f"{x.__module__}.{x.__qualname__}" for x in (TASKS.get(name, cls), cls))
+    if taken != own:  # a module that runs again, as in a notebook, may
+        raise UserValueError(f"The task {name!r} is {taken} already. Choose another name for {own}.")
     TASKS[name] = cls
     from torchrl_quad import register_envs  # which needs the package whole
 
@@ -59,8 +54,8 @@ def register_task(name: str, cls: type[QuadrotorEnv]) -> None:
 
 
 def available_tasks() -> list[str]:
-    """The names that :func:`make_env` knows, with those of installed packages."""
-    return sorted({*TASKS, *_offered()})
+    """The names that :func:`make_env` knows."""
+    return sorted(TASKS)
 
 
 def task_class(task: str) -> type[QuadrotorEnv]:
@@ -68,17 +63,10 @@ def task_class(task: str) -> type[QuadrotorEnv]:
 
     Raises:
         ValueError: there is no such task.
-        TypeError: what the path or an entry point leads to is no class of a task, or lacks methods.
+        TypeError: what the path leads to is no class of a task, or lacks methods.
     """
     if isinstance(task, str) and task in TASKS:
         return TASKS[task]
-    offers = _offered().get(task, []) if isinstance(task, str) else []
-    if len(offers) > 1:
-        raise UserValueError(
-            f"Several packages offer a task {task!r}: {', '.join(x.value for x in offers)}. Remove all but one."
-        )
-    if offers:
-        return _checked_class(offers[0].load(), f"The entry point {task} = {offers[0].value!r}")
     if isinstance(task, str) and re.fullmatch(r"\w+(\.\w+)+", task):
         return _checked_class(imported(task), f"task {task!r}")
     raise UserValueError(
@@ -90,22 +78,11 @@ def task_class(task: str) -> type[QuadrotorEnv]:
 def make_env(task: str, **kwargs: Any) -> QuadrotorEnv:
     """Build a task by its name: ``make_env("hovering", num_envs=64)``; the keywords go to the environment.
 
-    :func:`register_task` names your own task.
-
     Raises:
         ValueError: the task is unknown, or an argument is out of its range.
         TypeError: a keyword is unknown.
     """
     return task_class(task)(**kwargs)
-
-
-@functools.cache
-def _offered() -> dict[str, list[EntryPoint]]:
-    """The entry points of installed packages by name; none of them is loaded."""
-    offers: dict[str, list[EntryPoint]] = {}
-    for point in entry_points(group=GROUP):
-        offers.setdefault(point.name, []).append(point)
-    return offers
 
 
 def _checked_class(cls: Any, source: str) -> type[QuadrotorEnv]:
@@ -118,19 +95,10 @@ def _checked_class(cls: Any, source: str) -> type[QuadrotorEnv]:
     return cls
 
 
-def _path(cls: type) -> str:
-    return f"{cls.__module__}.{cls.__qualname__}"
-
-
-def _set_time_limits() -> None:
-    """Give gymnasium's ids of this package the episode lengths, where there is gymnasium."""
-    try:
-        from gymnasium import registry
-    except ModuleNotFoundError:
-        return
-    for name, cls in TASKS.items():
-        if spec := registry.get(f"torchrl_quad/{name.capitalize()}-v0"):
-            spec.max_episode_steps = inspect.signature(cls).parameters["max_episode_steps"].default
-
-
-_set_time_limits()
+try:  # gymnasium's ids of this package get the episode lengths, where there is gymnasium
+    from gymnasium import registry as _ids
+except ModuleNotFoundError:
+    _ids = {}
+for _name, _cls in TASKS.items():
+    if _spec := _ids.get(f"torchrl_quad/{_name.capitalize()}-v0"):
+        _spec.max_episode_steps = inspect.signature(_cls).parameters["max_episode_steps"].default

@@ -30,8 +30,6 @@ SMALLEST = 1e-3  # [m], of an obstacle: what single precision resolves at a dist
 TOLERANCE = 1e-3  # [m], by which a state may lie nearer to an obstacle than a flight would have left it
 Obstacles = Sequence[Mapping[str, Any]]
 Count = Annotated[int, between(1, MAX_OBSTACLES)]
-Clearance = Annotated[float, between(0.0, 100.0)]
-Radius = Annotated[float, between(1e-3, 10.0)]
 
 # The fields of an obstacle by kind, with the number of their entries; the first is where it stands.
 _FIELDS = {
@@ -68,10 +66,8 @@ class Scene(Disturbance):
 
     Args:
         ground: whether there is the plane z = 0.
-        spheres: a list of mappings with centre, and radius; lengths are 0.001 to 10,000 m, coordinates within 10 km.
-        cylinders: a list of mappings with base, radius and height.
-        boxes: a list of mappings with centre, size, and yaw or quaternion.
-        walls: a list of mappings with point and normal, all fixed.
+        spheres, cylinders, boxes, walls: lists of mappings as above; walls are all fixed. Lengths are 0.001 to 10,000
+            m, coordinates within 10 km.
         clearance: the least distance from the drone's surface to random obstacles at its start, and at its target, 0 to
             100 m.
         drone_radius: of the sphere around the drone's centre that must not touch anything, 0.001 to 10 m; by default
@@ -82,7 +78,6 @@ class Scene(Disturbance):
         ValueError: an obstacle is not one, or (in use) a drone would start within one.
     """
 
-    is_drawn_elsewhere = False  #: whether a subclass draws obstacles that its arguments do not name
     constants: Primitives  #: the fixed obstacles, in the precision and on the device of a drone
     touchable: Primitives  #: the same without the ground
     radius: float  #: of the drone [m]
@@ -95,8 +90,8 @@ class Scene(Disturbance):
         cylinders: Obstacles = (),
         boxes: Obstacles = (),
         walls: Obstacles = (),
-        clearance: Clearance = 0.3,
-        drone_radius: Radius | None = None,
+        clearance: Annotated[float, between(0.0, 100.0)] = 0.3,
+        drone_radius: Annotated[float, between(1e-3, 10.0)] | None = None,
         source: str = "scene",
     ) -> None:
         self.source, self.ground, self.clearance, self.drone_radius = source, ground, clearance, drone_radius
@@ -110,13 +105,8 @@ class Scene(Disturbance):
         count = sum(len(x) for x in self.fixed.values()) + sum(x["count"] for y in self.random.values() for x in y)
         if count > MAX_OBSTACLES:
             raise UserValueError(f"{count:,} obstacles are too many; the maximum is {MAX_OBSTACLES:,}.")
-        if not (count or self.is_drawn_elsewhere):
+        if not count:
             raise UserValueError("a scene needs an obstacle or the ground: give it one.")
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        if "__init__" in vars(cls):
-            checked(cls)
 
     @classmethod
     def of(cls, spec: Scene | str | Path | Mapping[str, Any]) -> Scene:
@@ -132,10 +122,11 @@ class Scene(Disturbance):
         fixed = {kind: like.new_tensor(self.fixed[kind]).reshape(1, -1, size) for kind, size in SIZES.items()}
         own.constants = Primitives(**fixed)
         own.touchable = own.constants._replace(planes=own.constants.planes[:, int(self.ground) :])
-        own.radius = drone_radius(nominal) if self.drone_radius is None else self.drone_radius
+        # As large as propellers can be without touching each other.
+        rotors = nominal.rotor_positions.detach().reshape(-1, 4, 2)[0]
+        reach = (rotors.norm(dim=-1).max() + 0.5 * torch.pdist(rotors).min()).item()
+        own.radius = reach if self.drone_radius is None else self.drone_radius
         return own
-
-    # -- what it draws -------------------------------------------------------------------------------------------------
 
     def draw(self, random: Randomness, state: State) -> dict[str, Tensor]:
         """The random obstacles (n, m, ...) by kind, for drones that start in a state; a subclass may draw others."""
@@ -153,7 +144,7 @@ class Scene(Disturbance):
         drawn: State = {("scene", kind): x for kind, x in self.draw(random, state).items()}
         state = {**state, **drawn}
         if looks_are_free(random.device):
-            for problem, where in self._too_close(state).items():
+            for problem, where in self.problems(state).items():
                 if where.any():
                     place = [round(x, 2) for x in state["position"][where][0].tolist()]
                     raise UserValueError(
@@ -161,8 +152,6 @@ class Scene(Disturbance):
                         "them."
                     )
         return {**drawn, "collided": torch.zeros_like(state["position"][:, :1], dtype=torch.bool)}
-
-    # -- what a task may ask -------------------------------------------------------------------------------------------
 
     def solids(self, state: State, ground: bool = True) -> Primitives:
         """All obstacles of the scenes of a state, with the ground or without it."""
@@ -186,56 +175,31 @@ class Scene(Disturbance):
         return closest_approach(solids, before["position"], state["position"]) < self.radius
 
     def problems(self, state: State) -> dict[str, Tensor]:
-        """What is wrong with a state to start from, in words, and where, bool (n)."""
-        wrong = self._too_close(state)
-        for kind, first, last in (("spheres", 3, 4), ("cylinders", 3, 5), ("boxes", 3, 6)):
-            if (x := state.get(("scene", kind))) is not None:
-                small = (x[..., first:last] <= 0.0).flatten(1).any(1)
-                wrong[f"('scene', {kind!r}) must have sizes above 0"] = small
-        for kind, first, last in (("boxes", 6, 10), ("planes", 0, 3)):  # an attitude, and a normal
-            if (x := state.get(("scene", kind))) is not None:
-                length = x[..., first:last].square().sum(-1)
-                wrong[f"('scene', {kind!r}) must be turned by unit vectors"] = ((length - 1.0).abs() > 1e-2).any(1)
-        return wrong
-
-    def _too_close(self, state: State) -> dict[str, Tensor]:
         solids = self.solids(state, ground=False)
         if not solids.total:
             return {}
         inside = nearest(solids, state["position"])[0] < self.radius - TOLERANCE
         return {f"an obstacle stands within {self.radius:.3g} m of 'position', the radius of the drone": inside[:, 0]}
 
-    # -- reading -------------------------------------------------------------------------------------------------------
-
     def _read(self, kind: str, obstacle: Mapping[str, Any]) -> None:
         """Add an obstacle to the fixed or to the random ones."""
-        fields, solids = dict(_FIELDS[kind]), "planes" if kind == "walls" else kind
-        is_random = "count" in obstacle and kind != "walls"
+        fields, is_random = dict(_FIELDS[kind]), "count" in obstacle and kind != "walls"
+        solids = "planes" if kind == "walls" else kind
+        place, *others = (name for name in fields if name != "quaternion")
         if is_random:
-            place = next(iter(fields))
-            fields = {"count": 0, "low": 3, "high": 3} | {
-                name: size for name, size in fields.items() if name not in (place, "quaternion")
-            }
-        what = f"{kind}: an obstacle has {', '.join(fields)}"
-        if unknown := sorted(str(key) for key in obstacle if key not in fields):
-            raise UserValueError(f"{what}; unknown: {shown(', '.join(unknown))}.")
-        if missing := [key for key in fields if key not in obstacle and key not in _OPTIONAL]:
-            raise UserValueError(f"{what}; missing: {', '.join(missing)}.")
-        ranges = {
-            name: _range(f"{kind}: {name}", obstacle[name], size, is_random and name not in ("low", "high"))
-            for name, size in fields.items()
-            if name in obstacle and name != "count"
-        }
-        for name in ranges.keys() & {"radius", "height", "size"}:
-            if min(ranges[name][0]) < SMALLEST:
-                raise UserValueError(f"{kind}: {name} must be at least {SMALLEST:g} m, got {shown(obstacle[name])}.")
+            fields = {"count": 0, "low": 3, "high": 3} | {name: fields[name] for name in others}
+        needed, given = fields.keys() - _OPTIONAL, set(map(str, obstacle))
+        for problem, names in (("unknown", given - fields.keys()), ("missing", needed - given)):
+            if names:
+                what = f"{kind}: an obstacle has {', '.join(fields)}"
+                raise UserValueError(f"{what}; {problem}: {', '.join(sorted(names))}.")
         if not is_random:
-            self.fixed[solids].append(_numbers(kind, {name: low for name, (low, _) in ranges.items()}))
+            numbers = {name: _range(kind, name, x, fields[name], False)[0] for name, x in obstacle.items()}
+            self.fixed[solids].append(_numbers(kind, numbers))
             return
-        low, high = ranges["low"][0], ranges["high"][0]
-        if any(a > b for a, b in zip(low, high, strict=True)):
-            raise UserValueError(f"{kind}: low must not be above high along any axis, got {low} and {high}.")
-        self.random[solids].append({"count": check_value(f"{kind}: count", obstacle["count"], Count), **ranges})
+        group = {name: _range(kind, name, obstacle[name], fields[name], True) for name in others if name in obstacle}
+        group[place] = _range(kind, "low and high", [obstacle["low"], obstacle["high"]], 3, True)
+        self.random[solids].append({"count": check_value(f"{kind}: count", obstacle["count"], Count), **group})
 
     def _draw_clear(self, random: Randomness, kind: str, group: dict[str, Any], points: Tensor) -> Tensor:
         """The obstacles (n, count, ...) of a group; none stands at the points (n, k, 3)."""
@@ -259,27 +223,21 @@ def left_out(solids: Tensor, who: Tensor) -> Tensor:
     return torch.where(who.unsqueeze(-1), elsewhere, solids)
 
 
-def drone_radius(params: QuadrotorParams) -> float:
-    """The radius of a sphere around a drone and its propellers, as large as they can be without touching [m]."""
-    rotors = params.rotor_positions.detach().reshape(-1, 4, 2)[0]
-    return (rotors.norm(dim=-1).max() + 0.5 * torch.pdist(rotors).min()).item()
-
-
-def _range(name: str, value: object, size: int, may_vary: bool) -> tuple[list[float], list[float]]:
+def _range(kind: str, name: str, value: object, size: int, may_vary: bool) -> tuple[list[float], list[float]]:
     """The least and the greatest value of a field, each a list of so many numbers."""
-    one = [(size,), ()] if size == 1 else [(size,)]
-    pair = [(2, size), (2,)] if size == 1 else [(2, size)]
     try:
-        found = presets.as_array(value)
+        found = presets.as_array(value).reshape(-1, size)
     except (ValueError, RecursionError):
-        found = np.array(np.nan)
-    if found.shape in (one + pair if may_vary else one) and (abs(found) < 1e4).all():
-        low, high = np.broadcast_to(found.reshape(-1, size), (2, size)).tolist()
-        if all(a <= b for a, b in zip(low, high, strict=True)):
-            return low, high
-    wanted = "a number within 10,000" if size == 1 else f"{size} numbers within 10,000"
+        found = np.full((1, size), np.nan)
+    low, high = found[[0, -1]].tolist() if found.size else ([], [])
+    least = SMALLEST if name in ("radius", "height", "size") else -1e4
+    in_order = all(least <= a <= b < 1e4 for a, b in zip(low, high, strict=True))
+    if low and len(found) <= 1 + may_vary and in_order:
+        return low, high
+    wanted = f"{size} numbers" if size > 1 else "a number"
+    limits = f"from {least:g} to 10,000" if least > 0 else "within 10,000"
     more = f", or the least and the greatest of {'it' if size == 1 else 'them'}" if may_vary else ""
-    raise UserValueError(f"{name} must be {wanted}{more}; got {shown(value)}.")
+    raise UserValueError(f"{kind}: {name} must be {wanted} {limits}{more}; got {shown(value)}.")
 
 
 def _numbers(kind: str, obstacle: dict[str, list[float]]) -> list[float]:
@@ -289,17 +247,18 @@ def _numbers(kind: str, obstacle: dict[str, list[float]]) -> list[float]:
             raise UserValueError("boxes: give a yaw or a quaternion, not both.")
         (yaw,) = obstacle.get("yaw", [0.0])
         attitude = obstacle.get("quaternion", [math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)])
-        norm = math.sqrt(sum(x * x for x in attitude))
-        if norm <= 1e-6:
-            raise UserValueError(f"boxes: quaternion must have unit norm, got {attitude}.")
-        return [*obstacle["centre"], *(0.5 * x for x in obstacle["size"]), *(x / norm for x in attitude)]
+        return [*obstacle["centre"], *(0.5 * x for x in obstacle["size"]), *_unit("boxes: quaternion", attitude)]
     if kind == "walls":
-        length = math.sqrt(sum(x * x for x in obstacle["normal"]))
-        if length <= 1e-6:
-            raise UserValueError(f"walls: normal must be a direction, got {obstacle['normal']}.")
-        normal = [x / length for x in obstacle["normal"]]
+        normal = _unit("walls: normal", obstacle["normal"])
         return [*normal, sum(x * y for x, y in zip(normal, obstacle["point"], strict=True))]
     return [x for name in _FIELDS[kind] for x in obstacle[name]]
+
+
+def _unit(name: str, vector: list[float]) -> list[float]:
+    length = math.sqrt(sum(x * x for x in vector))
+    if length <= 1e-6:
+        raise UserValueError(f"{name} must not be zero, got {vector}.")
+    return [x / length for x in vector]
 
 
 def _draw(random: Randomness, kind: str, group: dict[str, Any], n: int) -> Tensor:
@@ -309,7 +268,7 @@ def _draw(random: Randomness, kind: str, group: dict[str, Any], n: int) -> Tenso
         least, most = random.tensor(low), random.tensor(high)
         return least + (most - least) * 0.5 * (random.uniform(n, group["count"], len(low)) + 1.0)
 
-    place = uniform(group["low"][0], group["high"][0])
+    place = uniform(*group[next(iter(_FIELDS[kind]))])
     if kind != "boxes":
         return torch.cat((place, *(uniform(*group[name]) for name in ("radius", "height") if name in group)), -1)
     yaw = uniform(*group["yaw"]) if "yaw" in group else torch.zeros_like(place[..., :1])
@@ -338,11 +297,9 @@ class MountedCamera(Disturbance):
 
     @property
     def noise_size(self) -> int:
-        """A number for each pixel of a noisy camera."""
         return self.camera.pixels if self.camera.is_noisy else 0
 
     def start(self, random: Randomness, state: State) -> State:
-        """As if the first image had been there for long."""
         if not self.remembers:
             return {}
         noise = random.normal(len(state["position"]), self.noise_size) if self.noise_size else None

@@ -15,18 +15,7 @@ from torchrl_quad.dynamics.vector import is_traced
 from torchrl_quad.engine import Transition, nested
 from torchrl_quad.engine.packing import like
 from torchrl_quad.engine.simulation import State
-from torchrl_quad.envs.guard import (
-    MAX_STEPS,
-    MAX_VALUE,
-    Containment,
-    Guard,
-    as_tensordict,
-    check_action,
-    entry_error,
-    first_ten,
-    is_true,
-    kind_of,
-)
+from torchrl_quad.envs import guard
 from torchrl_quad.envs.scenes import MountedCamera
 from torchrl_quad.envs.task import Task
 from torchrl_quad.envs.terms import time_terms
@@ -39,15 +28,12 @@ class ControlStep:
     """Queue the action, fly, disturb, guard, advance the task, judge: a pure function from entries to entries.
 
     An eager flight calls it. The engine compiles ``begin``, the physics and ``finish``, which share every line with it.
-
-    Args:
-        env: its ``dynamics`` fly, its ``disturbances`` disturb, its task advances and judges.
-        safe_state: takes over where a state is meaningless.
+    ``safe_state`` takes over where a state is meaningless.
     """
 
     def __init__(self, env: Task, safe_state: State) -> None:
         self.env, self.dynamics, self.substeps = env, env.dynamics, env.dynamics.substeps
-        self.safe_state, self.guard = safe_state, Guard(safe_state, env.dynamics, env.task_entries)
+        self.safe_state, self.guard = safe_state, guard.Guard(safe_state, env.dynamics, env.task_entries)
         self.task_advances = type(env).advance is not Task.advance
         self.event_names = list(env.events(safe_state, safe_state)) if env.event_discount is not None else []
         has_gradient = env.camera is None or env.camera.differentiable
@@ -58,32 +44,26 @@ class ControlStep:
         """The whole step, eager; ``valid`` (n) is False where the state was meaningless and the episode ends."""
         params, contain = self.env.params, None
         if torch.is_grad_enabled() and not is_traced():
-            contain = Containment()
+            contain = guard.Containment()
             state, action, params = contain.enter(state, action, params)
         state, applied, valid = self.queue(state, valid, action)
-        drone = self.dynamics.control_step(state, applied, self.plant_params(params, state), state.get("wind"))
+        if drawn := {name: state["drone", name] for name in self.drawn}:
+            fields = params._asdict() if isinstance(params, RawParams) else params.fields()
+            params = RawParams(**{**fields, **drawn})
+        drone = self.dynamics.control_step(state, applied, params, state.get("wind"))
         end = self.judge(state, drone, valid, noise)
         if contain is not None:
             contain.valid = end.valid
         return end
 
-    # -- what happens, in order ----------------------------------------------------------------------------------------
-
     def queue(self, state: State, valid: Tensor, action: Tensor) -> tuple[State, Tensor, Tensor]:
         """The state with the action queued, the action (n, 4) that takes effect now, and where both make sense (n)."""
-        valid = valid & (action.detach().abs().amax(1) < MAX_VALUE)
+        valid = valid & (action.detach().abs().amax(1) < guard.MAX_VALUE)
         action = torch.where(valid.unsqueeze(1), action, self.dynamics.hover_action)
         if "action_queue" not in state:
             return state, action, valid
         queue = state["action_queue"]
         return {**state, "action_queue": torch.cat((queue[:, 1:], action.unsqueeze(1)), 1)}, queue[:, 0], valid
-
-    def plant_params(self, params: QuadrotorParams | RawParams, state: State) -> QuadrotorParams | RawParams:
-        """The parameters of the drones that fly: those given, with what each episode has drawn."""
-        drawn = {name: state["drone", name] for name in self.drawn}
-        if not drawn:
-            return params
-        return RawParams(**{**(params._asdict() if isinstance(params, RawParams) else params.fields()), **drawn})
 
     def judge(self, before: State, drone: State, valid: Tensor, noise: dict[str, Tensor]) -> Transition:
         """Where the step leads, from the state at its start and where the drone has flown."""
@@ -95,7 +75,7 @@ class ControlStep:
             state = {**state, **disturbance.advance(state, noise.get(name), env.control_dt)}
         state, meaningful = self.guard(state)
         valid = valid & meaningful
-        keep, everywhere = valid.unsqueeze(1), is_true(valid)
+        keep, everywhere = valid.unsqueeze(1), guard.is_true(valid)
         if self.task_advances:
             advanced = env.advance(before, state)
             for key in env.task_entries:
@@ -150,19 +130,14 @@ class ControlStep:
             return observation
         return torch.cat((observation, state["action_queue"].flatten(1)), -1)
 
-    # -- where it starts -----------------------------------------------------------------------------------------------
-
-    def at_start(self, state: State) -> Outputs:
-        """All outputs of the first state of an episode, nested; there is no reward yet."""
+    def reset(self, state: State) -> Outputs:
+        """All entries that a reset to a state writes, nested; there is no reward yet."""
         no = torch.zeros_like(state["step"], dtype=torch.bool)
         flags = {name: no.clone() for name in ("crash", "terminated", "truncated", "done")}
         terms = {name: torch.zeros_like(term) for name, term in self.env.reward_terms(state).items()}
         terms |= {f"{name}_time": torch.zeros_like(state["position"][:, :1]) for name in self.event_names}
-        return {**self.measure(state), "reward_terms": terms, "success": self.env.is_success(state), **flags}
-
-    def reset(self, state: State) -> Outputs:
-        """All entries that a reset to a state writes, nested."""
-        return {"state": nested(state), **self.at_start(state)}
+        outputs = {"reward_terms": terms, "success": self.env.is_success(state), **flags}
+        return {"state": nested(state), **self.measure(state), **outputs}
 
     def draw_start(self) -> Outputs:
         """All entries that a reset of all environments writes, nested."""
@@ -172,34 +147,23 @@ class ControlStep:
         return self.reset(self.restore(source(env.num_envs), "initial_state_source"))
 
     def restore(self, state: object, source: str, mask: Tensor | None = None) -> State:
-        """A copy of a state to fly from, in the precision and on the device of the environment.
+        """A copy of a state to fly from, in the precision and on the device of the environment, if it can fly.
 
-        Args:
-            state: a tensordict with all entries of the state.
-            source: where the state comes from, for messages.
-            mask: which environments it is for, bool (n) or (n, 1); all for None. The others may hold anything.
-
-        Raises:
-            ValueError: an entry is missing, of another shape or kind, or outside of what can fly.
+        The mask, bool (n) or (n, 1), says which environments it is for: the others may hold anything.
         """
-        given = as_tensordict(state, source)
-        entries: dict[Any, Any] = {key: given.get(key, None) for key in self.safe_state}
-        for key, x in entries.items():
-            if x is None or x.shape != self.safe_state[key].shape or kind_of(x) != kind_of(self.safe_state[key]):
-                raise entry_error(entries, key, self.safe_state, source)
-        entries = {key: x.to(self.safe_state[key], copy=True) for key, x in entries.items()}
+        entries = guard.read_state(state, self.safe_state, source, convert=True)
         if is_traced():
             return entries
         wrong = self.guard.problems(entries)
         for disturbance in self.env.disturbances.values():
             wrong |= disturbance.problems(entries)
-        for key, (low, high) in {"step": (0, MAX_STEPS), **self.env.state_bounds()}.items():
+        for key, (low, high) in {"step": (0, guard.MAX_STEPS), **self.env.state_bounds()}.items():
             inside = (entries[key] >= low) & (entries[key] <= high)
             wrong[f"{key!r} must lie between {low} and {high}"] = ~inside.flatten(1).all(1)
         for problem, where in wrong.items():
             where = where if mask is None else where & mask.flatten()
             if where.any():
-                who = first_ten(where)
+                who = guard.first_ten(where)
                 raise UserValueError(f"{source}: no drone can fly from the state of environments {who}: {problem}.")
         return entries
 
@@ -214,12 +178,12 @@ class ControlStep:
 
     def example(self) -> tuple[State, Outputs]:
         """The safe state and outputs of it."""
-        outputs = self.at_start(self.safe_state)
+        outputs = self.reset(self.safe_state)
+        del outputs["state"]
         return self.safe_state, {**outputs, "reward": outputs["observation"][:, :1]}
 
     def check_action(self, action: Tensor | None) -> None:
-        """Check the shape, precision and device of an action."""
-        check_action(action, self.safe_state["position"])
+        guard.check_action(action, self.safe_state["position"])
 
     def begin(
         self, state: State, valid: Tensor, action: Tensor, parameters: tuple[Tensor, ...]
@@ -239,7 +203,6 @@ class ControlStep:
         return state, valid, x, (self.dynamics.setpoint_rows(applied), plant, wind)
 
     def rows_step(self) -> Any:
-        """The physics on rows."""
         return self.dynamics.rows_step()
 
     def finish(self, before: State, x: Tensor, valid: Tensor, noise: dict[str, Tensor]) -> Transition:
@@ -247,8 +210,6 @@ class ControlStep:
         sizes = self.dynamics.sizes
         drone = {name: part.t() for name, part in zip(sizes, x.split(list(sizes.values())), strict=True)}
         return self.judge(before, drone, valid, noise)
-
-    # -- for TorchRL ---------------------------------------------------------------------------------------------------
 
     def specs(self) -> dict[str, TensorSpec]:
         """The specs of the environment by name, read off what the step writes of the safe state."""
@@ -262,14 +223,13 @@ class ControlStep:
                 return Binary(1, x.shape, device=device, dtype=torch.bool)
             return Unbounded(x.shape, device=device, dtype=x.dtype)
 
-        outputs = self.at_start(self.safe_state)
+        outputs = self.reset(self.safe_state)
         done = {name: outputs.pop(name) for name in ("done", "terminated", "truncated")}
         outputs = {name: x for name, x in outputs.items() if not isinstance(x, Mapping) or x}
-        state = nested(self.safe_state)
         return {
             # TorchRL carries no key to the next step that is only in the state spec: it has to be in both.
-            "observation_spec": spec({**outputs, "state": state}),
-            "state_spec": spec({"state": state}),
+            "observation_spec": spec(outputs),
+            "state_spec": spec({"state": outputs["state"]}),
             "action_spec": Bounded(-1.0, 1.0, torch.Size((*n, 4)), device=device, dtype=example.dtype),
             "reward_spec": Unbounded(torch.Size((*n, 1)), device=device, dtype=example.dtype),
             "done_spec": spec(done),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import numbers
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +16,7 @@ from torchrl_quad.engine.packing import Key
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.markers import Markers
-from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, summarise_episodes
+from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, at_episode_end, first_episode, read
 from torchrl_quad.envs.randomness import Randomness
 from torchrl_quad.envs.scenes import MountedCamera, Scene
 from torchrl_quad.envs.terms import Event
@@ -63,8 +63,6 @@ class Task(abc.ABC):
     disturbances: Mapping[str, Disturbance]  #: by name; see :mod:`~torchrl_quad.envs.disturbances`
     task_entries: list[Key]  #: the names of the task's own entries of the state
     initial_state_source: Callable[[int], TensorDictBase] | None  #: where resets start, if not as the task says
-
-    # -- what a task defines -------------------------------------------------------------------------------------------
 
     weights: Mapping[str, Any] = {}  #: of the reward's terms; an argument of the same name overrides some
     ends_on_success = False  #: whether success terminates the episode, too
@@ -133,9 +131,20 @@ class Task(abc.ABC):
             and the metrics of the task, as they are at the end of the episode. Here an episode is solved when its last
             state fulfils the task and the drone has not crashed; a task may ask more.
         """
-        return summarise_episodes(rollout)
-
-    # -- what a task may use -------------------------------------------------------------------------------------------
+        missing = [name for name in ("crash", "success", "reward", "done") if ("next", name) not in rollout]
+        if missing:
+            raise UserValueError(
+                f'episode_metrics reads ("next", {missing[0]!r}), which is not in the rollout. Judge a rollout before '
+                "you leave out entries, and evaluate without the transform that drops this one."
+            )
+        reward, measured = read(rollout, "reward"), cast(Mapping, rollout.get(("next", "metrics"), {}))
+        crash, success = (at_episode_end(rollout, read(rollout, name)) for name in ("crash", "success"))
+        return {
+            "return": (reward * first_episode(rollout)).sum(1).squeeze(-1),
+            "crash": crash.to(reward.dtype),
+            "solved": (success & ~crash).to(reward.dtype),
+            **{name: at_episode_end(rollout, value) for name, value in measured.items()},
+        }
 
     @property
     def scene(self) -> Scene | None:
@@ -191,10 +200,7 @@ class Task(abc.ABC):
 
 
 def check_task(env: Task, state: State) -> None:
-    """Check that the methods of a task return what :class:`Task` says.
-
-    A tensor with more columns than it should have would shift all that lies behind it.
-    """
+    """Check that the methods of a task return what :class:`Task` says."""
     task, n = type(env).__name__, env.num_envs
 
     def check(condition: bool, message: str) -> None:
@@ -227,8 +233,7 @@ def check_task(env: Task, state: State) -> None:
             f"or bool; got ({kind(x)}).",
         )
         if isinstance(key, tuple) and key[0] == "drone" and key[1] not in fields:
-            choices = ", ".join(fields)
-            raise UserValueError(f"Entry {key!r} changes no parameter of the drone. Choose from: {choices}.")
+            raise UserValueError(f"Entry {key!r} changes no parameter of the drone. Choose from: {', '.join(fields)}.")
     check_tensor("observe(state)", env.observe(state), env.dtype, None)
     terms, metrics, events = env.reward_terms(state), env.metrics(state), env.events(state, state)
     for method, term in named("reward_terms(state)", terms):

@@ -74,18 +74,12 @@ class Event(NamedTuple):
 
 
 def ball_entry(start: Tensor, end: Tensor, centre: Tensor | float, radius: float) -> Tensor:
-    """When the straight way between two vectors enters a ball, as a fraction of the way, with its derivative.
+    """When the straight way from ``start`` to ``end`` (*, k) of a control step enters a ball, with its derivative.
 
-    Args:
-        start: any quantity at the start of the control step, such as a position or a velocity, (*, k).
-        end: the same at its end.
-        centre: of the ball, (*, k) or a number.
-        radius: of the ball.
-
-    Returns:
-        (*, 1) in [0, 1]: 0 without a gradient where the way begins inside. Where it misses the ball the number means
-        nothing. No derivative in ``start`` or ``end`` is larger than one over the larger of 0.3 times the way's length
-        and 1e-4.
+    Of any quantity, such as a position or a velocity; the centre is (*, k) or a number. Returns a fraction of the way,
+    (*, 1) in [0, 1]: 0 without a gradient where the way begins inside. Where it misses the ball the number means
+    nothing. No derivative in ``start`` or ``end`` is larger than one over the larger of 0.3 times the way's length
+    and 1e-4.
     """
     first, way = (start - centre).detach(), (end - start).detach()
     outside = first.square().sum(-1, keepdim=True) - radius**2
@@ -100,16 +94,9 @@ def ball_entry(start: Tensor, end: Tensor, centre: Tensor | float, radius: float
 
 
 def level_crossing(start: Tensor, end: Tensor, level: float) -> Tensor:
-    """When a number that changes evenly comes down to a level, as a fraction of the way, with its derivative.
+    """When a number (*) that changes evenly in a control step comes down to a level, as :func:`ball_entry` gives it.
 
-    Args:
-        start: any quantity at the start of the control step, such as a height, (*).
-        end: the same at its end.
-        level: to which it comes down.
-
-    Returns:
-        (*) in [0, 1]: 0 without a gradient where it begins at the level or below. Where it ends above the number means
-        nothing. No derivative is larger than 1e4.
+    It is 0 without a gradient where it begins at the level or below. No derivative is larger than 1e4.
     """
     above, drop = start.detach() - level, (start - end).detach()
     time = (above / drop.clamp_min(1e-12)).clamp(0.0, 1.0)
@@ -123,14 +110,9 @@ def time_terms(
     """Reward terms (n, 1) named ``<event>_time``, whose values are zero and whose gradients those in the events' times.
 
     An event at the fraction x of control step t adds ``amount * discount ** (t + x)`` to the return. The dense terms
-    are those of before until it, for x of the step, and those of after it for the rest.
-
-    Args:
-        events: what may have happened in the step.
-        discount: per control step.
-        terms: all terms of the task at the end of the step; those that pay an event are not dense.
-        terms_before: the same, had no event changed the task's own entries.
-        terminated: whether the episode ends with this step, bool (n, 1): then nothing is paid after the event.
+    are those of before until it, for x of the step, and those of after it for the rest: ``terms`` are all terms at the
+    end of the step, ``terms_before`` the same, had no event changed the task's own entries. Nothing is paid after an
+    event that ends the episode, where ``terminated`` is true, bool (n, 1).
     """
     at_once = {event.term or name for name, event in events.items()}
     dense = [name for name in terms if name not in at_once]

@@ -41,7 +41,6 @@ CURVES: dict[str, tuple[Curve, float]] = {  # by name: the curve, and its period
 }
 _CURVE = f"one of {', '.join(CURVES)}, or a function from phases (*) [rad] to positions (*, 3) [m]"
 CurveOption = Annotated[Any, accepted(lambda x: callable(x) or (isinstance(x, str) and x in CURVES), _CURVE)]
-Period = Annotated[float, between(0.1, 10_000.0)]
 
 
 class TrackingEnv(QuadrotorEnv):
@@ -101,17 +100,17 @@ class TrackingEnv(QuadrotorEnv):
         num_envs: Size = 64,
         *,
         curve: CurveOption = "slow_circle",
-        period: Period | None = None,
+        period: Annotated[float, between(0.1, 10_000.0)] | None = None,
         max_episode_steps: Size = 512,
         **kwargs: Any,
     ) -> None:
         if isinstance(curve, str):
-            curve, default_period = CURVES[curve]
-            period = default_period if period is None else period
+            curve, usual = CURVES[curve]
+            period = period or usual
         if period is None:
             raise UserValueError("Your own curve needs a period in seconds, such as period=10.0; got none.")
         self.curve = functools.partial(curve)  # not itself: an environment registers modules as its own
-        self.period = period
+        self.period, self.phase_rate = period, 2 * math.pi / period  # [s], [rad/s]
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
 
     def set_up(self) -> None:
@@ -121,12 +120,8 @@ class TrackingEnv(QuadrotorEnv):
         self.centre = 0.5 * (low + high)
         self.half_width = (0.5 * (high - low)[:2] + self.box_margin).clamp_min(self.box_half_width)
         self.ceiling = max(self.box_height, high[2].item() + self.box_margin)
+        self.settling_steps = round(self.settling_time / self.control_dt)  # that the tracking error leaves out
         self.ahead = phase.new_tensor(range(1, self.lookahead + 1)) * self.lookahead_interval * self.phase_rate
-
-    @property
-    def phase_rate(self) -> float:
-        """How fast the point moves along the curve [rad/s]."""
-        return 2 * math.pi / self.period
 
     def initial_state(self, n: int) -> State:
         phase = (self.uniform(n, 1) + 1.0) * math.pi
@@ -176,11 +171,6 @@ class TrackingEnv(QuadrotorEnv):
         phase = torch.linspace(0, 2 * math.pi, 129, device=self.device, dtype=self.dtype)
         return Markers(curve=self.curve(phase), success=self.success_radius)
 
-    @property
-    def settling_steps(self) -> int:
-        """Control steps at the start of an episode that the tracking error leaves out."""
-        return round(self.settling_time / self.control_dt)
-
 
 def _checked_points(curve: Curve, phase: Tensor, margin: float) -> Tensor:
     """The points (257, 3) of a curve at phases (257) over one period with both ends, if it can be flown."""
@@ -189,19 +179,15 @@ def _checked_points(curve: Curve, phase: Tensor, margin: float) -> Tensor:
         points = curve(phase.repeat(2, 1))
     except Exception as error:
         raise UserValueError(f"{rule}; given a tensor of shape (2, 257) it failed: {error}") from error
-    if not isinstance(points, Tensor):
-        raise UserValueError(f"{rule}; it made a {type(points).__name__}.")
-    if points.shape != (2, 257, 3) or points.dtype != phase.dtype:
-        raise UserValueError(f"{rule}; from shape (2, 257) it made {tuple(points.shape)}, {points.dtype}.")
+    if not isinstance(points, Tensor) or points.shape != (2, 257, 3) or points.dtype != phase.dtype:
+        made = f"{tuple(points.shape)}, {points.dtype}" if isinstance(points, Tensor) else f"a {type(points).__name__}"
+        raise UserValueError(f"{rule}; from shape (2, 257) it made {made}.")
     points = points[0]
     if not points.isfinite().all():
         raise UserValueError("The curve is not finite everywhere in [0, 2 pi].")
-    gap = terms.norm(points[0] - points[-1]).item()
+    gap, lowest = terms.norm(points[0] - points[-1]).item(), points[:, 2].min().item()
     if gap > 0.01:
-        raise UserValueError(
-            f"The curve is not periodic: from phase 0 to 2 pi it moves by {gap:.3g} m. Make it close at 2 pi."
-        )
-    lowest = points[:, 2].min().item()
+        raise UserValueError(f"The curve is not periodic: it moves by {gap:.3g} m from phase 0 to 2 pi. Make it close.")
     if lowest <= margin:
         raise UserValueError(
             f"The curve goes down to z = {lowest:.3g} m, and drones start up to {margin} m below it. Lift it."

@@ -1,15 +1,5 @@
-"""The logs that autopilots write: PX4's ULog, and the one of a Crazyflie on its micro SD card; both are little-endian.
-
-ULog (https://docs.px4.io/main/en/dev_log/ulog_file_format.html): 16 bytes of header; then messages: size (16 bits),
-type (a letter) and body. Definitions come first: F says which fields a message has, as in "name:float[3] x;uint8_t y;",
-where a type may be another message; P is a parameter. In the data, A subscribes a message by a number, D is one sample
-of it, O a dropout, and S eight bytes by which a reader finds its way back after damage.
-
-uSD log (``src/deck/drivers/src/usddeck.c`` of the firmware): the byte 0xBC; version (1 or 2) and the number of kinds of
-events, 16 bits each; for each kind its id (16 bits), its name and a zero, the number of variables (16 bits), and each
-variable as "name(t)" and a zero, where t is a letter of Python's ``struct``. Then come the events: id, time (version 1:
-32 bits, ms; version 2: 64 bits, us) and values. The last four bytes are the CRC-32 of all others.
-"""
+"""PX4's ULog (https://docs.px4.io/main/en/dev_log/ulog_file_format.html), and the log of a Crazyflie on its micro SD
+card (``src/deck/drivers/src/usddeck.c`` of the firmware); both are little-endian."""
 
 from __future__ import annotations
 
@@ -29,18 +19,15 @@ from numpy.typing import NDArray
 from torchrl_quad.deploy.frames import motor_signal
 from torchrl_quad.errors import shown
 from torchrl_quad.identification.errors import UnreadableLog
-from torchrl_quad.identification.signals import MAX_COLUMNS, MAX_RECORDS, Array, Stream, too_many
+from torchrl_quad.identification.signals import MAX_COLUMNS, Array, Stream
 
 _SYNC = bytes.fromhex("2f731320250cbb12")
 _KINDS = frozenset(b"BFIMPQARDLCSO")
 _TYPES = {f"{sign}int{8 * size}_t": f"<{sign[:1] or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)}
 _TYPES |= {"float": "<f4", "double": "<f8", "bool": "<i1", "char": "<i1"}
+_FIELD = re.compile(r"([\w/-]+)(?:\[(\d+)\])? (\w+)")
 _TICKS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}
 _VARIABLE = re.compile(r"(.+)\(([bBhHiIqQfd?])\)")
-
-
-class _Damaged(Exception):
-    """A message that cannot be read."""
 
 
 @dataclass
@@ -49,8 +36,7 @@ class _Subscription:
 
     name: str
     instance: int
-    size: int  # of a sample [bytes]
-    columns: int
+    record: np.dtype
     starts: array = field(default_factory=lambda: array("Q"))
 
 
@@ -63,10 +49,8 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     to its size; the notes say what could not be read.
     """
     log = _Log(data)
-    log.scan(name)
+    log.scan()
     used = sorted((s for s in log.subscriptions if s.starts), key=lambda s: (s.name, s.instance))
-    if sum(s.columns for s in used) > MAX_COLUMNS:
-        raise too_many(name, MAX_COLUMNS, "columns", "Log fewer messages.")
     if not used:
         raise UnreadableLog(f"{name} is not a readable ULog: it holds no sample of any message. Copy it again.")
     notes = []
@@ -77,13 +61,13 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
         notes.append(f"the logger lost {lost:.2f} s in {len(log.dropouts)} dropouts: gaps where samples are missing")
     streams = []
     for message in used:
-        fields = dict(itertools.islice(log.columns(message.name), message.columns))
-        if len(fields) < message.columns or fields.get("timestamp", "")[1:2] not in ("i", "u"):
-            notes.append(f"{message.name} was left out: it has no timestamp, or two fields of one name")
+        parts = message.record.names or ()
+        if "timestamp" not in parts or message.record["timestamp"].kind not in "iu":
+            notes.append(f"{message.name} was left out: it has no timestamp")
             continue
-        rows = pick(data, message.starts, np.dtype(list(fields.items())))
+        rows = pick(data, message.starts, message.record)
         stem = message.name + (f"#{message.instance}" if message.instance else "")
-        columns = {f"{stem}.{part}": rows[part] for part in fields}
+        columns = {f"{stem}.{part}": rows[part] for part in parts}
         sampled = columns.get(f"{stem}.timestamp_sample")
         time = columns[f"{stem}.timestamp"] if sampled is None or not sampled.all() else sampled
         for k in range(4 if message.name == "actuator_motors" else 0):
@@ -106,7 +90,7 @@ class _Log:
     def __init__(self, data: bytes) -> None:
         self.data = data
         self.formats: dict[str, list[tuple[str, int, str]]] = {}  # type, length (0: no array), field
-        self.sizes: dict[str, tuple[int, int]] = {}  # bytes and columns
+        self.room = MAX_COLUMNS  # for those of subscribed messages
         self.subscriptions: list[_Subscription] = []
         self.current: dict[int, _Subscription] = {}
         self.curve = 0.0
@@ -115,14 +99,12 @@ class _Log:
         self.damage = self.unread = 0
         self.flying = False  # whether the definitions are over
 
-    def scan(self, name: str) -> None:
+    def scan(self) -> None:
         """Take every message once, from the first byte to the last."""
         data, at = self.data, 16
-        for _ in range(MAX_RECORDS):
+        while at + 3 <= len(data):
             end = next((end for end in self.ends if end > at), len(data))
             if at + 3 > end:
-                if end == len(data):
-                    break
                 at = end
                 continue
             size, kind = data[at] | data[at + 1] << 8, data[at + 2]
@@ -132,7 +114,7 @@ class _Log:
             try:
                 if good:
                     self._take(kind, at + 3, stop)
-            except (_Damaged, ValueError, IndexError, struct.error):
+            except (ValueError, IndexError, struct.error):
                 good = False
             if not good:
                 self.damage += 1
@@ -142,80 +124,56 @@ class _Log:
                         self.unread += end - at
                     stop = end if found < 0 else found + len(_SYNC)
             at = stop
-        else:
-            raise too_many(name, MAX_RECORDS, "messages", "Log fewer.")
         self.unread += len(data) - at
 
     def _take(self, kind: int, start: int, stop: int) -> None:
         data = self.data
         if kind == ord("D"):
             subscription = self.current.get(data[start] | data[start + 1] << 8) if stop - start > 1 else None
-            if subscription is None or subscription.size != stop - start - 2:
-                raise _Damaged
+            if subscription is None or subscription.record.itemsize != stop - start - 2:
+                raise ValueError
             subscription.starts.append(start + 2)
         elif kind == ord("A"):
             instance, number = struct.unpack_from("<BH", data, start)
             message = data[start + 3 : stop].decode(errors="ignore")
-            size, columns = self._measure(message)
-            for part, length, name in reversed(self.formats[message]):
-                if not name.startswith("_padding") or part not in _TYPES:
-                    break
-                size -= (length or 1) * int(_TYPES[part][2])  # padding at the end is not logged
-                columns -= length or 1
             before = self.current.get(number)
             if before is None or (before.name, before.instance) != (message, instance):
-                self.current[number] = _Subscription(message, instance, size, columns)
+                columns = list(itertools.islice(self._columns(message), self.room + 1))
+                while columns and columns[-1][0].startswith("_padding"):  # which is not logged at the end
+                    columns.pop()
+                if len(columns) > self.room:
+                    del self.formats[message]  # so that it is not unfolded again and again
+                    raise ValueError
+                self.current[number] = _Subscription(message, instance, np.dtype(columns))
                 self.subscriptions.append(self.current[number])
+                self.room -= len(columns)
         elif kind == ord("F") and not self.flying:
             message, _, fields = data[start:stop].decode(errors="ignore").partition(":")
-            self.formats[message] = [_field(text) for text in fields.split(";") if text]
+            self.formats[message] = [(kind, int(length or 0), name) for kind, length, name in _FIELD.findall(fields)]
         elif kind == ord("P") and not self.flying:
             value = start + 1 + data[start]
             if data[start + 1 : value] == b"float THR_MDL_FAC":
                 (self.curve,) = struct.unpack("<f", data[value:stop])
                 if not 0.0 <= self.curve <= 1.0:
                     self.curve = 0.0
-                    raise _Damaged
+                    raise ValueError
         elif kind == ord("B"):
             flags, *offsets = struct.unpack_from("<8xB7x3Q", data, start)
             self.ends = sorted(offset for offset in offsets if flags & 1 and start < offset < len(data))
         elif kind == ord("O"):
             self.dropouts += struct.unpack("<H", data[start:stop])
 
-    def _measure(self, message: str, depth: int = 0) -> tuple[int, int]:
-        """The bytes and the columns of a message, with those of the messages in it, from its formats."""
-        if message not in self.sizes:
-            self.sizes[message] = (0, 0)  # while it is measured, so that one in itself is damaged, too
-            size = columns = 0
-            for kind, length, _ in self.formats.get(message, ()):
-                if kind in _TYPES:
-                    own = int(_TYPES[kind][2]), 1
-                else:
-                    own = self._measure(kind, depth + 1) if depth <= 9 else (0, 0)
-                if not own[0]:
-                    raise _Damaged
-                size += (length or 1) * own[0]
-                columns += (length or 1) * own[1]
-            self.sizes[message] = (size, columns)
-        if not self.sizes[message][0]:
-            raise _Damaged
-        return self.sizes[message]
-
-    def columns(self, message: str, prefix: str = "") -> Iterator[tuple[str, str]]:
-        """The name and the type of each column of a message."""
+    def _columns(self, message: str, prefix: str = "") -> Iterator[tuple[str, str]]:
+        """The name and the type of each column of a message, with those of the messages in it."""
+        if not self.formats.get(message) or prefix.count(".") > 9:
+            raise ValueError
         for kind, length, name in self.formats[message]:
             for k in range(length or 1):
                 place = f"{prefix}{name}{f'[{k}]' if length else ''}"
                 if kind in _TYPES:
                     yield place, _TYPES[kind]
                 else:
-                    yield from self.columns(kind, f"{place}.")
-
-
-def _field(text: str) -> tuple[str, int, str]:
-    kind, name = text.split()
-    kind, bracket, length = kind.partition("[")
-    return kind, int(length.removesuffix("]")) if bracket else 0, name
+                    yield from self._columns(kind, f"{place}.")
 
 
 def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
@@ -229,9 +187,9 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     try:
         version, kinds = struct.unpack_from("<HH", body, 1)
         if version not in _TICKS:
-            raise UnreadableLog(f"{name} is a uSD log of version {version}; 1 and 2 are known. Export it as CSV.")
+            raise ValueError(f"version {version}, and 1 and 2 are known")
         tick, unit = _TICKS[version]
-        records, names, at, columns = {}, {}, 5, 0
+        records, names, at = {}, {}, 5
         for _ in range(kinds):
             (kind,) = struct.unpack_from("<H", body, at)
             names[kind], at = _text(body, at + 2)
@@ -242,17 +200,14 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
                 variable, at = _text(body, at)
                 found = _VARIABLE.fullmatch(variable)
                 if found is None:
-                    raise UnreadableLog(f"{name} has a variable of unknown type, {shown(variable)}. Export it as CSV.")
-                columns += 1
-                if columns > MAX_COLUMNS:
-                    raise too_many(name, MAX_COLUMNS, "variables", "Log fewer.")
+                    raise ValueError(f"a variable of unknown type, {shown(variable)}")
                 fields.append((found[1], np.dtype(found[2]).newbyteorder("<")))
             records[kind] = np.dtype(fields)
-    except UnreadableLog:
-        raise
     except (struct.error, ValueError) as error:
-        raise UnreadableLog(f"{name} begins like a uSD log, but its header is cut off. Copy it again.") from error
-    starts, left = _events(body, at, {kind: record.itemsize for kind, record in records.items()}, name)
+        raise UnreadableLog(
+            f"{name} begins like a uSD log, but its header cannot be read: {error}. Copy it again, or export it as CSV."
+        ) from error
+    starts, left = _events(body, at, {kind: record.itemsize for kind, record in records.items()})
     if left:
         notes.append(f"the last {left} bytes of the uSD log were not read: they are not whole events")
     streams = []
@@ -267,19 +222,15 @@ def read_usd(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     return streams, notes
 
 
-def _events(body: bytes, at: int, sizes: dict[int, int], name: str) -> tuple[dict[int, array], int]:
+def _events(body: bytes, at: int, sizes: dict[int, int]) -> tuple[dict[int, array], int]:
     """Where the events of each kind begin, and how many bytes at the end belong to none."""
     starts = {kind: array("Q") for kind in sizes}
-    for _ in range(MAX_RECORDS):
-        if at + 2 > len(body):
-            break
+    while at + 2 <= len(body):
         kind = body[at] | body[at + 1] << 8
         if kind not in sizes or at + sizes[kind] > len(body):
             break
         starts[kind].append(at)
         at += sizes[kind]
-    else:
-        raise too_many(name, MAX_RECORDS, "events", "Log fewer.")
     return starts, len(body) - at
 
 

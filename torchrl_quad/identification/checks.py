@@ -1,8 +1,4 @@
-"""Does a log mean what its columns claim, and which pieces of it are in flight?
-
-Each quantity is compared with what follows from another one. The ground, take-off, landing, impacts and gaps are cut
-out.
-"""
+"""Does a log mean what its columns claim, as each follows from others, and which pieces of it are in flight?"""
 
 from __future__ import annotations
 
@@ -11,14 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from torchrl_quad.identification.errors import (
-    GapsTooLarge,
-    InconsistentRates,
-    NoFlight,
-    WrongFrame,
-    WrongQuaternion,
-    WrongUnit,
-)
+from torchrl_quad.identification.errors import GapsTooLarge, NoFlight, WrongFrame, WrongQuaternion, WrongUnit
 from torchrl_quad.identification.layouts import G
 from torchrl_quad.identification.signals import Array, Mask, Signal, body_rates, runs, slope, smooth
 from torchrl_quad.rotations import conjugate, rotate, rotate_inverse
@@ -116,10 +105,7 @@ def check_specific_force(at: Mapping[str, Array], signals: Mapping[str, Signal],
 
 
 def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> str:
-    """Compare the gyro with the derivative of the attitude, under every convention that a file may have used.
-
-    The note that it returns says by which time the gyro lags the attitude.
-    """
+    """Compare the gyro with the derivative of the attitude under every convention, and note how late it is."""
     q, given = at["quaternion"], signals["quaternion"]
     last, first = np.roll(q, 1, -1), np.roll(q, -1, -1)
     hypotheses = {
@@ -166,7 +152,7 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
     if turning < CALM:
         return calm
     if fit < 0.5:
-        raise InconsistentRates(
+        raise WrongFrame(
             f"{signal} does not follow {given}: their correlation is {fit:.2f} at best, also if the quaternion is "
             "scalar last or inverse, or the gyro in another frame. Name columns that belong together."
         )
@@ -234,8 +220,7 @@ def find_pieces(
 ) -> tuple[tuple[tuple[int, int], ...], list[str]]:
     """Pieces (start, stop) in flight without gaps, and notes.
 
-    The drone stands where its motors idle and it does not move. It flies where its motors run and it is more than
-    ``clearance`` above the place where it stood, or will stand next.
+    The drone flies where its motors run and it is more than ``clearance`` above where it stood, or will stand next.
     """
     carried, idle = motors_on(at["motor_command"], dt, name)
     z = at["position"][:, 2]

@@ -36,11 +36,7 @@ class WrongQuaternion(LogError):
 
 
 class WrongFrame(LogError):
-    """A quantity is in another frame: z down, body y right, a velocity of the body, or rates of the world."""
-
-
-class InconsistentRates(LogError):
-    """The gyro and the derivative of the attitude fit under no convention."""
+    """A quantity is in another frame: z down, body y right, a velocity of the body, rates of the world or of none."""
 
 
 class NoFlight(LogError):
@@ -48,12 +44,4 @@ class NoFlight(LogError):
 
 
 class TooShort(LogError):
-    """No piece of the flight is long enough to predict anything."""
-
-
-class TooLittleFlight(LogError):
-    """The flights have fewer windows than a fit has unknowns."""
-
-
-class UnknownField(LogError):
-    """A field cannot be identified, or is not known."""
+    """No piece of the flight is long enough to predict anything, or all are too short for so many unknowns."""

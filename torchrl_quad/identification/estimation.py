@@ -1,5 +1,4 @@
-"""Find the parameters of a drone from its flights, in stages: what the flights do not tell is left out, and a second
-time constant is tried at the end."""
+"""Find the parameters of a drone from its flights, in stages."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ from torch import Tensor
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.files import replacing
-from torchrl_quad.identification.errors import TooLittleFlight, UnknownField
+from torchrl_quad.identification.errors import TooShort
 from torchrl_quad.identification.fitting import MAX_ITERATIONS, Linear, Problem, State, bootstrap, covariance, minimise
 from torchrl_quad.identification.log import FlightLog
 from torchrl_quad.identification.parameters import FIELDS, UNKNOWNS, Model, report, unknowns_of
@@ -38,7 +37,6 @@ from torchrl_quad.identification.prediction import (
 from torchrl_quad.identification.result import IdentificationResult
 from torchrl_quad.options import Seed, checked
 
-MAX_BYTES = 10**7  # of a checkpoint, which has some numbers for each unknown
 _BODY_STEP = 0.02  # [s]
 _MOST_WINDOWS = 360  # more would cost more and tell little more, since neighbours overlap
 _HORIZONS = (0.1, 0.25, 0.5)  # [s], of the errors that are reported
@@ -62,15 +60,12 @@ def identify(
     progress: bool = False,
     checkpoint: str | Path | None = None,
 ) -> IdentificationResult:
-    """Fit a drone to the open-loop predictions of short windows, by gradient through its dynamics.
-
-    Every window starts in a measured state and reads only motor commands, as in :func:`prediction_error`. The fit
-    minimises, robustly, how far its states at five times lie from the measured ones. All windows fly at once, and the
-    derivative of each prediction in each unknown makes Gauss-Newton steps. A fifth of the flight is held out.
+    """Fit a drone to open-loop predictions of short windows as in :func:`prediction_error`, by gradient through its
+    dynamics: Gauss-Newton steps bring the states at five times of each window nearer to the measured ones, robustly. A
+    fifth of the flight is held out.
 
     Motion only tells ratios: thrust, drag and inertia by the mass. ``known={"mass": 0.03}`` makes numbers of them.
     Rotor speeds have no scale of their own either: k2 belongs to the speeds that the drone's ``motor_command`` gives.
-    For a drone without one, speed is proportional to command times voltage, so that the prior's thrust carries it.
 
     Args:
         log: a flight, or several of the same drone.
@@ -87,10 +82,8 @@ def identify(
         checkpoint: a file that gets each step, and from which a fit of the same flights and settings continues.
 
     Raises:
-        UnknownField: a field cannot be fitted.
-        TooShort: no piece of a flight is long enough for a window.
-        TooLittleFlight: there are too few windows for the unknowns.
-        ValueError: the drone is wrong, or a known value.
+        TooShort: no piece of a flight is long enough for a window, or there are too few windows for the unknowns.
+        ValueError: a field cannot be fitted, or the drone is wrong, or a known value.
     """
     logs = as_logs(log, "identify")
     if draws == 1:
@@ -105,7 +98,7 @@ def identify(
     wanted = [x for x in unknowns if x not in not_fitted]
     moves_streams = "stream" in unknowns and any("angular_velocity" in x.onboard for x in logs)
     if not wanted and not moves_streams:
-        raise UnknownField("identify: nothing is left to fit, since all of the fields are known. Name more fields.")
+        raise UserValueError("identify: nothing is left to fit, since all of the fields are known. Name more fields.")
     step = min(x.dt * max(1, round(0.01 / x.dt)) for x in logs)
     seconds = sum((b - a) * x.dt for x in logs for a, b in x.segments)
     every = max(0.5 * horizon, seconds / _MOST_WINDOWS)
@@ -113,7 +106,7 @@ def identify(
     held = held_out(windows)
     kept = windows.select(torch.nonzero(~held).flatten())
     if len(kept) < 2 * len(wanted) + 4:
-        raise TooLittleFlight(
+        raise TooShort(
             f"identify: {len(kept)} windows of {horizon:g} s are too few for {len(wanted)} unknowns. Give more "
             "flights, or fewer fields."
         )
@@ -294,14 +287,11 @@ class Checkpoint:
         try:
             if found is None or tuple(found["free"]) != start.free:
                 return start
-            changes: dict[str, Any] = {**found, "free": start.free}
-            for name in ("x", "streams"):
-                changes[name] = torch.tensor(found[name], dtype=torch.float64)
-                if changes[name].shape != getattr(start, name).shape:
-                    raise ValueError("another number of unknowns")
-                if not changes[name].isfinite().all():
-                    raise ValueError("an unknown is not finite")
-            return State(**changes)
+            x = torch.tensor(found["x"], dtype=torch.float64).reshape(start.x.shape)
+            streams = torch.tensor(found["streams"], dtype=torch.float64).reshape(start.streams.shape)
+            if not (x.isfinite().all() and streams.isfinite().all()):
+                raise ValueError("an unknown is not finite")
+            return State(**found | {"free": start.free, "x": x, "streams": streams})
         except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
             raise self._broken(error) from error
 
@@ -317,8 +307,6 @@ class Checkpoint:
     def _read(self) -> dict[str, Any]:
         if self.path is None or not Path(self.path).is_file():
             return {}
-        if Path(self.path).stat().st_size > MAX_BYTES:
-            raise self._broken(f"it has more than {MAX_BYTES:,} bytes")
         try:
             content = json.loads(Path(self.path).read_text())
             return dict(content["stages"]) if content["fingerprint"] == self.fingerprint else {}

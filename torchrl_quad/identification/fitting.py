@@ -117,10 +117,7 @@ class Problem:
 
 
 def minimise(problem: Problem, state: State, report: Callable[[State], None], max_iterations: int) -> State:
-    """Levenberg-Marquardt steps from a state until the coordinates stand still, each of which is reported.
-
-    The scales of the residuals follow the first steps.
-    """
+    """Levenberg-Marquardt steps from a state until the coordinates stand still, each of which is reported."""
     if state.scale is not None:
         problem.scale = state.x.new_tensor(state.scale)
     while not state.converged and state.iteration < max_iterations:
@@ -193,10 +190,7 @@ def covariance(linear: Linear, log: Tensor, logs: int, lags: int) -> tuple[Tenso
 
 
 def bootstrap(linear: Linear, log: Tensor, logs: int, block: int, draws: int, seed: int) -> Tensor:
-    """Changes of the unknowns (draws, n + L) where blocks of windows are resampled, with one Gauss-Newton step each.
-
-    ``log`` is that of each window (W), of so many ``logs``; a ``block`` is a number of windows.
-    """
+    """Changes of the unknowns (draws, n + L) where blocks of windows are resampled, with one Gauss-Newton step each."""
     h, g = per_window(linear)
     n = g.shape[1] - 1
     place = torch.cat((torch.arange(n).expand(len(g), n), (n + log).unsqueeze(1)), 1)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from torchrl_quad.deploy import frames
-from torchrl_quad.dynamics.presets import as_array
+from torchrl_quad.dynamics import presets
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
 from torchrl_quad.identification.signals import LARGEST, Signal, Stream
@@ -29,7 +31,6 @@ QUANTITIES: dict[str, tuple[int, str | None]] = {
 }
 _TRANSLATED = ("position", "velocity", "quaternion", "angular_velocity")  # setpoints
 _NEEDED = (("position",), ("quaternion", "euler"), ("motor_command",))
-DEGREE = np.pi / 180.0
 G = 9.80665
 OURS = frames.Convention("torchrl_quad", motors=(0, 1, 2, 3))
 ROS = frames.Convention("ROS", xyzw=True, motors=(0, 1, 2, 3))
@@ -55,7 +56,7 @@ class Columns:
         for field in ("scale", "offset"):
             value = getattr(self, field)
             try:
-                numbers = as_array(value)
+                numbers = presets.as_array(value)
             except (ValueError, RecursionError):
                 numbers = np.array(np.nan)
             fits = numbers.shape in ((), (len(names),)) and (np.abs(numbers) <= 1e30).all()
@@ -76,21 +77,11 @@ class Layout:
     required: frozenset[str] = frozenset()  #: quantities that a caller named; a file without their columns is refused
 
     def __post_init__(self) -> None:
-        onboard = None if isinstance(self.onboard, str) else self.onboard
-        rules = {
-            "columns must map quantities to tuples of Columns": isinstance(self.columns, Mapping)
-            and all(_are(c, Columns) for c in self.columns.values()),
-            "convention must be one of torchrl_quad.deploy.frames": isinstance(self.convention, frames.Convention),
-            "onboard must be a tuple of fields": _are(onboard, str),
-            "time must be Columns of one name": isinstance(self.time, Columns) and len(self.time.names) == 1,
-            "required must be a set of quantities": isinstance(self.required, Set),
-        }
-        for rule, holds in rules.items():
-            if not holds:
-                raise UserValueError(f"Layout: {rule}, got {shown(getattr(self, rule.split()[0]))}.")
-        for quantity, choices in self.columns.items():
+        if not isinstance(self.convention, frames.Convention):
+            raise UserTypeError(f"convention must be one of torchrl_quad.deploy.frames, got {shown(self.convention)}.")
+        for quantity, choices in (*self.columns.items(), ("time", (self.time,))):
             for choice in choices:
-                _check_quantity(quantity, choice)
+                _as_columns(quantity, choice)
 
     @property
     def names(self) -> set[str]:
@@ -98,93 +89,49 @@ class Layout:
         return {name for choices in self.columns.values() for choice in choices for name in choice.names}
 
 
-def _are(values: object, kind: type) -> bool:
-    return isinstance(values, Sequence) and all(isinstance(value, kind) for value in values)
-
-
-def _check_quantity(quantity: object, columns: Columns) -> None:
+def _as_columns(quantity: object, names: object) -> Columns:
+    if not isinstance(names, Columns):
+        if not isinstance(names, Sequence) or isinstance(names, bytes):
+            raise UserTypeError(
+                f"columns: {shown(quantity)} takes the name of a column, a list of them, or Columns; got "
+                f"{shown(names)}."
+            )
+        names = Columns((names,) if isinstance(names, str) else tuple(names))
     known = [*QUANTITIES, "time"]
     if not (isinstance(quantity, str) and (quantity in known or quantity.startswith("setpoint."))):
         raise MissingColumns(
             f"Unknown quantity {shown(quantity)} in columns. Choose from: {', '.join(known)}, setpoint.NAME."
         )
-    count = len(columns.names)
+    count = len(names.names)
     size = 1 if quantity == "time" else QUANTITIES.get(quantity, (count, None))[0]
     if count != size:
-        raise MissingColumns(f"{quantity} takes {size} column(s), got {count}: {', '.join(columns.names)}. Name each.")
+        raise MissingColumns(f"{quantity} takes {size} column(s), got {count}: {', '.join(names.names)}. Name each.")
+    return names
 
 
-def _c(names: str, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0, *, of: str = "") -> Columns:
-    """Columns whose names all begin alike."""
+def named_alike(names: str, of: str = "", scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> Columns:
+    """Columns whose names all begin with ``of``, as the files of this package list them."""
     return Columns(tuple(of + name for name in names.split()), scale, offset)
 
 
+def shipped(name: str) -> dict[str, Any]:
+    """A file of this package."""
+    return presets.parse(Path(__file__).with_name(name).read_bytes(), name)
+
+
+Asked = str | Layout | Mapping[str, object] | None  # what a caller says of the columns
 LAYOUTS = {
-    "nanobench": Layout(  # arXiv:2603.09908: Vicon, and the on-board log of a Crazyflie 2.1
-        {
-            "position": (_c("px py pz"),),
-            "quaternion": (_c("qx qy qz qw"),),
-            "velocity": (_c("vx vy vz"),),
-            "angular_velocity": (_c("x y z", of="imu_gyro_"),),
-            "acceleration": (_c("x y z", G, of="imu_acc_"),),
-            "motor_command": (_c("m1 m2 m3 m4", 1 / 65535, of="motor_motor_"),),
-            "battery_voltage": (_c("pwr_pm_vbat"),),
-            "setpoint.position": (_c("x y z", of="sp_ctrltarget_"),),
-            "setpoint.yaw": (_c("sp_ctrltarget_yaw", DEGREE),),
-        },
-        frames.crazyflie(),
-        BY_IMU,
-        Columns(("t",)),
-    ),
-    "px4": Layout(  # msg/*.msg of PX4 1.14; older firmware has no actuator_motors
-        {
-            "position": (_c("x y z", of="vehicle_local_position."),),
-            "quaternion": (_c("[0] [1] [2] [3]", of="vehicle_attitude.q"),),
-            "velocity": (_c("vx vy vz", of="vehicle_local_position."),),
-            "angular_velocity": (
-                _c("[0] [1] [2]", of="vehicle_angular_velocity.xyz"),
-                _c("[0] [1] [2]", of="sensor_combined.gyro_rad"),
-            ),
-            "acceleration": (
-                _c("[0] [1] [2]", of="vehicle_acceleration.xyz"),
-                _c("[0] [1] [2]", of="sensor_combined.accelerometer_m_s2"),
-            ),
-            "motor_command": (
-                _c("[0] [1] [2] [3]", of="actuator_motors.signal"),
-                _c("[0] [1] [2] [3]", 1e-3, 1000.0, of="actuator_outputs.output"),
-            ),
-            "battery_voltage": (_c("battery_status.voltage_v"),),
-            "setpoint.position": (
-                _c("[0] [1] [2]", of="trajectory_setpoint.position"),
-                _c("x y z", of="vehicle_local_position_setpoint."),
-            ),
-        },
-        frames.px4(),
-    ),
-    "crazyflie": Layout(  # the log variables of the firmware, as the uSD deck writes them
-        {
-            "position": (_c("x y z", of="stateEstimate."), _c("x y z", 1e-3, of="stateEstimateZ.")),
-            "quaternion": (_c("qx qy qz qw", of="stateEstimate."), _c("qx qy qz qw", of="stateEstimateZ.")),
-            "euler": tuple(  # the firmware counts pitch the other way round
-                _c("roll pitch yaw", (DEGREE, -DEGREE, DEGREE), of=group) for group in ("stateEstimate.", "stabilizer.")
-            ),
-            "velocity": (_c("vx vy vz", of="stateEstimate."), _c("vx vy vz", 1e-3, of="stateEstimateZ.")),
-            "angular_velocity": (
-                _c("x y z", DEGREE, of="gyro."),
-                _c("rateRoll ratePitch rateYaw", (1e-3, -1e-3, 1e-3), of="stateEstimateZ."),
-            ),
-            "acceleration": (_c("x y z", G, of="acc."),),
-            "motor_command": (_c("m1 m2 m3 m4", 1 / 65535, of="motor."),),
-            "battery_voltage": (_c("pm.vbat"),),
-            "setpoint.position": (_c("x y z", of="ctrltarget."),),
-            "setpoint.yaw": (_c("ctrltarget.yaw", DEGREE),),
-        },
-        frames.crazyflie(),
-    ),
+    name: Layout(
+        {quantity: tuple(named_alike(**choice) for choice in choices) for quantity, choices in said["columns"].items()},
+        getattr(frames, said["convention"])(),
+        tuple(said.get("onboard", ())),
+        Columns((said.get("time", "time"),)),
+    )
+    for name, said in shipped("layouts.yaml").items()
 }
 
 
-def choose(columns: str | Layout | Mapping[str, object], default: Layout | None) -> Layout:
+def choose(columns: Asked, default: Layout | None) -> Layout:
     """The layout for what a caller names: a preset, a layout, or a mapping, which replaces entries of a default."""
     if isinstance(columns, Layout):
         return columns
@@ -204,18 +151,6 @@ def choose(columns: str | Layout | Mapping[str, object], default: Layout | None)
     if "quaternion" in chosen or "euler" in chosen:  # the caller names the attitude: not that of the preset, too
         kept = {quantity: choices for quantity, choices in kept.items() if quantity not in ("quaternion", "euler")}
     return replace(default, columns=kept | chosen, time=time[0] if time else default.time, required=frozenset(chosen))
-
-
-def _as_columns(quantity: str, names: object) -> Columns:
-    if not isinstance(names, Columns):
-        if not isinstance(names, Sequence) or isinstance(names, bytes):
-            raise UserTypeError(
-                f"columns: {shown(quantity)} takes the name of a column, a list of them, or Columns; got "
-                f"{shown(names)}."
-            )
-        names = Columns(tuple(names) if not isinstance(names, str) else (names,))
-    _check_quantity(quantity, names)
-    return names
 
 
 def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Signal]:

@@ -98,15 +98,7 @@ def read_log(
 ) -> FlightLog:
     """Read the log of a flight: CSV (also gz), PX4 ULog, ROS bag, or the uSD log of a Crazyflie.
 
-    .. code-block:: python
-
-        log = read_log("flight.csv", columns={"time": "t", "position": ["x", "y", "z"],
-                       "quaternion": ["qw", "qx", "qy", "qz"], "motor_command": ["m4", "m3", "m2", "m1"],
-                       "acceleration": Columns(("ax", "ay", "az"), scale=9.80665)})
-        print(log)
-
-    Bags need rosbags: ``pip install '.[logs]'`` in a clone. Time and memory are proportional to the size of the file;
-    ``docs/flight_logs.md`` has the limits.
+    Bags need rosbags: ``pip install '.[logs]'`` in a clone. ``docs/flight_logs.md`` has examples and limits.
 
     Args:
         path: a file, or the folder of a ROS 2 bag. Its first bytes say of what kind it is.
@@ -126,8 +118,6 @@ def read_log(
     Raises:
         LogError: the log cannot be used. Its subclasses name the reason.
     """
-    if not (convention is None or isinstance(convention, Convention)):
-        raise UserTypeError(f"convention must be one of torchrl_quad.deploy.frames, or None; got {shown(convention)}.")
     path = Path(path)
     with _naming(path):
         streams, layout, notes = read_streams(path, columns)

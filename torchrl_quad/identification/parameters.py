@@ -12,8 +12,7 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
 from torchrl_quad.dynamics.parameters import RawParams
-from torchrl_quad.errors import shown
-from torchrl_quad.identification.errors import UnknownField
+from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.identification.prediction import MAX_DELAY, Plant, plant_of
 
 
@@ -195,11 +194,8 @@ _NUMBERS = {
 def report(
     model: Model, x: Tensor, covariance: Tensor, quantile: float, has_mass: bool
 ) -> tuple[dict[str, Estimate], dict[str, Estimate]]:
-    """The parameters and the ratios by name, at coordinates (n) with a covariance (n, n).
-
-    ``quantile`` is how many standard deviations half of an interval has. Without a known mass, fields that scale with
-    it are left out.
-    """
+    """The parameters and the ratios by name, at coordinates (n) with a covariance (n, n); ``quantile`` is how many
+    standard deviations half of an interval has. Without a known mass, fields that scale with it are left out."""
     place = {name: i for i, name in enumerate(model.free)}
     fitted, prior = model.plant(x, x.new_zeros(())), model.only(()).plant(x[:0], x.new_zeros(()))
 
@@ -232,10 +228,10 @@ def unknowns_of(fields: str | Sequence[str] | None) -> list[str]:
     """The unknowns behind fields; None means all."""
     fields = [fields] if isinstance(fields, str) else list(FIELDS if fields is None else dict.fromkeys(fields))
     if not fields:
-        raise UnknownField(f"identify: fields is empty. Choose from: {', '.join(FIELDS)}; None is everything.")
+        raise UserValueError(f"identify: fields is empty. Choose from: {', '.join(FIELDS)}; None is everything.")
     for name in fields:
         if name not in FIELDS:
-            raise UnknownField(
+            raise UserValueError(
                 f"identify cannot fit {shown(name)}. Choose from: {', '.join(FIELDS)}. Geometry, gravity and the mass "
                 'are taken as known: known={"mass": 0.03}, or in the drone.'
             )

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams, load_drone, quaternion
 from torchrl_quad.dynamics.rigid_body import RigidBodyState, Rotors, accelerations, rk4
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
-from torchrl_quad.identification.errors import NoFlight, TooLittleFlight, TooShort
+from torchrl_quad.identification.errors import NoFlight, TooShort
 from torchrl_quad.identification.log import FlightLog
 from torchrl_quad.identification.signals import Array, convolved
 from torchrl_quad.options import checked
@@ -45,10 +45,9 @@ def prediction_error(
     squares over all windows of the flight: of the distance in ``position`` [m] and ``velocity`` [m/s], of the angle in
     ``attitude`` [rad], of the length of the difference in ``body_rate`` [rad/s].
 
-    Every model gets the same help from before the window, and none from within it. The speeds of its rotors follow from
-    the commands before. What the drone moved beyond the model over the last ``past`` seconds continues, as a constant
-    force and torque in the body frame: it stands for the drone's trim, a worn rotor and slow air. The delay of the
-    on-board clock is found from the gyro and the attitude, without the drone.
+    The speeds of the rotors follow from the commands before a window, and the delay of the on-board clock from the gyro
+    and the attitude. What the drone moved beyond the model over the last ``past`` seconds continues, as a constant
+    force and torque in the body frame: it stands for the drone's trim, a worn rotor and slow air.
 
     A drone with a ``motor_command`` (:class:`~torchrl_quad.dynamics.MotorCommand`) turns commands into rotor speeds by
     that. For one without, speed is proportional to command times battery voltage, by the factor that makes its mean
@@ -63,8 +62,8 @@ def prediction_error(
         every: time between the starts of predictions [s].
 
     Raises:
-        ValueError: a horizon is not positive, or the drone is wrong.
         TooShort: no piece of the flight is long enough.
+        ValueError: the drone is wrong.
     """
     horizons = [float(h) for h in horizons]
     windows, flown, seen = predict(as_logs(log, "prediction_error"), drone, max(horizons), past, every)
@@ -103,7 +102,7 @@ def as_logs(log: FlightLog | Sequence[FlightLog], whose: str) -> list[FlightLog]
         if not one.segments:
             raise TooShort(f"{whose}: {one.name} has no piece in flight.")
     if not logs:
-        raise TooLittleFlight(f"{whose} needs at least one flight: read_log(path) gives it.")
+        raise UserValueError(f"{whose} needs at least one flight: read_log(path) gives it.")
     return logs
 
 
@@ -244,10 +243,8 @@ class Windows:
         return Push(quaternion.rotate_inverse(middle.quaternion, sped).mean(1), spun.mean(1))
 
     def turning(self, stream_delay: Tensor, span: int) -> Tensor:
-        """How much further the attitude turned in pieces of ``span`` samples than the gyro says, (W, pieces, 3) [rad].
-
-        It depends on the delay between them, and not on the drone.
-        """
+        """How much further the attitude turned in pieces of ``span`` samples than the gyro says, (W, pieces, 3) [rad]:
+        it depends on the delay between them, and not on the drone."""
         count = self.future // span
         seen = self.measured(stream_delay, torch.arange(0, count * span + 1))
         attitude = seen.quaternion[:, ::span]
@@ -287,9 +284,7 @@ class Windows:
 
     def _between(self, series: Tensor, index: Tensor) -> Tensor:
         """A series (L, T, k) at fractional samples (W, n): cubic (Catmull and Rom), and so differentiable in time.
-
-        A straight line between samples would lose two per cent of what moves five times a second.
-        """
+        A straight line between samples would lose two per cent of what moves five times a second."""
         below = index.detach().floor().clamp(1, series.shape[1] - 3)
         s = (index - below).unsqueeze(-1)
         below, log = below.long(), self.log[:, None]
@@ -306,10 +301,7 @@ def cut(
     logs: Sequence[FlightLog], future: float, past: float, every: float, stride: int = 1, nominal_voltage: float = 1.0
 ) -> Windows:
     """Windows of length ``future``, one ``every`` so often [s]; each lies in one piece of flight, with its ``past`` [s]
-    and room for delays.
-
-    A step of the body is ``stride`` samples long. ``nominal_voltage`` [V] is of a battery that is not in the log.
-    """
+    and room for delays. ``nominal_voltage`` [V] is of a battery that is not in the log."""
     dt = min(log.dt * max(1, round(SAMPLE / log.dt)) for log in logs)
     columns, starts, owners = [], [], []
     n_past, n_future = round(past / dt), round(future / dt)
@@ -339,10 +331,8 @@ def cut(
 
 
 def stream_delay(log: FlightLog) -> float:
-    """The time [s] by which the on-board clock is late: where the gyro fits the attitude best; 0 for a single clock.
-
-    It compares how far the attitude turned in a tenth of a second with the integral of the gyro, without the drone.
-    """
+    """The time [s] by which the on-board clock is late: where the integral of the gyro over a tenth of a second fits
+    best how far the attitude turned; 0 for a single clock."""
     if "angular_velocity" not in log.onboard:
         return 0.0
     span = max(2, round(0.1 / log.dt))

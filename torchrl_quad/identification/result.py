@@ -18,7 +18,7 @@ from torchrl_quad.dynamics.rigid_body import RigidBodyState
 from torchrl_quad.files import make_folder, replacing
 from torchrl_quad.identification.log import FlightLog
 from torchrl_quad.identification.parameters import Estimate
-from torchrl_quad.identification.prediction import ERRORS, PAST, differences, predict
+from torchrl_quad.identification.prediction import ERRORS, differences, predict
 from torchrl_quad.identification.signals import Array
 from torchrl_quad.options import checked
 
@@ -129,10 +129,6 @@ class IdentificationResult:
 
         Pictures come last, and need matplotlib: ``prediction.png`` shows predictions against the first flight,
         ``residuals.png`` the errors of all.
-
-        Raises:
-            ImportError: matplotlib is not installed.
-            OSError: the folder cannot be made or written.
         """
         folder = make_folder(folder)
         for name, text in {
@@ -143,71 +139,60 @@ class IdentificationResult:
             with replacing(folder / name) as path:
                 path.write_text(text, encoding="utf-8")
         if pictures and self.flights:
-            span = {"horizon": self.settings["horizon"], "past": self.settings["past"]}
-            draw_prediction(self.flights[0], self.drone, folder / "prediction.png", prior=self.prior, **span)
-            draw_residuals(self.flights, self.drone, folder / "residuals.png", **span)
+            self._draw_prediction(folder / "prediction.png")
+            self._draw_residuals(folder / "residuals.png")
         return folder
 
+    def _draw_prediction(self, path: Path) -> None:
+        """Draw a piece of the first flight, and over it predictions from one state to the next."""
+        from torchrl_quad.render.canvas import BLUE, INK, RED, make_figure, save  # which imports the environments
 
-def draw_prediction(
-    log: FlightLog, drone: Any, path: str | Path, prior: Any = None, horizon: float = 0.5, past: float = PAST
-) -> None:
-    """Draw a piece of a flight, and over it predictions from one state to the next, ``horizon`` [s] long each.
+        horizon, past = self.settings["horizon"], self.settings["past"]
+        figure = make_figure(figsize=(7.2, 6.4), layout="constrained")
+        axes = figure.subplots(4, 2, sharex=True)
+        for drone, color, label in ((self.prior, RED, "before the fit"), (self.drone, BLUE, "fitted")):
+            windows, flown, seen = predict(self.flights[:1], drone, horizon, past, every=horizon)
+            count = min(len(windows), round(_SECONDS / horizon))
+            time = windows.dt * (windows.start[:count, None].numpy() + np.arange(windows.future + 1))
+            for (row, quantity), pair in zip(_ROWS.items(), axes, strict=True):
+                for k, ax in enumerate(pair):
+                    name = ("roll", "pitch")[k] if row in ("tilt", "body_rate") else "xy"[k]
+                    real, guess = (_component(x, row, k)[:count] for x in (seen, flown))
+                    if color == BLUE:  # the last
+                        ax.set_ylabel(quantity.format(name), fontsize=8)
+                        ax.tick_params(labelsize=7)
+                        ax.grid(alpha=0.3, linewidth=0.5)
+                        ax.plot(time.T, real.T, color=INK, linewidth=1.6, alpha=0.55)
+                        margin = 0.25 * (real.max() - real.min()) + 1e-3
+                        ax.set_ylim(real.min() - margin, real.max() + margin)
+                    ax.plot(time.T, guess.T, color=color, linewidth=0.9)
+                    ax.plot([], [], color=color, label=label)
+        axes[0, 0].plot([], [], color=INK, linewidth=1.6, alpha=0.55, label="flight")
+        axes[0, 0].legend(fontsize=7, frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0))
+        for ax in axes[-1]:
+            ax.set_xlabel("time [s]", fontsize=8)
+        axes[0, 1].set_title(f"{self.flights[0].name}, predictions of {horizon:g} s", fontsize=8, loc="right")
+        save(figure, path, dpi=110)
 
-    ``drone``, ``past`` and, for comparison, ``prior`` are what :func:`prediction_error` takes.
-    """
-    from torchrl_quad.render.canvas import BLUE, INK, RED, make_figure, save  # which imports the environments
+    def _draw_residuals(self, path: Path) -> None:
+        """Draw how errors grow over a prediction: the median, and half and nine in ten of the windows around it."""
+        from torchrl_quad.render.canvas import BLUE, make_figure, save
 
-    figure = make_figure(figsize=(7.2, 6.4), layout="constrained")
-    axes = figure.subplots(4, 2, sharex=True)
-    for one, color, label in ((prior, RED, "before the fit"), (drone, BLUE, "fitted")):
-        if one is None:
-            continue
-        windows, flown, seen = predict([log], one, horizon, past, every=horizon)
-        count = min(len(windows), round(_SECONDS / horizon))
-        time = windows.dt * (windows.start[:count, None].numpy() + np.arange(windows.future + 1))
-        for (row, quantity), pair in zip(_ROWS.items(), axes, strict=True):
-            for k, ax in enumerate(pair):
-                name = ("roll", "pitch")[k] if row in ("tilt", "body_rate") else "xy"[k]
-                real, guess = (_component(x, row, k)[:count] for x in (seen, flown))
-                if color == BLUE:  # the last
-                    ax.set_ylabel(quantity.format(name), fontsize=8)
-                    ax.tick_params(labelsize=7)
-                    ax.grid(alpha=0.3, linewidth=0.5)
-                    ax.plot(time.T, real.T, color=INK, linewidth=1.6, alpha=0.55)
-                    margin = 0.25 * (real.max() - real.min()) + 1e-3
-                    ax.set_ylim(real.min() - margin, real.max() + margin)
-                ax.plot(time.T, guess.T, color=color, linewidth=0.9)
-                ax.plot([], [], color=color, label=label)
-    axes[0, 0].plot([], [], color=INK, linewidth=1.6, alpha=0.55, label="flight")
-    axes[0, 0].legend(fontsize=7, frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0))
-    for ax in axes[-1]:
-        ax.set_xlabel("time [s]", fontsize=8)
-    axes[0, 1].set_title(f"{log.name}, predictions of {horizon:g} s", fontsize=8, loc="right")
-    save(figure, path, dpi=110)
-
-
-def draw_residuals(
-    logs: Sequence[FlightLog], drone: Any, path: str | Path, horizon: float = 0.5, past: float = PAST
-) -> None:
-    """Draw how errors grow over a prediction: the median, and half and nine in ten of the windows around it."""
-    from torchrl_quad.render.canvas import BLUE, make_figure, save
-
-    windows, flown, seen = predict(logs, drone, horizon, past, every=0.1)
-    errors = differences(flown, seen).norm(dim=-1).numpy()
-    time = windows.dt * np.arange(errors.shape[1])
-    figure = make_figure(figsize=(7.2, 2.2), layout="constrained")
-    for i, (ax, (name, unit)) in enumerate(zip(figure.subplots(1, 4), ERRORS.items(), strict=True)):
-        low, lower, median, upper, high = np.quantile(errors[:, :, i], (0.05, 0.25, 0.5, 0.75, 0.95), axis=0)
-        ax.fill_between(time, low, high, color=BLUE, alpha=0.15, linewidth=0)
-        ax.fill_between(time, lower, upper, color=BLUE, alpha=0.3, linewidth=0)
-        ax.plot(time, median, color=BLUE)
-        ax.set_title(f"{name.replace('_', ' ')} [{unit}]", fontsize=8)
-        ax.tick_params(labelsize=7)
-        ax.set_xlabel("time [s]", fontsize=8)
-        ax.grid(alpha=0.3, linewidth=0.5)
-        ax.set_ylim(bottom=0.0)
-    save(figure, path, dpi=110)
+        windows, flown, seen = predict(self.flights, self.drone, self.settings["horizon"], self.settings["past"])
+        errors = differences(flown, seen).norm(dim=-1).numpy()
+        time = windows.dt * np.arange(errors.shape[1])
+        figure = make_figure(figsize=(7.2, 2.2), layout="constrained")
+        for i, (ax, (name, unit)) in enumerate(zip(figure.subplots(1, 4), ERRORS.items(), strict=True)):
+            low, lower, median, upper, high = np.quantile(errors[:, :, i], (0.05, 0.25, 0.5, 0.75, 0.95), axis=0)
+            ax.fill_between(time, low, high, color=BLUE, alpha=0.15, linewidth=0)
+            ax.fill_between(time, lower, upper, color=BLUE, alpha=0.3, linewidth=0)
+            ax.plot(time, median, color=BLUE)
+            ax.set_title(f"{name.replace('_', ' ')} [{unit}]", fontsize=8)
+            ax.tick_params(labelsize=7)
+            ax.set_xlabel("time [s]", fontsize=8)
+            ax.grid(alpha=0.3, linewidth=0.5)
+            ax.set_ylim(bottom=0.0)
+        save(figure, path, dpi=110)
 
 
 def _component(states: RigidBodyState, row: str, k: int) -> Array:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,17 +18,17 @@ from torchrl_quad.rotations import conjugate, continuous, multiply, rotate
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 LARGEST = 1e9  # of a quantity, in SI units; only damage makes larger ones
-MAX_COLUMNS = 100_000  # of a table, and of all messages of a ULog or a uSD log together
-MAX_RECORDS = 20 * 10**6  # messages of a ULog or a bag, events of a uSD log
+MAX_COLUMNS = 100_000  # of a table, and of all messages of a ULog together
 
 
 def open_plain(path: Path) -> io.BufferedReader:
     """A plain file, open for reading. A pipe, a socket or a device is not opened: to read one may never end."""
-    if not path.is_file():
-        raise UnreadableLog(
-            f"{path.name} is not a regular file but a pipe, a socket or a device. Give the path of a log."
-        )
-    return open(path, "rb")
+    if path.is_file():
+        file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb")
+        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):  # which may have become a pipe in between
+            return file
+        file.close()
+    raise UnreadableLog(f"{path.name} is not a regular file but a pipe, a socket or a device. Give the path of a log.")
 
 
 def too_many(name: str, most: int, what: str, remedy: str) -> UnreadableLog:
@@ -90,11 +92,8 @@ def clean(signal: Signal) -> tuple[Signal, list[str]]:
 
 
 def resample(signal: Signal, grid: Array, dt: float, hold: bool = False) -> Array:
-    """The signal at the times of a uniform grid (T, size).
-
-    Slower signals are interpolated linearly, or held. Faster ones are averaged over a step that is centred at each
-    time, so that nothing aliases and nothing is delayed.
-    """
+    """The signal at the times of a uniform grid (T, size): slower ones interpolated linearly, or held, and faster ones
+    averaged over a step that is centred at each time, so that nothing aliases and nothing is delayed."""
     t, x = signal.time, signal.values
     if hold:
         return x[np.clip(np.searchsorted(t, grid + 1e-9, side="right") - 1, 0, None)]
@@ -102,8 +101,7 @@ def resample(signal: Signal, grid: Array, dt: float, hold: bool = False) -> Arra
         return np.stack([np.interp(grid, t, column) for column in x.T], -1)
     area = np.concatenate((np.zeros_like(x[:1]), np.cumsum((x[1:] + x[:-1]) * np.diff(t)[:, None] / 2.0, 0)))
 
-    def integral(at: Array) -> Array:
-        """Of the linear interpolation, from t[0] to each time."""
+    def integral(at: Array) -> Array:  # of the linear interpolation, from t[0] to each time
         k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
         share = (at - t[k])[:, None]
         slope = (x[k + 1] - x[k]) / (t[k + 1] - t[k])[:, None]

@@ -20,10 +20,9 @@ import numpy as np
 from torchrl_quad.identification.autopilots import read_ulog, read_usd
 from torchrl_quad.identification.bags import MAGIC, read_bag
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
-from torchrl_quad.identification.layouts import LAYOUTS, Layout, choose, match
+from torchrl_quad.identification.layouts import LAYOUTS, Asked, Layout, choose, match
 from torchrl_quad.identification.signals import MAX_COLUMNS, Array, Stream, open_plain, too_many
 
-Asked = str | Layout | Mapping[str, object] | None
 Read = tuple[list[Stream], Layout, list[str]]
 # Of a file, which may be packed, and of what it unpacks to. All is read in time and memory proportional to its size.
 MAX_BYTES, MAX_UNPACKED = 2 * 10**9, 500 * 10**6
@@ -37,10 +36,6 @@ def read_streams(path: Path, columns: Asked) -> Read:
     if not path.exists():
         raise UnreadableLog(f"{path} does not exist. Give the path of a log.")
     if path.is_dir():
-        if not (path / "metadata.yaml").is_file():
-            raise UnreadableLog(
-                f"{path} is a folder without metadata.yaml, so not a ROS 2 bag. Give the path of a log."
-            )
         return read_bag(path, columns)
     with open_plain(path) as file:
         start = file.peek(16)[:16]

@@ -54,19 +54,18 @@ def make_actor(
         activation: of the hidden layers; smooth ones give smooth policy gradients.
         input_scale: the input is multiplied by this; a number, or one for each of ``in_keys``. What the tasks observe
             is of one to ten; entries of the state may be far larger.
-        action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``,
-            averaged over environments, if there is one (see :mod:`torchrl_quad.data`; a drone's is to hover), and the
-            middle of the range otherwise.
+        action_init: the mean action at the start, (k), strictly between the bounds. By default ``env.neutral_action``
+            (see :mod:`torchrl_quad.data`; a drone's is to hover), or the middle of the range.
         scale_init: the standard deviation of the policy's noise at the start, before the tanh, in units of half the
             range. Training brings it down to 0.01 at least, or to a tenth of this.
         learn_scale: whether this noise changes with the state and in training. Otherwise neither a gradient through the
             simulator nor a KL bound takes the exploration away.
-        noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise. Correlated noise moves a
-            drone where independent noise averages out; try 0.9 at 50 Hz. Then loc, scale and the log-probability are
-            those of the action given the noise of the step before, ``noise_before``; ``noise`` is that of the step.
+        noise_correlation: of the policy's noise in two consecutive steps; 0 is white noise, which averages out; try 0.9
+            at 50 Hz. Then loc, scale and the log-probability are those of the action given ``noise_before``, that of
+            the step before; ``noise`` is that of the step.
         return_log_prob: whether it also writes the log-probability of the action, which an entropy bonus and PPO need.
             mu then stays between -5 and 5: further out, rounding of the action determines the log-probability.
-        recurrent: whether it has a memory: a GRU reads the last hidden layer, and the last layer reads both. See
+        recurrent: whether it has a memory: a GRU reads the last hidden layer, and the head reads both. See
             :func:`make_visual_actor` for the entries that this adds.
         hidden_size: numbers in that memory.
 
@@ -231,10 +230,9 @@ class ComposedActor(TanhGaussianActor):
         """Write loc, scale and action, the memory, correlated noise, and the log-probability if wanted."""
         if "is_init" in self.in_keys and "is_init" not in tensordict:
             raise UserValueError(
-                "A policy with memory reads 'is_init', which says where episodes begin. Fly it by "
-                "differentiable_rollout, or by env.rollout(..., break_when_any_done=False), on an environment without "
-                "transforms; or give the environment TorchRL's: TransformedEnv(env, Compose(InitTracker(), "
-                "actor.make_tensordict_primer()))."
+                "A policy with memory reads 'is_init', which says where episodes begin. Fly an environment without "
+                "transforms by differentiable_rollout, or give it TorchRL's: "
+                "TransformedEnv(env, Compose(InitTracker(), actor.make_tensordict_primer()))."
             )
         return super().forward(tensordict, **kwargs)
 

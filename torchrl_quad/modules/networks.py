@@ -26,15 +26,14 @@ MOST_WEIGHTS = 100_000_000  # of a network
 
 
 def _pointwise(activation: Any) -> Any:
-    if isinstance(activation, type) and issubclass(activation, nn.Module):
-        x = torch.zeros(2, 3)
-        try:
-            with torch.random.fork_rng(devices=[]):
-                if activation()(x).shape == x.shape:
-                    return activation
-        except Exception:  # classes that are no activations raise anything
-            pass
-    raise UserValueError("be a class of activations of torch.nn without arguments, such as torch.nn.ELU")
+    try:
+        with torch.random.fork_rng(devices=[]):
+            fits = issubclass(activation, nn.Module) and activation()(torch.zeros(2, 3)).shape == (2, 3)
+    except Exception:  # what is no activation raises anything
+        fits = False
+    if not fits:
+        raise UserValueError("be a class of activations of torch.nn without arguments, such as torch.nn.ELU")
+    return activation
 
 
 Actor = TypeVar("Actor", bound=TanhGaussianActor)
@@ -98,9 +97,8 @@ def first_action(env: EnvBase, action_init: Tensor | None, name: str) -> tuple[B
         raise UserValueError(f"{name} needs an action with bounds, a Bounded spec; got {type(spec).__name__}.")
     if len(spec.shape) != 1:
         raise UserValueError(
-            f"{name} writes one action (k) for each environment, and here it has shape {tuple(spec.shape)}: a "
-            "transform such as MultiAction asks for several actions at once. Leave it out. To hold each action longer, "
-            "give the environment a longer control step, control_dt=0.04."
+            f"{name} writes one action (k) for each environment, and here it has shape {tuple(spec.shape)}: leave out "
+            "transforms such as MultiAction. To hold each action longer, give the environment control_dt=0.04."
         )
     low, high = spec.low, spec.high
     middle = 0.5 * (low + high)

@@ -130,9 +130,8 @@ class Critic(ValueOperator):
 class TanhGaussianActor(ProbabilisticActor):
     """What :func:`~torchrl_quad.make_actor` builds: a tanh-Gaussian policy that environments can fly as pure functions.
 
-    With noise that is correlated in time it writes ``noise``, that of the step, and ``noise_before``, that of the step
-    before. A flight hands ``noise`` on from step to step. If there is none yet it is drawn. A deterministic flight has
-    none.
+    With noise that is correlated in time it writes ``noise``, which a flight hands on, and ``noise_before``, that of
+    the step before. If there is none yet it is drawn. A deterministic flight has none.
     """
 
     built: list[Any]  # its layout
@@ -237,8 +236,7 @@ class PlainTanhGaussian:
 
         Noise that is correlated in time comes with that of the step before, (steps, n, 2 size).
         """
-        like = self.weights[0]
-        noise = like.new_zeros((steps, n, self.size))
+        noise = self.weights[0].new_zeros((steps, n, self.size))
         if not self.rho:
             for x in noise if self.is_random else ():
                 x.normal_()

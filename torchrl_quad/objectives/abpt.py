@@ -26,8 +26,8 @@ class ABPTLoss(PathwiseCriticLoss):
     - J_N, the discounted rewards plus gamma^n Q(s_n, a_n), which is exact if the reward is differentiable;
     - J_0 = Q(s_0, a_0), the critic's estimate of the whole reward, differentiable or not.
 
-    Q is the least of the critics; it keeps its gradient in state and action and has none in the critics' parameters.
-    a_n, and the actions in the critics' targets, are sampled from the policy again.
+    Q is the least of the critics, with its gradient in state and action and none in the critics' parameters. a_n, and
+    the actions in the critics' targets, are sampled from the policy again.
 
     .. code-block:: python
 
@@ -44,8 +44,8 @@ class ABPTLoss(PathwiseCriticLoss):
         actor_network: the policy that flew the rollout.
         qvalue_network: the critic Q(s, a), which writes ``state_action_value`` (see ``set_keys``).
         num_qvalue_nets: the critics made from it, each initialised independently, whose smallest value counts.
-        n_step_return: whether J includes J_N, the rewards of the horizon and the value of its end.
-        zero_step_return: whether J includes J_0, the critic's estimate at the start.
+        n_step_return: whether J includes J_N.
+        zero_step_return: whether J includes J_0.
         simulated_steps: control steps that the return of the start flies through the simulator before it asks the
             critic: J_0 is then sum_(t<k) gamma^t r_t + gamma^k V(s_k), with V(s) = Q(s, a) and a sampled. Its gradient
             in a_0 is the simulator's, not the critic's, which may be noise. With an action delay of d steps a_0 moves
@@ -56,8 +56,6 @@ class ABPTLoss(PathwiseCriticLoss):
 
     @dataclass
     class _AcceptedKeys(PathwiseCriticLoss._AcceptedKeys):
-        """As for every pathwise loss with a critic, and the key of the critics' predictions."""
-
         state_action_value: NestedKey = "state_action_value"
 
     default_keys = _AcceptedKeys
@@ -90,8 +88,7 @@ class ABPTLoss(PathwiseCriticLoss):
         super().__init__(actor_network, **kwargs)
         self.simulated_steps = simulated_steps
         self.n_step_return, self.zero_step_return = n_step_return, zero_step_return
-        switched = {"n_step_return": n_step_return, "zero_step_return": zero_step_return}
-        self.out_keys = [*self.out_keys, *(name for name, on in switched.items() if on)]
+        self.out_keys = [*self.out_keys, *["n_step_return"] * n_step_return, *["zero_step_return"] * zero_step_return]
         copies = {"expand_dim": num_qvalue_nets, "create_target_params": delay_qvalue}
         self.convert_to_functional(qvalue_network, "qvalue_network", **copies)
 

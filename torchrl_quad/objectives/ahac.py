@@ -43,14 +43,14 @@ class AHACLoss(SHACLoss):
         loss.adapt_horizon(losses["stiffness"])
 
     Args:
-        actor_network, value_network: as for :class:`SHACLoss`; the policy is one of :func:`~torchrl_quad.make_actor`.
+        actor_network: the policy that flew the rollout, as :func:`~torchrl_quad.make_actor` builds it.
         horizon: control steps of the first rollout.
         min_horizon: the shortest horizon; null for a quarter of the first.
         max_horizon: the longest horizon; null for twice the first.
         max_stiffness: the bound on the growth of action gradients along a horizon, beyond which it gets shorter; 1.5 to
             5 are usual.
         horizon_lr: the share by which the horizon may change in an iteration.
-        num_value_nets, **kwargs: as for :class:`SHACLoss`.
+        **kwargs: as for :class:`SHACLoss`.
     """
 
     measured_of_actions = ["stiffness"]
@@ -74,11 +74,6 @@ class AHACLoss(SHACLoss):
             raise UserValueError(f"horizon={horizon} must lie between min_horizon={low} and max_horizon={high}.")
         options = with_fixed(self, kwargs, target_bootstrap=False, delay_value=False)
         super().__init__(actor_network, value_network, num_value_nets=num_value_nets, **options)
-        if not {"loc", "scale"} <= set(self.actor_network.out_keys):
-            raise UserValueError(
-                "AHACLoss needs a policy as make_actor builds it, which writes loc and scale; this one writes "
-                f"{', '.join(map(str, self.actor_network.out_keys))}."
-            )
         self.min_horizon, self.max_horizon = low, high
         self.max_stiffness, self.horizon_lr = max_stiffness, horizon_lr
         number = {"device": self._default_device, "dtype": torch.float64}

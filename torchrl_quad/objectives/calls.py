@@ -151,13 +151,9 @@ def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
 
 
 def sources_of_steps(entry: Tensor) -> Tensor | list[GradientEdge] | None:
-    """What the rewards of a rollout depend on instead of one of its entries, which was stacked afterwards.
-
-    A compiled horizon holds the actions of all steps in one tensor (horizon, num_envs, k). Otherwise each step that has
-    a graph has its own place in it. None: the entry is no stack.
-    """
+    """What the rewards of a rollout depend on instead of one of its entries, if that was stacked afterwards."""
     node: Any = entry.grad_fn
-    if hasattr(node, "actions"):  # a compiled horizon, a node of its own
+    if hasattr(node, "actions"):  # of a compiled horizon, a node of its own: (horizon, num_envs, k)
         return node.actions
     if node is None or node.name() != "StackBackward0":
         return None
@@ -165,11 +161,10 @@ def sources_of_steps(entry: Tensor) -> Tensor | list[GradientEdge] | None:
 
 
 def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
-    """What a policy of ``make_actor`` or ``make_visual_actor`` writes in a rollout's states, with the rollout's noise.
+    """What a policy writes in a rollout's states, with the rollout's noise.
 
-    The values are those of the rollout as long as the policy has not changed. The gradients reach the policy's
-    parameters alone, neither earlier states nor the noise. A memory is built up again from that at the start.
-    Actions within 1e-6 of a bound count as if they were that far from it.
+    The gradients reach the policy's parameters alone, neither earlier states nor the noise. A memory is built up again
+    from that at the start. Actions within 1e-6 of a bound count as if they were that far from it.
     """
     with params.to_module(actor):
         plain = plain_of(actor)

@@ -58,22 +58,21 @@ class HybridLoss(SHACLoss):
             (losses["loss_actor"] + losses["loss_value"]).backward()
 
     Args:
-        actor_network, value_network: as for :class:`SHACLoss`; the policy is one of :func:`~torchrl_quad.make_actor`.
+        actor_network: the policy that flew the rollout, as ``make_actor`` builds it.
+        value_network: the critic V(s).
         gradient_lmbda: the lambda of the return that the pathwise gradient differentiates; 0.9 is usual. That of the
             advantage and of the critic's targets is ``make_value_estimator(lmbda=...)``.
         clip_epsilon: how far the ratio of probabilities may move from 1; 0.2 is usual.
         entropy_coeff: the weight of the entropy bonus, next to advantages of standard deviation 1; 0 for none.
-        clip_action_gradient, reduction: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
+        clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for none.
+        reduction: mean, sum or none, over samples.
         decay: the share of the running weight that a rollout leaves as it is.
         average: of a scalar over the processes that train together, if there are several.
     """
 
     @dataclass
     class _AcceptedKeys(SHACLoss._AcceptedKeys):
-        """As for SHAC, and the keys of what :meth:`HybridLoss.write_targets` writes.
-
-        ``advantage`` is A' and ``location_gradient`` b p, both divided by the standard deviation of A; ``latent`` is u.
-        """
+        """``advantage`` is A' and ``location_gradient`` b p, both divided by the deviation of A; ``latent`` is u."""
 
         advantage: NestedKey = "advantage"
         location_gradient: NestedKey = "location_gradient"
@@ -188,7 +187,6 @@ class HybridLoss(SHACLoss):
         return grad if self.clip is None else self.clip(grad)[0]
 
     def _in_location(self, data: TensorDictBase, grad: Tensor) -> tuple[Tensor, Tensor]:
-        """The gradient in the mean before the tanh, from that in the action, and the action before the tanh."""
         with self.actor_network_params.to_module(self.actor_network):
             plain = plain_of(self.actor_network)
             xi = plain.drawn_again(data)[:, : plain.size].view_as(grad)

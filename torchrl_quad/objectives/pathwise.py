@@ -339,8 +339,6 @@ class PathwiseCriticLoss(PathwiseLoss):
 
     @dataclass
     class _AcceptedKeys(PathwiseLoss._AcceptedKeys):
-        """As for every pathwise loss, and the key under which targets are kept."""
-
         value_target: NestedKey = "value_target"
 
     default_keys = _AcceptedKeys

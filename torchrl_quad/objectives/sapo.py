@@ -34,14 +34,13 @@ class SAPOLoss(SHACLoss):
         (losses["loss_actor"] + losses["loss_value"] + losses["loss_alpha"]).backward()
 
     Args:
-        actor_network, value_network: as for :class:`SHACLoss`; the policy writes log-probabilities
-            (``return_log_prob=True``).
+        actor_network: the policy that flew the rollout, with log-probabilities (``return_log_prob=True``).
         alpha: the coefficient of the entropy: a positive number, or auto to hold the entropy at its target; without
             entropy take SHACLoss.
         alpha_init: what alpha=auto starts from.
         target_entropy: where alpha=auto holds the entropy: a negative number, or auto for minus half the number of
             action entries. The entropy is measured in its size.
-        num_value_nets, **kwargs: as for :class:`SHACLoss`.
+        **kwargs: as for :class:`SHACLoss`.
     """
 
     def __init__(

@@ -37,7 +37,7 @@ class SHACLoss(PathwiseCriticLoss):
         actor_network: the policy that flew the rollout.
         value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
         terminal_gradient: whether the terminal value keeps its gradient in the state. False cuts it, as the code
-            published with the paper does: the actor then climbs the rewards of the horizon alone, as with BPTT.
+            published with the paper does: the actor then climbs the rewards of the horizon alone.
         target_bootstrap: whether the terminal value is the target critic's. False takes it from the critic itself.
         average_over_horizon: whether the objective is divided by the number of steps of the rollout. The entropy bonus
             is a mean over steps either way.
@@ -49,8 +49,6 @@ class SHACLoss(PathwiseCriticLoss):
 
     @dataclass
     class _AcceptedKeys(PathwiseCriticLoss._AcceptedKeys):
-        """As for every pathwise loss with a critic, and the key of the critic's prediction."""
-
         value: NestedKey = "state_value"
 
     default_keys = _AcceptedKeys

@@ -22,8 +22,8 @@ class TrustRegion:
     """Shortens an update that would move a Gaussian policy beyond a bound on the Kullback-Leibler divergence.
 
     The divergence KL(before || after) is summed over the entries of the action and averaged over the states of a
-    rollout. For short steps it grows with the square of the step, so a step that is too long is shortened by the root
-    of its excess until it keeps the bound. An update to numbers that are not finite is undone.
+    rollout. It grows with the square of the step, so a step that is too long is shortened by the root of its excess
+    until it keeps the bound. An update to numbers that are not finite is undone.
 
     .. code-block:: python
 
@@ -51,10 +51,7 @@ class TrustRegion:
         average: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         if not hasattr(actor, "get_dist_params"):
-            raise UserTypeError(
-                f"actor must be a policy as make_actor builds it, which writes loc and scale; got "
-                f"{type(actor).__name__}."
-            )
+            raise UserTypeError(f"actor must be a policy as make_actor builds it; got {type(actor).__name__}.")
         self.actor, self.max_kl, self.min_scale, self.average = actor, max_kl, min_scale, average
         self.metrics: dict[str, Tensor] = {}
 
@@ -70,20 +67,17 @@ class TrustRegion:
         before = [x.detach().clone() for x in parameters]
         yield
         with torch.no_grad():
-            kl = self._mean_divergence(rollout)
-            self.metrics = {"kl": kl}
-            for _ in range(20):
+            for attempt in range(21):
+                kl = self.divergence(rollout)
+                kl = kl if self.average is None else self.average(kl)
+                if attempt == 0:
+                    self.metrics = {"kl": kl}
                 if kl <= self.max_kl:
                     return
                 if not kl.isfinite():
                     break
                 torch._foreach_lerp_(parameters, before, 1.0 - (self.max_kl / float(kl)) ** 0.5)
-                kl = self._mean_divergence(rollout)
             torch._foreach_copy_(parameters, before)
-
-    def _mean_divergence(self, rollout: TensorDictBase) -> Tensor:
-        kl = self.divergence(rollout)
-        return kl if self.average is None else self.average(kl)
 
     def divergence(self, rollout: TensorDictBase) -> Tensor:
         """KL(policy that flew the rollout || policy as it is now), a scalar."""

@@ -24,11 +24,7 @@ INK, BLUE, RED, GREEN = "#222222", "#2f6db5", "#c8452f", "#3a7d4f"
 
 
 def make_figure(**options: Any) -> Figure:
-    """Make a matplotlib figure that needs no screen, leaves the user's backend alone, and shows itself in a notebook.
-
-    Args:
-        **options: of ``matplotlib.figure.Figure``.
-    """
+    """A matplotlib figure that needs no screen, leaves the user's backend alone, and shows itself in a notebook."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -65,10 +61,7 @@ def bounds(*points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def box(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Widen a box, from low to high (3), until no side is much shorter than the others.
-
-    It grows in both directions, except that a box above the ground does not grow below it.
-    """
+    """Widen a box, from low to high (3), until no side is much shorter than the others, but not to below the ground."""
     extent = high - low
     more = 0.5 * ((0.6 * extent.amax().clamp_min(0.5)) - extent).clamp_min(0.0)
     ground = torch.minimum(low, torch.zeros_like(low))
@@ -97,10 +90,10 @@ def set_box(space: Axes3D, low: Tensor, high: Tensor, zoom: float) -> None:
 
 def set_scale(axis: Axes, log: bool) -> None:
     """Make the vertical axis linear or logarithmic, with plain numbers at its ticks."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     axis.set_yscale("log" if log else "linear")
     if log:
-        from matplotlib.ticker import LogLocator, NullFormatter
-
         axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
         axis.yaxis.set_minor_formatter(NullFormatter())
     axis.yaxis.set_major_formatter("{x:g}")

@@ -5,9 +5,8 @@ from __future__ import annotations
 import csv
 import itertools
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import torch
@@ -18,21 +17,8 @@ from torchrl.envs import EnvBase
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, describe_metric
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import Positive, Size, checked
-from torchrl_quad.render.canvas import (
-    BLUE,
-    GREEN,
-    INK,
-    RED,
-    add_space,
-    bounds,
-    box,
-    draw_markers,
-    drone_colors,
-    make_figure,
-    save,
-    set_box,
-    set_scale,
-)
+from torchrl_quad.render import canvas
+from torchrl_quad.render.canvas import BLUE, GREEN, INK, RED
 from torchrl_quad.render.flights import Flight, box_shape, state_keys, with_obstacles
 from torchrl_quad.vision import Primitives
 
@@ -58,6 +44,7 @@ def plot_flight(
     num_envs: Size = 12,
     control_dt: Positive = 0.02,
     title: str | None = None,
+    view: Literal["space", "above"] = "space",
 ) -> Figure:
     """Draw the first episodes of a flight: their paths in space, and over time how well they go.
 
@@ -73,41 +60,44 @@ def plot_flight(
         num_envs: the maximum number of environments to draw.
         control_dt: control step [s]; used only without ``env``.
         title: of the picture; by default the name of the environment and the number of flights.
+        view: "above" shows the paths alone, coloured by speed, between the obstacles that they could meet. Where each
+            environment has obstacles of its own, it has a panel of its own. A ring is a start, a cross a crash.
 
     Raises:
         ImportError: matplotlib is missing.
-        TypeError: ``env`` is not a quadrotor environment.
-        ValueError: the rollout has another shape, or lacks the position or the reward; ``num_envs`` is less than 1; or
-            matplotlib does not know the suffix.
+        TypeError, ValueError: what is given cannot be drawn, or matplotlib does not know the suffix.
     """
-    flight = Flight("plot_flight", rollout, env, control_dt, [*state_keys("position"), ("next", "reward")], num_envs)
+    needed = state_keys("position", "velocity") if view == "above" else [*state_keys("position"), ("next", "reward")]
+    flight = Flight("plot_flight", rollout, env, control_dt, needed, num_envs)
+    title = flight.title if title is None else title
+    if view == "above":
+        return canvas.save(_draw_from_above(flight, title), path)
     position = flight.position
     label, log, values, success = flight.progress()
-
-    figure = make_figure(figsize=(11, 4.6), dpi=130)
-    space = add_space(figure, (0.0, 0.02, 0.46, 0.9))
+    figure = canvas.make_figure(figsize=(11, 4.6), dpi=130)
+    space = canvas.add_space(figure, (0.0, 0.02, 0.46, 0.9))
     over_time = figure.add_axes((0.55, 0.12, 0.43, 0.77))
-    for i, color in enumerate(drone_colors(len(flight))):
+    for i, color in enumerate(canvas.drone_colors(len(flight))):
         flown = slice(int(flight.steps[i]) + 1)
         space.plot(*position[i, flown].T.numpy(), color=color, linewidth=1.2)
         space.scatter(*position[i, 0], color=color, s=14)
         over_time.plot(flight.times[flown], values[i, flown], color=color, linewidth=1.2)
     alike = len(flight) == 1 or not flight.has_own_obstacles
     markers = with_obstacles(flight.markers, flight.solids(0) if alike else None)
-    draw_markers(space, markers)
-    set_box(space, *box(*bounds(position, *markers.points())), zoom=0.9)
+    canvas.draw_markers(space, markers)
+    canvas.set_box(space, *canvas.box(*canvas.bounds(position, *markers.points())), zoom=0.9)
     named = dict(zip(*reversed(space.get_legend_handles_labels()), strict=True))  # a name once
     if named:
         space.legend(named.values(), named.keys(), loc="upper left", frameon=False)
     over_time.set(xlabel="time [s]", ylabel=label)
-    set_scale(over_time, log)
+    canvas.set_scale(over_time, log)
     over_time.grid(alpha=0.3)
     if success is not None:
         near = "" if flight.markers.progress else "below "
         over_time.axhline(success, color=RED, linestyle="--", linewidth=1.0, label=f"success: {near}{success:g}")
         over_time.legend(loc="best", frameon=False)
-    figure.suptitle(flight.title if title is None else title, x=0.04, y=0.965, ha="left", fontsize=13)
-    return save(figure, path)
+    figure.suptitle(title, x=0.04, y=0.965, ha="left", fontsize=13)
+    return canvas.save(figure, path)
 
 
 @checked
@@ -119,30 +109,23 @@ def plot_episode(
     env_index: int = 0,
     control_dt: Positive = 0.02,
 ) -> Figure:
-    """Draw the first episode of one drone as a figure for a paper, as wide as a page of two columns (7.16 inches).
+    """Draw the first episode of the environment ``env_index`` for a paper, as wide as a page of two columns.
 
-    Shows its path in space, coloured by speed, with the task's markers and numbers at its gates. Shows over time the
+    Shows its path in space, coloured by speed, with the task's markers and numbers at its gates; and over time the
     distance to the target with the metrics that are lengths (without targets: all metrics, or the reward), the actions,
     and the rotor speeds if the state holds them. Dotted lines mark the times at which the drone passes gates, a dashed
-    line the distance from which a state fulfils the task, if the markers name it. PDF and SVG embed their fonts, PNG
-    has 300 dots per inch.
+    line the distance from which a state fulfils the task. PDF and SVG embed their fonts, PNG has 300 dots per inch.
 
     The other arguments, and errors, are those of :func:`plot_flight`; the rollout needs velocity and action, too.
-
-    Args:
-        env_index: which environment.
-
-    Raises:
-        IndexError: there is no such environment.
     """
     keys = [*state_keys("position", "velocity"), ("action",), ("next", "reward")]
     flight = Flight("plot_episode", rollout, env, control_dt, keys, env_index=env_index)
-    figure = make_figure(figsize=(_WIDTH, 3.4))
+    figure = canvas.make_figure(figsize=(_WIDTH, 3.4))  # first: it says so where matplotlib is missing
     from matplotlib import rc_context
     from matplotlib.ticker import MaxNLocator
 
     with rc_context(fname=_PAPER):
-        space = add_space(figure, (0.0, 0.2, 0.44, 0.8), computed_zorder=False)
+        space = canvas.add_space(figure, (0.0, 0.2, 0.44, 0.8), computed_zorder=False)
         _draw_path(space, figure.add_axes((0.09, 0.12, 0.26, 0.02)), flight)
         rotor_speed = flight.state("rotor_speed")
         axes = figure.subplots(2 if rotor_speed is None else 3, 1, sharex=True, gridspec_kw=_BESIDE)
@@ -152,12 +135,11 @@ def plot_episode(
         if flight.target is not None and (near := flight.near_enough) is not None:
             axes[0].axhline(near, color=RED, linestyle="--", linewidth=0.6, label=f"success: below {near:g}")
             axes[0].legend(**_ABOVE)
-        set_scale(axes[0], log)
+        canvas.set_scale(axes[0], log)
         actions = cast("Tensor", flight.entry("action"))[0].T.numpy()
         actions = np.concatenate((actions, actions[:, -1:]), 1)  # each lasts until the next instant
-        _draw_lines(
-            axes[1], times, dict(zip(flight.action_names, actions, strict=True)), "action", drawstyle="steps-post"
-        )
+        actions = dict(zip(flight.action_names, actions, strict=True))
+        _draw_lines(axes[1], times, actions, "action", drawstyle="steps-post")
         if rotor_speed is not None:
             speeds = {f"rotor {i + 1}": x for i, x in enumerate(rotor_speed[0].T.numpy())}
             _draw_lines(axes[2], times, speeds, "rotor speed\n[rad/s]")
@@ -168,7 +150,7 @@ def plot_episode(
         axes[-1].set(xlabel="time [s]", xlim=(0, times[-1]))
         for axis in axes[1:]:
             axis.yaxis.set_major_locator(MaxNLocator(4))
-        return save(figure, path)
+        return canvas.save(figure, path)
 
 
 def _draw_path(space: Axes3D, below: Axes, flight: Flight) -> None:
@@ -186,8 +168,8 @@ def _draw_path(space: Axes3D, below: Axes, flight: Flight) -> None:
         halo = [withStroke(linewidth=2, foreground="white")]
         for i, (x, y, z) in enumerate(markers.gates.tolist(), 1):
             space.text(x, y, z, f"   {i}", color=RED, zorder=11, path_effects=halo)
-    draw_markers(space, markers)
-    set_box(space, *box(*bounds(flight.position, *markers.points())), zoom=0.86)
+    canvas.draw_markers(space, markers)
+    canvas.set_box(space, *canvas.box(*canvas.bounds(flight.position, *markers.points())), zoom=0.86)
     bar = space.figure.colorbar(path, cax=below, orientation="horizontal")
     bar.set_label("speed [m/s]")
     bar.outline.set_linewidth(0.6)
@@ -205,43 +187,23 @@ def _draw_lines(axis: Axes, time: np.ndarray, lines: dict[str, np.ndarray], labe
 # -- from above --------------------------------------------------------------------------------------------------------
 
 
-@checked
-def plot_from_above(
-    rollout: TensorDictBase,
-    path: str | Path | None = None,
-    *,
-    env: EnvBase,
-    num_envs: Size = 4,
-    title: str | None = None,
-) -> Figure:
-    """Draw the first episodes of a flight from above: obstacles, and the paths between them, coloured by speed.
+def _draw_from_above(flight: Flight, title: str) -> Figure:
+    """The paths between the obstacles that stand between the least and the greatest height of the flight."""
+    from matplotlib.collections import LineCollection
 
-    Environments with obstacles of their own get a panel each; those that share them, one for all. A cross marks a
-    crash, a ring the start. Only what stands between the least and the greatest height of the flight is drawn.
-
-    Arguments and errors are those of :func:`plot_flight`; the environment has a scene, and the rollout the velocity.
-    """
-    flight = Flight("plot_from_above", rollout, env, 0.02, state_keys("position", "velocity"), num_envs)
-    if flight.solids(0) is None:
-        raise UserValueError(
-            f"plot_from_above draws obstacles, and this {type(flight.env).__name__} has none: build it with a scene, "
-            "or draw its flights with plot_flight."
-        )
-    position, speed = flight.position, flight.speed
-    groups = [[i] for i in range(len(flight))] if flight.has_own_obstacles else [list(range(len(flight)))]
-    points = position.nan_to_num().flatten(0, 1)
-    low, high = points.amin(0), points.amax(0)
+    position, speed, everyone = flight.position, flight.speed, range(len(flight))
+    groups = [[i] for i in everyone] if flight.has_own_obstacles else [everyone]
+    low, high = canvas.bounds(position)
     sides = (high - low)[:2].clamp_min(2.0) + 4.0
     middle, width = 0.5 * (low + high)[:2], 10.0
     left, bottom, right, top = torch.cat((middle - 0.5 * sides, middle + 0.5 * sides)).tolist()
     height = min(0.6 + len(groups) * (0.88 * width * (sides[1] / sides[0]).item() + 0.2), 14.0)
-    figure = make_figure(figsize=(width, height), dpi=130, layout="constrained")
-    from matplotlib.collections import LineCollection
-
+    figure = canvas.make_figure(figsize=(width, height), dpi=130, layout="constrained")
     axes = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
-    fastest, crash = speed.nan_to_num().amax().item(), flight.rollout.get(("next", "crash"), None)
+    fastest, crash = speed.nan_to_num().amax().item(), flight.entry("next", "crash")
     for axis, group in zip(axes, groups, strict=True):
-        _draw_sections(axis, flight.solids(group[0]), low[2].item(), high[2].item())
+        if (solids := flight.solids(group[0])) is not None:
+            _draw_sections(axis, solids, low[2].item(), high[2].item())
         for i in group:
             flown = position[i, : int(flight.steps[i]) + 1, :2].numpy()
             line = LineCollection(list(itertools.pairwise(flown)), cmap="viridis", linewidth=1.8)
@@ -253,17 +215,15 @@ def plot_from_above(
                 axis.plot(*flown[-1], marker="x", color=RED, markersize=9, markeredgewidth=2)
         axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", ylabel="y [m]")
     axes[-1].set_xlabel("x [m]")
-    figure.suptitle(flight.title if title is None else title, x=0.02, ha="left", fontsize=12)
+    figure.suptitle(title, x=0.02, ha="left", fontsize=12)
     figure.colorbar(axes[-1].collections[-1], ax=list(axes), label="speed [m/s]", shrink=0.6, pad=0.01, aspect=30)
-    return save(figure, path)
+    return figure
 
 
-def _draw_sections(axis: Axes, solids: Primitives | None, low: float, high: float) -> None:
+def _draw_sections(axis: Axes, solids: Primitives, low: float, high: float) -> None:
     """Draw what stands between two heights [m] from above."""
     from matplotlib.patches import Circle, Polygon
 
-    if solids is None:
-        return
     style: dict[str, Any] = {"facecolor": GREEN, "alpha": 0.6, "edgecolor": "none"}
     round_ones = [(x, y, z - r, z + r, r) for x, y, z, r in solids.spheres[0].tolist()]
     round_ones += [(x, y, z, z + height, r) for x, y, z, r, height in solids.cylinders[0].tolist()]
@@ -288,7 +248,7 @@ def _draw_sections(axis: Axes, solids: Primitives | None, low: float, high: floa
 def plot_learning_curve(
     csv_path: str | Path, path: str | Path | None = None, *, metrics: Mapping[str, Metric] = EPISODE_METRICS
 ) -> Figure:
-    """Draw the evaluations of a training run over training time, with the control steps at the top.
+    """Draw the evaluations of a training run over training time; the label of its axis says how many steps it took.
 
     Draws up to four of the columns ``eval/NAME``: first those that ``metrics`` describes, in its order, then the
     others.
@@ -317,41 +277,17 @@ def plot_learning_curve(
     def column(name: str) -> np.ndarray:
         return np.array([float(row[name] or "nan") for row in rows])  # a cell may be empty
 
-    seconds = column("time/seconds")
-    known_seconds, known_steps = _knots(seconds, column("steps"))
-    figure = make_figure(figsize=(3.4 * len(names), 3.2), dpi=130, layout="constrained")
-    from matplotlib.ticker import EngFormatter, MaxNLocator
-
+    seconds, steps = column("time/seconds"), column("steps")[-1]
+    figure = canvas.make_figure(figsize=(3.4 * len(names), 3.2), dpi=130, layout="constrained")
     axes = figure.subplots(1, len(names), squeeze=False)
     for axis, name in zip(axes[0], names, strict=True):
         metric = describe_metric(name, metrics)
         values = metric.scale * column(f"eval/{name}")
         axis.plot(seconds, values, color=BLUE, marker="o", markersize=3, linewidth=1.4)
-        axis.set(xlabel="training time [s]", ylabel=metric.axis_label + (", median" if metric.median else ""))
+        axis.set(
+            xlabel=f"training time [s] of {steps:.3g} control steps",
+            ylabel=metric.axis_label + (", median" if metric.median else ""),
+        )
         axis.grid(alpha=0.3)
-        if metric.log:
-            set_scale(axis, log=True)
-        if len(known_steps) > 1:
-            to_steps = partial(np.interp, xp=known_seconds, fp=known_steps)
-            to_seconds = partial(np.interp, xp=known_steps, fp=known_seconds)
-            upper = axis.secondary_xaxis("top", functions=(to_steps, to_seconds))
-            upper.set_xlabel("control steps", color=INK)
-            upper.xaxis.set_major_locator(MaxNLocator(5))
-            upper.xaxis.set_major_formatter(EngFormatter(sep=""))
-    return save(figure, path)
-
-
-def _knots(seconds: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of seconds and steps between which to interpolate, both increasing, from (0, 0) and beyond both ends.
-
-    A constant rate would not do: an iteration that compiles takes far longer than the others.
-    """
-    pairs = [(0.0, 0.0)]
-    for pair in zip(seconds, steps, strict=True):
-        if pair[0] > pairs[-1][0] and pair[1] > pairs[-1][1]:
-            pairs.append(pair)
-    knots = np.array(pairs)
-    if len(knots) > 1:  # the axes have margins: continue at the rates of both ends
-        first, last = (knots[-1, 0] / step[0] * step for step in (knots[1] - knots[0], knots[-1] - knots[-2]))
-        knots = np.concatenate((knots[:1] - first, knots, knots[-1:] + last))
-    return knots[:, 0], knots[:, 1]
+        canvas.set_scale(axis, metric.log)
+    return canvas.save(figure, path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, cast
@@ -30,14 +31,9 @@ _WALL = 5.0  # [m], half of the sides of the square that stands for an endless w
 
 
 class Flight:
-    """The first episodes of a rollout, without their graph, on the CPU.
+    """The first episodes of a rollout, without their graph, on the CPU; of one alone with an ``env_index``.
 
-    Arguments and errors are those of :func:`plot_flight`, and:
-
-    Args:
-        who: the function that draws, for its errors.
-        needed: keys of the rollout without which nothing can be drawn.
-        env_index: the one environment to keep, up to the end of its first episode.
+    ``who`` draws, and needs the keys ``needed``. The other arguments, and errors, are those of :func:`plot_flight`.
     """
 
     def __init__(
@@ -81,6 +77,10 @@ class Flight:
         self.target = self.state("target")
         self.named = Markers() if self.env is None else self.env.markers()  # by the task
         self.markers = self._with_targets()
+        # The distance to the target [m] from which a state fulfils the task, if it says so; and whether its axis is
+        # logarithmic: not on a course, where it jumps from gate to gate.
+        self.near_enough = self.named.success if self.named.progress is None else None
+        self.log_distance = self.gate_index() is None
 
     def __len__(self) -> int:
         return len(self.rollout)
@@ -105,19 +105,21 @@ class Flight:
         return dict(cast("Mapping[str, Tensor]", self.rollout.get(key, {})).items())
 
     def state(self, name: str) -> Tensor | None:
-        """An entry of the state (num_envs, time + 1, k): at the start of the first episode, and after each step.
+        """An entry of the state (num_envs, time + 1, k), at the start of the first episode and after each step.
 
-        After the end of the episode it keeps its last value. It is NaN where it is infinite, and at the start if the
-        rollout does not hold the start. None if there is no such entry, or if the target is not a position.
+        It ends with the episode's last value, and is NaN where it is infinite or not known. None if there is no such
+        entry, or if the target is not a position.
         """
         ends, starts = self.entry("next", "state", name), self.entry("state", name)
         if ends is None or (name == "target" and ends.shape != self.rollout["next", "state", "position"].shape):
             return None
-        ends = ends.float()
-        start = torch.full_like(ends[:, :1], math.nan) if starts is None else starts[:, :1].float()
+        start = torch.full_like(ends[:, :1], math.nan) if starts is None else starts[:, :1]
+        return self._at_instants(start, ends).nan_to_num(math.nan, math.nan, math.nan)
+
+    def _at_instants(self, start: Tensor, ends: Tensor) -> Tensor:
+        """What was at the start (num_envs, 1, ...) and after each step (num_envs, time, ...) of the first episodes."""
         instants = torch.arange(self.rollout.shape[1] + 1).minimum(self.steps[:, None])
-        value = torch.cat((start, ends), 1).take_along_dim(instants.unsqueeze(-1), 1)
-        return value.nan_to_num(math.nan, math.nan, math.nan)
+        return torch.cat((start, ends), 1)[torch.arange(len(ends))[:, None], instants].float()
 
     @property
     def position(self) -> Tensor:
@@ -148,9 +150,7 @@ class Flight:
         images, first = self.entry("next", "depth"), self.entry("depth")
         if images is None:
             return None
-        images = torch.cat(((images if first is None else first)[:, :1], images), 1).squeeze(2)
-        instants = torch.arange(images.shape[1]).minimum(self.steps[:, None])
-        return images[torch.arange(len(images))[:, None], instants].float()
+        return self._at_instants((images if first is None else first)[:, :1], images).squeeze(2)
 
     @property
     def distance(self) -> np.ndarray | None:
@@ -163,10 +163,10 @@ class Flight:
         return {name: pad(x.squeeze(-1).float(), (1, 0), value=math.nan).numpy() for name, x in values.items()}
 
     def progress(self) -> tuple[str, bool, np.ndarray, float | None]:
-        """What best shows how the flight goes: the label of its axis, whether that is logarithmic, values, and success.
+        """The label of an axis, whether it is logarithmic, values, and the value from which a state fulfils the task.
 
-        That is the metric that the task names, else the distance to the target, else the first metric or the reward.
-        Success is the value from which a state fulfils the task, if the task says so.
+        They are of the metric that the task names, else of the distance to the target, else of the first metric or the
+        reward.
         """
         outputs, distance = self.outputs(), self.distance
         named = self.markers.progress if self.markers.progress in outputs else None
@@ -178,7 +178,7 @@ class Flight:
         return metric.axis_label, metric.log, metric.scale * outputs[name], success and metric.scale * success
 
     def progress_lines(self) -> tuple[str, bool, dict[str, np.ndarray]]:
-        """All that shows how the flight goes: the label of the axis, whether it is logarithmic, and lines by name.
+        """The label of an axis, whether it is logarithmic, and lines by name.
 
         These are the distance to the target and the metrics that are lengths; without a target, all metrics or the
         reward.
@@ -191,16 +191,6 @@ class Flight:
             if metric.is_length and not np.allclose(x[:, 1:], distance[:, 1:], atol=1e-5, equal_nan=True):
                 lines[metric.label] = x
         return "distance [m]", self.log_distance, lines
-
-    @property
-    def log_distance(self) -> bool:
-        """Whether the axis of a distance is logarithmic; not on a course, where it jumps from gate to gate."""
-        return self.gate_index() is None
-
-    @property
-    def near_enough(self) -> float | None:
-        """The distance to the target from which a state fulfils the task [m], if the task says so."""
-        return self.markers.success if self.markers.progress is None else None
 
     @property
     def action_names(self) -> list[str]:
@@ -243,12 +233,10 @@ def obstacle_shapes(solids: Primitives | None) -> list[Shape]:
     meshes += [Shape.cylinder(x[:3], x[3], x[4]) for x in solids.cylinders[0].tolist()]
     meshes += [box_shape(x) for x in solids.boxes[0].detach().cpu().float()]
     meshes += [_wall(x) for x in solids.planes[0].detach().cpu().float() if x[2].abs() < 0.99]
-    points, faces, first = [], [], 0
-    for mesh in meshes:
-        if mesh.faces is not None and mesh.points[:, 2].min() > 0.5 * ELSEWHERE:
-            points.append(mesh.points)
-            faces.append(mesh.faces + first)
-            first += len(mesh.points)
+    meshes = [mesh for mesh in meshes if mesh.points[:, 2].min() > 0.5 * ELSEWHERE]
+    first = itertools.accumulate((len(mesh.points) for mesh in meshes), initial=0)
+    faces = [mesh.faces + i for mesh, i in zip(meshes, first, strict=False)]
+    points = [mesh.points for mesh in meshes]
     return [Shape(torch.cat(points), torch.cat(faces), color=GREEN, opacity=0.6)] if points else []
 
 

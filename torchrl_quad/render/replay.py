@@ -8,13 +8,13 @@ import json
 import math
 import re
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import QuadrotorParams
@@ -68,14 +68,8 @@ def write_replay(
     Args:
         rollout: (num_envs, time), of any task. It must hold ``("next", "state", "position")`` and ``("next", "state",
             "quaternion")``; the page leaves out whatever else is missing.
-        path: the HTML file to write; None for none.
-        env: the environment that flew, also under transforms. It provides the control step, the markers, the positions
-            of the rotors, and their thrust in newtons. Without it, the page shows an X frame and the squared speed of
-            each rotor.
-
-    Raises:
-        ImportError: plotly is not installed.
-        ValueError: ``env`` has individual drones, for fewer environments than the page shows.
+        env: the environment that flew, also under transforms. Without it, the page shows an X frame and the squared
+            speed of each rotor.
     """
     try:
         from plotly.offline import get_plotlyjs
@@ -93,14 +87,11 @@ def write_replay(
 
 def page_of(content: str, title: str, plotlyjs: str) -> Replay:
     """The page of a flight, from its content as JSON."""
-    parts = {
-        "title": html.escape(title),
-        "flight": content.replace("<", "\\u003c"),  # "<" could close the script
-        "plotly": plotlyjs,
-        "script": _asset("replay.js"),
-    }
+    page, script = (Path(__file__).with_name(f"replay.{x}").read_text(encoding="utf-8") for x in ("html", "js"))
+    flight = content.replace("<", "\\u003c")  # "<" could close the script
+    parts = {"title": html.escape(title), "flight": flight, "plotly": plotlyjs, "script": script}
     # In one pass, so that what has been filled in is not searched again.
-    return Replay(re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _asset("replay.html")))
+    return Replay(re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], page))
 
 
 def _content(flight: Flight) -> dict[str, Any]:
@@ -112,9 +103,14 @@ def _content(flight: Flight) -> dict[str, Any]:
     def frames(values: Tensor | None) -> Tensor | None:
         return None if values is None else values[:, first:]
 
-    rotors, lift = _rotors(flight, frames(flight.state("rotor_speed")))
-    gate, markers = flight.gate_index(), flight.named
     over = torch.arange(rollout.shape[1] + 1) > steps[:, None]  # panels show nothing after the end of the episode
+
+    def panel(label: str, lines: dict[str, Tensor]) -> dict[str, Any]:
+        values = torch.stack([x.masked_fill(over, math.nan) for x in lines.values()], -1)
+        return {"label": label, "names": list(lines), "values": values[:, first:]}
+
+    rotors, lift = _rotors(flight, frames(flight.state("rotor_speed")))
+    markers = flight.named
     return {
         "environments": len(flight),
         "frames": rollout.shape[1] + 1 - first,
@@ -129,29 +125,19 @@ def _content(flight: Flight) -> dict[str, Any]:
         "lift": lift,
         "target": frames(flight.target),
         "gates": markers.rings(),
-        "gate": frames(gate),
+        "gate": frames(flight.gate_index()),
         "places": markers.places,
         "curve": markers.curve,
         "shapes": [vars(shape) for shape in markers.shapes],
         "obstacles": _obstacles(flight),
         "images": _images(flight, first),
-        "panels": [
-            {
-                "label": label,
-                "names": list(lines),
-                "values": torch.stack([x.masked_fill(over, math.nan) for x in lines.values()], -1)[:, first:],
-                **options,
-            }
-            for label, lines, options in _panels(flight)
-        ],
+        "panels": [panel(label, lines) | options for label, lines, options in _panels(flight)],
     }
 
 
 def _obstacles(flight: Flight) -> list[dict[str, Any]]:
     """The obstacles of each environment, or of the first if all share them; none without a scene."""
-    count = len(flight) if flight.has_own_obstacles else 1
-    if flight.solids(0) is None:
-        return []
+    count = 0 if flight.solids(0) is None else len(flight) if flight.has_own_obstacles else 1
     nothing = {"points": torch.zeros(0, 3), "faces": torch.zeros(0, 3)}
     shapes = (obstacle_shapes(flight.solids(i)) for i in range(count))
     return [vars(shape[0]) if shape else nothing for shape in shapes]
@@ -170,32 +156,24 @@ def _images(flight: Flight, first: int) -> dict[str, Any] | None:
 
 def _panels(flight: Flight) -> list[_Panel]:
     """What to show over time: rewards, actions, the speed, and the distance to the target or the height."""
-    rollout, panels = flight.rollout, []
-    nothing = torch.full((len(rollout), 1), math.nan)
+    panels: list[_Panel] = []
     terms = flight.entries("next", "reward_terms")
     if (reward := flight.entry("next", "reward")) is not None:
         terms = {"sum" if terms else "reward": reward, **terms}
-    elif terms:
-        terms = {"sum": torch.stack(list(terms.values())).sum(0), **terms}
     if terms:
-        lines = {name: torch.cat((nothing, x[..., 0].float()), 1) for name, x in terms.items()}
+        lines = {name: pad(x[..., 0].float(), (1, 0), value=math.nan) for name, x in terms.items()}
         panels.append(("reward", lines, {"peaks": True}))
     if (action := flight.entry("action")) is not None:
-        over = torch.arange(rollout.shape[1]) >= flight.steps[:, None]
-        lines = {
-            name: torch.cat((x.masked_fill(over, math.nan), nothing), 1)
-            for name, x in zip(flight.action_names, action.float().unbind(-1), strict=True)
-        }
+        over = torch.arange(action.shape[1]) >= flight.steps[:, None]
+        actions = pad(action.float().masked_fill(over.unsqueeze(-1), math.nan), (0, 0, 0, 1), value=math.nan)
+        lines = dict(zip(flight.action_names, actions.unbind(-1), strict=True))
         panels.append(("action [-1, 1]", lines, {"held": True}))
     if flight.state("velocity") is not None:
         panels.append(("speed [m/s]", {"speed": flight.speed}, {}))
-    if (distance := flight.distance) is not None:
-        options = {"log": flight.log_distance, "success": flight.near_enough}
-        label = f"distance to the {flight.named.target} [m]"
-        panels.append((label, {"distance": torch.from_numpy(distance)}, options))
-    else:
-        panels.append(("height [m]", {"height": flight.position[..., 2]}, {}))
-    return panels
+    if (distance := flight.distance) is None:
+        return [*panels, ("height [m]", {"height": flight.position[..., 2]}, {})]
+    label, options = f"distance to the {flight.named.target} [m]", {"log": flight.log_distance}
+    return [*panels, (label, {"distance": torch.from_numpy(distance)}, options | {"success": flight.near_enough})]
 
 
 def _endings(rollout: TensorDictBase) -> list[str]:
@@ -211,10 +189,9 @@ def _endings(rollout: TensorDictBase) -> list[str]:
 
 
 def _rotors(flight: Flight, speed: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Positions of the rotors (num_envs, 4, 2) [m], and the lift of each (num_envs, frames, 4).
+    """Positions of the rotors (num_envs, 4, 2) [m], and the lift of each (num_envs, frames, 4), in thrusts that hover.
 
-    The unit of lift is the thrust that hovers; without the environment, half of the greatest squared speed of the
-    flight.
+    Without the environment the unit is half of the greatest squared speed of the flight.
     """
     n = len(flight)
     if flight.env is None:
@@ -242,7 +219,3 @@ def _rotors(flight: Flight, speed: Tensor | None) -> tuple[Tensor, Tensor | None
 def _encoded(value: Tensor) -> str:
     """Numbers as base64 of little-endian float32."""
     return base64.b64encode(value.contiguous().numpy().astype("<f4").tobytes()).decode()
-
-
-def _asset(name: str) -> str:
-    return (resources.files("torchrl_quad.render") / name).read_text(encoding="utf-8")

@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import numbers
 import os
+import select
 import subprocess
 import tempfile
 import weakref
@@ -25,27 +26,18 @@ from torchrl_quad.envs.markers import Markers
 from torchrl_quad.errors import MissingPackage, UserValueError, one_line
 from torchrl_quad.files import replacing
 from torchrl_quad.options import Positive, Size, checked
-from torchrl_quad.render.canvas import (
-    INK,
-    RED,
-    add_space,
-    bounds,
-    box,
-    draw_markers,
-    drone_colors,
-    make_figure,
-    set_box,
-)
+from torchrl_quad.render import canvas
+from torchrl_quad.render.canvas import INK, RED
 from torchrl_quad.render.flights import Flight, depth_image, state_keys, with_obstacles
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from mpl_toolkits.mplot3d.art3d import Line3D
 
     from torchrl_quad.envs import QuadrotorEnv
 
 _INCHES = 4.2
+_PATIENCE = 20.0  # [s], with an ffmpeg that makes no progress
 _REINSTALL = "pip install --force-reinstall --no-deps imageio-ffmpeg"
 _ARMS = torch.tensor([[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [0.0, 0.0, 0.0], [1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]])
 
@@ -55,34 +47,32 @@ class NoFfmpeg(MissingPackage):
 
 
 class View:
-    """A view for many frames of the same drones; it draws axes and markers only once.
+    """A view of ``size`` pixels for many frames of the same drones; it draws axes and markers only once.
 
-    Args:
-        points: (*, 3) [m]; the finite ones, and the ground below, are in view.
-        num_drones: how many drones a frame shows.
-        size: width and height of a frame [pixels].
-        markers: what to draw with the drones.
-        image: the height and width of a camera's images [pixels], if a frame shows one.
+    The finite ones of the points (*, 3) [m] are in view, with the ground below. ``image`` is the height and width of a
+    camera's images [pixels], if a frame shows one.
     """
 
     def __init__(
         self, points: Tensor, num_drones: int, size: int, markers: Markers, image: Sequence[int] | None = None
     ) -> None:
-        low, high = bounds(points, *markers.points())
+        low, high = canvas.bounds(points, *markers.points())
         low[2].clamp_(max=0.0)
-        self.low, self.high = box(low, high)
+        self.low, self.high = canvas.box(low, high)
         self.arms = (0.04 * (self.high - self.low).amax()).float() * _ARMS
 
-        self.figure = make_figure(figsize=(_INCHES, _INCHES), dpi=(size + 0.01) / _INCHES)  # it rounds down to pixels
+        self.figure = canvas.make_figure(
+            figsize=(_INCHES, _INCHES), dpi=(size + 0.01) / _INCHES
+        )  # it rounds down to pixels
         self.canvas: FigureCanvasAgg = self.figure.canvas  # pyrefly: ignore[bad-assignment]  as make_figure sets it
-        space = add_space(self.figure, (0.0, 0.02, 0.96, 0.98))
-        set_box(space, self.low, self.high, zoom=0.82)
-        draw_markers(space, markers, size=8)
+        space = canvas.add_space(self.figure, (0.0, 0.02, 0.96, 0.98))
+        canvas.set_box(space, self.low, self.high, zoom=0.82)
+        canvas.draw_markers(space, markers, size=8)
 
         def line(**style: Any) -> Line3D:  # drawn onto the axes in each frame
             return cast("Line3D", space.plot([], [], [], animated=True, **style)[0])
 
-        colors = drone_colors(num_drones)
+        colors = canvas.drone_colors(num_drones)
         self.drones = [line(color=color, linewidth=2.5) for color in colors]
         self.trails = [line(color=color, linewidth=1, alpha=0.5) for color in colors]
         self.targets = line(color=RED, marker="*", markersize=8, linestyle="none")
@@ -103,10 +93,8 @@ class View:
         text: str = "",
         image: Tensor | None = None,
     ) -> np.ndarray:
-        """Draw a frame (size, size, 3), uint8.
-
-        Shows positions (num_drones, 3) [m], quaternions (num_drones, 4), targets (num_drones, 3), a trail (*, 3) of
-        each drone, a text in the corner, and the image (height, width) of a camera, from 0 to 1.
+        """A frame (size, size, 3), uint8: positions and targets (num_drones, 3), quaternions (num_drones, 4), a trail
+        (*, 3) of each drone, a text in the corner, and the image (height, width) of a camera, from 0 to 1.
         """
         arms = self.arms.to(position.dtype).expand(len(position), -1, -1)
         bodies = position.unsqueeze(1) + quaternion.rotate(attitude.unsqueeze(1), arms)
@@ -118,12 +106,11 @@ class View:
             self.targets.set_data_3d(*_numpy(target).T)
         self.text.set_text(text)
         self.canvas.restore_region(self.background)
-        artists: list[Artist] = [*self.trails, self.targets, *self.drones, self.text]
+        for artist in (*self.trails, self.targets, *self.drones, self.text):
+            self.figure.draw_artist(artist)
         if self.image is not None and image is not None:
             self.image.set_data(_numpy(image))
-            artists.append(self.image)
-        for artist in artists:
-            self.figure.draw_artist(artist)
+            self.figure.draw_artist(self.image)
         return np.array(self.canvas.buffer_rgba())[..., :3].copy()
 
 
@@ -144,9 +131,8 @@ def animate_flight(
     """Film the first episodes of a flight in real time: drones with trails, their targets, and the task's markers.
 
     A task with a camera shows the first drone's depth image, the nearer the brighter. Where each episode has obstacles
-    of its own, the film shows only the first environment.
-
-    The other arguments, and errors, are those of :func:`plot_flight`; the rollout needs the quaternion.
+    of its own, the film shows only the first environment. The other arguments, and errors, are those of
+    :func:`plot_flight`; the rollout needs the quaternion.
 
     Args:
         path: the film to write: GIF, or MP4 (H.264) with ``imageio-ffmpeg`` of the extra ``render``, by its suffix.
@@ -176,22 +162,15 @@ def animate_flight(
 
     def pictures(flight: Flight, label: str) -> Iterator[np.ndarray]:
         images = None if flight.depth is None else depth_image(flight.depth[0], camera.range if camera else 10.0)
-        markers = with_obstacles(flight.markers, flight.solids(0))
-        pixels = None if images is None else images.shape[1:]
+        pixels, markers = None if images is None else images.shape[1:], with_obstacles(flight.markers, flight.solids(0))
         view = View(everywhere, len(flight), size + size % 2, markers, pixels)
-        attitude = cast("Tensor", flight.state("quaternion"))
-        position, target = flight.position, flight.target
+        position, attitude, target = flight.position, cast("Tensor", flight.state("quaternion")), flight.target
         for t in instants:
-            yield view.draw(
-                position[:, t],
-                attitude[:, t],
-                None if target is None else target[:, t],
-                trails=position[:, max(t - trail, 0) : t + 1],
-                text=f"{control_dt * t:.1f} s  {label}".rstrip(),
-                image=None if images is None else images[t],
-            )
+            aim, image = None if target is None else target[:, t], None if images is None else images[t]
+            trails, text = position[:, max(t - trail, 0) : t + 1], f"{control_dt * t:.1f} s  {label}".rstrip()
+            yield view.draw(position[:, t], attitude[:, t], aim, trails, text=text, image=image)
 
-    films = [pictures(flight, label) for flight, label in zip(flights, labels, strict=False)]
+    films = map(pictures, flights, labels)
     frames = (np.concatenate(parts, 1) for parts in zip(*films, strict=True))
     with replacing(path) as temporary:
         write(temporary, frames, control_dt * np.append(instants, instants[-1] + stride))
@@ -216,28 +195,40 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], times: np.ndarray) -> N
     first, rate = next(frames), Fraction(1.0 / (times[-1] - times[-2])).limit_denominator()
     source = f"-f rawvideo -pix_fmt rgb24 -s {first.shape[1]}x{first.shape[0]} -r {rate} -i -".split()
     target = ["-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-movflags", "+faststart", "-f", "mp4"]
-    exe, whole = "ffmpeg", False
+    exe, whole, why = "ffmpeg", False, f"no progress for {_PATIENCE:g} s"
     with tempfile.TemporaryFile() as log:
         try:
             exe = get_ffmpeg_exe()
             command = [exe, "-y", "-v", "error", *source, *target, f"file:{path.absolute()}"]
-            process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log)
+            process = subprocess.Popen(command, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log)
         except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: imageio-ffmpeg finds none
-            raise NoFfmpeg(_broken(exe, one_line(error))) from error
-        with contextlib.suppress(BrokenPipeError):  # it has ended before the film
-            with process:
-                for frame in itertools.chain([first], frames):
-                    cast("IO[bytes]", process.stdin).write(frame.tobytes())
-            whole = True
+            raise _no_ffmpeg(exe, one_line(error)) from error
+        try:
+            with contextlib.suppress(subprocess.TimeoutExpired):  # it hangs
+                with contextlib.suppress(BrokenPipeError), cast("IO[bytes]", process.stdin) as pipe:  # it has ended
+                    os.set_blocking(pipe.fileno(), False)
+                    for frame in itertools.chain([first], frames):
+                        rest = memoryview(frame.tobytes())
+                        while rest:
+                            if not select.select([], [pipe], [], _PATIENCE)[1]:
+                                raise subprocess.TimeoutExpired(exe, _PATIENCE)
+                            rest = rest[os.write(pipe.fileno(), rest) :]
+                    whole = True
+                why = f"exit status {process.wait(_PATIENCE)}"
+        finally:
+            process.kill()
+            process.wait()
         if not whole or process.returncode or not (path.exists() and path.stat().st_size):
             log.seek(0)
             said = one_line(log.readline(200).decode(errors="replace"))
-            raise NoFfmpeg(_broken(exe, f"exit status {process.returncode}{': ' * bool(said)}{said}"))
+            raise _no_ffmpeg(exe, f"{why}: {said}" if said else why)
 
 
-def _broken(exe: str, why: str) -> str:
+def _no_ffmpeg(exe: str, why: str) -> NoFfmpeg:
     mend = "unset IMAGEIO_FFMPEG_EXE" if os.environ.get("IMAGEIO_FFMPEG_EXE") else _REINSTALL
-    return f"Films in MP4 need an ffmpeg that writes H.264, and {exe} does not ({why}). Write a GIF, or {mend}."
+    return NoFfmpeg(
+        f"Films in MP4 need an ffmpeg that writes H.264, and {exe} does not ({why}). Write a GIF, or {mend}."
+    )
 
 
 # The views of each environment, by number of drones, size and obstacles. They are kept outside the environment, which
@@ -249,17 +240,17 @@ def draw_frame(env: QuadrotorEnv, drones: Sequence[int] | None, size: int) -> np
     """Draw an environment as it is; see :meth:`~torchrl_quad.envs.QuadrotorEnv.render`."""
     if not env.render_state:
         raise UserValueError("render() draws the state after the last reset or step. Call env.reset() first.")
-    alone = any(not isinstance(key, str) for key in env.render_state)  # each environment has other obstacles
-    chosen = list(range(min(env.num_envs, 1 if alone else 6)) if drones is None else drones)
+    state = {key: x for key, x in env.render_state.items() if isinstance(key, str)}
+    obstacles = {key: x for key, x in env.render_state.items() if key not in state}  # each environment has its own
+    chosen = list(range(min(env.num_envs, 1 if obstacles else 6)) if drones is None else drones)
     if not chosen or not all(isinstance(i, numbers.Integral) and 0 <= i < env.num_envs for i in chosen):
         raise UserValueError(
             f"render: drones are indices from 0 to {env.num_envs - 1}, at least one, such as drones=[0]; got {chosen}."
         )
     if size < 100:
         raise UserValueError(f"render: size must be at least 100 pixels, got {size}.")
-    state = {key: x for key, x in env.render_state.items() if isinstance(key, str)}
     shown = {key: x[chosen].cpu() for key, x in state.items()}
-    obstacles = {key: x[chosen[:1]] for key, x in env.render_state.items() if not isinstance(key, str)}
+    obstacles = {key: x[chosen[:1]] for key, x in obstacles.items()}
     solids = None if env.scene is None else env.scene.solids(obstacles)
     image = None
     if env.camera is not None and solids is not None:
@@ -270,12 +261,10 @@ def draw_frame(env: QuadrotorEnv, drones: Sequence[int] | None, size: int) -> np
     kind = len(chosen), size, b"".join(_numpy(x).tobytes() for x in obstacles.values())
     view = views.get(kind)
     if view is None:  # half a metre of room around all drones, their targets and the markers
-        points = [x for key, x in state.items() if key != "quaternion"]
-        low, high = bounds(*points, *env.markers().points())
+        low, high = canvas.bounds(*(x for key, x in state.items() if key != "quaternion"), *env.markers().points())
         low, high = low - torch.tensor([0.5, 0.5, 0.0]), high + 0.5
     else:  # a side that has become too near moves out by half of the view, so that it need not at every step
-        points = [x for key, x in shown.items() if key != "quaternion"]
-        low, high = bounds(*points, view.low, view.high)
+        low, high = canvas.bounds(*(x for key, x in shown.items() if key != "quaternion"), view.low, view.high)
         room = 0.5 * (view.high - view.low)
         low, high = low - room * (low < view.low), high + room * (high > view.high)
     if view is None or (low < view.low).any() or (high > view.high).any():

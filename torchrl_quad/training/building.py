@@ -19,19 +19,18 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import ObservationNormalizer, QuadrotorEnv, TrustRegion, make_actor, make_env, make_visual_actor
 from torchrl_quad.data.unwrap import base_env, leaf, observed
+from torchrl_quad.envs.registry import imported
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.options import argument_names
-from torchrl_quad.training.configuration import own_disturbances, own_loss, plain
+from torchrl_quad.training.configuration import own_disturbances, plain
 
 SEEDS_PER_PROCESS = 10_000
 _Loss = TypeVar("_Loss", bound=PathwiseLoss)
 
-# -- several processes that train one policy, as torchrun starts them; all this also works for a single one ------------
-
 
 def rank() -> int:
-    """Which of the processes this is; 0 logs, evaluates and saves."""
+    """Which of the processes that torchrun has started this is, and 0 without it; 0 logs, evaluates and saves."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
@@ -59,14 +58,8 @@ def own_seed(cfg: DictConfig) -> int:
     return cfg.seed + SEEDS_PER_PROCESS * rank()
 
 
-# -- environment, networks and loss ------------------------------------------------------------------------------------
-
-
 def set_up(cfg: DictConfig) -> tuple[EnvBase, TensorDictModule]:
-    """Seed everything, and build the environment and the policy.
-
-    Under ``torchrun`` each process has environments and random numbers of its own, and networks that start equal.
-    """
+    """Seed everything, and build the environment and the policy; in all processes networks start equal."""
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
     env = build_env(cfg, cfg.num_envs, own_seed(cfg), compile=cfg.compile)
@@ -95,10 +88,7 @@ def task_of(env: EnvBase) -> QuadrotorEnv:
 
 
 def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModule:
-    """Build the policy of a configuration; it writes log-probabilities if the loss needs them.
-
-    It reads the depth images of a camera, unless the environment has none or ``actor.vision`` is false.
-    """
+    """Build the policy of a configuration, which reads the depth images of a camera if there is one."""
     log_prob = "entropy_bonus" in cfg.loss or cfg.loss.get("alpha", 0) != 0  # of PPO, or of an entropy bonus
     options = network(cfg, "actor") | {x: cfg.actor[x] for x in ("scale_init", "noise_correlation", "learn_scale")}
     if not cfg.actor.vision or "depth" not in observed(env):
@@ -108,15 +98,12 @@ def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModule:
 
 
 def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str, Any]:
-    """The options of a network as keywords of ``make_actor``, ``make_value`` and ``make_qvalue``.
-
-    A critic, which is given the environment, also reads where the nearest obstacle is; a policy has images of it.
-    """
+    """The options of a network as keywords of ``make_actor``, ``make_value`` and ``make_qvalue``."""
     section = cfg[name]
     scale = 1.0 if cfg.normalize else section.input_scale
     activation = getattr(nn, section.activation)
     options = {"num_cells": list(section.num_cells), "activation": activation, "input_scale": scale}
-    if env is not None and "obstacle" in observed(env):
+    if env is not None and "obstacle" in observed(env):  # a critic reads where it is; a policy has images of it
         options |= {"in_keys": ["observation", "obstacle"], "input_scale": [scale, 1.0]}
     return options
 
@@ -131,21 +118,16 @@ def make_loss(
 ) -> _Loss:
     """Build the loss of a recipe, or the one that ``loss._target_`` names, with critic and discounts as configured.
 
-    A loss of your own also gets those settings of the recipe's loss that it knows. ``make_critic`` is ``make_value`` or
-    ``make_qvalue``; ``more`` are arguments of the loss that are no settings.
+    ``make_critic`` is ``make_value`` or ``make_qvalue``; ``more`` are arguments of the loss that are no settings.
     """
     options = plain(cfg.loss, resolve=True) | more
     if path := options.pop("_target_", None):
-        kind = cast("type[_Loss]", own_loss(path, kind))
-        known = argument_names(kind)
-        options = {name: value for name, value in options.items() if name in known}
+        kind = imported(path)  # which gets those settings of the recipe's loss that it knows
+        options = {name: value for name, value in options.items() if name in argument_names(kind)}
     networks = [actor] if make_critic is None else [actor, make_critic(env, **network(cfg, "critic", env))]
     loss = kind(*networks, **options)
     loss.make_value_estimator(gamma=cfg.gamma, **({"lmbda": cfg.critic.lmbda} if "critic" in cfg else {}))
     return loss
-
-
-# -- optimisers and averages -------------------------------------------------------------------------------------------
 
 
 def iterations(cfg: DictConfig) -> int:
@@ -154,16 +136,12 @@ def iterations(cfg: DictConfig) -> int:
 
 
 def parameter_groups(name: str, module: nn.Module) -> list[dict[str, Any]]:
-    """The parameters of a loss's "actor" or "critic", or of a network; groups are clipped apart.
-
-    An entropy coefficient that is learned is a group of the actor's.
-    """
-    if not isinstance(module, PathwiseLoss):
-        return [{"params": list(module.parameters())}]
-    if name == "critic":
-        return [{"params": list(getattr(module, f"{module.critic_name}_params").parameters())}]
-    learned = [{"params": [module.log_alpha]}] if module.automatic_alpha else []
-    return [{"params": list(module.actor_network_params.parameters())}, *learned]
+    """The parameters of a loss's "actor" or "critic", or of a network; groups are clipped apart."""
+    network = module
+    if isinstance(module, PathwiseLoss):
+        network = getattr(module, f"{module.critic_name if name == 'critic' else 'actor_network'}_params")
+    learned = name == "actor" and getattr(module, "automatic_alpha", False)  # an entropy coefficient
+    return [{"params": list(network.parameters())}, *([{"params": [module.log_alpha]}] if learned else [])]
 
 
 class Optimizer(torch.optim.Adam):
@@ -230,27 +208,20 @@ class TargetUpdate(SoftUpdate):
 
 
 def average_policy(cfg: DictConfig, actor: TensorDictModuleBase) -> AveragedModel | None:
-    """The running average of a policy's weights, where the configuration wants one.
+    """The average of a policy's weights over about the share ``actor.average`` of the iterations so far.
 
-    It spans about the share ``actor.average`` of the iterations so far, so it lengthens with the run and forgets the
-    start (the power function average of Karras et al. 2024, arXiv:2312.02696).
+    It is the power function average of Karras et al. 2024, arXiv:2312.02696. None where no share is configured.
     """
-    share = cfg.actor.average
-    if share is None:
-        return None
 
     def update(average: Any, now: Any, updates: Tensor | int) -> None:
-        get_ema_multi_avg_fn((1 - 1 / (int(updates) + 1)) ** (1 / share))(average, now, updates)
+        get_ema_multi_avg_fn((1 - 1 / (int(updates) + 1)) ** (1 / cfg.actor.average))(average, now, updates)
 
-    return AveragedModel(actor, multi_avg_fn=update)
+    return None if cfg.actor.average is None else AveragedModel(actor, multi_avg_fn=update)
 
 
 def trust_region(cfg: DictConfig, actor: TensorDictModule) -> TrustRegion:
     """The bound of a configuration on what an update does to the policy; all processes shorten alike."""
     return TrustRegion(cast("ProbabilisticActor", actor), cfg.actor.max_kl, average=mean_of_all)
-
-
-# -- data --------------------------------------------------------------------------------------------------------------
 
 
 def update_normalizer(env: EnvBase, rollout: TensorDictBase) -> None:
@@ -269,9 +240,9 @@ def minibatches(rollout: TensorDictBase, cfg: DictConfig) -> Iterator[TensorDict
 
 def shuffled(rollout: TensorDictBase, batch_size: int, epochs: int) -> Iterator[TensorDictBase]:
     """All steps of a rollout ``epochs`` times, in random batches; of a policy with a memory, whole horizons."""
-    remembers, horizon = "is_init" in rollout, rollout.shape[-1]
-    steps = cast("TensorDict", rollout if remembers else rollout.reshape(-1))
-    size = max(batch_size // horizon, 1) if remembers else batch_size
+    steps, size = cast("TensorDict", rollout), max(batch_size // rollout.shape[-1], 1)
+    if "is_init" not in rollout:
+        steps, size = steps.reshape(-1), batch_size
     for _ in range(epochs):
         mixed = cast("TensorDict", steps[torch.randperm(len(steps), device=steps.device)])
         yield from mixed.split(size)

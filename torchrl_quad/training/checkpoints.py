@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import os
 import shutil
 import subprocess
 from collections.abc import Collection, Iterator, Mapping
@@ -25,11 +24,6 @@ from torchrl_quad.training.schema import check
 
 FORMAT = 5  # of the content; raise it when older files can no longer be read
 MARK = b"\ntorchrl_quad checkpoint, sha256 "  # then 64 digits: the checksum of all bytes before the mark
-CONTENT = {  # and its types
-    **{"version": str, "revision": str, "config": str, "logger": (dict, type(None)), "stateful": list},
-    **{"iteration": int, "steps": int, "skipped": int, "seconds": float, "processor_seconds": float},
-    **{"rows": list, "best": dict, "processes": list},
-}
 # Settings that a resumed run may change.
 MAY_CHANGE = ("resume", "trust", "total_steps", "threads", "compile", "max_skipped", "diagnostics", "eval", "logger")
 
@@ -40,11 +34,7 @@ def previous(path: Path) -> Path:
 
 
 def write_checkpoint(path: Path, content: dict[str, Any], keep: Path | None = None) -> None:
-    """Write a checkpoint, completely or not at all, and keep an intact one as the previous.
-
-    Raises:
-        OSError: the disk is full; all files are then as they were.
-    """
+    """Write a checkpoint, completely or not at all, and keep an intact one as the previous."""
     buffer = io.BytesIO()
     torch.save({"format": FORMAT, **content}, buffer)
     payload = buffer.getvalue()
@@ -52,20 +42,11 @@ def write_checkpoint(path: Path, content: dict[str, Any], keep: Path | None = No
         temporary.write_bytes(payload + MARK + hashlib.sha256(payload).hexdigest().encode())
         if keep is not None and keep != previous(path) and keep.exists():
             with replacing(previous(path)) as copy:
-                copy.unlink()
-                try:
-                    os.link(keep, copy)
-                except OSError:  # a file system without hard links
-                    shutil.copyfile(keep, copy)
+                shutil.copyfile(keep, copy)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Read the content of a checkpoint, on the CPU. Nothing in the file is executed.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        UserValueError: the file is damaged, cut off, foreign, or of another version, or its entries are of other types.
-    """
+    """Read the content of a checkpoint, on the CPU. Nothing in the file is executed."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"No checkpoint at {path}. Train one first: python recipes/abpt.py")
@@ -89,9 +70,6 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             f"by torchrl_quad {content.get('version')} at revision {content.get('revision')}: use that version, or "
             "train again."
         )
-    wrong = [name for name, kind in CONTENT.items() if not isinstance(content.get(name), kind)]
-    if wrong:
-        raise UserValueError(f"{path} lacks {', '.join(wrong)}, or has it in another type. {_way_out(path)}")
     return content
 
 
@@ -104,12 +82,8 @@ def _way_out(path: Path) -> str:
 def take_over(cfg: DictConfig, folder: Path) -> None:
     """Replace the configuration by that of the checkpoint that ``cfg.resume`` names.
 
-    ``resume=auto`` means the checkpoint in the run's own folder, if there is one; name the folder with hydra.run.dir or
-    hydra.sweep.dir. The command line must agree with the checkpoint, except for ``MAY_CHANGE``.
-
-    Raises:
-        FileExistsError: the folder holds another run, and ``resume`` does not name it.
-        UserValueError: the command line contradicts the checkpoint.
+    ``resume=auto`` means the checkpoint in the run's own folder, if there is one. The command line must agree with the
+    checkpoint, except for ``MAY_CHANGE``.
     """
     own = folder / "checkpoint.pt"
     if cfg.resume == "auto":
@@ -121,13 +95,13 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
     if cfg.resume is None:
         return
     overrides = [override.lstrip("+~").partition("=") for override in HydraConfig.get().overrides.task]
-    asked = {name: OmegaConf.select(cfg, name) for name, _, _ in overrides}
-    path = Path(cfg.resume)
-    saved = saved_config(path, read_checkpoint(path), [*cfg.trust, *named_code(plain(cfg))])
+    asked = {"algorithm": cfg.algorithm} | {name: OmegaConf.select(cfg, name) for name, _, _ in overrides}
     for name, _, value in overrides:
         if name == "tuned" and value != "null":
             asked |= _leaves(OmegaConf.load(CONFIG / f"tuned/{value}.yaml"))
-    for key, value in ({"algorithm": cfg.algorithm} | asked).items():
+    path = Path(cfg.resume)
+    saved = saved_config(path, read_checkpoint(path), [*cfg.trust, *named_code(plain(cfg))])
+    for key, value in asked.items():
         was = OmegaConf.select(saved, key)
         if value != was and key.split(".")[0] not in MAY_CHANGE:
             raise UserValueError(
@@ -142,13 +116,19 @@ def take_over(cfg: DictConfig, folder: Path) -> None:
         cfg.update(saved)
 
 
+def _leaves(node: Any, section: str = "") -> dict[str, Any]:
+    """The settings of a YAML file by their whole names."""
+    found = {}
+    for name, value in node.items():
+        inner = _leaves(value, f"{section}{name}.") if OmegaConf.is_dict(value) else {f"{section}{name}": value}
+        found |= {} if name == "defaults" else inner
+    return found
+
+
 def saved_config(path: Path, content: Mapping[str, Any], trust: Collection[str] = ()) -> DictConfig:
     """The configuration in a checkpoint, which has passed the schema like a command line.
 
     ``trust`` lists the paths of the classes that it may name; nothing else that a file names is imported.
-
-    Raises:
-        UserValueError: it would not pass as a command line, or names a class that is not trusted.
     """
     source = f"{path}: the configuration in it"
     values = presets.parse(content["config"].encode(), source)
@@ -180,16 +160,6 @@ def fits(path: Path, what: str) -> Iterator[None]:
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         said = (str(error) or repr(error)).split("\n\t")[-1].splitlines()[0]
         raise UserValueError(f"{path}: {what} in it does not fit its configuration: {said} {_way_out(path)}") from error
-
-
-def _leaves(node: Any, section: str = "") -> dict[str, Any]:
-    """The settings of a YAML file by their whole names."""
-    found = {}
-    for name in node:
-        value = OmegaConf.select(node, name)
-        inner = _leaves(value, f"{section}{name}.") if OmegaConf.is_dict(value) else {f"{section}{name}": value}
-        found |= {} if name == "defaults" else inner
-    return found
 
 
 def revision() -> str:

@@ -1,16 +1,10 @@
-"""Where a configuration comes from: YAML files, the signatures of tasks, recipes and classes of your own.
-
-Command lines may be written as sweeps of wandb do, ``--env.wind={'mean': [1, 0, 0]}`` and ``env.randomize=None``, as
-Python prints them. hydra reads ``env.wind={mean: [1, 0, 0]}`` and ``env.randomize=null``.
-"""
+"""Where a configuration comes from: YAML files, the signatures of tasks, recipes and classes of your own."""
 
 from __future__ import annotations
 
-import ast
 import inspect
-import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import NoneType
 from typing import Any, cast
@@ -19,20 +13,20 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_quad import BPTTLoss, QuadrotorEnv, available_tasks
+from torchrl_quad import QuadrotorEnv, available_tasks
 from torchrl_quad.envs import TASKS, task_class
+from torchrl_quad.envs.config import as_disturbances
 from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.registry import imported
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
-from torchrl_quad.objectives import PathwiseLoss
-from torchrl_quad.options import build
 
 CONFIG = Path(__file__).parent / "config"  # in the repository a link to recipes/config
 SET_BY_RECIPES = ("num_envs", "device", "seed", "compile")  # settings outside ``env``
 OWN: dict[str, tuple[str, Mapping[str, Any]]] = {}  # recipes of your own: the configuration each is made from, and more
-MAX_DEPTH = 20  # of lists and mappings within each other, as in a YAML file
 # hydra's own options that take a value are these, and some with a hyphen in their name.
 _SETTING = re.compile(r"--(?!cfg=|package=|info=)([\w.@/]+=.*)", re.DOTALL)
+# What Python and hydra write differently: a string, which may be a key with its colon, and None.
+_PYTHON = re.compile(r"""('(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*")(\s*:)?|(?<![^\s,\[{:])None(?![^\s,\]}])""")
 
 
 def compose(recipe: str, overrides: Iterable[str] = ()) -> DictConfig:
@@ -42,15 +36,8 @@ def compose(recipe: str, overrides: Iterable[str] = ()) -> DictConfig:
 
 
 def command_line(arguments: Iterable[str]) -> list[str]:
-    """A command line in hydra's grammar, with a configuration on offer for each task that ships or is named on it.
-
-    Raises:
-        UserValueError: a task is unknown, or an argument nests too deeply.
-        UserTypeError: a path leads to what is no task.
-    """
+    """A command line in hydra's grammar, with a configuration on offer for each task that ships or is named on it."""
     arguments = [re.sub(r"^task\._target_=", "task=", hydra_argument(argument)) for argument in arguments]
-    for argument in arguments:
-        _check_depth(argument)
     if any(argument.startswith("loss._target_=") for argument in arguments):
         arguments = [re.sub(r"^loss\.", "++loss.", argument) for argument in arguments]  # the files lack its options
     asked = ",".join(argument.removeprefix("task=") for argument in arguments if argument.startswith("task="))
@@ -79,9 +66,6 @@ def defaults(cls: type[QuadrotorEnv]) -> dict[str, Any]:
     return settings
 
 
-# -- classes and recipes of your own -----------------------------------------------------------------------------------
-
-
 def own_class(path: Any, base: type, setting: str) -> type:
     """Import a subclass of ``base`` by its path, such as "mypackage.Gust"; a UserError says what is wrong with it."""
     if not (isinstance(path, str) and re.fullmatch(r"\w+(\.\w+)+", path)):
@@ -92,20 +76,9 @@ def own_class(path: Any, base: type, setting: str) -> type:
     return cls
 
 
-def own_loss(path: Any, kind: type) -> type:
-    """The loss that ``loss._target_`` names, for a recipe whose loss is of a kind."""
-    return own_class(path, PathwiseLoss if kind is BPTTLoss else kind, "loss._target_")
-
-
 def own_disturbances(specs: Sequence[str | Mapping[str, Any]] | None) -> list[Disturbance] | None:
     """The disturbances that ``env.disturbances`` names: paths, or mappings with ``_target_`` and arguments."""
-    if specs is None:
-        return None
-    found, setting = [], "env.disturbances"
-    for spec in specs:
-        options: dict[str, Any] = {"_target_": spec} if isinstance(spec, str) else dict(spec)
-        found.append(build(own_class(options.pop("_target_", None), Disturbance, setting), setting, options))
-    return found
+    return None if specs is None else as_disturbances(specs, "env.disturbances")
 
 
 def named_code(values: Any) -> list[str]:
@@ -122,8 +95,8 @@ def own_recipe(config: str, settings: Mapping[str, Any]) -> str:
     name = settings.get("algorithm")
     if not isinstance(name, str) or (CONFIG / f"{name}.yaml").exists():
         raise UserValueError(
-            f"A recipe of your own needs its own name: @recipe({config!r}, algorithm='my_{config}', ...); {name!r} "
-            + ("is a recipe that ships." if isinstance(name, str) else "is no name.")
+            f"A recipe of your own needs a name that no recipe has which ships, and not {name!r}: "
+            f"@recipe({config!r}, algorithm='my_{config}', ...)."
         )
     OWN[name] = config, settings
     node = OmegaConf.load(CONFIG / f"{config}.yaml")
@@ -134,50 +107,16 @@ def own_recipe(config: str, settings: Mapping[str, Any]) -> str:
     return name
 
 
-# -- the grammar of hydra ----------------------------------------------------------------------------------------------
-
-
 def hydra_argument(argument: str) -> str:
-    """One argument of a command line: without hyphens, if it is a setting, and with its value as hydra writes it."""
+    """One argument in hydra's grammar: a sweep of wandb writes ``--env.wind={'mean': [1, 0, 0], 'gust': None}``."""
     if match := _SETTING.fullmatch(argument):
         argument = match[1]
     name, equals, value = argument.partition("=")
-    return name + equals + _rewritten(value) if equals and not name.startswith("-") else argument
+    return name + equals + _PYTHON.sub(_as_in_hydra, value) if equals and not name.startswith("-") else argument
 
 
-def _rewritten(value: str) -> str:
-    """A value, or several with commas between them; those that Python and JSON cannot read stay as they are."""
-    if not re.search(r"[\[{]|\bNone\b", value):
-        return value
-    readers: tuple[Callable[[str], Any], ...] = (ast.literal_eval, json.loads)
-    for read in readers:
-        try:
-            content = read(value.strip())
-            if isinstance(content, tuple):
-                return ",".join(map(_written, content))
-            if isinstance(content, dict | list | None):
-                return _written(content)
-        except (ValueError, SyntaxError, RecursionError, MemoryError):
-            continue
-    return value
-
-
-def _written(content: Any) -> str:
-    if isinstance(content, dict):
-        pairs = {re.sub(r"([^\w./+-])", r"\\\1", str(key)): _written(x) for key, x in content.items()}
-        return f"{{{', '.join(f'{key}: {x}' for key, x in pairs.items())}}}"
-    if isinstance(content, list | tuple):
-        return f"[{', '.join(map(_written, content))}]"
-    if isinstance(content, str):  # hydra reads \' as a quotation mark, and backslashes before one in pairs
-        return "'" + re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + match[2].replace("'", r"\'"), content) + "'"
-    return json.dumps(content, default=str)
-
-
-def _check_depth(argument: str) -> None:
-    depth = 0
-    for letter in argument:
-        depth += (letter in "[{(") - (letter in ")}]")
-        if depth > MAX_DEPTH:
-            raise UserValueError(
-                f"{argument[:40]}... nests more than {MAX_DEPTH} lists or mappings. Give the path of a YAML file."
-            )
+def _as_in_hydra(match: re.Match[str]) -> str:
+    string, colon = match.groups()
+    if string is None:
+        return "null"
+    return string if colon is None else re.sub(r"([^\w./+-])", r"\\\1", string[1:-1]) + ":"

@@ -1,9 +1,4 @@
-"""The pictures of a flight, each file complete or not there.
-
-Pictures are drawn after the results are written, and never cost them: one that cannot be drawn is missing, an older one
-of its name is deleted, and a line on stderr says why. An error that explains itself is that line; of any other, which
-may be a mistake of ours, the traceback goes into ``drawing.log`` beside the picture.
-"""
+"""The pictures of a flight. One that cannot be drawn is missing, and a line on stderr says why."""
 
 from __future__ import annotations
 
@@ -19,8 +14,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-from torchrl_quad import QuadrotorEnv
-from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.deploy import Bundle
 from torchrl_quad.deploy.contract import sha256
 from torchrl_quad.deploy.transfer import as_rollout, fly
@@ -28,10 +21,10 @@ from torchrl_quad.errors import UserError
 from torchrl_quad.files import check_place
 from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, write_replay
 from torchrl_quad.render.video import NoFfmpeg
-from torchrl_quad.training.building import build_env
+from torchrl_quad.training.building import build_env, task_of
 from torchrl_quad.training.evaluation import load_policy
 
-EXPLAINED = (UserError, OSError, ImportError, MemoryError)
+EXPLAINED = (UserError, OSError, ImportError, MemoryError)  # of any other error drawing.log has the traceback
 
 
 def draw_flight(flight: TensorDictBase, path: Path, env: EnvBase, title: str) -> None:
@@ -51,10 +44,7 @@ def publish_flight(flight: TensorDictBase, figure: Path, page: Path, env: EnvBas
 
 
 def draw_transfer(bundle: Bundle, simulator: str, loop: str, path: Path, drones: int = 4) -> None:
-    """Film a bundle in our simulator and in another one, side by side, and write a page that plays both together.
-
-    The task's markers are in the pictures if the checkpoint that was exported lies beside the bundle.
-    """
+    """Film a bundle in our simulator and in another one, side by side, and write a page that plays both together."""
     ways = (("torchrl_quad", "contract"), (simulator, loop))
     flights = [fly(bundle, name, how, episodes=drones) for name, how in ways]
     ours, theirs = map(as_rollout, flights)
@@ -79,7 +69,7 @@ def environment_beside(bundle: Bundle) -> EnvBase | None:
 def draw_learning_curve(metrics: Path, path: Path, env: EnvBase) -> None:
     """Draw the evaluations in a metrics.csv over training time and steps."""
     with _or_without(path):
-        plot_learning_curve(metrics, path, metrics=cast("QuadrotorEnv", base_env(env)).metric_info)
+        plot_learning_curve(metrics, path, metrics=task_of(env).metric_info)
 
 
 def _film(path: Path, flight: TensorDictBase, sharp: dict[str, Any] | None = None, **options: Any) -> None:
@@ -124,7 +114,6 @@ def _log_traceback(path: Path) -> str:
     return f"The traceback is in {log}."
 
 
-@functools.cache
+@functools.cache  # each evaluation may draw
 def _warn(line: str) -> None:
-    """Say something once, although each evaluation may draw."""
     print(f"Warning: {line}", file=sys.stderr)

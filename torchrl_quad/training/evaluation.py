@@ -31,9 +31,8 @@ def evaluate(
 ) -> tuple[dict[str, float], TensorDictBase]:
     """Fly one episode in every environment, again and again until there are as many episodes as asked for.
 
-    Returns:
-        the metrics by name, each the mean over the episodes that have one (the median if the task asks for it), and the
-        last flight of all environments.
+    Returns the metrics by name, each the mean over the episodes that have one (the median if the task asks for it), and
+    the last flight of all environments.
     """
     task, of_episodes = task_of(env), []
     with torch.no_grad():
@@ -106,10 +105,6 @@ def load_policy(
     """Read the configuration, the best policy, and the state of its normaliser if it has one, from a checkpoint.
 
     ``trust`` lists the paths of your own classes that the configuration may name, such as "mypackage.WindowEnv".
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        UserValueError: the file is not a checkpoint that these recipes can read, or holds no policy.
     """
     saved = read_checkpoint(checkpoint)
     cfg = saved_config(checkpoint, saved, trust)

@@ -30,7 +30,6 @@ from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 import torchrl_quad
-from torchrl_quad.dynamics import presets
 from torchrl_quad.errors import UserError, UserValueError
 from torchrl_quad.files import locked, make_folder
 from torchrl_quad.training.building import rank, world_size
@@ -39,9 +38,6 @@ from torchrl_quad.training.configuration import CONFIG, OWN, command_line, named
 from torchrl_quad.training.schema import check
 
 LOCK = "run.lock"  # names the process that writes into the folder of a run
-FOLDER_SETTINGS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
-NO_MEMORY = "the memory is full. Lower num_envs, horizon, batch_size, or the size of the networks."
-THEIRS = tuple(str(Path(str(module.__file__)).parent) for module in (hydra, omegaconf, joblib))
 
 # A run that resumes continues in the folder of its checkpoint; hydra.run.dir asks for it by this name.
 OmegaConf.register_new_resolver(
@@ -55,10 +51,6 @@ class Refused(BaseException):
 
 class RefusedInSweep(Exception):
     """The same in one run of a sweep: hydra reports it when the others have ended."""
-
-
-class Stopped(KeyboardInterrupt):
-    """Ctrl-C, with a message that says how to continue."""
 
 
 class CheckBeforeFolder(Callback):
@@ -80,7 +72,6 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
     ``HYDRA_FULL_ERROR=1`` in a traceback. While a training recipe runs, no other process writes into its folder,
     ``HydraConfig.get().runtime.output_dir``.
     """
-
     name = own_recipe(config, settings) if settings else config
     registered: dict[str, type] = {}  # travels along with the job into the processes of a sweep
     flies = []  # once main has been called
@@ -116,14 +107,12 @@ def recipe(config: str, **settings: Any) -> Callable[[Callable[[DictConfig], Non
             registered.update(torchrl_quad.envs.TASKS)
             try:
                 with _explained():
-                    for path in sorted(CONFIG.rglob("*.yaml")):
-                        presets.parse(path.read_bytes(), str(path))
                     sys.argv[1:] = command_line(sys.argv[1:])
                 job()
             except (Refused, RefusedInSweep) as error:
                 _end(error, 2, full)
             except KeyboardInterrupt as error:
-                _end(error if str(error) else Stopped("Stopped. What is finished is kept."), 130, full)
+                _end(error if str(error) else KeyboardInterrupt("Stopped. What is finished is kept."), 130, full)
             except Exception as error:
                 if flies or not _is_of_the_command_line(error):
                     raise
@@ -169,7 +158,8 @@ def _is_of_the_command_line(error: Exception) -> bool:
     """Whether hydra, or the system, refuses what the user has written: with no mistake of ours in between."""
     if isinstance(error, (HydraException, OmegaConfBaseException, OSError, yaml.YAMLError)):
         return True
-    return traceback.extract_tb(error.__traceback__)[-1].filename.startswith(THEIRS)
+    theirs = tuple(str(Path(str(module.__file__)).parent) for module in (hydra, omegaconf, joblib))
+    return traceback.extract_tb(error.__traceback__)[-1].filename.startswith(theirs)
 
 
 @contextlib.contextmanager
@@ -180,10 +170,10 @@ def _explained() -> Iterator[None]:
     except (UserError, OSError) as error:
         raise Refused(str(error)) from error
     except (MemoryError, RuntimeError) as error:
-        full = isinstance(error, MemoryError | torch.OutOfMemoryError) or "can't allocate memory" in str(error)
-        if not full:
-            raise
-        raise Refused(NO_MEMORY) from error
+        if isinstance(error, MemoryError | torch.OutOfMemoryError) or "can't allocate memory" in str(error):
+            why = "the memory is full. Lower num_envs, horizon, batch_size, or the size of the networks."
+            raise Refused(why) from error
+        raise
 
 
 @contextlib.contextmanager
@@ -202,23 +192,17 @@ def _joined(cfg: DictConfig) -> Iterator[None]:
         dist.destroy_process_group()
 
 
-# -- the folder of a run -----------------------------------------------------------------------------------------------
-
-
 @contextlib.contextmanager
 def _run_folder(resume: str | None) -> Iterator[Path]:
-    """Hold the folder of this run, the same for all processes that train together.
-
-    That is the checkpoint's if one is named, otherwise the one that hydra has made; or one beside it, if another run
-    has got hydra's and the user has not named it.
-    """
+    """Hold the folder of this run, the checkpoint's if one is named, the same for all processes that train together."""
     hydra_config: Any = HydraConfig.get()
     made = Path(hydra_config.runtime.output_dir)
     goes_on = resume not in (None, "auto")
-    named = goes_on or any(x.lstrip("+").startswith(FOLDER_SETTINGS) for x in hydra_config.overrides.hydra)
-    with contextlib.ExitStack() as stack:
-        folder = Path(str(resume)).resolve().parent if goes_on else made
-        values = [stack.enter_context(own_folder(folder, named)) if rank() == 0 else folder]
+    folders = ("hydra.run.dir", "hydra.sweep.")
+    named = goes_on or any(x.lstrip("+").startswith(folders) for x in hydra_config.overrides.hydra)
+    folder = Path(str(resume)).resolve().parent if goes_on else made
+    with own_folder(folder, named) if rank() == 0 else contextlib.nullcontext(folder) as own:
+        values = [own]
         if world_size() > 1:
             dist.broadcast_object_list(values)  # that of the first process
         if values[0] != made:
@@ -235,9 +219,6 @@ def own_folder(folder: Path, named: bool) -> Iterator[Path]:
 
     A folder that the user has named is taken as it is. Otherwise its name is only a proposal: when another run has it,
     the next free one of ``folder_2``, ``folder_3`` and so on is made.
-
-    Raises:
-        FileExistsError: another process runs in the folder that was named.
     """
     for number in itertools.count(1):
         path = make_folder(folder if number == 1 else folder.with_name(f"{folder.name}_{number}"))
@@ -279,7 +260,7 @@ def _resumable(folder: Path, cfg: DictConfig) -> Iterator[None]:
         is_saved = checkpoint.exists()
         if isinstance(error, KeyboardInterrupt):
             why = how if is_saved else "Nothing was saved yet: the first evaluation writes a checkpoint."
-            raise Stopped(f"Stopped. {why}") from error
+            raise KeyboardInterrupt(f"Stopped. {why}") from error
         if error.errno != errno.ENOSPC:
             raise
         why = f"The last checkpoint is intact. Make room. {how}" if is_saved else "Nothing was saved yet."

@@ -5,15 +5,13 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, cast
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 from torchrl.record.loggers import get_logger
 
-from torchrl_quad.envs.metrics import Metric
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.files import write_rows
 from torchrl_quad.training.configuration import plain
@@ -24,34 +22,26 @@ NOT_IN_A_NAME = ("task=", "seed=", "resume=", "device=", "threads=", "logger.")
 
 
 class Logs:
-    """The log of a run: ``add`` a row, ``show_flight``, ``finish`` with the summary.
+    """The log of a run. ``saved`` is its state in the checkpoint from which the run goes on, in the same wandb run.
 
-    ``rows`` are those of metrics.csv so far, ``metrics`` the task's. ``saved`` is the logger's state in the checkpoint
-    from which the run continues, in the same wandb run; tensorboard forgets what it was given later.
+    Tensorboard forgets what it was given later than the checkpoint.
     """
 
-    def __init__(
-        self,
-        cfg: DictConfig,
-        folder: Path,
-        revision: str,
-        rows: list[dict[str, float]],
-        metrics: Mapping[str, Metric],
-        saved: dict[str, Any] | None,
-    ) -> None:
-        self.cfg, self.folder, self.rows = cfg, folder, rows
+    def __init__(self, run: Any, saved: dict[str, Any] | None) -> None:
+        cfg, folder, rows = self.cfg, self.folder, self.rows = run.cfg, run.folder, run.rows
         self.backend: Any = None
-        if rows:
-            self._write()  # without those that came after the checkpoint
+        if rows:  # without those that came after the checkpoint
+            write_rows(folder / "metrics.csv", rows, missing=math.nan)
         if not cfg.logger.backend:
             return
-        config = plain(cfg, resolve=True) | {"revision": revision}
+        config = plain(cfg, resolve=True) | {"revision": run.revision}
         name = f"{cfg.task}_{cfg.algorithm}_seed{cfg.seed}"
         self.name = (saved or {}).get("name") or run_name(name, HydraConfig.get().overrides.task)
+        drone = Path(cfg.env.drone).stem if isinstance(cfg.env.get("drone"), str) else "own drone"
         wandb = {
             **{key: cfg.logger[key] for key in ("mode", "project", "group")},
             "name": self.name,
-            "tags": tags(cfg),
+            "tags": [str(tag)[:64] for tag in (cfg.task, cfg.algorithm, drone)],
             "job_type": "train",
             "config": config,
             "log_env_packages": False,  # would take the place of the configuration's own section env
@@ -63,7 +53,7 @@ class Logs:
         if cfg.logger.backend == "wandb":
             self.backend.experiment.define_metric("steps", hidden=True)
             self.backend.experiment.define_metric("*", step_metric="steps")
-            for metric, described in metrics.items():
+            for metric, described in run.task.metric_info.items():
                 if described.goal:  # the table of runs then shows the best value, not the last
                     self.backend.experiment.define_metric(f"eval/{metric}", step_metric="steps", summary=described.goal)
         if rows and cfg.logger.backend == "tensorboard":
@@ -74,7 +64,7 @@ class Logs:
     def add(self, row: dict[str, float]) -> None:
         """Log a row, and rewrite metrics.csv: after a resume it ends where the checkpoint does."""
         self.rows.append(row)
-        self._write()
+        write_rows(self.folder / "metrics.csv", self.rows, missing=math.nan)
         metrics = {key: x for key, x in row.items() if "/" in key}
         if self.cfg.logger.backend == "wandb":
             self.backend.experiment.log({"steps": row["steps"], **metrics})
@@ -125,9 +115,6 @@ class Logs:
         paths = [str(self.folder / file) for file in files if (self.folder / file).exists()]
         return {name: make(paths[0])} if paths else {}
 
-    def _write(self) -> None:
-        write_rows(self.folder / "metrics.csv", self.rows, missing=math.nan)
-
 
 def _logger(backend: str, *arguments: Any, **options: Any) -> Any:
     """TorchRL's logger; what wandb refuses, such as a run without a login, is a UserValueError."""
@@ -145,10 +132,3 @@ def run_name(name: str, overrides: Iterable[str]) -> str:
     given = [x.lstrip("+") for x in overrides if not x.lstrip("+~").startswith(NOT_IN_A_NAME)]
     name = " ".join([name, *given])
     return name if len(name) <= 128 else f"{name[:127]}…"
-
-
-def tags(cfg: DictConfig) -> list[str]:
-    """Task, algorithm and drone."""
-    drone = cfg.env.get("drone")
-    drone = Path(drone).stem if isinstance(drone, str) else "own drone"
-    return [str(tag)[:64] for tag in (cfg.task, cfg.algorithm, drone)]

@@ -65,25 +65,17 @@ CELL = 0.5  # [m]: train/start_cells counts the cubes of this size in which hori
 class Run:
     """A training run: ``for _ in run: ...``, with ``run.carry``, ``run.optimise(...)`` and ``run.record(...)`` in it.
 
-    Before each iteration every :class:`Optimizer` gets its learning rate, by the steps of the run so far. Every
-    ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs to
-    continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of those
-    the one with the greatest return. At the end that policy flies from other starts. With ``actor.average``
-    evaluations fly the average of the policy's weights.
+    Every ``eval.interval`` iterations the run writes a row of metrics and a checkpoint, which holds all that it needs
+    to continue bit for bit, and the best policy so far: the one that solved most episodes in an evaluation, and of
+    those the one with the greatest return. At the end that policy flies from other starts.
 
-    The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints. Processor seconds count
-    the time in which the threads of this process computed. Of several processes the first evaluates, logs and saves.
+    The seconds are those of the loop, without set-up, compilation, evaluations and checkpoints.
 
     Args:
-        cfg: the configuration.
-        env: the environment.
-        actor: the policy, whose parameters are those of the loss.
-        loss: holds everything that is trained.
+        cfg, env: the configuration and its environment.
+        actor, loss: the policy, and what holds everything that is trained, its parameters too.
         stateful: optimisers, and whatever else has a ``state_dict`` that changes in training.
         buffer: of visited states, if the algorithm has one.
-
-    Raises:
-        ValueError: the checkpoint to resume does not fit.
 
     Attributes:
         carry: where the next horizon starts; the algorithm sets it in each iteration.
@@ -119,20 +111,16 @@ class Run:
         self.revision = revision()
         if world_size() > 1:
             torch.manual_seed(own_seed(cfg))  # the networks are built, and equal
-        logger_state = None
-        if cfg.resume:
-            logger_state = self._load(Path(cfg.resume))
-        else:
+        logger_state = self._load(Path(cfg.resume)) if cfg.resume else None
+        if not cfg.resume:
             self.carry = env.reset()
         self.is_over = self.steps >= self.total_steps and (self.folder / "summary.json").exists()
         if rank() == 0 and not self.is_over:
             for name in ("summary.json", "failure.pt"):  # of the run before it was made longer, or went on
                 (self.folder / name).unlink(missing_ok=True)
-            self.logs = Logs(cfg, self.folder, self.revision, self.rows, self.task.metric_info, logger_state)
+            self.logs = Logs(self, logger_state)
             with replacing(self.folder / "config.yaml") as path:
                 OmegaConf.save(cfg, path, resolve=True)
-
-    # -- what the algorithm calls --------------------------------------------------------------------------------------
 
     def __iter__(self) -> Iterator[int]:
         if self.is_over:
@@ -172,10 +160,7 @@ class Run:
     def optimise(self, optimizer: Optimizer, loss: Tensor) -> None:
         """Take one step down a loss with its clipped gradient, averaged over all processes; record the norm.
 
-        The step is skipped if the loss or its gradient is not finite.
-
-        Raises:
-            Diverged: more than ``max_skipped`` steps were skipped; the run is saved as it is.
+        The step is skipped if the loss or its gradient is not finite; more than ``max_skipped`` of them end the run.
         """
         both = torch.stack(backward(loss, optimizer, optimizer.max_grad_norm))
         value, norm = both.tolist()  # in one call, so that it waits for a GPU once
@@ -204,13 +189,7 @@ class Run:
     ) -> dict[str, Any]:
         """Take ``critic.updates`` steps of the critic towards the value targets in ``data``, on random minibatches.
 
-        Args:
-            optimizer: of the critic.
-            data: a rollout with value targets.
-            target: moves the target critic after each step, if there is one.
-
-        Returns:
-            the loss and the metrics of the last minibatch.
+        ``target`` moves the target critic after each. Returns the loss and the metrics of the last minibatch.
         """
         loss, metrics = cast("PathwiseCriticLoss", self.loss), {}
         read = data.select(*getattr(loss, loss.critic_name).in_keys, loss.tensor_keys.value_target)
@@ -227,8 +206,6 @@ class Run:
         for name, value in metrics.items():
             name = f"grad/{name.removeprefix('grad_')}" if name.startswith("grad_") else f"train/{name}"
             self.recorded[name].append(float(value.detach()) if isinstance(value, Tensor) else value)
-
-    # -- evaluating ----------------------------------------------------------------------------------------------------
 
     def _warm_up(self) -> None:
         """Compile all that the loop will call, before the clock starts; change nothing."""
@@ -300,8 +277,6 @@ class Run:
         self.logs.show_flight(self.steps)
         self.logs.finish(summary)
 
-    # -- stopping and going on -----------------------------------------------------------------------------------------
-
     def _save(self, path: Path) -> None:
         """Write all that the run needs to continue, of all processes."""
         own = {
@@ -365,8 +340,7 @@ class Run:
 def backward(loss: Tensor, optimizer: torch.optim.Optimizer, max_grad_norm: float) -> tuple[Tensor, Tensor]:
     """Compute the gradient of a loss, average it over the processes, and clip that of each group of parameters.
 
-    Returns:
-        the loss and the norm of the gradient of the first group before clipping, both averaged over the processes.
+    Returns the loss and the norm of the first group's gradient before clipping, both averaged over the processes.
     """
     optimizer.zero_grad()
     loss.backward()

@@ -1,8 +1,7 @@
 """The schema of the configuration: the type and the range of every setting, checked before a run makes its folder.
 
-A setting is refused with its name, its value, what it must be, and the sentence that describes it. The signatures of
-task and loss declare the settings in ``env`` and ``loss``, ``SETTINGS`` all others. The YAML files of a recipe say
-which of them it has.
+The signatures of task and loss declare the settings in ``env`` and ``loss``, ``SETTINGS`` all others. The YAML files of
+a recipe say which of them it has.
 """
 
 from __future__ import annotations
@@ -15,17 +14,18 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, cast
 
-import torch
 from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from torchrl_quad import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
 from torchrl_quad.envs import task_class
 from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.objectives import PathwiseLoss
 from torchrl_quad.options import (
     Below1,
     Count,
+    Device,
     Fraction,
     Horizon,
     NonNegative,
@@ -34,30 +34,13 @@ from torchrl_quad.options import (
     Share,
     Size,
     Width,
+    accepted,
     argument_names,
     check_known,
     declared,
     must,
 )
-from torchrl_quad.training.configuration import CONFIG, OWN, SET_BY_RECIPES, own_disturbances, own_loss, plain
-
-MAX_ROLLOUT = 100_000_000  # control steps of a rollout: with a graph they take more than 50 GB
-
-
-def available_device(name: str) -> str:
-    """The name of a device that this machine has."""
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
-        raise UserValueError("be cpu, cuda, or one of several GPUs, such as cuda:1")
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise UserValueError("be cpu: torch finds no CUDA device on this machine")
-    return name
-
-
-def existing_checkpoint(path: str) -> str:
-    """The path of a checkpoint to continue from, or auto."""
-    if path != "auto" and not Path(path).is_file():
-        raise UserValueError("be the path of a checkpoint.pt that exists, or auto")
-    return path
+from torchrl_quad.training.configuration import CONFIG, OWN, SET_BY_RECIPES, own_class, own_disturbances, plain
 
 
 class Section(BaseModel):
@@ -66,20 +49,19 @@ class Section(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid")
 
 
-# -- what is declared here ---------------------------------------------------------------------------------------------
-
 ACTIVATIONS = "CELU ELU GELU Hardswish LeakyReLU Mish PReLU ReLU SELU SiLU Sigmoid Softplus Softsign Tanh"  # torch.nn
 _Channels = Annotated[list[Annotated[int, Field(ge=1, le=4096)]], Field(min_length=1, max_length=8)]
 _Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
+_Resume = accepted(lambda x: x == "auto" or Path(x).is_file(), "the path of a checkpoint.pt that exists, or auto")
 
 #: The type and the description of each setting outside env and loss; "network" stands for actor and critic.
 SETTINGS: dict[str, tuple[Any, str]] = {
     "algorithm": (str, ""),
     "task": (str, ""),
     "seed": (_Seed, "All random numbers follow from it."),
-    "resume": (Annotated[str, AfterValidator(existing_checkpoint)] | None, ""),
+    "resume": (Annotated[str, _Resume] | None, ""),
     "trust": (list[str], "The paths of your own classes that a checkpoint names, and that may be imported."),
-    "device": (Annotated[str, AfterValidator(available_device)], ""),
+    "device": (Device, ""),
     "threads": (Annotated[int, Field(ge=1, le=1024)], "Torch threads; 1 is the fastest for tensors as small as these."),
     "num_envs": (Size, "Drones of each process; no memory holds more than these."),
     "horizon": (Horizon, "Control steps in a rollout."),
@@ -140,8 +122,6 @@ SETTINGS: dict[str, tuple[Any, str]] = {
 }
 PROGRAMS = {"logs": "identify", "folder": "export", "checkpoint": "evaluate"}  # by a setting that only they have
 IDENTIFYING = {"horizon": (Positive, ""), "folder": (str, "The folder to write.")}  # of identify.py, under these names
-# -- what is declared elsewhere ----------------------------------------------------------------------------------------
-
 #: The options of TorchRL's ClipPPOLoss that the recipe takes.
 PPO: dict[str, tuple[Any, str]] = {
     "clip_epsilon": (Annotated[Real, Field(gt=0, lt=1)], "How far the ratio of probabilities may move from 1."),
@@ -187,16 +167,8 @@ def settings(name: str) -> dict[str, Any]:
     return {name: value for name, value in merged.items() if name not in ("defaults", "hydra")}
 
 
-# -- the check ---------------------------------------------------------------------------------------------------------
-
-
 def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
-    """Check a configuration against the schema, and what the command line has changed in it.
-
-    Raises:
-        UserValueError: the first setting that is unknown, has the wrong type, is out of its range, or has no effect.
-        UserTypeError: the task has no such option, or a path leads to a class of another kind.
-    """
+    """Raise a UserError for the first setting that is unknown, of a wrong value, or written without effect."""
     try:
         chosen = OmegaConf.masked_copy(cfg, [str(name) for name in cfg if name != "hydra"])
         values = plain(chosen, resolve=True, throw_on_missing=True)
@@ -205,7 +177,6 @@ def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
         raise UserValueError(f"{name} is missing: write {name}=... on the command line.") from None
     except OmegaConfBaseException as error:
         raise UserValueError(f"{error.full_key or 'the configuration'}: {str(error).splitlines()[0]}") from None
-    _check_none(values)
     asked = {name.lstrip("+~"): value for name, _, value in (override.partition("=") for override in overrides)}
     schema = schema_of(values, asked)
     try:
@@ -213,7 +184,7 @@ def check(cfg: DictConfig, overrides: Sequence[str] = ()) -> None:
     except ValidationError as error:
         raise UserValueError(_sentence(schema, error.errors()[0])) from None
     if "algorithm" in values:
-        own_disturbances(values["env"].get("disturbances"))
+        own_disturbances(values.get("env", {}).get("disturbances"))
         _check_together(values, asked)
 
 
@@ -226,34 +197,31 @@ def schema_of(values: dict[str, Any], asked: Mapping[str, str] = MappingProxyTyp
         if not isinstance(values.get(name), str):
             raise UserValueError(f"{name}={shown(values.get(name))}: it must be a name.")
     config, own = OWN.get(values["algorithm"], (values["algorithm"], {}))
-    known = settings(values["algorithm"])
     kinds: dict[str, tuple[Any, str]] = {"env": (_environment(values), ""), "loss": (dict[str, Any], "")}
-    if config not in LOSSES:  # of a recipe that is somebody's own, in another program, and may lack what BPTT does
-        must = {name: value for name, value in settings("bptt").items() if name != "restart_fraction"}
-        return _section(known, SETTINGS | kinds, must=must)
-    kinds["loss"] = _loss(LOSSES[config], own.get("loss") or {}, values.get("loss"), asked), ""
-    # What the tuned file of another recipe sets, which this one starts from, is left alone.
+    if config in LOSSES:
+        kinds["loss"] = _loss(LOSSES[config], own.get("loss") or {}, values.get("loss"), asked), ""
+    # What the tuned file of another recipe sets, which this one starts from, is left alone. A recipe that is somebody's
+    # own, in another program, may lack anything.
     spare = {name for name in SETTINGS if name.startswith("critic.") and name not in asked}
-    return _section(known, SETTINGS | kinds, spare)
+    return _section(settings(values["algorithm"]), SETTINGS | kinds, spare, config in LOSSES)
 
 
 def _section(
     known: Mapping[str, Any],
     kinds: Mapping[str, tuple[Any, str]],
     spare: Collection[str] = (),
+    is_complete: bool = True,
     section: str = "",
-    must: Mapping[str, Any] | None = None,
 ) -> type[BaseModel]:
-    """The schema of a section that has these settings, all or some of which it must have, and may have spare ones."""
-    must = known if must is None else must
+    """The schema of a section with these settings, all of which it must have if it is complete, and spare ones."""
     fields: dict[str, Any] = {}
     more = [name.removeprefix(section) for name in spare if section and name.startswith(section)]
     for key, value in {**dict.fromkeys(more), **known}.items():
         name = section + key
         kind, text = kinds.get(name) or kinds.get(re.sub(r"^(actor|critic)\.", "network.", name)) or (None, "")
         if kind is None and isinstance(value, Mapping):
-            kind = _section(value, kinds, spare, f"{name}.", must.get(key) or {})
-        fields[key] = _field(key, kind or Any, text, ... if key in must else None)
+            kind = _section(value, kinds, spare, is_complete, f"{name}.")
+        fields[key] = _field(key, kind or Any, text, ... if is_complete and key in known else None)
     return create_model(section or "Configuration", __base__=Section, **fields)
 
 
@@ -283,7 +251,7 @@ def _loss(kind: type | None, added: Mapping[str, Any], values: Any, asked: Mappi
     if path := values.get("_target_"):
         if kind is None:
             raise UserValueError(f"loss._target_={path}: this recipe takes only TorchRL's loss. Write your own recipe.")
-        own = own_loss(path, kind)
+        own = own_class(path, PathwiseLoss if kind is BPTTLoss else kind, "loss._target_")
         options |= declared(own)
         # A setting of the recipe's own loss that this one lacks is left out, but the command line must not name it.
         unasked = {name for name in values if f"loss.{name}" not in asked}
@@ -300,8 +268,6 @@ def _loss(kind: type | None, added: Mapping[str, Any], values: Any, asked: Mappi
 
 def _check_together(values: dict[str, Any], asked: Mapping[str, str]) -> None:
     """Refuse settings that do not fit each other, or that the command line sets in vain."""
-    if values["num_envs"] * values["horizon"] > MAX_ROLLOUT:
-        raise UserValueError(f"num_envs times horizon must be at most {MAX_ROLLOUT:,}, or no memory holds a rollout.")
     for name in ("actor", "critic"):
         section = values.get(name) or {}
         if section.get("schedule") == "exponential" and section["final_lr"] == 0:
@@ -316,15 +282,6 @@ def _check_together(values: dict[str, Any], asked: Mapping[str, str]) -> None:
         for name in set(names.split()) & asked.keys():
             if is_idle(values):
                 raise UserValueError(f"{name}={asked[name]} has no effect: {why}. Leave it out, or change that.")
-
-
-def _check_none(values: Any, name: str = "") -> None:
-    """Refuse the word None, which YAML reads as a string."""
-    if isinstance(values, dict):
-        for key, value in values.items():
-            _check_none(value, f"{name}.{key}" if name else str(key))
-    elif values in ("None", "none"):
-        raise UserValueError(f"{name}={values}: it is the word {values!r} to YAML. For no value write {name}=null.")
 
 
 def _sentence(schema: type[BaseModel], error: Any) -> str:

@@ -16,15 +16,7 @@ from torchrl_quad.options import Below1, Delay, Fraction, between, build, checke
 from torchrl_quad.vision.primitives import Primitives
 from torchrl_quad.vision.rays import cast_rays
 
-MAX_PIXELS = 1_000_000
-MAX_ANGLE = math.radians(170.0)  # a picture plane cannot show half of all directions
-Angle = Annotated[float, between(0.01, 2.967)]
 Side = Annotated[int, between(1, 10_000)]
-Rate = Annotated[int, between(1, 1_000)]
-Place = Annotated[Sequence[Annotated[float, between(-10.0, 10.0)]], entries(3, 3)]
-Quaternion = Annotated[Sequence[Annotated[float, between(-1.001, 1.001)]], entries(4, 4)]
-Turn = Annotated[float, between(-math.pi, math.pi)]
-Range = Annotated[float, between(0.01, 10_000.0)]
 
 
 @checked
@@ -55,12 +47,12 @@ class DepthCamera:
 
     width: Side = 16
     height: Side = 12
-    field_of_view: Angle = 0.5 * math.pi
-    position: Place = (0.0, 0.0, 0.0)
-    pitch: Turn = 0.0
-    quaternion: Quaternion | None = None
-    range: Range = 10.0
-    rate: Rate = 1
+    field_of_view: Annotated[float, between(0.01, 2.967)] = 0.5 * math.pi
+    position: Annotated[Sequence[Annotated[float, between(-10.0, 10.0)]], entries(3, 3)] = (0.0, 0.0, 0.0)
+    pitch: Annotated[float, between(-math.pi, math.pi)] = 0.0
+    quaternion: Annotated[Sequence[Annotated[float, between(-1.001, 1.001)]], entries(4, 4)] | None = None
+    range: Annotated[float, between(0.01, 10_000.0)] = 10.0
+    rate: Annotated[int, between(1, 1_000)] = 1
     delay: Delay = 0
     noise: Fraction = 0.0
     dropout: Below1 = 0.0
@@ -69,15 +61,14 @@ class DepthCamera:
 
     def __post_init__(self) -> None:
         tall = 2 * math.atan(self.height / self.width * math.tan(0.5 * self.field_of_view))
-        if self.pixels > MAX_PIXELS:
+        if self.pixels > 1_000_000:
             raise UserValueError(f"{self.width} x {self.height} pixels are too many. Give a million at most.")
-        if tall >= MAX_ANGLE:
+        if tall >= math.radians(170.0):  # a picture plane cannot show half of all directions
             raise UserValueError(
                 f"{self.height} rows of {self.width} square pixels span {math.degrees(tall):.0f} degrees from top to "
                 "bottom, and 170 are too many. Give fewer rows, or a smaller field_of_view."
             )
-        q = self.quaternion
-        if q is not None and abs(math.sqrt(sum(x * x for x in q)) - 1.0) > 1e-3:
+        if (q := self.quaternion) is not None and abs(math.hypot(*q) - 1.0) > 1e-3:
             raise UserValueError(f"quaternion must be four numbers (w, x, y, z) of unit norm, got {q!r}.")
         if q is not None and self.pitch != 0.0:
             raise UserValueError("pitch and quaternion both say where the camera looks. Give one of them.")
@@ -121,20 +112,13 @@ class DepthCamera:
         return place, quaternion.multiply(attitude, self.mount(attitude).expand_as(attitude))
 
     def depth(self, solids: Primitives, position: Tensor, attitude: Tensor, *, fused: bool = False) -> Tensor:
-        """Images without noise, rate and delay.
+        """Images (n, 1, height, width) [m] of n scenes, without noise, rate and delay.
 
-        Args:
-            solids: of n scenes.
-            position: of the drones (n, 3) [m], world frame.
-            attitude: of the drones (n, 4), unit quaternions, body to world.
-            fused: compile the rays, 30 times as fast; as a compiled step does in any case.
-
-        Returns:
-            images (n, 1, height, width) [m].
+        The drones are at positions (n, 3) [m], world frame, with unit quaternions (n, 4), body to world. ``fused``
+        compiles the rays, 30 times as fast, as a compiled step does in any case.
         """
         plane = self.plane(position)
-        pose = self.pose(position, attitude)
-        depth = cast_rays(solids, *pose, plane, self.range, self.differentiable, fused=fused)
+        depth = cast_rays(solids, *self.pose(position, attitude), plane, self.range, self.differentiable, fused=fused)
         if self.along_ray:
             depth = (depth * (1.0 + plane.square().sum(0)).sqrt()).clamp_max(self.range)
         return depth.unflatten(1, (1, self.height, self.width))
@@ -145,10 +129,9 @@ class DepthCamera:
         One number decides both whether a pixel measures anything, and its error: the share ``dropout`` of the least
         numbers drops out, and what is left of the distribution is stretched to a whole one.
         """
-        normal = normal.reshape(depth.shape)
-        error, lost = normal, None
+        error, lost = normal.reshape(depth.shape), None
         if self.dropout:
-            share = 0.5 * (1.0 + torch.erf(normal * math.sqrt(0.5)))
+            share = 0.5 * (1.0 + torch.erf(error * math.sqrt(0.5)))
             lost = share < self.dropout
             rest = (share - self.dropout) / (1.0 - self.dropout)
             error = math.sqrt(2.0) * torch.erfinv((2.0 * rest - 1.0).clamp(-0.999999, 0.999999))

@@ -75,10 +75,9 @@ def nearest(solids: Primitives, position: Tensor) -> tuple[Tensor, Tensor]:
 def closest_approach(solids: Primitives, start: Tensor, end: Tensor) -> Tensor:
     """The least signed distance (n, 1) [m] on the straight way between two positions (n, 3), without gradient.
 
-    The distance to a convex solid is a convex function of the way, so its least value lies next to the least of some
-    samples. It is sampled twice, the second time between the neighbours of the least. For a way of length L that passes
-    a surface at a distance d, what is found is at most (L / 64)^2 / d too large, and never more than L / 64: at 10 m/s,
-    with control steps of 0.02 s and d = 0.1 m, 0.1 mm.
+    The distance to a convex solid is a convex function of the way. It is sampled twice, the second time between the
+    neighbours of the least value. For a way of length L that passes a surface at a distance d, what is found is at most
+    (L / 64)^2 / d too large, and never more than L / 64: at 10 m/s, with steps of 0.02 s and d = 0.1 m, 0.1 mm.
     """
     with torch.no_grad():
         share = torch.arange(SAMPLES + 1, device=start.device, dtype=start.dtype) / SAMPLES
@@ -144,7 +143,7 @@ def _sphere_normal(x: Tensor, point: Tensor) -> tuple[Tensor, ...]:
 
 def _cylinder(x: Tensor, point: Tensor) -> Tensor:
     _, _, beside, above, _ = _cylinder_parts(x, point)
-    return _length(beside.clamp_min(0.0), above.clamp_min(0.0)) + torch.maximum(beside, above).clamp_max(0.0)
+    return _from_faces(beside, above)
 
 
 def _cylinder_normal(x: Tensor, point: Tensor) -> tuple[Tensor, ...]:
@@ -162,20 +161,18 @@ def _cylinder_parts(x: Tensor, point: Tensor) -> tuple[Tensor, ...]:
 
 
 def _box(x: Tensor, point: Tensor) -> Tensor:
-    beyond = [p.abs() - half for p, half in zip(_box_frame(x, point), x[..., 3:6].unbind(-1), strict=True)]
-    deepest = functools.reduce(torch.maximum, beyond)
-    return _length(*(q.clamp_min(0.0) for q in beyond)) + deepest.clamp_max(0.0)
+    return _from_faces(*_box_parts(x, point)[1])
 
 
 def _box_normal(x: Tensor, point: Tensor) -> tuple[Tensor, ...]:
-    local = _box_frame(x, point)
-    beyond = [p.abs() - half for p, half in zip(local, x[..., 3:6].unbind(-1), strict=True)]
+    local, beyond = _box_parts(x, point)
     outward = [weight * _sign(p) for weight, p in zip(_outwards(*beyond), local, strict=True)]
     return quaternion.rotate(x[..., 6:], torch.stack(outward, -1)).unbind(-1)
 
 
-def _box_frame(x: Tensor, point: Tensor) -> tuple[Tensor, ...]:
-    return quaternion.rotate_inverse(x[..., 6:], point - x[..., :3]).unbind(-1)
+def _box_parts(x: Tensor, point: Tensor) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+    local = quaternion.rotate_inverse(x[..., 6:], point - x[..., :3]).unbind(-1)
+    return local, [p.abs() - half for p, half in zip(local, x[..., 3:6].unbind(-1), strict=True)]
 
 
 def _plane(x: Tensor, point: Tensor) -> Tensor:
@@ -195,6 +192,11 @@ def _length(*parts: Tensor) -> Tensor:
 def _unit(*parts: Tensor) -> tuple[Tensor, ...]:
     length = _length(*parts)
     return tuple(p / length for p in parts)
+
+
+def _from_faces(*beyond: Tensor) -> Tensor:
+    """The distance, from how far the point lies beyond each face."""
+    return _length(*(q.clamp_min(0.0) for q in beyond)) + functools.reduce(torch.maximum, beyond).clamp_max(0.0)
 
 
 def _sign(x: Tensor) -> Tensor:

@@ -32,10 +32,7 @@ def cast_rays(
     *,
     fused: bool = False,
 ) -> Tensor:
-    """How far rays fly until they meet a solid, as a multiple of their direction, (n, p), at most ``far``.
-
-    The direction of ray p is (1, ``plane[0, p]``, ``plane[1, p]``) in the frame of the camera: the multiple is the
-    depth along the camera's x axis [m].
+    """How far rays fly until they meet a solid: the depth (n, p) along the camera's x axis [m], at most ``far``.
 
     Args:
         solids: of n scenes.
@@ -43,9 +40,9 @@ def cast_rays(
         attitude: of the camera (n, 4), a unit quaternion, to the world.
         plane: where the rays pass the plane x = 1 in the frame of the camera (2, p): y to the left, z upwards.
         far: the greatest depth [m].
-        fused: compile the rays into one loop, as a compiled step does in any case; it takes seconds the first time.
         differentiable: with the derivative in position and attitude. It is that of the visible surface; a jump, as of
             an edge before another surface, has none. At a grazing ray it is limited.
+        fused: compile the rays into one loop, as a compiled step does in any case; it takes seconds the first time.
     """
     solids = Primitives(*(x.detach() for x in solids))
     inputs = position.detach(), attitude.detach(), plane, *solids._replace(boxes=_with_axes(solids.boxes))
@@ -70,22 +67,20 @@ def meet(
 ) -> tuple[Tensor, ...]:
     """The depth of each ray (n, p), and with ``which`` the index of the solid that it meets, in the order of kinds."""
     rays = tuple(d.unsqueeze(1) for d in directions(attitude, plane))  # (n, 1, p)
-    found: list[Tensor] = []  # depth, and index
-    first = 0
+    depth: list[Tensor] = []
+    index, first = None, 0
     for function, x in zip((_meet_spheres, _meet_cylinders, _meet_boxes, _meet_planes), solids, strict=True):
-        if not x.shape[1]:
-            continue
-        entry, exit = function(x, position, rays)
-        entry = entry.clamp_min(0.0)
-        met = torch.where((exit > entry) & (entry < far), entry, far)  # NaN, where a ray misses, is not greater
-        least = met.amin(1)
-        mine = [least, met.argmin(1) + first] if which else [least]
-        if found:
-            nearer = [torch.where(least < found[0], mine[1], found[1])] if which else []
-            mine = [torch.minimum(found[0], least), *nearer]
-        found = mine
+        if x.shape[1]:
+            entry, exit = function(x, position, rays)
+            entry = entry.clamp_min(0.0)
+            met = torch.where((exit > entry) & (entry < far), entry, far)  # NaN, where a ray misses, is not greater
+            least = met.amin(1)
+            if which:
+                mine = met.argmin(1) + first
+                index = mine if index is None else torch.where(least < depth[-1], mine, index)
+            depth.append(torch.minimum(depth[-1], least) if depth else least)
         first += x.shape[1]
-    return tuple(found)
+    return (depth[-1],) if index is None else (depth[-1], index)
 
 
 def _meet_spheres(x: Tensor, position: Tensor, rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
@@ -186,15 +181,15 @@ def _chunks(
     position: Tensor, attitude: Tensor, plane: Tensor, *solids: Tensor, far: float, which: bool
 ) -> tuple[Tensor, Tensor]:
     """Eager: some scenes after the others, so that what lies between stays in the cache."""
-    most = max(x.shape[1] for x in solids)
-    rays = max(1, CHUNK // max(most, 1))  # of a scene at once, of which an image may have more
-    step = max(1, CHUNK // max(most * plane.shape[1], 1))
+    most = max(1, *(x.shape[1] for x in solids))
+    rays = max(1, CHUNK // most)  # of a scene at once, of which an image may have more
+    step = max(1, CHUNK // (most * plane.shape[1]))
     parts = []
     for i in range(0, len(position), step):
         some = slice(i, i + step)
         own = [x if len(x) == 1 else x[some] for x in solids]
         images = [meet(position[some], attitude[some], p, *own, far=far, which=which) for p in plane.split(rays, 1)]
-        parts.append(images[0] if len(images) == 1 else [torch.cat(x, 1) for x in zip(*images, strict=True)])
+        parts.append([torch.cat(x, 1) for x in zip(*images, strict=True)])
     depth, *index = (torch.cat(x) for x in zip(*parts, strict=True))
     return depth, index[0] if which else depth
 
@@ -202,27 +197,19 @@ def _chunks(
 class _Kernel:
     """The rays of one kind of scene and camera, compiled into one loop."""
 
-    def __init__(self, far: float, which: bool) -> None:
+    def __init__(self, far: float, which: bool, kind: object) -> None:
         self.far, self.which = far, which
         # Inductor would store what two expressions share, which costs more than to compute it again.
         keep = dict.fromkeys(("realize_reads_threshold", "realize_acc_reads_threshold"), 10_000)
         keep |= {"realize_opcount_threshold": 10_000, "unroll_reductions_threshold": 1}
-        self.compiled = Compiled(types.MethodType(_Kernel.cast, self), {"options": keep})
-        self.is_ready = False
+        # All inputs of a kernel are of one kind, and the function reads nothing that could change.
+        self.call = Compiled(types.MethodType(_Kernel.cast, self), {"options": keep}).again
 
     def cast(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         return meet(*inputs, far=self.far, which=self.which)
 
-    def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        # All inputs of a kernel are of one kind, and the function reads nothing that could change.
-        outputs = self.compiled.again(*inputs) if self.is_ready else self.compiled(*inputs)
-        self.is_ready = True
-        return outputs
 
-
-@functools.lru_cache(maxsize=32)  # the code of one takes some megabytes, and few programs have as many kinds
-def _kernel(far: float, which: bool, *kind: object) -> _Kernel:
-    return _Kernel(far, which)
+_kernel = functools.lru_cache(maxsize=32)(_Kernel)  # the code of one takes some megabytes; few programs need so many
 
 
 # A function of its own for the compiler, which would tear it apart within a step.
@@ -242,7 +229,7 @@ def _cast(
     inputs = [x.contiguous() for x in (position, attitude, plane, spheres, cylinders, boxes, planes)]
     kind = tuple((x.shape, x.dtype, x.device) for x in inputs)
     with torch.no_grad():
-        depth, *index = _kernel(far, which, kind)(*inputs)
+        depth, *index = _kernel(far, which, kind).call(*inputs)
     return depth, index[0] if which else depth.new_empty(0, dtype=torch.int64)
 
 

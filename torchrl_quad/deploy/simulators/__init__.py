@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.contract import Contract
+from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone
 from torchrl_quad.errors import MissingPackage, UserValueError, shown
-
-Array = NDArray[np.float64]
 
 # By name: the module here, its class, and what to install.
 SIMULATORS = {
@@ -23,8 +21,8 @@ SIMULATORS = {
 }
 
 
-class Simulator(Protocol):
-    """The protocol of all simulators: many drones at once, in the conventions of the package.
+class Simulator:
+    """The base of all simulators: many drones at once, in the conventions of the package, by default at 1 kHz.
 
     Args:
         contract: of a bundle. Its ``plant`` flies; its ``drone`` is what the rate loop believes in.
@@ -33,15 +31,20 @@ class Simulator(Protocol):
     """
 
     version: str  #: name and version
-    loops: tuple[str, ...]  #: the rate loops that it can fly with
+    loops: tuple[str, ...] = tuple(LOOPS)  #: the rate loops that it can fly with
 
-    def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None: ...
+    def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
+        self.substeps = max(round(1000.0 * contract["control_dt"]), 1)
+        self.dt = contract["control_dt"] / self.substeps
+        nominal, self.drone = Drone(contract["drone"]), Drone(contract["drone"] | contract["plant"])
+        self.loop, self.hover_speed, self.motors = LOOPS[loop](nominal, self.dt), nominal.hover_speed, list(motors)
 
     def reset(self, starts: Mapping[str, Array]) -> None:
         """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
 
     def state(self) -> dict[str, Array]:
         """``position``, ``quaternion``, ``velocity``, ``angular_velocity`` and ``rotor_speed``, each (n, ...)."""
+        raise NotImplementedError
 
     def step(self, thrust: Array, rates: Array) -> None:
         """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
@@ -51,12 +54,7 @@ class Simulator(Protocol):
 
 
 def simulator_class(name: str) -> type[Simulator]:
-    """The class of a simulator by its name.
-
-    Raises:
-        ValueError: it is unknown.
-        ImportError: it is not installed.
-    """
+    """The class of a simulator by its name; ValueError where it is unknown, ImportError where it is not installed."""
     if not isinstance(name, str) or name not in SIMULATORS:
         raise UserValueError(f"Unknown simulator {shown(name)}. Choose from: {', '.join(SIMULATORS)}.")
     module, cls, package = SIMULATORS[name]
@@ -69,29 +67,15 @@ def simulator_class(name: str) -> type[Simulator]:
 def make_simulator(
     name: str, contract: Contract, loop: str = "contract", motors: Sequence[int] = (0, 1, 2, 3)
 ) -> Simulator:
-    """Build a simulator by its name.
-
-    Raises:
-        ValueError: it is unknown, has no such rate loop, or cannot show the policy of the contract what it needs.
-        ImportError: it is not installed.
-    """
-    check_open_air(contract)
-    kind = simulator_class(name)
-    if loop not in kind.loops:
-        raise UserValueError(f"{name} has no rate loop {shown(loop)}. Choose from: {', '.join(kind.loops)}.")
-    return kind(contract, loop, motors)
-
-
-def check_open_air(contract: Contract) -> None:
-    """Refuse a bundle that needs obstacles or images: no simulator here has any.
-
-    Raises:
-        ValueError: it needs them.
-    """
+    """Build a simulator by its name; ValueError where it is unknown, or lacks the rate loop, or the images or obstacles
+    that the policy of the contract needs, ImportError where it is not installed."""
     task, unjudged = contract["task"]["name"], contract["task"]["unjudged"]
-    why = "its policy reads images, and they have no camera" if contract["camera"] else unjudged
-    if why:
+    if why := "its policy reads images, and they have no camera" if contract["camera"] else unjudged:
         raise UserValueError(
             f"The simulators here cannot fly this bundle of the task {task!r}: {why}. Fly it in the package's own "
             "environment: python recipes/evaluate.py checkpoint=..."
         )
+    kind = simulator_class(name)
+    if loop not in kind.loops:
+        raise UserValueError(f"{name} has no rate loop {shown(loop)}. Choose from: {', '.join(kind.loops)}.")
+    return kind(contract, loop, motors)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from importlib.metadata import version
 
@@ -16,41 +16,31 @@ from crazyflow.sim.sim import clip_rotor_vel_cmd
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy import frames
-from torchrl_quad.deploy.contract import Contract, Fields
-from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone
+from torchrl_quad.deploy.contract import Fields
+from torchrl_quad.deploy.simulators import Simulator
+from torchrl_quad.deploy.simulators.vehicle import Array, Drone
 
-RATE = 1000.0  # [Hz], of the physics and of the rate loop
 RPM = 60.0 / (2.0 * np.pi)  # in 1 rad/s
 NAMES = {"position": "pos", "quaternion": "quat", "velocity": "vel", "angular_velocity": "ang_vel"}
 
 
-class Crazyflow:
-    """Independent drones in Crazyflow; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
+class Crazyflow(Simulator):
+    """Independent drones in Crazyflow.
 
     Its dynamics have everything that a contract says of a drone except quadratic drag. They compute in
     float32, and hold drones above the ground. Physics and rate loop run at 1 kHz, by symplectic Euler.
     """
 
-    loops = tuple(LOOPS)
-
-    def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
-        self.version = f"Crazyflow {version('crazyflow')}"
-        self.substeps = max(round(contract["control_dt"] * RATE), 1)
-        self.rate = round(self.substeps / contract["control_dt"])
-        self.drone = Drone(contract["drone"] | contract["plant"])
-        nominal = Drone(contract["drone"])
-        self.loop, self.hover_speed = LOOPS[loop](nominal, 1.0 / self.rate), nominal.hover_speed
-        self.frame, self.order = frames.crazyflow(), list(motors)
+    version, frame = f"Crazyflow {version('crazyflow')}", frames.crazyflow()
 
     def reset(self, starts: Mapping[str, Array]) -> None:
-        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
         n, drone = len(starts["position"]), self.drone
         self.sim = Sim(
             n_worlds=n,
             dynamics=Dynamics.first_principles,
             control=Control.rotor_vel,
             integrator=Integrator.symplectic_euler,
-            freq=self.rate,
+            freq=round(1.0 / self.dt),
         )
         limits = {"lower": drone.rotor_speed_min * RPM, "upper": drone.rotor_speed_max * RPM}
         clip = partial(clip_rotor_vel_cmd, dynamics=Dynamics.first_principles, **limits)
@@ -60,33 +50,27 @@ class Crazyflow:
         theirs["rotor_vel"] = np.tile(self.frame.to({"motors": self.hover_speed})["motors"] * RPM, (n, 1))
         data = self.sim.data
         states = data.states.replace(**{name: jnp.asarray(x, jnp.float32)[:, None] for name, x in theirs.items()})
-        params = data.params.replace(
-            **{k: jnp.asarray(x, jnp.float32) for k, x in _parameters(drone, self.frame).items()}
-        )
+        fields = _parameters(drone, self.frame)
+        params = data.params.replace(**{name: jnp.asarray(x, jnp.float32) for name, x in fields.items()})
         self.sim.data = data.replace(states=states, params=params)
         self.flying = np.arange(n)  # the others also fly on, unobserved
 
     def state(self) -> dict[str, Array]:
-        """The present states (n, ...)."""
         states = self.sim.data.states
         theirs = {name: np.asarray(getattr(states, key), float)[self.flying, 0] for name, key in NAMES.items()}
         speeds = np.asarray(states.rotor_vel, float)[self.flying, 0] / RPM
         return {**self.frame.back(theirs), "rotor_speed": self.frame.back({"motors": speeds})["motors"]}
 
     def step(self, thrust: Array, rates: Array) -> None:
-        """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
         command = np.array(self.sim.data.controls.rotor_vel)
         for _ in range(self.substeps):
-            states = self.sim.data.states
-            turning = np.asarray(states.ang_vel, float)[self.flying, 0]
-            speed = self.frame.back({"motors": np.asarray(states.rotor_vel, float)[self.flying, 0] / RPM})["motors"]
-            asked = self.loop(thrust, rates, turning, speed)[:, self.order]
+            state = self.state()
+            asked = self.loop(thrust, rates, state["angular_velocity"], state["rotor_speed"])[:, self.motors]
             command[self.flying, 0] = self.frame.to({"motors": asked})["motors"] * RPM
             self.sim.rotor_vel_control(jnp.asarray(command))
             self.sim.step(1)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Continue with only these drones (n)."""
         self.flying = self.flying[chosen]
         self.loop.keep(chosen)
 

@@ -10,11 +10,10 @@ from mujoco import rollout
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.contract import Contract
-from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone
+from torchrl_quad.deploy.simulators import Simulator
+from torchrl_quad.deploy.simulators.vehicle import Array, Drone
 from torchrl_quad.errors import UserValueError
 
-RATE = 1000.0  # [Hz], of the physics and of the rate loop
-FRONT_TO_BACK = ("front_left", "back_left", "back_right", "front_right")
 # qpos of a free joint: position and quaternion (w, x, y, z), body to world. qvel: velocity in the world frame, angular
 # velocity in the body frame. act: the rotor speeds.
 STATE = {"position": slice(1, 4), "quaternion": slice(4, 8), "velocity": slice(8, 11)}
@@ -30,14 +29,12 @@ def model(drone: Drone, timestep: float) -> str:
     written into them, and turn by its drag torque.
     """
     places, spins = drone.rotor_positions.tolist(), drone.rotor_spin.tolist()
-    sites = "".join(
-        f'<site name="{name}" pos="{x!r} {y!r} 0"/>' for name, (x, y) in zip(FRONT_TO_BACK, places, strict=True)
-    )
+    sites = "".join(f'<site name="rotor{i}" pos="{x!r} {y!r} 0"/>' for i, (x, y) in enumerate(places))
     lag = f'dyntype="filterexact" dynprm="{drone.motor_time_constant!r}" gaintype="fixed" gainprm="0" biastype="none"'
-    lags = "".join(f'<general site="{name}" {lag} gear="0 0 1 0 0 0" ctrllimited="false"/>' for name in FRONT_TO_BACK)
+    lags = "".join(f'<general site="rotor{i}" {lag} gear="0 0 1 0 0 0" ctrllimited="false"/>' for i in range(4))
     thrusts = "".join(
-        f'<motor site="{name}" gear="0 0 1 0 0 {spin * drone.yaw_torque_coefficient!r}" ctrllimited="false"/>'
-        for name, spin in zip(FRONT_TO_BACK, spins, strict=True)
+        f'<motor site="rotor{i}" gear="0 0 1 0 0 {spin * drone.yaw_torque_coefficient!r}" ctrllimited="false"/>'
+        for i, spin in enumerate(spins)
     )
     inertia = " ".join(map(repr, drone.inertia.tolist()))
     return f"""<mujoco>
@@ -57,35 +54,29 @@ def model(drone: Drone, timestep: float) -> str:
 </mujoco>"""
 
 
-class MuJoCo:
-    """Independent drones in MuJoCo; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
+class MuJoCo(Simulator):
+    """Independent drones in MuJoCo.
 
     Thrust follows from the speed of the rotors by the contract's thrust map, and drag by its coefficients; both are
     forces to MuJoCo, held over a step of 1 ms. The rate loop runs at 1 kHz, too.
     """
 
-    loops = tuple(LOOPS)
+    version = f"MuJoCo {mujoco.__version__}"
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
-        self.version = f"MuJoCo {mujoco.__version__}"
-        self.substeps = max(round(contract["control_dt"] * RATE), 1)
-        timestep = contract["control_dt"] / self.substeps
-        nominal = Drone(contract["drone"])
-        self.drone, self.hover_speed = Drone(contract["drone"] | contract["plant"]), nominal.hover_speed
-        self.loop, self.motors = LOOPS[loop](nominal, timestep), list(motors)
+        super().__init__(contract, loop, motors)
         inertia = self.drone.inertia
         if 2.0 * inertia.max() > inertia.sum():
             raise UserValueError(
                 f"MuJoCo flies no body with the inertia {inertia.tolist()}, since there is none: each of the three is "
                 "at most the sum of the other two. Fly it in another simulator."
             )
-        self.model = mujoco.MjModel.from_xml_string(model(self.drone, timestep))
+        self.model = mujoco.MjModel.from_xml_string(model(self.drone, self.dt))
         self.data = mujoco.MjData(self.model)
         self.rollout = rollout.Rollout(nthread=0)
         self.inputs = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED)
 
     def reset(self, starts: Mapping[str, Array]) -> None:
-        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
         n = len(starts["position"])
         self.x = np.zeros((n, mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
         for name, at in STATE.items():
@@ -93,11 +84,9 @@ class MuJoCo:
         self._allocate()
 
     def state(self) -> dict[str, Array]:
-        """The present states (n, ...)."""
         return {name: self.x[:, at].copy() for name, at in STATE.items()}
 
     def step(self, thrust: Array, rates: Array) -> None:
-        """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
         drone, limits = self.drone, (self.drone.rotor_speed_min, self.drone.rotor_speed_max)
         command, lift, force = self.control[:, 0, :4], self.control[:, 0, 4:8], self.control[:, 0, 14:17]
         for _ in range(self.substeps):
@@ -111,7 +100,6 @@ class MuJoCo:
             self.x, self.after = self.after[:, 0], x[:, None]
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Continue with only these drones (n)."""
         self.x = self.x[chosen]
         self.loop.keep(chosen)
         self._allocate()

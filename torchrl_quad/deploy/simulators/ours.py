@@ -10,13 +10,14 @@ import torch
 from numpy.typing import NDArray
 
 from torchrl_quad.deploy.contract import Contract
+from torchrl_quad.deploy.simulators import Simulator
 from torchrl_quad.deploy.simulators.vehicle import Array
 from torchrl_quad.dynamics import DYNAMICS, load_drone
 from torchrl_quad.errors import UserValueError, shown
 
 
-class Ours:
-    """The simulator of the contract; see :class:`~torchrl_quad.deploy.simulators.Simulator`."""
+class Ours(Simulator):
+    """The simulator of the contract."""
 
     loops = ("contract",)
 
@@ -37,21 +38,17 @@ class Ours:
         self.params = load_drone(flies) if contract["plant"] else self.dynamics.nominal
 
     def reset(self, starts: Mapping[str, Array]) -> None:
-        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
         given = {name: torch.from_numpy(x).float() for name, x in starts.items()}
         self.now = {**self.dynamics.rest(given["position"]), **given}
 
     def state(self) -> dict[str, Array]:
-        """The present states (n, ...)."""
         return {name: x.double().numpy() for name, x in self.now.items()}
 
     @torch.no_grad()
     def step(self, thrust: Array, rates: Array) -> None:
-        """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
         command = torch.cat((torch.from_numpy(thrust)[:, None], torch.from_numpy(rates)), 1).float()
         action = self.dynamics.controller.encode(command)
         self.now = self.dynamics.control_step(self.now, action, self.params, None)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Continue with only these drones (n)."""
         self.now = {name: x[torch.from_numpy(chosen)] for name, x in self.now.items()}

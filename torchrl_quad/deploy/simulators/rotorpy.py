@@ -11,13 +11,14 @@ from rotorpy.vehicles.multirotor import Multirotor
 
 from torchrl_quad.deploy import frames
 from torchrl_quad.deploy.contract import Contract, Fields
+from torchrl_quad.deploy.simulators import Simulator
 from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone, damping_ratio
 
 NAMES = {"position": "x", "quaternion": "q", "velocity": "v", "angular_velocity": "w"}
 
 
-class RotorPy:
-    """Independent drones in RotorPy; see :class:`~torchrl_quad.deploy.simulators.Simulator`.
+class RotorPy(Simulator):
+    """Independent drones in RotorPy.
 
     RotorPy integrates over steps of the contract's simulator, in which commands are held: 5 ms by default. Its vehicle
     cannot be all that a contract says:
@@ -38,18 +39,18 @@ class RotorPy:
         self.substeps = round(contract["control_dt"] / self.dt)
         speed = Drone(contract["drone"]).hover_speed
         nominal, drone = (_squared(x, speed) for x in (contract["drone"], contract["drone"] | contract["plant"]))
-        self.frame, self.hover_speed, self.order = frames.rotorpy(), nominal.hover_speed, list(motors)
-        self.loop = None if loop == "own" else LOOPS[loop](nominal, self.dt)
+        self.frame, self.hover_speed, self.motors = frames.rotorpy(), nominal.hover_speed, list(motors)
+        self.own = loop == "own"
+        self.loop = LOOPS["contract" if self.own else loop](nominal, self.dt)
         tau = nominal.motor_time_constant
         ratio = damping_ratio(nominal.rate_gain, nominal.inertia, nominal.rate_damping, tau)
         gain = float((1.0 / (4.0 * ratio**2 * tau))[:2].mean())
-        kind = "cmd_ctbr" if loop == "own" else "cmd_motor_speeds"
+        kind = "cmd_ctbr" if self.own else "cmd_motor_speeds"
         solver = {"method": "RK23", "first_step": self.dt}  # half the time of its defaults
         parameters = _parameters(drone, self.frame) | {"k_w": gain}
         self.vehicle = Multirotor(parameters, control_abstraction=kind, integrator_kwargs=solver)
 
     def reset(self, starts: Mapping[str, Array]) -> None:
-        """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
         theirs = self.frame.to(starts)
         speeds = self.frame.to({"motors": self.hover_speed})["motors"]
         still = {"wind": np.zeros(3), "rotor_speeds": speeds}
@@ -57,28 +58,24 @@ class RotorPy:
         self.now = [{**{NAMES[k]: x[i] for k, x in theirs.items()}, **still} for i in range(n)]
 
     def state(self) -> dict[str, Array]:
-        """The present states (n, ...)."""
         theirs = {name: np.stack([x[theirs] for x in self.now]) for name, theirs in NAMES.items()}
         speeds = self.frame.back({"motors": np.stack([x["rotor_speeds"] for x in self.now])})["motors"]
         return {**self.frame.back(theirs), "rotor_speed": speeds}
 
     def step(self, thrust: Array, rates: Array) -> None:
-        """Fly one control step with collective thrusts (n) [N] and body rates (n, 3) [rad/s]."""
         rates = self.frame.to({"body_rate": rates})["body_rate"]
         for _ in range(self.substeps):
-            if self.loop is None:
+            if self.own:
                 commands = [{"cmd_thrust": t, "cmd_w": w} for t, w in zip(thrust, rates, strict=True)]
             else:
                 state = self.state()
-                speeds = self.loop(thrust, rates, state["angular_velocity"], state["rotor_speed"])[:, self.order]
+                speeds = self.loop(thrust, rates, state["angular_velocity"], state["rotor_speed"])[:, self.motors]
                 commands = [{"cmd_motor_speeds": x} for x in self.frame.to({"motors": speeds})["motors"]]
             self.now = [self.vehicle.step(x, c, self.dt) for x, c in zip(self.now, commands, strict=True)]
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Continue with only these drones (n)."""
         self.now = [x for x, on in zip(self.now, chosen, strict=True) if on]
-        if self.loop is not None:
-            self.loop.keep(chosen)
+        self.loop.keep(chosen)
 
 
 def _squared(fields: Contract, speed: Array) -> Drone:

@@ -19,7 +19,6 @@ class Drone:
     """A quadrotor from the fields of a contract's ``drone``: what :class:`~torchrl_quad.QuadrotorParams` documents.
 
     Attributes:
-        fields: the fields by name, as arrays.
         allocation: (4, 4), from four rotor thrusts [N] to collective thrust [N] and torque [N m].
         mixer: its inverse.
         thrust_limits: the least and the greatest thrust [N] that may be commanded of one rotor.
@@ -45,15 +44,15 @@ class Drone:
     rate_damping: Array
 
     def __init__(self, fields: Contract) -> None:
-        self.fields = {name: np.array(value, float) for name, value in fields.items()}
-        unknown = ["drag_height"] if self.fields.get("drag_height", np.zeros(1)).any() else []
-        unknown += ["two motor_time_constants"] if self.fields["motor_time_constant"].size > 1 else []
+        arrays = {name: np.array(value, float) for name, value in fields.items()}
+        unknown = ["drag_height"] if arrays.get("drag_height", np.zeros(1)).any() else []
+        unknown += ["two motor_time_constants"] if arrays["motor_time_constant"].size > 1 else []
         if unknown:
             raise UserValueError(
                 f"Third-party simulators do not fly drones with {' and '.join(unknown)}. Export the "
                 "policy of a drone without: env.drone with drag_height: 0 and one motor_time_constant."
             )
-        for name, value in self.fields.items():
+        for name, value in arrays.items():
             setattr(self, name, value if value.ndim else float(value))
         k2, k1, k0 = self.thrust_map
         self.vertex_speed, self.vertex_thrust = -k1 / (2.0 * k2), k0 - k1 * k1 / (4.0 * k2)
@@ -85,11 +84,8 @@ class ContractLoop:
     """The rate loop of the contract, as the drone was trained with; it reads rotor speeds.
 
     torque = J K (desired - rate) - D (angular acceleration) + w x J w, where the angular acceleration follows from the
-    rotor speeds. Where rotors saturate it gives up yaw first, then thrust, then roll and pitch.
-
-    Args:
-        drone: the nominal drone.
-        dt: time between two calls [s].
+    rotor speeds. Where rotors saturate it gives up yaw first, then thrust, then roll and pitch. ``drone`` is nominal,
+    ``dt`` the time between two calls [s].
     """
 
     def __init__(self, drone: Drone, dt: float) -> None:
@@ -104,15 +100,12 @@ class ContractLoop:
     def __call__(self, thrust: Array, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
         """Rotor speeds (n, 4) [rad/s] to command, for a collective thrust (n) [N] and body rates (n, 3) [rad/s], from
         the body rates (n, 3) [rad/s] and rotor speeds (n, 4) [rad/s] of this moment."""
-        return self.mix(thrust, self.torque(rates, angular_velocity, rotor_speed))
-
-    def torque(self, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
-        """The torque to ask for (n, 3) [N m]."""
         drone = self.drone
         gyroscopic = cross(angular_velocity, drone.inertia * angular_velocity)
         believed = drone.thrust(rotor_speed) @ drone.allocation[1:].T
         acceleration = (believed - gyroscopic) / drone.inertia
-        return gyroscopic + self.gain * (rates - angular_velocity) - drone.rate_damping * acceleration
+        torque = gyroscopic + self.gain * (rates - angular_velocity) - drone.rate_damping * acceleration
+        return self.mix(thrust, torque)
 
     def mix(self, collective: Array, torque: Array) -> Array:
         """Rotor speeds (n, 4) [rad/s] for a collective thrust (n) [N] and a torque (n, 3) [N m], within the limits."""
@@ -164,7 +157,6 @@ class PIDLoop(ContractLoop):
         self.before: Array | None = None
 
     def __call__(self, thrust: Array, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
-        """The command; see :class:`ContractLoop`. The rotor speeds are not read."""
         if self.before is None:
             self.before = angular_velocity
         error = rates - angular_velocity
@@ -179,7 +171,6 @@ class PIDLoop(ContractLoop):
         return self.mix(thrust, torque)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Continue with only these drones."""
         if self.before is not None:
             self.integral, self.derivative = self.integral[chosen], self.derivative[chosen]
             self.before = self.before[chosen]
@@ -194,14 +185,8 @@ class PDLoop(PIDLoop):
 def damping_ratio(gain: Array, inertia: Array, damping: Array, motor_time_constant: float) -> Array:
     """The damping ratio (3) of a rate loop about hover, which is a second-order system about each axis.
 
-    torque = J K (desired - rate) - D (angular acceleration) + gyroscopic torque, and rotors that lag by tau, give
-    tau w'' + (1 + D / J) w' + K w = K desired.
-
-    Args:
-        gain: K (3) [1/s].
-        inertia: J (3) [kg m2].
-        damping: D (3) [kg m2].
-        motor_time_constant: tau [s].
+    The torque of :class:`ContractLoop`, with gain K (3) [1/s], inertia J (3) [kg m2], damping D (3) [kg m2], and rotors
+    that lag by tau [s], give tau w'' + (1 + D / J) w' + K w = K desired.
     """
     return (1.0 + damping / inertia) / (2.0 * np.sqrt(gain * motor_time_constant))
 

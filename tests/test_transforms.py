@@ -26,8 +26,8 @@ from torchrl.envs import (
     TargetReturn,
     TrajCounter,
     TransformedEnv,
-    VecNormV2,
 )
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor
 from torchrl_quad.data import flight_mode
@@ -96,10 +96,13 @@ def fly(env, actor, *, inside):
     return flown, of_actions, torch.autograd.grad(loss, list(actor.parameters()))
 
 
-def check(transform, in_keys=("observation",), *, coarse=False, **options):
+def check(transform, in_keys=("observation",), *, coarse=False, recurrent=False, **options):
     base = HoveringEnv(num_envs=3, max_episode_steps=5, dtype=torch.float64, **options)
     env = TransformedEnv(base, transform)
-    actor = make_actor(env, (8,), in_keys=list(in_keys), return_log_prob=True)
+    options = {"recurrent": True, "hidden_size": 5, "noise_correlation": 0.4} if recurrent else {}
+    actor = make_actor(env, (8,), in_keys=list(in_keys), return_log_prob=True, **options)
+    if recurrent:
+        env = TransformedEnv(base, Compose(transform.clone(), InitTracker(), actor.make_tensordict_primer()))
     assert flight_mode(env, actor).mode == ("inside" if base.is_compiled else "called")
     expected, found = fly(env, actor, inside=False), fly(env, actor, inside=True)
     torch.testing.assert_close(found, expected, **({"rtol": 2e-4, "atol": 2e-5} if coarse else {}))
@@ -110,18 +113,23 @@ def test_each_transform_flies_inside_with_torchrl_s_numbers_and_gradients(name):
     check(TRANSFORMS[name](), KEYS.get(name, OBSERVATION), coarse=name in ("cast", "all of float"))
 
 
-def test_transforms_fly_inside_the_compiled_step():
+def test_a_memory_flies_under_transforms():
+    check(Compose(normalizer(), RewardSum()), recurrent=True)
+
+
+def test_transforms_and_memory_fly_inside_the_compiled_step():
     check(
         Compose(
-            CatTensors(["observation", ("state", "rotor_speed")], "features", del_keys=False),
-            normalizer("features", 17),
-            ClipTransform(in_keys=["features"], low=-3.0, high=3.0),
+            CatTensors(["observation", ("state", "rotor_speed")], "both", del_keys=False),
+            normalizer("both", 17),
+            ClipTransform(in_keys=["both"], low=-3.0, high=3.0),
             RewardScaling(0.1, 3.0),
             RewardSum(),
             StepCounter(),
             ActionScaling(loc=torch.tensor(0.1).double(), scale=torch.tensor(0.7).double()),
         ),
-        ["features", ("state", "velocity")],
+        ["both", ("state", "velocity")],
+        recurrent=True,
         compile=True,
         wind={"gust": 0.5},
     )
@@ -155,16 +163,13 @@ def test_what_flies_in_torchrl_s_loop_says_why():
     assert reason(RewardSum(), policy=called).reason.startswith("TensorDictModule has no form on plain tensors")
 
 
-@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers with non-empty batch-size:UserWarning")
-def test_statistics_that_change_at_each_step_are_refused():
-    env = TransformedEnv(HoveringEnv(num_envs=2), VecNormV2(in_keys=OBSERVATION))
-    with pytest.raises(ValueError, match=r"changes its statistics in place.* torchrl_quad.ObservationNormalizer"):
-        differentiable_rollout(env, make_actor(env, (8,)), None, 3)
-
-
-def test_an_observation_that_does_not_belong_to_the_state_flies_in_torchrl_s_loop():
-    env = TransformedEnv(HoveringEnv(num_envs=2, dtype=torch.float64), normalizer())
-    start = env.reset()
+def test_the_first_step_reads_what_the_start_says():
+    env = TransformedEnv(
+        HoveringEnv(num_envs=2, dtype=torch.float64), Compose(normalizer(), ExcludeTransform("success"))
+    )
+    start, actor = env.reset(), make_actor(env, (8,))
     start["observation"] = start["observation"] + 1.0
-    rollout, _ = differentiable_rollout(env, make_actor(env, (8,)), start, 2)
+    rollout, _ = differentiable_rollout(env, actor, start, 2, exploration_type=ExplorationType.DETERMINISTIC)
     assert torch.equal(rollout["observation"][:, 0], start["observation"])
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        torch.testing.assert_close(rollout["action"][:, 0], actor(start.copy())["action"])

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ObservationNorm
 
@@ -88,30 +87,3 @@ class ObservationNormalizer(ObservationNorm):
         # New tensors: those of before may belong to a graph.
         self.count, self.loc, self.variance = count, self.loc + share * gap, spread
         self.scale = spread.sqrt().clamp_min(self.min_scale)
-
-
-class NormalizedPolicy(TensorDictModuleBase):
-    """A policy of normalised observations, as one of observations that are not normalised yet."""
-
-    def __init__(self, policy: TensorDictModuleBase, normalizer: ObservationNormalizer) -> None:
-        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
-        super().__init__()
-        self.policy, self.normalizer = policy, normalizer
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write what the policy writes, and leave the observation as it is."""
-        (key,) = self.normalizer.in_keys
-        read = tensordict.copy()
-        if key in read:  # otherwise the policy complains, if it reads it
-            read.set(key, self.normalizer.normalize(leaf(read, key)))
-        return tensordict.update(self.policy(read).select(*self.out_keys, strict=False))
-
-    def plain(self) -> Any:
-        """The same on plain tensors, if the policy has such a form that can normalise; None otherwise."""
-        plain = cast(Any, self.policy).plain() if hasattr(self.policy, "plain") else None
-        (key,) = self.normalizer.in_keys
-        if plain is not None and key in plain.in_keys:
-            if not hasattr(plain, "normalize"):
-                return None
-            plain.normalize(key, self.normalizer.loc, self.normalizer.scale)
-        return plain

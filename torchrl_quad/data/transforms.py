@@ -40,7 +40,6 @@ from torchrl.envs import (
 
 from torchrl_quad.data.normalizer import ObservationNormalizer
 from torchrl_quad.data.unwrap import base_env, check_actor, check_env, leaf, memory_keys, observed
-from torchrl_quad.engine.packing import flat, looks_are_free
 from torchrl_quad.engine.policy import GivenActions, PlainPolicy
 from torchrl_quad.errors import UserValueError
 
@@ -73,6 +72,23 @@ class Value(NamedTuple):
             return x.clamp(a, b)
         return x.to(self.about) if self.kind == "cast" else torch.cat([x, *more], self.about)
 
+    def undo(self, x: Tensor, found: dict[Any, Tensor], spec: Mapping[Any, Any]) -> None:
+        """Add the entries from which the value is ``x``, unless they are found already; where it is clipped, ``x``."""
+        a, b = cast(Any, self.constants or (None, None))
+        if self.kind == "entry":
+            found.setdefault(self.about, x.to(spec[self.about].dtype))
+        elif self.kind == "cat":
+            sizes = [part.size(spec, self.about) for part in self.parts]
+            for part, own in zip(self.parts, x.split(sizes, self.about), strict=True):
+                part.undo(own, found, spec)
+        else:
+            x = x * b + a if self.kind == "normalize" else (x - a) / b if self.kind == "scale" else x
+            self.parts[0].undo(x, found, spec)
+
+    def size(self, spec: Mapping[Any, Any], dim: int) -> int:
+        """The size in a dimension."""
+        return sum(part.size(spec, dim) for part in self.parts) if self.parts else spec[self.about].shape[dim]
+
     def sources(self) -> list[Any]:
         """The entries of the environment that it reads."""
         return [self.about] if self.kind == "entry" else [key for part in self.parts for key in part.sources()]
@@ -98,13 +114,13 @@ class Flown(NamedTuple):
     policy: TensorDictModuleBase
 
     def fly(self, env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> Any:
-        """The rollout as TorchRL's own loop writes it; None if ``start`` is not what transforms make of its state."""
-        inside = self.start(env, start)
+        """The rollout as TorchRL's own loop writes it; None if ``start`` lacks what is counted or read."""
         counted = [key for t in self.transforms if isinstance(t, COUNTERS) for key in _counted(t)]
-        if inside is None or any(key not in start for key in counted):
+        read = [key for key in map(unravel_key, actor.in_keys) if key in self.known]
+        if any(key not in start for key in (*counted, *read)):
             return None
         options: dict[str, Any] = {"auto_reset": False, "break_when_any_done": False}
-        root = base_env(env).rollout(horizon, self.policy, tensordict=inside, **options)
+        root = base_env(env).rollout(horizon, self.policy, tensordict=self.start(env, start), **options)
         after = cast(TensorDictBase, root.pop("next"))
         done = leaf(after, "done")
         own = {*map(unravel_key, self.policy.out_keys), "is_init"}
@@ -122,35 +138,26 @@ class Flown(NamedTuple):
             written[cast(Any, env).action_key] = (written.pop("action"), written.pop(OUTER))[1]
         return root.update(written).set("next", after.update(memory))
 
-    def start(self, env: EnvBase, start: TensorDictBase) -> TensorDictBase | None:
+    def start(self, env: EnvBase, start: TensorDictBase) -> TensorDictBase:
         """What the environment inside would have written where ``start`` stands."""
-        base = base_env(env)
-        entries = start
+        base, entries = cast(Any, base_env(env)), start
         if any(unravel_key(key) in self.known for t in self.transforms for key in t.in_keys_inv or ()):
             entries = start.copy().set(cast(Any, env).action_key, cast(Any, env).action_spec.zero())
             while isinstance(env, TransformedEnv):
                 env, entries = env.base_env, env.transform.inv(entries)
-        wanted = [unravel_key(key) for key in (*observed(base).keys(True, True), *cast(Any, base).done_keys)]
-        same = {x.about: key for key, x in self.known.items() if x is not None and x.kind == "entry"}
-        state = {unravel_key(key) for key in cast(Any, base).state_keys}
-        names = {key: key if key in state else same.get(key) for key in wanted}
-        found: Any = {key: entries.get(name, None) for key, name in names.items() if name is not None}
-        if not set(wanted) <= {key for key, x in found.items() if x is not None}:
-            step, missing = cast(Any, base).control_step, {key for key in wanted if found.get(key) is None}
-            present = {key: entries.get(unravel_key(("state", key))) for key in step.safe_state}
-            again = flat(step.measure(present))
-            if not missing <= set(again):
-                again = dict(base.reset(entries.select("state"), set_state=True).items(True, True))
-            found = {key: again.get(key) if found.get(key) is None else found[key] for key in wanted}
-        policy = self.policy
-        if isinstance(policy, PolicyUnder) and looks_are_free(start.device or torch.device("cpu")):
-            for key, value in policy.reads.items():
-                seen, now = leaf(start, key), value.compute(found)
-                if seen.shape != now.shape or not torch.allclose(seen, now, 1e-4, 1e-5):
-                    return None
-        own = {unravel_key(key) for key in (*policy.in_keys, *policy.out_keys)}
+        spec = {unravel_key(key): x for key, x in observed(base).items(True, True)}
+        spec |= {key: base.full_done_spec[key] for key in base.done_keys}
+        found = {key: leaf(entries, key) for key in map(unravel_key, base.state_keys)}
+        for is_entry in (True, False):
+            for key, value in self.known.items():
+                if value is not None and (value.kind == "entry") == is_entry and key in start:
+                    value.undo(leaf(start, key), found, spec)
+        if not spec.keys() <= found.keys():  # a transform leaves some out
+            again = base.reset(entries.select("state"), set_state=True)
+            found |= {key: leaf(again, key) for key in spec.keys() - found.keys()}
+        own = {unravel_key(key) for key in (*self.policy.in_keys, *self.policy.out_keys)}
         kept = start.select(*(key for key in own if key not in found and key != "action"), strict=False)
-        return TensorDict(found, start.batch_size, start.device).update(kept)
+        return TensorDict(cast(Any, found), start.batch_size, start.device).update(kept)
 
 
 class PolicyUnder(TensorDictModuleBase):
@@ -193,6 +200,13 @@ class PolicyUnder(TensorDictModuleBase):
         return _PlainUnder(inner, self)
 
 
+def normalized(policy: TensorDictModuleBase, normalizer: ObservationNormalizer) -> PolicyUnder:
+    """A policy of normalised observations, as one of observations that are not normalised yet."""
+    (key,) = normalizer.in_keys
+    own = {key: _elementwise(normalizer, Value("entry", key))} if key in policy.in_keys else {}
+    return PolicyUnder(policy, own, Value("entry", "action"))
+
+
 class _PlainUnder:
     """See the engine's ``PlainPolicy``."""
 
@@ -200,8 +214,10 @@ class _PlainUnder:
         self.reads = [under.reads.get(unravel_key(key), Value("entry", unravel_key(key))) for key in inner.in_keys]
         self.in_keys = [*dict.fromkeys(key for x in self.reads for key in x.sources())]
         self.action, self.own, self.size = under.action if under.changes else None, under.own, inner.size
-        self.out_keys = [OUTER if self.action and unravel_key(key) == self.own else key for key in inner.out_keys]
+        self.written = list(map(unravel_key, inner.out_keys))
+        self.out_keys = [OUTER if self.action and key == self.own else key for key in self.written]
         self.out_keys += ["action"] if self.action else []
+        self.command = OUTER if self.action else "action"
         values = [*self.reads, *([self.action] if self.action else [])]
         self.signature = (inner.signature, *map(str, (self.out_keys, *(value.describe() for value in values))))
         self.inner, self.count, self.memory = inner, len(inner.weights), inner.memory
@@ -229,6 +245,10 @@ class _PlainUnder:
         """What the transforms make of an action of the policy."""
         return action if self.action is None else self.action.compute({self.own: action})
 
+    def pull(self, kept: Sequence[Tensor], grad: Tensor) -> Tensor:
+        """The gradient of the policy's action, from that of what the transforms make of it."""
+        return vjp(self.applied, kept[-1])[1](grad)[0]
+
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
     ) -> tuple[list[Tensor], dict[Any, Tensor]]:
@@ -253,8 +273,8 @@ class _PlainUnder:
         if self.action is not None:
             action, (*kept, outer), constants = self.action, kept, self._read(weights, inputs)[1]
             (grad,) = vjp(lambda x: action.compute({self.own: x}, constants), outer)[1](grads["action"])
-            others = {key: x for key, x in grads.items() if key not in (OUTER, "action")}
-            grads = {**others, self.own: grads[OUTER] + grad}
+            own = {key: grads[OUTER] + grad if key == self.own else grads.get(key) for key in self.written}
+            grads = cast(Any, own)  # in the order in which the policy writes
         traces, of_read, of_drawn = self.inner.adjoint(weights[: self.count], read, kept, drawn, grads)
         return traces, list(pull(tuple(of_read))), of_drawn
 
@@ -321,7 +341,8 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
     if not hasattr(base, "flies_inside"):
         return f"{type(base).__name__} has only TorchRL's own loop"
     memory = {unravel_key(key) for key in memory_keys(actor)}
-    known: Known = {unravel_key(key): Value("entry", unravel_key(key)) for key in observed(base).keys(True, True)}
+    inside = (*observed(base).keys(True, True), *cast(Any, base).done_keys)
+    known: Known = {unravel_key(key): Value("entry", unravel_key(key)) for key in inside}
     for transform in transforms:
         name, kind = type(transform).__name__, type(transform)
         if kind is StepCounter and transform.max_steps is not None:
@@ -376,7 +397,8 @@ def _follow(transform: Any, known: Known) -> None:
             raise NotImplementedError("inverse=True is left to TorchRL")
         _keep(known, lambda key: not _below(key, transform.excluded_keys))
     elif isinstance(transform, SelectTransform):
-        kept = [*transform.selected_keys, *cast(Any, transform.parent).state_spec.keys(True, True)]
+        parent = cast(Any, transform.parent)
+        kept = [*transform.selected_keys, *parent.state_spec.keys(True, True), *parent.done_keys]
         _keep(known, lambda key: _below(key, kept))
     elif isinstance(transform, RenameTransform):
         for a, b in zip(ins, outs, strict=True):

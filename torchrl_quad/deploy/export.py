@@ -22,7 +22,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
 from torchrl_quad.data import ObservationNormalizer, base_env, differentiable_rollout
-from torchrl_quad.data.normalizer import NormalizedPolicy
+from torchrl_quad.data.transforms import normalized
 from torchrl_quad.data.unwrap import leaf, memory_keys, observed
 from torchrl_quad.deploy import contract as contracts
 from torchrl_quad.deploy.bundle import load_bundle
@@ -99,7 +99,7 @@ def export_policy(
     if reads["observation"] != (size,):
         (width,) = reads["observation"]
         raise UserValueError(f"export_policy: the policy reads {width} numbers, the environment observes {size}.")
-    policy = actor if normalizer is None else NormalizedPolicy(actor, normalizer)
+    policy = actor if normalizer is None else normalized(actor, normalizer)
     count, self_test = (IMAGES, SELF_TEST_IMAGES) if "depth" in reads else (VECTORS, SELF_TEST_VECTORS)
     whole, replayed, chosen = _fly(task, policy, count)
     vectors = _vectors(policy, task, chosen)

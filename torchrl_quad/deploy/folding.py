@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data import ObservationNormalizer
-from torchrl_quad.data.normalizer import NormalizedPolicy
+from torchrl_quad.data.transforms import PolicyUnder
 from torchrl_quad.deploy.network import ACTIVATIONS, Layer, Memory, Network
 from torchrl_quad.errors import UserValueError
 
@@ -29,16 +29,16 @@ def fold(
     """
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         plain, parts = (
-            getattr(actor, name)() if hasattr(actor, name) and not isinstance(actor, NormalizedPolicy) else None
+            getattr(actor, name)() if hasattr(actor, name) and not isinstance(actor, PolicyUnder) else None
             for name in ("plain", "parts")
         )
-    if plain is not None:
+    if parts is not None:
+        network = _composed(actor, parts, normalizer, image)
+    elif plain is not None:
         _check_ends(plain.in_keys, ["observation"], plain.low, plain.high)
         linear = zip(plain.weights[::2], plain.weights[1::2], [*plain.activations, nn.Tanh()], strict=True)
         layers = _layers(linear, plain.size, np.repeat(plain.scales, plain.widths), normalizer)
         network = Network(layers, max_loc=plain.head.max_loc)
-    elif parts is not None:
-        network = _visual(actor, parts, normalizer, image)
     else:
         raise UserValueError(
             "export_policy exports what make_actor and make_visual_actor build, with its parts unchanged and without "
@@ -50,18 +50,20 @@ def fold(
     return network
 
 
-def _visual(actor: Any, parts: Any, normalizer: ObservationNormalizer | None, image: Sequence[int] | None) -> Network:
-    """The network of a visual policy, from the parts that it names."""
-    bounds = actor[1].distribution_kwargs
-    _check_ends([*actor[0][0].in_keys], ["depth", "observation"], bounds.get("low"), bounds.get("high"))
+def _composed(actor: Any, parts: Any, normalizer: ObservationNormalizer | None, image: Sequence[int] | None) -> Network:
+    """The network of a policy with eyes or memory, from the parts that it names."""
+    bounds, sees = actor[1].distribution_kwargs, bool(parts.convolutions)
+    known = ["depth", "observation"] if sees else ["observation"]
+    _check_ends([*actor[0][0].in_keys], known, bounds.get("low"), bounds.get("high"))
     convolutions, trunk = (
         [(layer.weight, layer.bias, activation) for layer, activation in zip(x[::2], x[1::2], strict=True)]
         for x in (parts.convolutions, parts.trunk)
     )
     memory = parts.memory and Memory(*(_numbers(getattr(parts.memory, name)).astype(np.float32) for name in GRU))
     height, width = image or (0, 0)
-    network = Network([], _layers(convolutions), (height, width), parts.nearest, memory, parts.max_loc)
-    if image is None or network.features != parts.widths[0] or network.convolutions[0].weight.shape[1] != 1:
+    seen = _layers(convolutions) if sees else []
+    network = Network([], seen, (height, width), parts.nearest, memory, parts.max_loc)
+    if sees and (image is None or network.features != parts.widths[0] or network.convolutions[0].weight.shape[1] != 1):
         camera = "has no camera" if image is None else f"shows it {image[1]} x {image[0]} pixels"
         raise UserValueError(f"export_policy: the policy is for images of another size; the environment {camera}.")
     last = parts.head.weight, parts.head.bias, nn.Tanh()

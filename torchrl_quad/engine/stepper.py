@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict.utils import unravel_key
@@ -84,9 +84,8 @@ class Stepper:
         """A compiled horizon with its graph, as one node.
 
         Gradients reach its start, what the policy draws (steps, n, k), its weights, and the parameters. They reach the
-        actions as well: the node of all that is flown has ``actions``, a tensor (steps, n, k) that stands for them,
-        ``applied``, which makes them of the policy's, and ``learns``, to be switched off for a backward pass that wants
-        no gradient of the policy's weights.
+        actions as well: the node of all that is flown has ``actions``, a tensor (steps, n, k) that stands for them, and
+        ``learns``, to be switched off for a backward pass that wants no gradient of the policy's weights.
 
         Args:
             valid: where the start is meaningful, bool (n); elsewhere the episode ends with the first step.
@@ -115,8 +114,7 @@ class Stepper:
         actions = drawn.new_zeros(()).expand(drawn[..., : policy.size].shape).requires_grad_(keeps)
         leaves = _Horizon.apply(horizon, keeps, actions, *tensors)
         if keeps:
-            node: Any = leaves[0].grad_fn
-            node.actions, node.applied, node.learns = actions, applied, True
+            leaves[0].grad_fn.actions, leaves[0].grad_fn.learns = actions, True
         return Flight(Record.of(leaves), dict(zip(policy.out_keys, leaves[7:], strict=True)), horizon.restarts)
 
 
@@ -215,7 +213,7 @@ class _Horizon(torch.autograd.Function):
             written = [None if g is None else g[:, t] for g in of_written]
             for place, grad in zip((policy.action, *policy.memory.values()), (grad_action, *after[3:]), strict=True):
                 written[place] = _add(written[place], grad)
-            grads_action.append(written[policy.action])
+            grads_action.append(policy.of_command(written, kept))
             written = [zero if g is None else g.contiguous() for g, zero in zip(written, zeros[3:], strict=True)]
             grad_inputs, grad_drawn = policy.adjoint(inputs, kept, drawn, written, is_first=is_first)
             after = policy.before(grad_floats, zeros[1], grad_inputs)
@@ -235,10 +233,17 @@ class _Policy:
         self.policy, self.program, self.step = horizon.policy, horizon.policy_program, horizon.step
         self.weights: Sequence[Tensor] = self.policy.weights
         place = {unravel_key(key): i for i, key in enumerate(self.policy.out_keys)}
-        self.action = place["action"]
+        self.action, self.command = place["action"], place[getattr(self.policy, "command", "action")]
         self.memory = {key: place[unravel_key(("next", key))] for key in self.policy.memory}
         self.steps: list[Sequence[Tensor]] = []  # whose gradient in the weights is still to be taken
         self.total: list[Tensor] | None = None
+
+    def of_command(self, grads: Sequence[Any], kept: Sequence[Tensor]) -> Tensor:
+        """The gradient of its action, before transforms between policy and simulation."""
+        if self.command == self.action:
+            return grads[self.action]
+        of_applied = cast(Any, self.policy).pull(kept, grads[self.action])
+        return of_applied if grads[self.command] is None else of_applied + grads[self.command]
 
     def inputs(self, at: Record, memory: Mapping[Any, Tensor]) -> list[Tensor]:
         """What it reads."""

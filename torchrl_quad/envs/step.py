@@ -137,7 +137,7 @@ class ControlStep:
         terms = {name: torch.zeros_like(term) for name, term in self.env.reward_terms(state).items()}
         terms |= {f"{name}_time": torch.zeros_like(state["position"][:, :1]) for name in self.event_names}
         outputs = {"reward_terms": terms, "success": self.env.is_success(state), **flags}
-        return {"state": nested(state), **self.measure(state), **outputs}
+        return {**self.measure(state), **outputs, "state": nested(state)}
 
     def draw_start(self) -> Outputs:
         """All entries that a reset of all environments writes, nested."""

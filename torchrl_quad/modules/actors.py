@@ -278,7 +278,7 @@ class ComposedActor(TanhGaussianActor):
 class PlainParts(PlainTanhGaussian):
     """A policy with eyes, with memory or with both on plain tensors; see the engine's ``PlainPolicy``.
 
-    Its adjoint computes the network again. What it saw has no gradient where ``constants`` says so, and is then
+    Its adjoint computes the network again. Where ``without_gradient`` names the image, it has no gradient, and is then
     convolved only once.
     """
 
@@ -288,7 +288,7 @@ class PlainParts(PlainTanhGaussian):
         self.sees = bool(parts.convolutions)
         self.memory = {MEMORY: (1, parts.memory.hidden_size)} if parts.memory else {}
         self.in_keys, self.out_keys = [*map(unravel_key, first.in_keys), *self.memory], list(actor.out_keys)
-        self.constants: frozenset[NestedKey] = frozenset()
+        self.without_gradient: frozenset[NestedKey] = frozenset()
         self._take_head(actor)
         layers: list[Any] = [*parts.convolutions[::2], *parts.trunk[::2], parts.head]
         gru = parts.memory
@@ -324,7 +324,7 @@ class PlainParts(PlainTanhGaussian):
         grads: dict[NestedKey, Tensor],
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """What the network read, and the gradients of what it returned; the gradients of inputs and noise."""
-        is_constant = self.sees and self.in_keys[0] in self.constants
+        is_constant = self.sees and self.in_keys[0] in self.without_gradient
         read = inputs[1:] if is_constant else inputs
 
         def network(*read: Tensor) -> tuple[Tensor, ...]:
@@ -332,7 +332,7 @@ class PlainParts(PlainTanhGaussian):
             return tuple(self._network(weights, every, kept if is_constant else self._see(weights, every)))
 
         (raw, *_), pull = vjp(network, *read)[:2]
-        own = {key: x for key, x in grads.items() if key not in ("features", "recalled", ("next", MEMORY))}
+        own = {key: grads[key] for key in self.out_keys if key not in ("features", "recalled", ("next", MEMORY))}
         grad_raw, grad_drawn = vjp(self._sample, raw, drawn)[1](own)
         grads_out = [grad_raw, grads["features"]]
         if self.memory:

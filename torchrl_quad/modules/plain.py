@@ -218,14 +218,6 @@ class PlainTanhGaussian:
         self.size, self.rho, self.log_prob_key = self.head.size, self.head.rho, actor.log_prob_entry
         self.low, self.high = (x.tolist() for x in actor.bounds) if actor.bounds else (None, None)
 
-    def normalize(self, key: NestedKey, loc: Tensor, scale: Tensor) -> None:
-        """Subtract ``loc`` (k) from the input ``key``, and divide it by ``scale`` (k); the first layer can do both."""
-        at = self.in_keys.index(key)
-        weight, bias, *others = self.weights
-        before, own, after = weight.split([sum(self.widths[:at]), len(loc), sum(self.widths[at + 1 :])], 1)
-        own = own / scale
-        self.weights = (torch.cat((before, own, after), 1), bias - own @ (loc * self.scales[at]), *others)
-
     def fits(self, inputs: Sequence[Tensor]) -> bool:
         """Whether the first layer can read inputs of this width, precision and device."""
         x, weight = torch.cat([x[:1] for x in inputs], -1), self.weights[0]
@@ -324,7 +316,7 @@ class PlainTanhGaussian:
         written = self.squash(loc, scale, xi, self.log_prob_key)
         if before:
             written |= {"noise_before": before[0], "noise": self.head.next(before[0], xi)}
-        return {key: x for key, x in written.items() if key in self.out_keys}
+        return {key: written[key] for key in self.out_keys if key in written}
 
 
 def _first_noise(x: Tensor, is_random: bool | None) -> Tensor:

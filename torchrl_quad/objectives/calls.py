@@ -12,7 +12,6 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.autograd.graph import GradientEdge
-from torch.func import vjp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.unwrap import check_tensordict, leaf
@@ -139,7 +138,7 @@ def action_gradient(objective: Tensor, action: Tensor) -> Tensor:
             (grad,) = torch.autograd.grad(objective, steps, retain_graph=True)
         finally:
             node.learns = True
-        return vjp(node.applied, action.detach())[1](grad.movedim(0, -2))[0]
+        return grad.movedim(0, -2)
     dim = None if steps is None else node._saved_dim  # of the stack; -2 is kept without its sign
     if steps is None or len(steps) != action.shape[-2] or dim not in (action.ndim - 2, 2**64 - 2):
         raise UserValueError(

@@ -91,10 +91,12 @@ def make_policy(cfg: DictConfig, env: EnvBase) -> TensorDictModule:
     """Build the policy of a configuration, which reads the depth images of a camera if there is one."""
     log_prob = "entropy_bonus" in cfg.loss or cfg.loss.get("alpha", 0) != 0  # of PPO, or of an entropy bonus
     options = network(cfg, "actor") | {x: cfg.actor[x] for x in ("scale_init", "noise_correlation", "learn_scale")}
-    if not cfg.actor.vision or "depth" not in observed(env):
-        return make_actor(env, **options, return_log_prob=log_prob)
-    options |= {name: cfg.actor[name] for name in ("recurrent", "hidden_size")} | {"channels": list(cfg.actor.channels)}
-    return make_visual_actor(env, **options, return_log_prob=log_prob)
+    sees = cfg.actor.vision and "depth" in observed(env)
+    options |= {"recurrent": sees if cfg.actor.recurrent is None else cfg.actor.recurrent}
+    options |= {"hidden_size": cfg.actor.hidden_size, "return_log_prob": log_prob}
+    if not sees:
+        return make_actor(env, **options)
+    return make_visual_actor(env, **options, channels=list(cfg.actor.channels))
 
 
 def network(cfg: DictConfig, name: str, env: EnvBase | None = None) -> dict[str, Any]:

@@ -33,7 +33,7 @@ def test_what_newcomers_stumble_over_is_said_where_they_stumble():
     assert env.reset(masked.clone(), set_state=False)["state", "step"].flatten().tolist() == [0, 5, 5]
     assert env.reset(masked.clone(), set_state=True)["state", "step"].flatten().tolist() == [5, 5, 5]
 
-    with pytest.raises(ValueError, match=r"one action \(k\) .* MultiAction .* control_dt=0.04"):
+    with pytest.raises(ValueError, match=r"one action \(k\) .* MultiAction.* control_dt=0.04"):
         make_actor(TransformedEnv(HoveringEnv(num_envs=3), Compose(MultiAction())))
     velocity = ("state", "velocity")
     for transform, message in (

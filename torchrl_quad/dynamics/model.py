@@ -30,7 +30,7 @@ class Dynamics(Protocol):
     as well. :class:`~torchrl_quad.dynamics.Quadrotor` and :class:`~torchrl_quad.dynamics.PointMass` are the examples.
     """
 
-    #: The entries of its state and their widths, first those that tasks observe: ``position``, ``quaternion``,
+    #: The width of each entry of its state, first of those that tasks observe, which are ``position``, ``quaternion``,
     #: ``velocity`` and ``angular_velocity``.
     sizes: dict[str, int]
     #: The fields of :class:`~torchrl_quad.QuadrotorParams` that the flying drone reads. They may differ from those of

@@ -155,7 +155,7 @@ class _Horizon(torch.autograd.Function):
             states_end = (step.forward if t == 0 else step.forward.again)(*start)
             states, leaves = states_end[: step.substeps], states_end[step.substeps :]
             at = Record.of(leaves)
-            remembered = {key: written[place] for key, place in memory.items()}
+            remembered = {key: written[place].contiguous() for key, place in memory.items()}
             if keeps:
                 saved.append((start, states, inputs, kept, drawn[t]))
             ends.append(leaves)

@@ -278,42 +278,48 @@ class ComposedActor(TanhGaussianActor):
 class PlainParts(PlainTanhGaussian):
     """A policy with eyes, with memory or with both on plain tensors; see the engine's ``PlainPolicy``.
 
-    Its adjoint computes the network again. Where ``without_gradient`` names the image, it has no gradient, and is then
-    convolved only once.
+    The image has no gradient where ``without_gradient`` names it.
     """
 
     def __init__(self, actor: ComposedActor, parts: Parts) -> None:
         first, *_ = cast(Any, actor[0].module)
-        self.parts, self.is_random, self.scales, self.widths = parts, actor.is_random, parts.scales, parts.widths
-        self.sees = bool(parts.convolutions)
-        self.memory = {MEMORY: (1, parts.memory.hidden_size)} if parts.memory else {}
+        self.is_random, self.scales, self.widths = actor.is_random, parts.scales, parts.widths
+        self.lenses, self.activations, self.nearest = parts.convolutions[1::2], parts.trunk[1::2], parts.nearest
+        self.sees, gru = bool(parts.convolutions), cast(Any, parts.memory)
+        self.memory = {MEMORY: (1, gru.hidden_size)} if gru else {}
         self.in_keys, self.out_keys = [*map(unravel_key, first.in_keys), *self.memory], list(actor.out_keys)
         self.without_gradient: frozenset[NestedKey] = frozenset()
         self._take_head(actor)
-        layers: list[Any] = [*parts.convolutions[::2], *parts.trunk[::2], parts.head]
-        gru = parts.memory
-        remembering = (gru.weight_ih_l0, gru.bias_ih_l0, gru.weight_hh_l0, gru.bias_hh_l0) if gru else ()
-        self.weights = (*(x for layer in layers for x in (layer.weight, layer.bias)), *cast(Any, remembering))
-        activations = [parts.convolutions[1::2], parts.trunk[1::2]]
-        self.signature = (*self._describe(), str((activations, parts.nearest, self.sees, list(self.memory))))
+        before = [(x.weight, x.bias) for x in cast(Any, [*parts.convolutions[::2], *parts.trunk[::2]])]
+        gates = [(gru.weight_ih_l0, gru.bias_ih_l0), (gru.weight_hh_l0, gru.bias_hh_l0)] if gru else []
+        self.weights = tuple(x for pair in (*before, *gates, (parts.head.weight, parts.head.bias)) for x in pair)
+        self.signature = (*self._describe(), str((self.lenses, self.activations, self.nearest, list(self.memory))))
 
     def fits(self, inputs: Sequence[Tensor]) -> bool:
         """Whether the network can read inputs of this width, precision and device."""
-        like = self.weights[0]
-        vectors = inputs[self.sees : len(inputs) - len(self.memory)]
+        like, vectors = self.weights[0], inputs[self.sees : len(inputs) - len(self.memory)]
         fits = [x.shape[-1] for x in vectors] == list(self.widths[self.sees :])
         return fits and all((x.dtype, x.device) == (like.dtype, like.device) for x in inputs)
 
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
     ) -> tuple[list[Tensor], dict[NestedKey, Tensor]]:
-        """What was seen, and loc, scale, action, features, memory, and log-probability if wanted."""
-        seen = self._see(weights, inputs)
-        raw, features, *recalled = self._network(weights, inputs, seen)
-        written = {**self._sample(raw, drawn), "features": features}
-        for x in recalled:
-            written |= {"recalled": x, ("next", MEMORY): x.unsqueeze(-2)}
-        return seen, {key: written[key] for key in self.out_keys}
+        """What was seen, and what each layer returns before its activation; and all that the policy writes."""
+        seen, layers = self._see(weights, inputs), self._layers_of(weights)
+        x, kept = self._read(inputs, seen), []
+        for (weight, bias), activation in zip(layers, self.activations, strict=False):
+            kept.append(torch.addmm(bias, x, weight.t()))
+            x = activation(kept[-1])
+        written: dict[NestedKey, Tensor] = {}
+        if self.memory:
+            h = inputs[-1].squeeze(-2)
+            kept += [torch.addmm(bias, y, weight.t()) for y, (weight, bias) in zip((x, h), layers[-3:], strict=False)]
+            recalled = _recall(kept[-2], kept[-1], h)
+            written["next", MEMORY] = recalled.unsqueeze(-2)
+            x = torch.cat((x, recalled), 1)
+        kept.append(torch.addmm(layers[-1][1], x, layers[-1][0].t()))
+        written |= self._sample(kept[-1], drawn)
+        return [*seen, *kept], {key: written[key] for key in self.out_keys}
 
     def adjoint(
         self,
@@ -323,56 +329,66 @@ class PlainParts(PlainTanhGaussian):
         drawn: Tensor,
         grads: dict[NestedKey, Tensor],
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
-        """What the network read, and the gradients of what it returned; the gradients of inputs and noise."""
-        is_constant = self.sees and self.in_keys[0] in self.without_gradient
-        read = inputs[1:] if is_constant else inputs
-
-        def network(*read: Tensor) -> tuple[Tensor, ...]:
-            every = [inputs[0], *read] if is_constant else read
-            return tuple(self._network(weights, every, kept if is_constant else self._see(weights, every)))
-
-        (raw, *_), pull = vjp(network, *read)[:2]
-        own = {key: grads[key] for key in self.out_keys if key not in ("features", "recalled", ("next", MEMORY))}
-        grad_raw, grad_drawn = vjp(self._sample, raw, drawn)[1](own)
-        grads_out = [grad_raw, grads["features"]]
+        """What each layer read, and the gradient of what it returned; the gradients of inputs and noise."""
+        layers, seen, kept = self._layers_of(weights), kept[: self.sees], kept[self.sees :]
+        own = {key: grads[key] for key in self.out_keys if key != ("next", MEMORY)}
+        grad, grad_drawn = vjp(self._sample, kept[-1], drawn)[1](own)
+        activated = [vjp(activation, x)[:2] for activation, x in zip(self.activations, kept, strict=False)]
+        x, of_x = activated[-1][0], grad @ layers[-1][0]
+        read, of_kept, of_inputs = [x], [grad], []
         if self.memory:
-            grads_out.append(grads["recalled"] + grads["next", MEMORY].squeeze(-2))
-        of_read = list(pull(tuple(grads_out)))
-        of_inputs = [torch.zeros_like(inputs[0]), *of_read] if is_constant else of_read
-        return [*inputs, *grads_out], of_inputs, grad_drawn
+            h = inputs[-1].squeeze(-2)
+            recalled, pull = vjp(_recall, *kept[-3:-1], h)[:2]
+            of_x, of_recalled = of_x.split([x.shape[1], h.shape[1]], 1)
+            of_gates, of_own, of_h = pull(of_recalled + grads["next", MEMORY].squeeze(-2))
+            read, of_kept = [x, h, torch.cat((x, recalled), 1)], [of_gates, of_own, grad]
+            of_x = of_x + of_gates @ layers[-3][0]
+            of_inputs = [(of_h + of_own @ layers[-2][0]).unsqueeze(-2)]
+        before = [self._read(inputs, seen), *(x for x, _ in activated)]
+        for i in reversed(range(len(activated))):
+            (grad,) = activated[i][1](of_x)
+            read, of_kept, of_x = [before[i], *read], [grad, *of_kept], grad @ layers[i][0]
+        of_read = [g * scale for g, scale in zip(of_x.split(list(self.widths), 1), self.scales, strict=True)]
+        if not self.sees:
+            return [*read, *of_kept], [*of_read, *of_inputs], grad_drawn
+        image, of_seen = inputs[0], of_read[0]
+        of_read[0] = torch.zeros_like(image)
+        if self.in_keys[0] not in self.without_gradient:
+            (of_read[0],) = vjp(lambda image: self._see(weights, [image])[0], image)[1](of_seen)
+        return [image, of_seen, *read, *of_kept], [*of_read, *of_inputs], grad_drawn
 
     def weight_gradient(self, weights: Sequence[Tensor], traces: Sequence[Tensor]) -> list[Tensor]:
         """The gradients of all weights, over a batch."""
-        inputs, grads = traces[: len(self.in_keys)], traces[len(self.in_keys) :]
-        _, pull = vjp(lambda *own: tuple(self._network(own, inputs, self._see(own, inputs))), *weights)[:2]
-        return list(pull(tuple(grads)))
+        if not self.sees:
+            return super().weight_gradient(weights, traces)
+        (image, of_seen, *others), count = traces, 2 * len(self.lenses)
+        pull = vjp(lambda *own: self._see(own, [image])[0], *weights[:count])[1]
+        return [*pull(of_seen), *super().weight_gradient(weights[count:], others)]
+
+    def _layers_of(self, weights: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
+        """Weight and bias of each layer after the convolutions."""
+        own = weights[2 * len(self.lenses) :]
+        return list(zip(own[::2], own[1::2], strict=True))
 
     def _see(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
         """What the convolutions return of a depth image (n, channels, height, width) [m], (n, k); nothing if blind."""
         if not self.sees:
             return []
-        x, layers = inputs[0].clamp_min(self.parts.nearest).reciprocal(), self.parts.convolutions
-        for i, activation in enumerate(layers[1::2]):
-            x = activation(nn.functional.conv2d(x, weights[2 * i], weights[2 * i + 1], stride=2, padding=1))
+        x = inputs[0].clamp_min(self.nearest).reciprocal()
+        for weight, bias, activation in zip(weights[::2], weights[1::2], self.lenses, strict=False):
+            x = activation(nn.functional.conv2d(x, weight, bias, stride=2, padding=1))
         return [x.flatten(1)]
 
-    def _network(self, weights: Sequence[Tensor], inputs: Sequence[Tensor], seen: Sequence[Tensor]) -> list[Tensor]:
-        """What the head returns, the features, and what is recalled (n, hidden_size)."""
-        weights = weights[len(self.parts.convolutions) :]
-        vectors = inputs[self.sees : len(inputs) - len(self.memory)]
-        x = concatenated([*seen, *vectors], self.scales)
-        layers = len(self.parts.trunk) // 2
-        for i, activation in enumerate(self.parts.trunk[1::2]):
-            x = activation(torch.addmm(weights[2 * i + 1], x, weights[2 * i].t()))
-        head, bias, *gru = weights[2 * layers :]
-        if not self.memory:
-            return [torch.addmm(bias, x, head.t()), x]
-        h = inputs[-1].squeeze(-2)
-        of_x, of_h = torch.addmm(gru[1], x, gru[0].t()).chunk(3, 1), torch.addmm(gru[3], h, gru[2].t()).chunk(3, 1)
-        reset, keep = (of_x[0] + of_h[0]).sigmoid(), (of_x[1] + of_h[1]).sigmoid()
-        new = (of_x[2] + reset * of_h[2]).tanh()
-        recalled = new + keep * (h - new)
-        return [torch.addmm(bias, torch.cat((x, recalled), 1), head.t()), x, recalled]
+    def _read(self, inputs: Sequence[Tensor], seen: Sequence[Tensor]) -> Tensor:
+        """What the first layer reads."""
+        return concatenated([*seen, *inputs[self.sees : len(inputs) - len(self.memory)]], self.scales)
+
+
+def _recall(of_input: Tensor, of_memory: Tensor, h: Tensor) -> Tensor:
+    """What a GRU recalls (n, k), from its layers' outputs for the input and the memory h, as TorchRL's GRUModule."""
+    (reset, keep, new), (own_reset, own_keep, own_new) = of_input.chunk(3, 1), of_memory.chunk(3, 1)
+    new = (new + (reset + own_reset).sigmoid() * own_new).tanh()
+    return new + (keep + own_keep).sigmoid() * (h - new)
 
 
 class Replay(PlainTanhGaussian):

@@ -145,8 +145,10 @@ def policy_of(
     read = [*in_keys, "noise_before"] if rho else list(in_keys)
     last = TensorDictModule(network, in_keys=read, out_keys=["loc", "scale"])
     low, high = spec.low, spec.high
+    # Of what the parts hand on to each other only the memory is kept.
+    written = ["loc", "scale", *(key for part in parts for key in part.out_keys if key[0] == "next")]
     actor = cls(
-        TensorDictSequential([*parts, last]) if parts else last,
+        TensorDictSequential([*parts, last], selected_out_keys=written) if parts else last,
         in_keys=["loc", "scale"],
         spec=spec,
         distribution_class=TanhNormal,

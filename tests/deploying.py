@@ -38,6 +38,7 @@ TASKS = {  # with all that policies may read, spread over the tasks
     "forest": {"camera": CAMERA, "density": 0.05, "random_start": {"tilt": 0.5, "yaw": 3.0, "velocity": 3.0}},
     "forest, blind": {"camera": {"width": 4, "height": 3}, "density": 0.01}
     | {"observe_velocity": False, "observe_last_action": True},
+    "hovering, with memory": {},
     "hovering, without memory": {"camera": {"width": 5, "height": 4, "position": [0.1, 0, 0], "along_ray": True}},
 }
 NORMALIZED = ("tracking", "racing", "forest")
@@ -55,8 +56,9 @@ def build(name, num_envs=16):
         actor = make_visual_actor(env, **SIZES, hidden_size=4, recurrent="without" not in name, input_scale=0.3)
         last = actor[0][-1].module.mlp[-1]
     else:
-        actor = make_actor(env, (16, 16))
-        last = actor[0].module.mlp[-1]
+        memory = {"recurrent": True, "hidden_size": 4} if "with memory" in name else {}
+        actor = make_actor(env, (16, 16), **memory)
+        last = actor.last.mlp[-1]
     with torch.no_grad():
         last.weight.add_(0.3 * torch.randn_like(last.weight))
     return env, actor

@@ -51,6 +51,12 @@ def test_a_bundle_that_acts_or_remembers_differently_from_its_policy_is_not_writ
     assert export_policy(actor, env, tmp_path / "policy").is_dir()
 
 
+def test_a_blind_policy_with_memory_is_exported_and_flies_as_it_flew(export_once):
+    folder = export_once("hovering, with memory")[2]
+    assert load_bundle(folder).memory.shape == (4,)
+    assert len(transfer.fly(folder, "torchrl_quad", episodes=4)["action"]) == 4
+
+
 def test_no_simulator_flies_a_visual_policy_or_a_task_with_obstacles(export_once):
     ways = (("forest", "images"), ("forest, blind", "obstacles"), ("hovering, without memory", "no camera"))
     for task, why in ways:
@@ -75,7 +81,7 @@ def test_a_visual_policy_that_was_built_for_another_camera_or_changed_is_refused
     hooked[0][1].gru.register_forward_hook(lambda *_: None)
     deeper[0][1].gru = nn.GRU(64, 64, 2, batch_first=True)
     for changed in (hooked, deeper):
-        refuses("exports what make_actor and make_visual_actor build, .* This VisualActor is something", changed)
+        refuses("exports what make_actor and make_visual_actor build, .* This ComposedActor is something", changed)
     velocity = make_visual_actor(forest, in_keys=[("state", "velocity")])
     refuses(r"reads \['depth', \('state', 'velocity'\)\]. A drone only has", velocity)
     flatter = make_visual_actor(forest)

@@ -53,7 +53,8 @@ def test_every_recipe_trains_on_its_tasks_and_leaves_what_it_promises(launch, no
     tasks = TASKS if recipe == "abpt" else ["landing", "forest"]  # the others differ in their losses alone
     tasks = ["landing"] if recipe in ("sapo", "ahac", "hybrid") else tasks
     sweep = [f"task={','.join(tasks)}", f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=${task}"]
-    printed = launch(recipe, "--multirun", *SMALL, *sweep, "hydra/launcher=basic")
+    memory = [] if recipe in ("abpt", "bptt") else ["actor.recurrent=true", "actor.hidden_size=8"]
+    printed = launch(recipe, "--multirun", *SMALL, *memory, *sweep, "hydra/launcher=basic")
     for task in tasks:
         folder = tmp_path / task
         rows = read_rows(folder / "metrics.csv")

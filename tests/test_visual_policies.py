@@ -22,11 +22,13 @@ from torchrl_quad import (
     TrustRegion,
     VisitedStateBuffer,
     differentiable_rollout,
+    make_actor,
     make_qvalue,
     make_value,
     make_visual_actor,
     restart,
 )
+from torchrl_quad.data import flight_mode
 
 CAMERA = {"width": 6, "height": 4}
 SMALL = {"channels": (2,), "num_cells": (5,), "hidden_size": 3}
@@ -98,8 +100,9 @@ def test_a_flight_is_that_of_torchrls_loop_with_its_transforms_and_forgets_where
     assert (before != 0).all() and (after == 0).all()
 
 
-@pytest.mark.slow  # it compiles
-def test_a_policy_that_is_called_before_each_compiled_step_remembers_as_in_an_eager_flight(monkeypatch):
+@pytest.mark.parametrize("way", ["inside", "called"])
+@pytest.mark.parametrize("sees", [True, False])
+def test_a_policy_in_a_compiled_horizon_sees_and_remembers_as_in_an_eager_flight(sees, way, monkeypatch):
     class Direct:  # what is compiled, without a compiler, which takes a minute
         def __init__(self, function, options):
             self.again = function
@@ -110,17 +113,20 @@ def test_a_policy_that_is_called_before_each_compiled_step_remembers_as_in_an_ea
     monkeypatch.setattr("torchrl_quad.engine.program.Compiled", Direct)
     monkeypatch.setattr("torch.compiler.nested_compile_region", lambda function: function)
     env = forest(max_episode_steps=3, dt=0.02)
-    actor, results = actor_for(env), []
+    actor, results = actor_for(env) if sees else make_actor(env, (4,), recurrent=True, hidden_size=5), []
+    if way == "called":
+        actor[0][0].register_forward_hook(lambda *_: None)
     for _ in range(2):
         env.set_seed(1)
         torch.manual_seed(1)
         _, carry = differentiable_rollout(env, actor, None, 2)
         flight, _ = differentiable_rollout(env, actor, carry, 4)
         loss = flight["next", "reward"].sum() + flight["next", "observation"].square().sum() + flight["loc"].sum()
-        results.append((flight[MEMORY], flight["is_init"], torch.autograd.grad(loss, list(actor.parameters()))))
+        loss = loss + flight["next", MEMORY].square().sum() + flight[MEMORY].sum()
+        results.append((dict(flight.items(True, True)), torch.autograd.grad(loss, list(actor.parameters()))))
         env._run({})
         env.disturbances["camera"].is_compiled = False
-    assert env.is_compiled and not env.flies_inside(actor) and results[0][1].any()
+    assert flight_mode(env, actor).mode == way and results[0][0]["is_init"].any()
     torch.testing.assert_close(*results)
 
 

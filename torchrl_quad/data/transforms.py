@@ -9,29 +9,18 @@ from typing import Any, Literal, NamedTuple, cast
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import unravel_key
 from torch import Tensor
 from torch.func import vjp
 from torchrl.envs import (
-    ActionScaling,
-    CatTensors,
-    ClipTransform,
     Compose,
-    DoubleToFloat,
-    DTypeCastTransform,
     EnvBase,
-    ExcludeTransform,
     InitTracker,
-    ObservationNorm,
     RenameTransform,
-    RewardClipping,
-    RewardScaling,
     RewardSum,
-    SelectTransform,
     StepCounter,
     TargetReturn,
     TensorDictPrimer,
-    TrajCounter,
     Transform,
     TransformedEnv,
     VecNorm,
@@ -40,70 +29,21 @@ from torchrl.envs import (
 
 from torchrl_quad.data.normalizer import ObservationNormalizer
 from torchrl_quad.data.unwrap import base_env, check_actor, check_env, leaf, memory_keys, observed
-from torchrl_quad.engine.policy import GivenActions, PlainPolicy
+from torchrl_quad.data.values import (
+    COUNTERS,
+    ELEMENTWISE,
+    OF_KEYS,
+    OF_REWARDS,
+    Known,
+    Value,
+    elementwise,
+    follow,
+    inverse,
+    written_by,
+)
 from torchrl_quad.errors import UserValueError
 
-ELEMENTWISE = (ObservationNorm, ObservationNormalizer, ClipTransform, DTypeCastTransform, DoubleToFloat, ActionScaling)
-OF_REWARDS = (RewardScaling, RewardClipping)
-COUNTERS = (RewardSum, TargetReturn, StepCounter, InitTracker, TrajCounter)
-OF_KEYS = (CatTensors, RenameTransform, SelectTransform, ExcludeTransform)
 OUTER = "action_of_policy"  # before the transforms, where these change it on its way to the environment
-
-
-class Value(NamedTuple):
-    """How an entry follows from those of the environment inside."""
-
-    kind: str  # entry, normalize, scale, clip, cast or cat
-    about: Any  # the key of an entry, the type or the dimension
-    parts: tuple[Value, ...] = ()
-    constants: tuple[Tensor | None, ...] = ()
-
-    def compute(self, entries: Mapping[Any, Tensor], given: Iterator[Tensor] | None = None) -> Tensor:
-        """The value (*, k) from entries (*, ...); with ``given`` instead of the constants, in the same order."""
-        if self.kind == "entry":
-            return entries[self.about]
-        x, *more = (part.compute(entries, given) for part in self.parts)
-        a, b = cast(Any, [c if c is None or given is None else next(given) for c in self.constants or (None, None)])
-        if self.kind == "normalize":
-            return (x - a) / b
-        if self.kind == "scale":
-            return x * b + a
-        if self.kind == "clip":
-            return x.clamp(a, b)
-        return x.to(self.about) if self.kind == "cast" else torch.cat([x, *more], self.about)
-
-    def undo(self, x: Tensor, found: dict[Any, Tensor], spec: Mapping[Any, Any]) -> None:
-        """Add the entries from which the value is ``x``, unless they are found already; where it is clipped, ``x``."""
-        a, b = cast(Any, self.constants or (None, None))
-        if self.kind == "entry":
-            found.setdefault(self.about, x.to(spec[self.about].dtype))
-        elif self.kind == "cat":
-            sizes = [part.size(spec, self.about) for part in self.parts]
-            for part, own in zip(self.parts, x.split(sizes, self.about), strict=True):
-                part.undo(own, found, spec)
-        else:
-            x = x * b + a if self.kind == "normalize" else (x - a) / b if self.kind == "scale" else x
-            self.parts[0].undo(x, found, spec)
-
-    def size(self, spec: Mapping[Any, Any], dim: int) -> int:
-        """The size in a dimension."""
-        return sum(part.size(spec, dim) for part in self.parts) if self.parts else spec[self.about].shape[dim]
-
-    def sources(self) -> list[Any]:
-        """The entries of the environment that it reads."""
-        return [self.about] if self.kind == "entry" else [key for part in self.parts for key in part.sources()]
-
-    def tensors(self) -> list[Tensor]:
-        """All constants, in the order in which :meth:`compute` takes them."""
-        return [x for part in self.parts for x in part.tensors()] + [x for x in self.constants if x is not None]
-
-    def describe(self) -> tuple[Any, ...]:
-        """What it computes, apart from the numbers."""
-        shapes = tuple(None if x is None else x.shape for x in self.constants)
-        return self.kind, self.about, shapes, *(part.describe() for part in self.parts)
-
-
-Known = dict[Any, Value | None]  # by key; None for what is known only after the flight, such as counters
 
 
 class Flown(NamedTuple):
@@ -115,7 +55,7 @@ class Flown(NamedTuple):
 
     def fly(self, env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> Any:
         """The rollout as TorchRL's own loop writes it; None if ``start`` lacks what is counted or read."""
-        counted = [key for t in self.transforms if isinstance(t, COUNTERS) for key in _counted(t)]
+        counted = [key for t in self.transforms if isinstance(t, COUNTERS) for key in written_by(t)]
         read = [key for key in map(unravel_key, actor.in_keys) if key in self.known]
         if any(key not in start for key in (*counted, *read)):
             return None
@@ -195,7 +135,7 @@ class PolicyUnder(TensorDictModuleBase):
         """The same on plain tensors, if the policy has such a form."""
         make = getattr(self.policy, "plain", None)
         inner = make() if callable(make) else None
-        if inner is None or isinstance(inner, GivenActions):
+        if not hasattr(inner, "weight_gradient"):  # nothing, or actions that are given
             return None if self.changes else inner
         return _PlainUnder(inner, self)
 
@@ -203,14 +143,14 @@ class PolicyUnder(TensorDictModuleBase):
 def normalized(policy: TensorDictModuleBase, normalizer: ObservationNormalizer) -> PolicyUnder:
     """A policy of normalised observations, as one of observations that are not normalised yet."""
     (key,) = normalizer.in_keys
-    own = {key: _elementwise(normalizer, Value("entry", key))} if key in policy.in_keys else {}
+    own = {key: elementwise(normalizer, Value("entry", key))} if key in policy.in_keys else {}
     return PolicyUnder(policy, own, Value("entry", "action"))
 
 
 class _PlainUnder:
     """See the engine's ``PlainPolicy``."""
 
-    def __init__(self, inner: PlainPolicy, under: PolicyUnder) -> None:
+    def __init__(self, inner: Any, under: PolicyUnder) -> None:
         self.reads = [under.reads.get(unravel_key(key), Value("entry", unravel_key(key))) for key in inner.in_keys]
         self.in_keys = [*dict.fromkeys(key for x in self.reads for key in x.sources())]
         self.action, self.own, self.size = under.action if under.changes else None, under.own, inner.size
@@ -355,7 +295,7 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
         if kind not in (*ELEMENTWISE, *OF_REWARDS, *COUNTERS, *OF_KEYS):
             return f"{name} is none of the transforms that are pure functions of entries"
         try:
-            _follow(transform, known)
+            follow(transform, known)
         except (NotImplementedError, KeyError, RuntimeError) as error:
             return f"{name}: {error}"
     reads = {}
@@ -372,7 +312,7 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
         for inner, outer in ((unravel_key(a), unravel_key(b)) for a, b in pairs):
             if outer in actions:
                 x = cast(Value, actions.pop(outer) if type(transform) is RenameTransform else actions[outer])
-                actions[inner] = _inverse(transform, x)
+                actions[inner] = inverse(transform, x)
     if (action := actions.get("action")) is None or action.sources()[0] not in map(unravel_key, actor.out_keys):
         return "the policy writes no action that the transforms pass on"
     if action == Value("entry", "action") and all(x == Value("entry", key) for key, x in reads.items()):
@@ -384,88 +324,12 @@ def _parts(transform: Transform) -> list[Transform]:
     return [x for part in transform for x in _parts(part)] if isinstance(transform, Compose) else [transform]
 
 
-def _follow(transform: Any, known: Known) -> None:
-    """What the entries that a transform reads and writes are made of, after it."""
-    ins, outs = list(map(unravel_key, transform.in_keys or ())), _counted(transform)
-    if isinstance(transform, OF_REWARDS):
-        if set(known) & {*ins, *outs}:
-            raise NotImplementedError("a reset leaves what it writes as it was, which is followed for rewards alone")
-    elif isinstance(transform, COUNTERS):
-        known.update(dict.fromkeys(outs))
-    elif isinstance(transform, ExcludeTransform):
-        if transform.inverse:
-            raise NotImplementedError("inverse=True is left to TorchRL")
-        _keep(known, lambda key: not _below(key, transform.excluded_keys))
-    elif isinstance(transform, SelectTransform):
-        parent = cast(Any, transform.parent)
-        kept = [*transform.selected_keys, *parent.state_spec.keys(True, True), *parent.done_keys]
-        _keep(known, lambda key: _below(key, kept))
-    elif isinstance(transform, RenameTransform):
-        for a, b in zip(ins, outs, strict=True):
-            known[b] = known[a] if transform.create_copy else known.pop(a)
-    elif isinstance(transform, CatTensors):
-        if transform.dim >= 0 or transform.unsqueeze_if_oor or not transform._initialized:
-            raise NotImplementedError("only in_keys that are named, and a negative dim, mean the same in a horizon")
-        parts = tuple(cast(Value, known[key]) for key in ins)
-        known[outs[0]] = None if None in parts else Value("cat", transform.dim, parts)
-        _keep(known, lambda key: not transform._del_keys or key not in ins or key == outs[0])
-    elif not isinstance(transform, ActionScaling):
-        for a, b in zip(ins, outs, strict=True):
-            if a in known:
-                known[b] = None if (x := known[a]) is None else _elementwise(transform, x)
-
-
-def _counted(transform: Any) -> list[Any]:
-    """The entries that a transform writes."""
-    keys = transform.step_count_keys if isinstance(transform, StepCounter) else transform.out_keys
-    return list(map(unravel_key, keys or ()))
-
-
-def _keep(known: Known, wanted: Any) -> None:
-    for key in [key for key in known if not wanted(key)]:
-        del known[key]
-
-
-def _below(key: Any, groups: Sequence[NestedKey]) -> bool:
-    """Whether an entry is one of some, or in a group of them."""
-    path = key if isinstance(key, tuple) else (key,)
-    return any(path[: len(g)] == g for g in ((x,) if isinstance(x, str) else x for x in map(unravel_key, groups)))
-
-
-def _elementwise(transform: Any, x: Value) -> Value:
-    """What a transform makes of an entry."""
-    if isinstance(transform, ObservationNorm):
-        if not transform.initialized or max(transform.loc.ndim, transform.scale.ndim) > 1:
-            raise NotImplementedError("statistics are vectors, or numbers; call init_stats")
-        kind = "normalize" if transform.standard_normal else "scale"
-        return Value(kind, None, (x,), (transform.loc, transform.scale))
-    if isinstance(transform, ClipTransform):
-        return Value("clip", None, (x,), (transform.low, transform.high))
-    return Value("cast", transform.dtype_out, (x,))
-
-
-def _inverse(transform: Any, x: Value) -> Value:
-    """What a transform makes of an action on its way to the environment."""
-    if isinstance(transform, RenameTransform):
-        return x
-    if isinstance(transform, ClipTransform):
-        return Value("clip", None, (x,), (transform.low, transform.high))
-    if isinstance(transform, DTypeCastTransform):
-        return Value("cast", transform.dtype_in, (x,))
-    if isinstance(transform, ActionScaling):
-        transform._ensure_initialized()
-        loc, scale = transform.loc, transform.scale
-        return Value("scale", None, (x,), (loc, scale) if transform.standard_normal else (loc - scale, 2.0 * scale))
-    kind = "scale" if transform.standard_normal else "normalize"
-    return Value(kind, None, (x,), (transform.loc, transform.scale))
-
-
 def _count(transform: Any, root: TensorDictBase, after: TensorDictBase, start: TensorDictBase, done: Tensor) -> None:
     """Write what a counter has at both ends of each step of a horizon, which began at ``start``; done is (n, T, 1)."""
     begun = torch.cat((torch.zeros_like(done[:, :1]), done[:, :-1]), 1)  # an episode at this step
     steps = torch.arange(done.shape[1], device=done.device).unsqueeze(-1)
     first = torch.where(begun, steps, -1).cummax(1).values  # step of the present episode; -1 where it began before
-    for i, key in enumerate(_counted(transform)):
+    for i, key in enumerate(written_by(transform)):
         if isinstance(transform, RewardSum | TargetReturn):
             is_sum = isinstance(transform, RewardSum)
             value, roots, ends = leaf(start, key), [], []

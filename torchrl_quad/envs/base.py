@@ -203,7 +203,7 @@ class QuadrotorEnv(Task, EnvBase):
 
     def flies_inside(self, policy: Any) -> bool:
         """Whether :meth:`rollout` flies a policy inside the compiled step, which is fastest, or calls it before each
-        step. It ignores transforms: under them, except a single ObservationNormalizer, policies are called."""
+        step. It ignores transforms; :func:`torchrl_quad.data.flight_mode` does not."""
         return flies_inside(self._stepper, policy)
 
     def eager(self) -> QuadrotorEnv:

@@ -80,7 +80,6 @@ IGNORED = {  # what a person wrote, which nothing would read
     "hybrid actor.schedule=cosine": "actor.schedule=cosine has no effect: actor.max_kl sets the rate",
     "abpt normalize=true critic.input_scale=2.0": "critic.input_scale=2.0 has no effect: normalize=true",
     "bptt actor.channels=[4]": r"actor.channels=\[4\] has no effect: env.camera=null",
-    "bptt task=forest actor.vision=false actor.recurrent=false": "actor.recurrent=false has no effect: actor.vision=",
     "bptt task=forest actor.recurrent=false actor.hidden_size=8": "actor.hidden_size=8 has no effect",
     "bptt task=forest env.difficulty=hard env.density=0.1": "env.difficulty=hard has no effect: env.density is set",
     "sapo loss.alpha=0.1 loss.target_entropy=-1.0": "loss.target_entropy=-1.0 has no effect: loss.alpha is not auto",

@@ -62,6 +62,59 @@ def test_in_keys_suffice_and_out_keys_come_out(entropy):
         loss.zero_grad()
 
 
+def masked(rollout, counts):
+    """A rollout in which a collector hides some steps, whose rewards mean nothing."""
+    hidden = rollout.copy()
+    hidden["next"] = rollout["next"].copy()
+    hidden["collector", "mask"] = counts
+    hidden["next", "reward"] = torch.where(counts.unsqueeze(-1), rollout["next", "reward"], torch.nan)
+    return hidden
+
+
+def seeded(loss, rollout):
+    torch.manual_seed(1)
+    return loss(rollout)
+
+
+def test_steps_that_a_collector_masks_do_not_count(env64):
+    # TorchRL asks the same of its losses in test_loss_module.py.
+    actor = make_actor(env64, return_log_prob=True)
+    value, qvalue = make_value(env64), make_qvalue(env64)
+    rollout, _ = differentiable_rollout(env64, actor, None, 6)
+    counts = torch.ones(4, 6, dtype=torch.bool)
+    every = masked(rollout, counts)
+    for loss in (
+        BPTTLoss(actor, alpha=0.1),
+        SHACLoss(actor, value),
+        ABPTLoss(actor, qvalue),
+        ABPTLoss(actor, qvalue, simulated_steps=2),
+        SAPOLoss(actor, value, alpha=0.1),
+    ):
+        hidden = masked(rollout, counts & (torch.arange(4) > 0).unsqueeze(1))
+        out, without = (seeded(loss, flight) for flight in (hidden, rollout[1:]))
+        torch.testing.assert_close(4 * out["loss_actor"], 3 * without["loss_actor"])
+        torch.testing.assert_close(seeded(loss, every)["loss_actor"], seeded(loss, rollout)["loss_actor"])
+        if "loss_value" in out:
+            torch.testing.assert_close(out["loss_value"], without["loss_value"])
+    for loss in (AHACLoss(actor, value), HybridLoss(actor, value)):
+        out = loss(masked(rollout, counts & (torch.arange(4) > 0).unsqueeze(1)))
+        assert all(x.isfinite() for x in out.values())
+        assert not torch.equal(out["loss_actor"], loss(rollout)["loss_actor"])
+    cut = masked(rollout, counts & (torch.arange(6) < 3))
+    torch.testing.assert_close(BPTTLoss(actor)(cut)["loss_actor"], BPTTLoss(actor)(rollout[:, :3])["loss_actor"])
+
+
+def test_a_reduction_of_none_is_the_mean_and_losses_are_shown_in_a_line(env):
+    actor, value = make_actor(env), make_value(env)
+    rollout, _ = differentiable_rollout(env, actor, None, 3)
+    assert torch.equal(
+        SHACLoss(actor, value, reduction=None)(rollout)["loss_actor"], SHACLoss(actor, value)(rollout)["loss_actor"]
+    )
+    each = SHACLoss(actor, value, reduction="none")
+    assert each.loss_value(rollout.detach())[0].shape == (4, 3) and each.loss_actor(rollout)[0].shape == (4,)
+    assert repr(each) == "SHACLoss(actor_network=TanhGaussianActor, value_network=Critic, reduction='none')"
+
+
 def test_a_critic_may_see_more_than_the_actor():
     env = HoveringEnv(num_envs=2)
     actor = make_actor(env)

@@ -12,7 +12,6 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor, nn
-from torchrl.collectors import BaseCollector
 from torchrl.data import Composite
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -22,6 +21,10 @@ from torchrl_quad.data.unwrap import base_env, check_actor, check_env, check_who
 from torchrl_quad.data.visited_states import restart
 from torchrl_quad.errors import UserTypeError, UserValueError
 from torchrl_quad.options import Field, Fraction, Horizon, accepted, checked
+
+with warnings.catch_warnings():  # TorchRL's collectors warn of their own classes when they are imported
+    warnings.simplefilter("ignore", DeprecationWarning)
+    from torchrl.collectors import BaseCollector
 
 Exploration = Annotated[
     Any,

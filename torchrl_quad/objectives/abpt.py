@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.calls import sample_action, segments, step_in_segment, total
-from torchrl_quad.objectives.pathwise import PathwiseCriticLoss
+from torchrl_quad.objectives.critic import PathwiseCriticLoss
 from torchrl_quad.options import Copies, Field
 
 
@@ -117,7 +117,8 @@ class ABPTLoss(PathwiseCriticLoss):
             rewards = (self._discounts(tensordict) * self._reward(tensordict) * is_first).sum((-2, -1))
             return rewards + self._discounted_value(tensordict, last)
         self._check_graph(leaf(tensordict, self.tensor_keys.action), self.tensor_keys.action)
-        start, _ = segments(self._next(tensordict, "done"))
+        start, counts = segments(self._next(tensordict, "done"))[0], self._counts(tensordict)
+        start = start if counts is None else start & counts
         first = cast(TensorDictBase, tensordict.select(*self.qvalue_network.in_keys)[start.squeeze(-1)])
         value = self._critics(first).amin(0)
         return torch.zeros_like(start, dtype=value.dtype).masked_scatter(start, value).sum((-2, -1))

@@ -128,8 +128,12 @@ class HybridLoss(SHACLoss):
         grad, latent = self._in_location(data, grad)
         with torch.no_grad():
             advantage = leaf(data, keys.value_target) - self._value(data, target=False)
-            deviation = advantage.std().clamp_min(1e-12)
-            advantage, grad = (advantage - advantage.mean()) / deviation, grad / deviation
+            counts = self._counts(data)
+            seen = advantage if counts is None else advantage[counts]
+            deviation = seen.std().clamp_min(1e-12)
+            advantage, grad = (advantage - seen.mean()) / deviation, grad / deviation
+            if counts is not None:
+                advantage, grad = torch.where(counts, advantage, 0.0), torch.where(counts, grad, 0.0)
             predicted = (grad * (latent - leaf(data, "loc"))).sum(-1, keepdim=True)
             weight = self._regress(advantage, predicted)
         data.set(keys.advantage, advantage - weight * (predicted - predicted.mean()))
@@ -153,7 +157,7 @@ class HybridLoss(SHACLoss):
             entropy = (new.entropy() + jacobian).sum(-1)
             objective = objective + self.entropy_coeff * entropy
             metadata["entropy"] = entropy.detach().mean()
-        return self._reduce_loss(-objective), metadata
+        return self._reduce_loss(-objective, tensordict), metadata
 
     def _with_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
         check_tensordict("HybridLoss", tensordict)

@@ -14,15 +14,13 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import ValueEstimators, default_value_kwargs, dispatch_value_estimator
 
-from torchrl_quad.data.unwrap import check_tensordict, group, leaf
+from torchrl_quad.data.unwrap import check_tensordict, leaf
 from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, WrongState, shown
 from torchrl_quad.objectives.calls import (
     MedianClip,
     act_again,
     action_gradient,
     discounts,
-    predict,
-    segments,
     takes_rollout,
     total,
 )
@@ -47,7 +45,10 @@ class PathwiseLoss(LossModule):
         clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for no
             bound. 1 to 5 keep tumbling drones from outweighing all others. Needs a policy of ``make_actor``. An entropy
             bonus then counts at fixed states.
-        reduction: mean or sum over environments (over samples for a critic), or none.
+        reduction: mean or sum over environments (over samples for a critic), or none; null is mean, as in TorchRL.
+
+    Steps that a collector's ``("collector", "mask")``, bool (*, horizon), marks as False do not count: such a step has
+    no reward, ends its segment, and is no target of a critic.
 
     Raises:
         ValueError: (in use) the rollout has no time dimension, lacks an entry, or is on another device.
@@ -96,10 +97,10 @@ class PathwiseLoss(LossModule):
         target_entropy: Annotated[float, between(-1e6, 1e6)] | Literal["auto"] = "auto",
         alpha_init: Scale = 1e-2,
         clip_action_gradient: Positive | None = None,
-        reduction: Literal["mean", "sum", "none"] = "mean",
+        reduction: Literal["mean", "sum", "none"] | None = "mean",
     ) -> None:
         super().__init__()
-        self.reduction = reduction
+        self.reduction = reduction or "mean"
         self.convert_to_functional(actor_network, "actor_network")
         number = {"device": self._default_device, "dtype": self._precision}
         self.clip = None if clip_action_gradient is None else MedianClip(clip_action_gradient).to(**number)
@@ -122,6 +123,11 @@ class PathwiseLoss(LossModule):
                 'TensorDictModule(module, in_keys=["observation"], out_keys=[...]).'
             )
         super().convert_to_functional(module, module_name, *args, **kwargs)
+
+    def __repr__(self) -> str:
+        names = [name for name in ("actor_network", "value_network", "qvalue_network") if hasattr(self, name)]
+        networks = ", ".join(f"{name}={type(getattr(self, name)).__name__}" for name in names)
+        return f"{type(self).__name__}({networks}, reduction={self.reduction!r})"
 
     @property
     def in_keys(self) -> list[NestedKey]:  # pyrefly: ignore[bad-override]  # without its setter
@@ -253,7 +259,16 @@ class PathwiseLoss(LossModule):
         return 0.0
 
     def _next(self, tensordict: TensorDictBase, name: str) -> Tensor:
-        return leaf(tensordict, ("next", getattr(self.tensor_keys, name)))
+        """Reward, done or terminated of each step: (*, horizon, 1)."""
+        x, counts = leaf(tensordict, ("next", getattr(self.tensor_keys, name))), self._counts(tensordict)
+        if counts is None:
+            return x
+        return torch.where(counts, x, 0.0) if name == "reward" else x | ~counts
+
+    def _counts(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Which steps count, bool (*, horizon, 1), if a collector says so."""
+        mask = tensordict.get(("collector", "mask"), None)
+        return None if mask is None else mask.reshape(*tensordict.shape, 1)
 
     def _reward(self, tensordict: TensorDictBase) -> Tensor:
         reward = self._next(tensordict, "reward")
@@ -286,7 +301,8 @@ class PathwiseLoss(LossModule):
                 "not in the rollout. Build the actor with return_log_prob=True, or set the loss's alpha to 0. If it "
                 "has another name there, write loss.set_keys(sample_log_prob=...)."
             )
-        return -log_prob.reshape(*tensordict.shape, 1)
+        log_prob, counts = log_prob.reshape(*tensordict.shape, 1), self._counts(tensordict)
+        return -log_prob if counts is None else torch.where(counts, -log_prob, 0.0)
 
     def _target_entropy(self, tensordict: TensorDictBase) -> float:
         if self.target_entropy == "auto":
@@ -332,118 +348,3 @@ class PathwiseLoss(LossModule):
                 "break_when_any_done=False) with gradients enabled, on an environment that is differentiable. "
                 "The horizon must be longer than the delay between an action and its effect."
             )
-
-
-class PathwiseCriticLoss(PathwiseLoss):
-    """A pathwise loss with a critic, whose value ends each segment and which learns TD(lambda) targets."""
-
-    @dataclass
-    class _AcceptedKeys(PathwiseLoss._AcceptedKeys):
-        value_target: NestedKey = "value_target"
-
-    default_keys = _AcceptedKeys
-    default_value_estimator = ValueEstimators.TDLambda
-    supported_value_estimators = (ValueEstimators.TD0, ValueEstimators.TDLambda)
-
-    critic_name: str  # the attribute that holds the critic network
-    critic_loss_key: str
-    prediction_key: str  # the tensor key under which the critic writes its prediction
-    value_part = "terminal_value"
-    target_bootstrap = False  # whether the terminal value comes from the target network
-
-    @takes_rollout
-    def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """The losses of actor and critic and their metadata, the ``out_keys``, of a rollout that carries its graph."""
-        losses = PathwiseLoss.forward(self, tensordict)
-        loss_critic, metadata = self._critic_loss(tensordict)
-        return losses.update({self.critic_loss_key: loss_critic, **metadata})
-
-    def objective_parts(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """The terms whose sum is J, each (*,): discounted ``rewards`` of the segments, and their ``terminal_value``."""
-        return {**super().objective_parts(tensordict), "terminal_value": self._terminal_value(tensordict)}
-
-    def write_value_target(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the TD(lambda) target of each step (paper, equations 17 and 18) into a rollout, and return it.
-
-        Each step's next value comes from the target network. A step that terminated does not bootstrap, one that was
-        truncated and the horizon's last one do. The critic's loss reads the targets if they are there, so that several
-        critic steps share them, and computes them otherwise. They are (*, horizon, 1), without a graph.
-        """
-        self._check_rollout(tensordict)
-        data = tensordict.detach()
-        with torch.no_grad():
-            next_value = self._value(group(data, "next"), target=True)
-            # A terminated state may not be finite, nor its value.
-            next_value = torch.where(self._next(data, "terminated"), 0.0, next_value)
-            target = self.value_estimator.value_estimate(data, next_value=next_value)
-        return tensordict.set(self.tensor_keys.value_target, target)
-
-    def _critics(self, tensordict: TensorDictBase, *, target: bool = False, learning: bool = False) -> Tensor:
-        """The prediction of each critic or of its target, (critics, *, 1); for ``learning`` see ``predict``."""
-        params = getattr(self, f"{'target_' if target else ''}{self.critic_name}_params")
-        key, shape = getattr(self.tensor_keys, self.prediction_key), (*tensordict.shape, 1)
-        found = predict(getattr(self, self.critic_name), params, tensordict, key, learning=learning)
-        if found.shape[1:] != shape:
-            raise UserValueError(
-                f"{self.critic_name} must write one number for each state, {key!r} of shape {shape}; got "
-                f"{tuple(found.shape[1:])}."
-            )
-        return found
-
-    def _value(self, tensordict: TensorDictBase, *, target: bool) -> Tensor:
-        """The value (*, 1) of states: the least of the predictions of the critics or of their targets."""
-        return self._critics(tensordict, target=target).amin(0)
-
-    def _critic_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        check_tensordict(str(type(self).__name__), tensordict)
-        key = self.tensor_keys.value_target
-        missing = [name for name in getattr(self, self.critic_name).in_keys if name not in tensordict]
-        if missing:
-            raise UserValueError(f"{self.critic_name} reads {missing[0]!r}, which these samples lack.")
-        samples = tensordict if key in tensordict else self.write_value_target(tensordict.copy())
-        target, prediction = leaf(samples, key).detach(), self._critics(tensordict, learning=True)
-        if target.shape != prediction.shape[1:]:
-            raise UserValueError(
-                f"{key!r} has shape {tuple(target.shape)}, and the critic's predictions {tuple(prediction.shape[1:])}: "
-                "give targets as write_value_target writes them."
-            )
-        error = (prediction - target).square().sum(0)
-        residual = (target - prediction.detach()).var(correction=0) / target.var(correction=0).clamp_min(1e-12)
-        return self._reduce_loss(error, tensordict), {
-            "pred_value": prediction.detach().mean(),
-            "target_value": target.mean(),
-            "explained_variance": 1.0 - residual,
-        }
-
-    def _terminal_value(self, tensordict: TensorDictBase) -> Tensor:
-        """gamma^n V(s_n) of each segment that did not terminate, summed over the segments: (*)."""
-        return self._discounted_value(tensordict, segments(self._next(tensordict, "done"))[1])
-
-    def _discounted_value(self, tensordict: TensorDictBase, after: Tensor) -> Tensor:
-        """gamma^(t+1) V(s_(t+1)) after steps (*, horizon, 1), but for those that terminated, summed over steps: (*)."""
-        where = after & ~self._next(tensordict, "terminated")
-        next_state = group(tensordict, "next").select(*self._critic_inputs(), strict=False)[where.squeeze(-1)]
-        discount = self._gamma * self._discounts(tensordict)
-        if next_state.shape[0] == 0:  # a recurrent policy refuses an empty batch
-            return torch.zeros_like(discount).sum((-2, -1))
-        value = self._value(cast(TensorDictBase, next_state), target=self.target_bootstrap)
-        return (discount * torch.zeros_like(discount).masked_scatter(where, value.to(discount.dtype))).sum((-2, -1))
-
-    def _critic_inputs(self) -> set[NestedKey]:
-        """The entries of a state that the critic, and the actor before it, read."""
-        actor = self.actor_network
-        names = set(actor.in_keys) - set(actor.out_keys) | set(getattr(self, self.critic_name).in_keys)
-        return names - {self.tensor_keys.action}
-
-    def _check_rollout(self, tensordict: TensorDictBase) -> None:
-        critic, key = getattr(self, self.critic_name), getattr(self.tensor_keys, self.prediction_key)
-        if key not in critic.out_keys:
-            raise UserValueError(
-                f"{type(self).__name__} reads {key!r} of its {self.critic_name}, which writes "
-                f"{', '.join(map(str, critic.out_keys))}. Give another network, or set_keys({self.prediction_key}=...)."
-            )
-        super()._check_rollout(tensordict)
-
-    def _network_in_keys(self) -> set[NestedKey]:
-        inputs = self._critic_inputs()
-        return inputs | {unravel_key(("next", key)) for key in inputs}

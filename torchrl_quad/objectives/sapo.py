@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
@@ -73,8 +74,9 @@ class SAPOLoss(SHACLoss):
 
     def _normalized_entropy(self, tensordict: TensorDictBase) -> Tensor:
         """(h + |h*|) / (2 |h*|) of each step: (*, horizon, 1)."""
-        size = abs(self._target_entropy(tensordict))
-        return (self._surprise(tensordict) + size) / (2.0 * size)
+        size, counts = abs(self._target_entropy(tensordict)), self._counts(tensordict)
+        entropy = (self._surprise(tensordict) + size) / (2.0 * size)
+        return entropy if counts is None else torch.where(counts, entropy, 0.0)
 
     def _target_entropy(self, tensordict: TensorDictBase) -> float:
         target = super()._target_entropy(tensordict)

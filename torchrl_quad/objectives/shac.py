@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.objectives.pathwise import PathwiseCriticLoss
+from torchrl_quad.objectives.critic import PathwiseCriticLoss
 from torchrl_quad.options import Copies
 
 

@@ -127,8 +127,13 @@ class Run:
             if rank() == 0:
                 print(f"Finished before: {self.folder}")
             return
+        began = time.perf_counter()
         if self.cfg.compile and self.steps < self.total_steps:
+            if rank() == 0:
+                print("Compiling the control step: about 30 s, which the next run finds in a cache.", flush=True)
             self._warm_up()
+            if rank() == 0:
+                print(f"Compiled in {time.perf_counter() - began:.0f} s.", flush=True)
         way = "inside" if self.task.flies_inside(self.actor) else "before"
         name = f"{self.cfg.algorithm} {self.cfg.task} {self.cfg.seed}, policy {way} the step"
         bounds = {"total": self.total_steps, "initial": self.steps}
@@ -156,6 +161,7 @@ class Run:
                     self._save(self.folder / "checkpoint.pt")
         if rank() == 0:
             self._finish()
+            print(f"{time.perf_counter() - began:.0f} s in all, {self.seconds:.0f} s of them training.")
 
     def optimise(self, optimizer: Optimizer, loss: Tensor) -> None:
         """Take one step down a loss with its clipped gradient, averaged over all processes; record the norm.

@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from rsl_rl.runners import OnPolicyRunner
 from skrl.agents.torch.ppo import PPO
 from skrl.memories.torch import RandomMemory
@@ -87,8 +88,7 @@ def test_rsl_rl_is_told_which_episodes_the_time_limit_has_ended():
     env.drones.now["state", "position"][2, 2] = -1.0  # underground
     _, _, done, extras = env.step(torch.zeros(3, 4))
     assert done.tolist() == [False, True, True]
-    assert extras["time_outs"].tolist() == [False, True, False]
-    assert extras["log"]["Episode/crash"] == 0.5
+    assert extras["time_outs"].tolist() == [False, True, False] and extras["log"]["Episode/crash"] == 0.5
     assert env.episode_length_buf.tolist() == [1, 0, 0]
 
 
@@ -120,15 +120,13 @@ def test_stable_baselines3_counts_successes_and_ends():
     env.reset()
     hover = np.tile(drones.torchrl_env.hover_action.numpy(), (2, 1))
     infos = [env.step(hover)[3] for _ in range(3)]
-    assert infos[0] == [{}, {}]
-    assert [info["is_success"] for info in infos[2]] == [True, False]
+    assert infos[0] == [{}, {}] and [info["is_success"] for info in infos[2]] == [True, False]
     assert all(info["TimeLimit.truncated"] for info in infos[2])
     np.testing.assert_allclose(infos[2][0]["terminal_observation"][:4], [0, 0, 0, 10], atol=0.1)
     assert [picture.shape for picture in env.get_images()] == 2 * [(336, 336, 3)]
     ppo = StablePPO("MlpPolicy", VecMonitor(env), n_steps=8, batch_size=16, n_epochs=1, device="cpu").learn(16)
     assert ppo.ep_success_buffer
-    with pytest.raises(NotImplementedError, match="share 'x'"):
-        env.set_attr("x", 1)
+    refuses("share 'x'", env.set_attr, "x", 1, error=NotImplementedError)
 
 
 def drones(**options):

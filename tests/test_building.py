@@ -3,6 +3,7 @@
 import pytest
 import torch
 from omegaconf import OmegaConf
+from refusals import cases
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
@@ -46,10 +47,7 @@ def test_a_target_critic_follows_as_with_torchrl_s_soft_update(kind, critic):
     torch.testing.assert_close(own, torchrl)
 
 
-@pytest.mark.parametrize(
-    ("schedule", "halfway", "last"),
-    [("constant", 1e-2, 1e-2), ("linear", 5.05e-3, 1e-4), ("exponential", 1e-3, 1e-4), ("cosine", 5.05e-3, 1e-4)],
-)
+@cases(("constant", 1e-2, 1e-2), ("linear", 5.05e-3, 1e-4), ("exponential", 1e-3, 1e-4), ("cosine", 5.05e-3, 1e-4))
 def test_a_schedule_goes_from_the_first_to_the_last_learning_rate(schedule, halfway, last):
     adam = optimizer(100, schedule=schedule)
     for iteration, rate in ((0, 1e-2), (49.5, halfway), (99, last), (200, last)):
@@ -92,16 +90,14 @@ def test_minibatches_are_random_steps_of_the_rollout():
     cfg = OmegaConf.create({"updates": 3, "batch_size": 50})
     batches = [batch["step"] for batch in minibatches(numbered(3, 4), cfg)]
     assert [batch.shape for batch in batches] == [(50,)] * 3
-    assert set(torch.cat(batches).tolist()) == set(range(12))
-    assert not torch.equal(batches[0], batches[1])
+    assert set(torch.cat(batches).tolist()) == set(range(12)) and not torch.equal(batches[0], batches[1])
 
 
 def test_shuffled_batches_hold_every_step_once_in_each_epoch():
     batches = [batch["step"] for batch in shuffled(numbered(3, 4), 5, 2)]
     assert [len(batch) for batch in batches] == [5, 5, 2, 5, 5, 2]
     epochs = [torch.cat(batches[:3]).tolist(), torch.cat(batches[3:]).tolist()]
-    assert epochs[0] != epochs[1]
-    assert [sorted(epoch) for epoch in epochs] == [list(range(12))] * 2
+    assert epochs[0] != epochs[1] and [sorted(epoch) for epoch in epochs] == [list(range(12))] * 2
 
 
 def test_the_horizons_of_a_policy_with_a_memory_stay_whole():

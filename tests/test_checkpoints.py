@@ -9,6 +9,7 @@ import pytest
 import torch
 import yaml
 from omegaconf import OmegaConf
+from refusals import refuses
 from small_runs import SMALL, rows, stop_at_save
 
 from torchrl_quad.training.building import average_policy
@@ -27,8 +28,7 @@ def test_no_flipped_bit_of_a_checkpoint_goes_unnoticed(tmp_path):
         damaged = bytearray(whole)
         damaged[at] ^= 1 << draw.randrange(8)
         path.write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"checkpoint\.pt (is damaged|is cut off)"):
-            read_checkpoint(path)
+        refuses(r"checkpoint\.pt (is damaged|is cut off)", read_checkpoint, path)
 
 
 def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(train, refused, launch, tmp_path):
@@ -51,8 +51,7 @@ def test_a_file_that_is_no_checkpoint_of_this_version_is_named_with_the_reason(r
     path = tmp_path / "bad.pt"
 
     def fails(match):
-        with pytest.raises((ValueError, FileNotFoundError), match=match):
-            read_checkpoint(path)
+        refuses(match, read_checkpoint, path, error=(ValueError, FileNotFoundError))
 
     fails("No checkpoint at .*bad.pt. Train one first")
     torch.save({"weights": torch.zeros(1)}, path)

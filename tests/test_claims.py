@@ -56,8 +56,7 @@ def test_an_interval_draws_starts_too_and_what_they_shift_alike_is_no_difference
     def from_starts(values, method, **options):
         return judged(values, Starts(tmp_path).shift("landing", method, "return", **options))
 
-    assert interval(seeds) == (10.0, 10.0)
-    assert interval(from_starts(seeds, "abpt")) == pytest.approx(tuple(10.0 + wide))
+    assert interval(seeds) == (10.0, 10.0) and interval(from_starts(seeds, "abpt")) == pytest.approx(tuple(10.0 + wide))
     assert interval(from_starts(seeds, "abpt", starts=64)) == pytest.approx(tuple(10.0 + 2.0 * wide))
     not_flown = interval(from_starts(seeds, "ppo"))  # as any of those that were
     assert not_flown == pytest.approx(tuple(10.0 + wide))
@@ -81,8 +80,7 @@ def test_a_part_is_decided_when_its_interval_is_on_one_side_and_one_of_many_by_a
     for draws, verdict in both.items():
         assert part(*draws, low=-0.1, high=0.1).verdict() == verdict
     alone = part(0.0, 1.0, low=0.98)  # the middle 95 % end at 0.975
-    assert alone.interval() == pytest.approx((0.025, 0.975))
-    assert alone.interval(10) == pytest.approx((0.0025, 0.9975))
+    assert alone.interval() == pytest.approx((0.025, 0.975)) and alone.interval(10) == pytest.approx((0.0025, 0.9975))
     assert alone.verdict() == "refuted" and alone.verdict(10) == "undecided"
 
 

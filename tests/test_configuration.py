@@ -3,6 +3,7 @@
 import pytest
 import yaml
 from omegaconf import OmegaConf
+from refusals import cases, refuses
 
 from torchrl_quad import load_drone
 from torchrl_quad.envs import TASKS
@@ -67,8 +68,7 @@ def test_a_setting_out_of_its_range_is_refused_with_what_to_write_instead(words,
     first, *rest = words.split()
     recipe, overrides = (first, rest) if first in (*RECIPES, "evaluate") else ("abpt", [first, *rest])
     cfg = composed(recipe, *overrides)
-    with pytest.raises(ValueError, match=message):
-        check(cfg)
+    refuses(message, check, cfg)
 
 
 IGNORED = {  # what a person wrote, which nothing would read
@@ -93,8 +93,7 @@ IGNORED = {  # what a person wrote, which nothing would read
 @pytest.mark.parametrize("words", IGNORED)
 def test_what_a_person_writes_takes_effect_or_is_refused(words):
     recipe, *overrides = words.split()
-    with pytest.raises(ValueError, match=IGNORED[words]):
-        check(composed(recipe, *overrides), overrides)
+    refuses(IGNORED[words], check, composed(recipe, *overrides), overrides)
     check(composed(recipe, *overrides[:-1]), overrides[:-1])
 
 
@@ -169,22 +168,18 @@ def test_under_torchrun_no_gpu_is_named_for_all_processes(monkeypatch):
 ALIASES = "a0: &a0 [1, 1]\n" + "".join(f"a{i + 1}: &a{i + 1} [*a{i}, *a{i}]\n" for i in range(40))
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (ALIASES.encode(), "line 2 uses the alias \\*a0. Write the values out instead"),
-        (b"mass: " + b"[" * 5000 + b"]" * 5000, "nests more than 20 lists or mappings"),
-        ("mass: 1  # Größe".encode("latin-1"), "not in UTF-8 .byte 13 is 0xf6.. Save it as UTF-8"),
-        (b"#" * 1_000_001, "has more than 1,000,000 bytes"),
-        (b"mass: 1\nmass: 2", "line 2 names 'mass' for the second time"),
-        (b"mass: !!int 1:30", "line 1 uses the tag"),
-        (b"1: 2", "line 1 names a value by 1, and a name must be a word"),
-        (b"mass: [1", "not a YAML file"),
-        (b"mass: " + b"9" * 5000, "line 1 has a number of 5000 digits"),
-    ],
+@cases(
+    (ALIASES.encode(), "line 2 uses the alias \\*a0. Write the values out instead"),
+    (b"mass: " + b"[" * 5000 + b"]" * 5000, "nests more than 20 lists or mappings"),
+    ("mass: 1  # Größe".encode("latin-1"), "not in UTF-8 .byte 13 is 0xf6.. Save it as UTF-8"),
+    (b"#" * 1_000_001, "has more than 1,000,000 bytes"),
+    (b"mass: 1\nmass: 2", "line 2 names 'mass' for the second time"),
+    (b"mass: !!int 1:30", "line 1 uses the tag"),
+    (b"1: 2", "line 1 names a value by 1, and a name must be a word"),
+    (b"mass: [1", "not a YAML file"),
+    (b"mass: " + b"9" * 5000, "line 1 has a number of 5000 digits"),
     ids=["aliases", "deep", "latin-1", "large", "twice", "tag", "no name", "cut off", "long number"],
 )
 def test_a_yaml_file_that_no_setting_needs_is_refused_by_name(content, message, tmp_path):
     (tmp_path / "mine.yaml").write_bytes(content)
-    with pytest.raises(ValueError, match=f"mine.yaml: {message}"):
-        load_drone(tmp_path / "mine.yaml")
+    refuses(f"mine.yaml: {message}", load_drone, tmp_path / "mine.yaml")

@@ -12,6 +12,7 @@ import pytest
 import torch
 from deploying import TASKS, build, by_hand, compiled, resting, run_c
 from flying import fly
+from refusals import refuses
 from torch import nn
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -280,8 +281,7 @@ def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_pa
             rename(source, target)
 
         patch.setattr("os.replace", replace)
-        with pytest.raises(OSError, match="no"):
-            export_policy(actor, env, folder)
+        refuses("no", export_policy, actor, env, folder, error=OSError)
     (aside,) = tmp_path.glob("*.old")
     assert (aside / "contract.json").read_bytes() == old
     export_policy(actor, env, folder)

@@ -8,6 +8,7 @@ import onnx
 import pytest
 from deploying import resting
 from onnx import TensorProto, helper
+from refusals import refuses
 
 from torchrl_quad.deploy import BrokenPolicy, TamperedBundle, UnknownContract, WrongActions, contract, load_bundle
 from torchrl_quad.dynamics.parameters import LIMITS
@@ -37,15 +38,13 @@ def test_a_file_that_was_changed_or_is_missing_is_named(copied, name):
         load_bundle(folder)
     (folder / name).unlink()
     why = f"{name} cannot be read|No bundle at .* has no contract"
-    with pytest.raises((TamperedBundle, FileNotFoundError), match=why):
-        load_bundle(folder)
+    refuses(why, load_bundle, folder, error=(TamperedBundle, FileNotFoundError))
 
 
 @pytest.mark.parametrize("text", ["[]", "{", "{}", "", "[" * 100_000, '{"version": NaN, "digest": ""}'])
 def test_a_file_that_is_no_contract_is_refused(tmp_path, text):
     (tmp_path / "contract.json").write_text(text)
-    with pytest.raises(TamperedBundle, match="contract.json is no contract of a policy, or is damaged"):
-        load_bundle(tmp_path)
+    refuses("contract.json is no contract of a policy, or is damaged", load_bundle, tmp_path, error=TamperedBundle)
 
 
 CHANGES = [  # of a contract whose checksums fit
@@ -73,8 +72,7 @@ def test_a_contract_that_this_package_does_not_fly_is_refused(copied, path, valu
         part = part[key]
     part[last] = value
     fit(folder, about)
-    with pytest.raises(UnknownContract, match=f"^{folder}.*{message}"):
-        load_bundle(folder)
+    refuses(f"^{folder}.*{message}", load_bundle, folder, error=UnknownContract)
 
 
 def test_the_ranges_of_the_schema_lie_within_those_of_the_simulated_drones():
@@ -90,8 +88,7 @@ def test_the_ranges_of_the_schema_lie_within_those_of_the_simulated_drones():
 def test_another_runtime_that_gives_different_results_is_found(copied):
     bundle = load_bundle(copied[0])
     bundle._vectors["action"] += np.float32(1e-3)
-    with pytest.raises(WrongActions, match="policy/policy.onnx: the policy differs by 0.001"):
-        bundle.check()
+    refuses("policy/policy.onnx: the policy differs by 0.001", bundle.check, error=WrongActions)
 
 
 def test_a_graph_that_onnxruntime_cannot_read_or_that_leaves_its_limits_or_its_shape_is_refused(copied):

@@ -13,23 +13,15 @@ import numpy as np
 import pytest
 import torch
 from deploying import FLOWN, build, measured, resting
+from refusals import cases
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import PendulumEnv, RewardSum, TransformedEnv
 
 import torchrl_quad
 from torchrl_quad import HoveringEnv, ObservationNormalizer, load_drone, make_actor, make_env
-from torchrl_quad.deploy import (
-    BrokenPolicy,
-    MissingQuantity,
-    NegativeDepth,
-    NotFinite,
-    NotUnitQuaternion,
-    StaleState,
-    contract,
-    export_policy,
-    load_bundle,
-)
+from torchrl_quad.deploy import BrokenPolicy, StaleState, contract, export_policy, load_bundle
+from torchrl_quad.deploy.contract import MissingQuantity, NegativeDepth, NotFinite, NotUnitQuaternion
 from torchrl_quad.envs import TASKS
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.training.drawing import environment_beside
@@ -72,11 +64,8 @@ FAULTS_OF_IMAGES = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("task", "kind", "message", "changes"),
-    [*(("tracking", *x) for x in FAULTS), *(("forest", *x) for x in FAULTS_OF_IMAGES)],
-)
-def test_each_fault_has_a_name_and_changes_nothing_or_hovers_and_is_counted(export_once, task, kind, message, changes):
+@cases(*(("tracking", *x) for x in FAULTS), *(("forest", *x) for x in FAULTS_OF_IMAGES))
+def test_each_fault_has_a_name_and_changes_nothing_or_hovers_and_is_counted(task, kind, message, changes, export_once):
     folder = export_once(task)[2]
     raising, hovering, untouched = load_bundle(folder), load_bundle(folder, on_fault="hover"), load_bundle(folder)
     good, state = measured(raising), changes
@@ -268,21 +257,18 @@ def test_a_step_that_failed_and_is_repeated_equals_one_that_never_failed(export_
         assert failing.faults == {kind.__name__: count} and str(failing.last_fault).startswith(f"{failing.folder}: ")
 
 
-@pytest.mark.parametrize(
-    ("task", "progress", "wanted"),
-    [
-        ("hovering", {"target": "here"}, r"numbers of shape \(3,\), from -1e\+06 to 1e\+06; got 'here'"),
-        ("hovering", {"target": [1, 2]}, r"numbers of shape \(3,\)"),
-        ("hovering", {"target": [True, False, True]}, "numbers"),
-        ("tracking", {"phase": "late"}, r"numbers of shape \(1,\), from 0 to 6.28319; got 'late'"),
-        ("racing", {"gate": [0, 1]}, r"whole numbers of shape \(1,\), from 0 to 3; got \[0, 1\]"),
-        ("racing", {"gate": np.arange(2)}, "whole numbers"),
-        *(("racing", {"gate": gate}, "whole numbers") for gate in (4, -1, True, 0.5)),
-        ("forest", {"target": [1, 2, 3], "speed": np.nan}, r"numbers of shape \(1,\), from 0.1 to 30; got nan"),
-        *(("forest", {"speed": speed}, "numbers") for speed in (0, -1, math.inf, "fast", True)),
-    ],
+@cases(
+    ("hovering", {"target": "here"}, r"numbers of shape \(3,\), from -1e\+06 to 1e\+06; got 'here'"),
+    ("hovering", {"target": [1, 2]}, r"numbers of shape \(3,\)"),
+    ("hovering", {"target": [True, False, True]}, "numbers"),
+    ("tracking", {"phase": "late"}, r"numbers of shape \(1,\), from 0 to 6.28319; got 'late'"),
+    ("racing", {"gate": [0, 1]}, r"whole numbers of shape \(1,\), from 0 to 3; got \[0, 1\]"),
+    ("racing", {"gate": np.arange(2)}, "whole numbers"),
+    *(("racing", {"gate": gate}, "whole numbers") for gate in (4, -1, True, 0.5)),
+    ("forest", {"target": [1, 2, 3], "speed": np.nan}, r"numbers of shape \(1,\), from 0.1 to 30; got nan"),
+    *(("forest", {"speed": speed}, "numbers") for speed in (0, -1, math.inf, "fast", True)),
 )
-def test_a_start_that_makes_no_sense_is_refused_and_changes_nothing(export_once, task, progress, wanted):
+def test_a_start_that_makes_no_sense_is_refused_and_changes_nothing(task, progress, wanted, export_once):
     bundle = load_bundle(export_once(task)[2])
     before = bundle.progress
     with pytest.raises(UserValueError, match=f"^{bundle.folder}: {list(progress)[-1]} must be {wanted}"):

@@ -9,6 +9,7 @@ import pytest
 import torch
 from deploying import pilot, resting
 from own_task import CornerEnv, RelayEnv
+from refusals import refuses
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_quad import RacingEnv, TrackingEnv, differentiable_rollout, make_actor, make_env
@@ -155,8 +156,7 @@ WRONGS = {
 @pytest.mark.parametrize("message", WRONGS)
 def test_a_rule_that_cannot_be_exported_is_refused_by_its_name_with_what_to_write(message):
     env = WRONGS[message](4)
-    with pytest.raises(UserValueError, match=f"^export_policy: Wrong: its {message}"):
-        trace(env, sample_state(env, 3))
+    refuses(f"^export_policy: Wrong: its {message}", trace, env, sample_state(env, 3), error=UserValueError)
 
 
 def test_a_task_that_cannot_be_judged_without_its_reward_still_flies(tmp_path):
@@ -171,5 +171,4 @@ def test_a_task_that_cannot_be_judged_without_its_reward_still_flies(tmp_path):
     assert bundle.contract["task"]["unjudged"] == why and bundle.graphs.keys() == {"policy", "observe"}
     with pytest.raises(UserValueError, match=f"cannot fly this bundle of the task .*: {why}. Fly it in the package's"):
         fly(bundle, "torchrl_quad")
-    with pytest.raises(UserValueError, match=f"cannot be judged here: {why}"):
-        Judge(bundle, bundle.starts())
+    refuses(f"cannot be judged here: {why}", Judge, bundle, bundle.starts(), error=UserValueError)

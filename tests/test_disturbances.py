@@ -3,6 +3,7 @@
 import pytest
 import torch
 from flying import fly, hold
+from refusals import cases, refuses
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
@@ -75,8 +76,7 @@ def test_drones_are_drawn_at_reset_within_their_bounds_and_stay_for_an_episode()
     assert (drone["inertia"] / nominal.inertia).std(0).min() > 0.05
     assert abs(drone["linear_drag"].std().item() - 0.001) < 1e-4
     flight = env.rollout(5, break_when_any_done=False)["state", "drone", "mass"]
-    assert (flight[:, 0] == flight[:, 2]).all()
-    assert (flight[:, 2] != flight[:, 3]).all()
+    assert (flight[:, 0] == flight[:, 2]).all() and (flight[:, 2] != flight[:, 3]).all()
 
 
 def test_a_drone_that_is_heavier_or_weaker_than_its_controller_believes_flies_so(tmp_path):
@@ -96,26 +96,22 @@ def test_a_drone_that_is_heavier_or_weaker_than_its_controller_believes_flies_so
     assert flight["next", "state", "rotor_speed"].max().item() == pytest.approx(1800.0, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("randomize", "message"),
-    [
-        ({"weight": {"scale": [0.9, 1.1]}}, "randomize: unknown field 'weight'. Choose from: mass, inertia"),
-        ({"rate_gain": {"scale": [0.9, 1.1]}}, "'rate_gain' belongs to the flight controller, which keeps the nominal"),
-        ({"mass": {"gamma": [1, 2]}}, "mass needs one distribution of: uniform: low and high; scale: .*; normal: "),
-        ({"mass": 0.5}, "mass needs one distribution of"),
-        ({"mass": {"uniform": [-0.1, 1.0]}}, "drones that may be drawn are not all possible: .*'mass' must be between"),
-        ({"mass": {"normal": [0.5, -0.1]}}, "mass needs two numbers, mean and standard deviation"),
-        ({"rotor_spin": {"scale": [-1, 1]}}, "unknown field 'rotor_spin'"),
-        (
-            {"rotor_speed_min": {"uniform": [100.0, 3000.0]}, "rotor_speed_max": {"uniform": [2500.0, 4000.0]}},
-            "rotor_speed_min must be below rotor_speed_max",
-        ),
-        ("none", "Unknown randomize 'none'. Give the path of a .yaml file"),
-    ],
+@cases(
+    ({"weight": {"scale": [0.9, 1.1]}}, "randomize: unknown field 'weight'. Choose from: mass, inertia"),
+    ({"rate_gain": {"scale": [0.9, 1.1]}}, "'rate_gain' belongs to the flight controller, which keeps the nominal"),
+    ({"mass": {"gamma": [1, 2]}}, "mass needs one distribution of: uniform: low and high; scale: .*; normal: "),
+    ({"mass": 0.5}, "mass needs one distribution of"),
+    ({"mass": {"uniform": [-0.1, 1.0]}}, "drones that may be drawn are not all possible: .*'mass' must be between"),
+    ({"mass": {"normal": [0.5, -0.1]}}, "mass needs two numbers, mean and standard deviation"),
+    ({"rotor_spin": {"scale": [-1, 1]}}, "unknown field 'rotor_spin'"),
+    (
+        {"rotor_speed_min": {"uniform": [100.0, 3000.0]}, "rotor_speed_max": {"uniform": [2500.0, 4000.0]}},
+        "rotor_speed_min must be below rotor_speed_max",
+    ),
+    ("none", "Unknown randomize 'none'. Give the path of a .yaml file"),
 )
 def test_impossible_drones_are_refused(randomize, message):
-    with pytest.raises(ValueError, match=message):
-        HoveringEnv(num_envs=1, randomize=randomize)
+    refuses(message, HoveringEnv, num_envs=1, randomize=randomize)
 
 
 def test_in_the_wind_a_drone_drifts_until_it_moves_with_the_air():
@@ -179,22 +175,18 @@ def test_random_starts_tilt_turn_and_push_within_their_bounds():
     assert state["quaternion"].norm(dim=-1).tolist() == pytest.approx([1.0] * 4000, abs=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"wind": {"speed": 3}}, "wind: unknown key 'speed'. Allowed: mean, spread, gust, gust_time"),
-        ({"wind": {"mean": [1.0]}}, "wind: mean must have at least 3 items, not 1, got .* Along x, y and z"),
-        ({"wind": {"spread": [-1.0, 0.0, 0.0]}}, r"wind: spread\[0\] must be at least 0, got -1"),
-        ({"wind": {"mean": [-60, 0, 0], "spread": [25, 0, 0], "gust": 4.0}}, "add up to 105 m/s; .* to 100 m/s"),
-        ({"wind": 3.0}, "wind must be a mapping with any of mean"),
-        ({"observation_noise": {"delay": 1}}, "observation_noise: unknown key 'delay'"),
-        ({"observation_delay": -1}, "observation_delay must be at least 0, got -1. Control steps by which"),
-        ({"random_start": {"tilt": float("nan")}}, "random_start: tilt must be a finite number, got nan"),
-    ],
+@cases(
+    ({"wind": {"speed": 3}}, "wind: unknown key 'speed'. Allowed: mean, spread, gust, gust_time"),
+    ({"wind": {"mean": [1.0]}}, "wind: mean must have at least 3 items, not 1, got .* Along x, y and z"),
+    ({"wind": {"spread": [-1.0, 0.0, 0.0]}}, r"wind: spread\[0\] must be at least 0, got -1"),
+    ({"wind": {"mean": [-60, 0, 0], "spread": [25, 0, 0], "gust": 4.0}}, "add up to 105 m/s; .* to 100 m/s"),
+    ({"wind": 3.0}, "wind must be a mapping with any of mean"),
+    ({"observation_noise": {"delay": 1}}, "observation_noise: unknown key 'delay'"),
+    ({"observation_delay": -1}, "observation_delay must be at least 0, got -1. Control steps by which"),
+    ({"random_start": {"tilt": float("nan")}}, "random_start: tilt must be a finite number, got nan"),
 )
 def test_bad_options_say_what_is_allowed(kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        HoveringEnv(num_envs=1, **kwargs)
+    refuses(message, HoveringEnv, num_envs=1, **kwargs)
 
 
 class GyroBias(Disturbance):
@@ -251,19 +243,15 @@ def test_a_disturbance_may_be_given_by_its_class_or_its_path_alone_or_in_a_list(
         HoveringEnv(num_envs=1, disturbances={"_target_": f"{__name__}.GyroBias", "size": 3})
 
 
-@pytest.mark.parametrize(
-    ("wrong", "error", "message"),
-    [
-        (3.0, TypeError, "disturbances must be a list of Disturbance, got float"),
-        ([3.0], TypeError, "disturbances=3.0: it must be a subclass of Disturbance, its path, or an instance"),
-        (HoveringEnv, TypeError, "disturbances=HoveringEnv: it must be a subclass of Disturbance"),
-        ("disturbed.Gyro", ValueError, "disturbances 'disturbed.Gyro': Python finds no module 'disturbed'"),
-        (own()[1], ValueError, r"Entry \('drone', 'thrust_map'\) changes no parameter of the drone"),
-    ],
+@cases(
+    (3.0, TypeError, "disturbances must be a list of Disturbance, got float"),
+    ([3.0], TypeError, "disturbances=3.0: it must be a subclass of Disturbance, its path, or an instance"),
+    (HoveringEnv, TypeError, "disturbances=HoveringEnv: it must be a subclass of Disturbance"),
+    ("disturbed.Gyro", ValueError, "disturbances 'disturbed.Gyro': Python finds no module 'disturbed'"),
+    (own()[1], ValueError, r"Entry \('drone', 'thrust_map'\) changes no parameter of the drone"),
 )
 def test_what_is_not_a_disturbance_is_refused(wrong, error, message):
-    with pytest.raises(error, match=message):
-        HoveringEnv(num_envs=1, disturbances=wrong, dynamics="point_mass")
+    refuses(message, HoveringEnv, error=error, num_envs=1, disturbances=wrong, dynamics="point_mass")
 
 
 def test_a_weight_may_be_changed_and_an_unknown_one_is_named():

@@ -6,6 +6,7 @@ import pickle
 import pytest
 import torch
 from flying import fly, hold, start
+from refusals import refuses
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
 
@@ -34,8 +35,7 @@ def test_a_drone_that_hovers_stays_and_succeeds(env64):
     td = start(env64, position=env64.tensor(env64.target))
     flight = fly(env64, td, hold(env64, 100))
     torch.testing.assert_close(flight["next", "state", "position"][:, -1], td["state", "target"])
-    assert flight["next", "success"].all()
-    assert not flight["next", "done"].any()
+    assert flight["next", "success"].all() and not flight["next", "done"].any()
     torch.testing.assert_close(flight["next", "reward"], torch.full((4, 100, 1), 0.1, dtype=torch.float64))
 
 
@@ -65,8 +65,7 @@ def test_the_reward_is_the_paper_s_formula_and_the_observation_ten_times_the_pap
 def test_starts_lie_in_their_box_level_and_at_rest():
     td = HoveringEnv(num_envs=2000, seed=3).reset()
     offset = (td["state", "position"] - torch.tensor([1.0, 0.0, 1.5])).abs().amax(0)
-    assert (offset <= torch.tensor([1.0, 1.0, 0.5])).all()
-    assert (offset > torch.tensor([0.98, 0.98, 0.49])).all()
+    assert (offset <= torch.tensor([1.0, 1.0, 0.5])).all() and (offset > torch.tensor([0.98, 0.98, 0.49])).all()
     assert (td["state", "velocity"] == 0).all()
     assert (td["state", "quaternion"] == torch.tensor([1.0, 0.0, 0.0, 0.0])).all()
 
@@ -93,8 +92,7 @@ def test_an_action_takes_effect_after_the_delay(delay):
     push = env.hover_action + torch.tensor([0.5, 0.0, 0.0, 0.0], dtype=torch.float64)
     flight = fly(env, env.reset(), [push.expand(1, 4)] * (delay + 2))
     speed = flight["next", "state", "rotor_speed"][0, :, 0] - env.dynamics.controller.hover_speed[0]
-    assert (speed[:delay].abs() < 1e-9).all()
-    assert (speed[delay:] > 10).all()
+    assert (speed[:delay].abs() < 1e-9).all() and (speed[delay:] > 10).all()
 
 
 def test_a_partial_reset_leaves_the_others_alone(env):
@@ -141,8 +139,7 @@ def test_every_field_of_the_drone_may_differ_between_environments(num_envs):
     env = HoveringEnv(num_envs=num_envs, drone=batched, action_delay=2)
     flight = fly(env, env.reset(), hold(env, 30))
     torch.testing.assert_close(flight["next", "state", "velocity"], torch.zeros(num_envs, 30, 3), atol=1e-4, rtol=0)
-    with pytest.raises(ValueError, match=f"is for {num_envs} environments, and num_envs=5"):
-        HoveringEnv(num_envs=5, drone=batched)
+    refuses(f"is for {num_envs} environments, and num_envs=5", HoveringEnv, num_envs=5, drone=batched)
 
 
 def test_the_controller_keeps_its_drone_when_the_true_one_is_fitted_in_place():
@@ -199,8 +196,7 @@ def test_episode_metrics_judge_the_first_episode_by_its_last_second():
     hover = TensorDictModule(lambda _: env.hover_action.expand(3, 4), in_keys=["observation"], out_keys=["action"])
     flight, _ = differentiable_rollout(env, hover, env.reset(td, set_state=True), 60)
     metrics = env.episode_metrics(flight)
-    assert metrics["solved"].tolist() == [1.0, 0.0, 0.0]
-    assert metrics["crash"].tolist() == [0.0, 0.0, 1.0]
+    assert metrics["solved"].tolist() == [1.0, 0.0, 0.0] and metrics["crash"].tolist() == [0.0, 0.0, 1.0]
     assert metrics["position_error"].tolist() == pytest.approx([0.0, 0.2, 4.6], abs=0.1)
     assert metrics["return"].tolist() == pytest.approx([6.0, 60 * (0.1 - 0.2 * 0.1 / 9), 0.04], abs=0.01)
 
@@ -228,15 +224,13 @@ def test_an_environment_that_moves_keeps_its_drone_and_restarts_from_its_seed():
     for env in (moved, fresh):
         env.params = env.params.replace(mass=0.5)
     fly_on(moved, 3)
-    assert moved.to("cpu:0") is moved
-    assert moved.device == moved.randomness.device == torch.device("cpu:0")
+    assert moved.to("cpu:0") is moved and moved.device == moved.randomness.device == torch.device("cpu:0")
     assert moved.params.mass.item() == 0.5 != moved.nominal.mass.item() == fresh.nominal.mass.item()
     for _ in range(2):  # the second episode draws on
         assert_equal(fly_on(moved, 5), fly_on(fresh, 5))
     check_env_specs(moved)
     nominal = HoveringEnv(num_envs=2, max_episode_steps=7).to("cpu:0")
-    assert nominal.params is nominal.nominal
-    assert nominal.rollout(9)["next", "state", "step"].flatten().max() == 7
+    assert nominal.params is nominal.nominal and nominal.rollout(9)["next", "state", "step"].flatten().max() == 7
 
 
 def test_an_environment_stays_compiled_where_it_moves_until_it_is_made_eager():

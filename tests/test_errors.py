@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from refusals import cases, refuses
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -33,66 +34,54 @@ def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them():
         ("racing", {"gate_bonsu": "log"}, r"RacingEnv got an unexpected .* 'gate_bonsu'. Did you mean 'gate_bonus'\?"),
         ("tracking", {"xyz": 1}, r"argument 'xyz'. Choose from: action_delay, camera, .*curve.* weights, wind.$"),
     ):
-        with pytest.raises(TypeError, match=message):
-            make_env(task, **kwargs)
+        refuses(message, make_env, task, error=TypeError, **kwargs)
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"num_envs": 2.5}, "num_envs must be a whole number, got 2.5"),
-        ({"max_episode_steps": -3}, "max_episode_steps must be at least 1, got -3"),
-        ({"dt": "fast"}, "dt must be a number, got 'fast'. The physics step, 1e-6 to 0.1 s"),
-        ({"control_dt": 0.002}, "control_dt must be a whole multiple of dt, .* 0.002 and 0.005. Try control_dt=0.005."),
-        ({"seed": "lucky"}, "seed must be a whole number, got 'lucky'. Of the environment's own random generator"),
-        ({"weights": ["velocity"]}, "weights must be a mapping from terms of the reward to numbers, got .'velocity'"),
-        ({"weights": {"velocity": nan}}, "weights: velocity must be a finite number, got nan"),
-        ({"weights": {"velocity": torch.ones(3)}}, "weights: velocity must be a number, got tensor"),
-        ({"event_discount": 0}, "event_discount must be greater than 0, got 0. The discount per control step"),
-        ({"event_discount": "gamma"}, "got 'gamma'. The discount .*; None for no gradient in it."),
-        ({"drone": visfly.replace(mass=460.0)}, r"to hover, its rotors would have to turn at .* Check mass \[kg\]"),
-        ({"drone": visfly.replace(max_thrust_to_weight=0.8)}, "max_thrust_to_weight .* must be above 1 to hover; got"),
-        (
-            {"drone": visfly.replace(rotor_positions=[[0.1 * i, 0.03 * i] for i in (-3, -1, 1, 3)])},
-            "the four rotors cannot make thrust and torque about each axis on their own",
-        ),
-        ({"drone": None}, "drone must be the name of a preset, .* or QuadrotorParams, got None"),
-        ({"seed": -1}, "seed must be at least 0, got -1"),
-        ({"dtype": torch.int32}, "dtype must be torch.float32 or torch.float64"),
-        ({"dynamics": "plane"}, r"dynamics must be one of quadrotor, point_mass(, \w+)*, got 'plane'"),
-        ({"action_delay": 0, "observe_last_action": True}, "with action_delay=0 there are none"),
-    ],
+@cases(
+    ({"num_envs": 2.5}, "num_envs must be a whole number, got 2.5"),
+    ({"max_episode_steps": -3}, "max_episode_steps must be at least 1, got -3"),
+    ({"dt": "fast"}, "dt must be a number, got 'fast'. The physics step, 1e-6 to 0.1 s"),
+    ({"control_dt": 0.002}, "control_dt must be a whole multiple of dt, .* 0.002 and 0.005. Try control_dt=0.005."),
+    ({"seed": "lucky"}, "seed must be a whole number, got 'lucky'. Of the environment's own random generator"),
+    ({"weights": ["velocity"]}, "weights must be a mapping from terms of the reward to numbers, got .'velocity'"),
+    ({"weights": {"velocity": nan}}, "weights: velocity must be a finite number, got nan"),
+    ({"weights": {"velocity": torch.ones(3)}}, "weights: velocity must be a number, got tensor"),
+    ({"event_discount": 0}, "event_discount must be greater than 0, got 0. The discount per control step"),
+    ({"event_discount": "gamma"}, "got 'gamma'. The discount .*; None for no gradient in it."),
+    ({"drone": visfly.replace(mass=460.0)}, r"to hover, its rotors would have to turn at .* Check mass \[kg\]"),
+    ({"drone": visfly.replace(max_thrust_to_weight=0.8)}, "max_thrust_to_weight .* must be above 1 to hover; got"),
+    (
+        {"drone": visfly.replace(rotor_positions=[[0.1 * i, 0.03 * i] for i in (-3, -1, 1, 3)])},
+        "the four rotors cannot make thrust and torque about each axis on their own",
+    ),
+    ({"drone": None}, "drone must be the name of a preset, .* or QuadrotorParams, got None"),
+    ({"seed": -1}, "seed must be at least 0, got -1"),
+    ({"dtype": torch.int32}, "dtype must be torch.float32 or torch.float64"),
+    ({"dynamics": "plane"}, r"dynamics must be one of quadrotor, point_mass(, \w+)*, got 'plane'"),
+    ({"action_delay": 0, "observe_last_action": True}, "with action_delay=0 there are none"),
 )
 def test_a_bad_value_is_refused_by_name(kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        HoveringEnv(**kwargs)
+    refuses(message, HoveringEnv, **kwargs)
 
 
-@pytest.mark.parametrize(
-    ("method", "wrong", "message"),
-    [
-        ("observe", lambda _, s: s["position"][:, 0], r"observe\(state\) must be a tensor \(4, k\), torch.float32"),
-        ("reward_terms", lambda _, s: {"near": -s["position"]}, r"reward_terms\(state\)\['near'\] must .* keepdim"),
-        ("reward_terms", lambda _, s: {"near": -s["position"][:, 0]}, r"\['near'\] must .*; got \(4,\)"),
-        ("reward_terms", lambda _, s: -s["position"], r"reward_terms\(state\) must be a mapping .*; got Tensor"),
-        ("advance", lambda _, p, s: None, r"advance\(previous, state\) must be a mapping .*; got NoneType"),
-        ("metrics", lambda _, s: {"far": s["position"]}, r"metrics\(state\)\['far'\] must be a tensor \(4, 1\)"),
-        ("is_crash", lambda _, s: s["position"][:, :1], r"is_crash\(state\) must be a tensor \(4, 1\), torch.bool"),
-        ("advance", lambda _, p, s: {"position": s["position"]}, "advance must return the whole state, and 'target'"),
-        ("advance", lambda _, p, s: {**s, "target": s["target"].double()}, "float32.; got .* torch.float64"),
-        ("events", lambda _, p, s: {"near": 0.5}, r"\['near'\] must be an Event; got float"),
-        ("events", lambda _, p, s: {"near": near(s, happened=s["step"])}, r"\.happened must be .* torch.bool; got"),
-        ("events", lambda _, p, s: {"near": near(s, time=s["position"])}, r"\.time must be a tensor \(4, 1\), .* got"),
-        ("events", lambda _, p, s: {"near": near(s, amount=None)}, r"\.amount must be a tensor \(4, 1\), .* NoneType"),
-        ("events", lambda _, p, s: {"near": near(s, term="gate")}, "term must be one of survival, .*; got 'gate'"),
-        ("initial_state", adding(legs=torch.zeros(4)), r"'legs' must be a tensor \(4, ...\) of at least two .*\(4,\)"),
-        ("initial_state", adding(step=torch.zeros(4, 1)), "entry 'step' is the environment's own; give yours another"),
-        (
-            "initial_state",
-            adding(legs=torch.zeros(4, 1).int()),
-            r"'legs' must be .* int64 or bool; got .* torch.int32\)",
-        ),
-    ],
+@cases(
+    ("observe", lambda _, s: s["position"][:, 0], r"observe\(state\) must be a tensor \(4, k\), torch.float32"),
+    ("reward_terms", lambda _, s: {"near": -s["position"]}, r"reward_terms\(state\)\['near'\] must .* keepdim"),
+    ("reward_terms", lambda _, s: {"near": -s["position"][:, 0]}, r"\['near'\] must .*; got \(4,\)"),
+    ("reward_terms", lambda _, s: -s["position"], r"reward_terms\(state\) must be a mapping .*; got Tensor"),
+    ("advance", lambda _, p, s: None, r"advance\(previous, state\) must be a mapping .*; got NoneType"),
+    ("metrics", lambda _, s: {"far": s["position"]}, r"metrics\(state\)\['far'\] must be a tensor \(4, 1\)"),
+    ("is_crash", lambda _, s: s["position"][:, :1], r"is_crash\(state\) must be a tensor \(4, 1\), torch.bool"),
+    ("advance", lambda _, p, s: {"position": s["position"]}, "advance must return the whole state, and 'target'"),
+    ("advance", lambda _, p, s: {**s, "target": s["target"].double()}, "float32.; got .* torch.float64"),
+    ("events", lambda _, p, s: {"near": 0.5}, r"\['near'\] must be an Event; got float"),
+    ("events", lambda _, p, s: {"near": near(s, happened=s["step"])}, r"\.happened must be .* torch.bool; got"),
+    ("events", lambda _, p, s: {"near": near(s, time=s["position"])}, r"\.time must be a tensor \(4, 1\), .* got"),
+    ("events", lambda _, p, s: {"near": near(s, amount=None)}, r"\.amount must be a tensor \(4, 1\), .* NoneType"),
+    ("events", lambda _, p, s: {"near": near(s, term="gate")}, "term must be one of survival, .*; got 'gate'"),
+    ("initial_state", adding(legs=torch.zeros(4)), r"'legs' must be a tensor \(4, ...\) of at least two .*\(4,\)"),
+    ("initial_state", adding(step=torch.zeros(4, 1)), "entry 'step' is the environment's own; give yours another"),
+    ("initial_state", adding(legs=torch.zeros(4, 1).int()), r"'legs' must be .* int64 or bool; got .* torch.int32\)"),
 )
 def test_a_task_of_another_form_is_refused_by_the_name_of_its_method(method, wrong, message):
     with pytest.raises(ValueError, match="OwnEnv." + (message if message.startswith(method) else ".*" + message)):
@@ -113,27 +102,19 @@ def test_parameters_that_do_not_fit_are_refused(env):
         env.params = "visfly"
 
 
-@pytest.mark.parametrize(
-    ("action", "message"),
-    [
-        *((torch.zeros(shape), r"must have shape \(4, 4\), .* got \(") for shape in ((4,), (4, 1), (4, 5), (4, 4, 1))),
-        *(
-            (
-                torch.zeros(4, 4, dtype=kind),
-                f"is {kind}, and the environment flies in torch.float32. Convert the policy",
-            )
-            for kind in (torch.float16, torch.float64, torch.bool, torch.int64, torch.complex64)
-        ),
-    ],
+@cases(
+    *((torch.zeros(shape), r"must have shape \(4, 4\), .* got \(") for shape in ((4,), (4, 1), (4, 5), (4, 4, 1))),
+    *(
+        (torch.zeros(4, 4, dtype=kind), f"is {kind}, and the environment flies in torch.float32. Convert the policy")
+        for kind in (torch.float16, torch.float64, torch.bool, torch.int64, torch.complex64)
+    ),
     ids=lambda x: f"{x.dtype} {tuple(x.shape)}" if isinstance(x, torch.Tensor) else "",
 )
-def test_an_action_of_another_shape_or_kind_is_refused_and_not_broadcast(env, action, message):
-    with pytest.raises(ValueError, match=f"The action {message}"):
-        env.step(env.reset().set("action", action))
+def test_an_action_of_another_shape_or_kind_is_refused_and_not_broadcast(action, message, env):
+    refuses(f"The action {message}", env.step, env.reset().set("action", action))
     policy = TensorDictModule(lambda _: action, in_keys=["observation"], out_keys=["action"])
     for break_when_any_done in (False, True):
-        with pytest.raises(ValueError, match=f"The action {message}"):
-            env.rollout(2, policy, break_when_any_done=break_when_any_done)
+        refuses(f"The action {message}", env.rollout, 2, policy, break_when_any_done=break_when_any_done)
 
 
 def test_a_policy_that_writes_no_action_learns_where_to(env):
@@ -154,8 +135,7 @@ def test_a_broken_policy_is_refused_and_does_not_crash_its_drones_in_silence(wra
     with torch.no_grad():
         next(actor.parameters())[0, 0] = nan
     message = r"not finite in environments 0, 1, .* 9, \.\.\..*: the weights of the policy are broken, or what it reads"
-    with pytest.raises(ValueError, match=message):
-        differentiable_rollout(env, actor, None, 3)
+    refuses(message, differentiable_rollout, env, actor, None, 3)
 
 
 @pytest.mark.parametrize("transform", ["grad", "jacrev", "vmap", "compile"])
@@ -179,16 +159,14 @@ def test_an_action_is_not_looked_at_where_nobody_can(env64, transform):
 def test_a_horizon_is_a_number_of_steps(env, horizon):
     with pytest.raises(ValueError, match="horizon must be (at least 1|a whole number), got"):
         differentiable_rollout(env, make_actor(env), None, horizon)
-    with pytest.raises(ValueError, match="max_steps must be"):
-        env.rollout(horizon)
+    refuses("max_steps must be", env.rollout, horizon)
 
 
 @pytest.mark.parametrize("key", ["obs", ("state", "speed")])
 def test_an_actor_that_reads_what_nobody_writes_is_refused_with_what_there_is(env, key):
     message = "The actor reads .*, which is not in the tensordict .* env.reset.. writes: .*'state', 'position'"
     for some in (env, TransformedEnv(env, StepCounter())):
-        with pytest.raises(ValueError, match=message):
-            differentiable_rollout(some, linear(13, 4, in_key=key), None, 2)
+        refuses(message, differentiable_rollout, some, linear(13, 4, in_key=key), None, 2)
     with pytest.raises(ValueError, match="The actor reads 'observation', which is not in the tensordict"):
         differentiable_rollout(env, make_actor(env), env.reset().select("state"), 2)
 

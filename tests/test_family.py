@@ -6,17 +6,8 @@ import pytest
 import torch
 from test_objectives import GAMMA, LAMBDA, REWARDS, make_abpt, make_networks, make_rollout, td_lambda
 
-from torchrl_quad import (
-    ABPTLoss,
-    AHACLoss,
-    HoveringEnv,
-    SAPOLoss,
-    SHACLoss,
-    differentiable_rollout,
-    make_actor,
-    make_qvalue,
-    make_value,
-)
+from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_qvalue, make_value
+from torchrl_quad.objectives import ABPTLoss, AHACLoss, SAPOLoss, SHACLoss
 
 ENTROPY = [-3.0, -1.0, 1.0, 3.0]  # of the four steps, in both environments
 

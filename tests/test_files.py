@@ -7,6 +7,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from refusals import refuses
 
 from torchrl_quad import files
 from torchrl_quad.files import add_rows, locked, make_folder, read_rows, replacing, replacing_folder, write_rows
@@ -69,8 +70,7 @@ def test_what_is_neither_file_nor_folder_is_refused_and_stays(write, make, tmp_p
     path = tmp_path / "place"
     make(path)
     before = everything_in(tmp_path)
-    with pytest.raises(FileExistsError, match=rf"{path} is a (pipe|socket|link|folder|file), and no"):
-        write(path)
+    refuses(rf"{path} is a (pipe|socket|link|folder|file), and no", write, path, error=FileExistsError)
     assert everything_in(tmp_path) == before
 
 

@@ -6,20 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from log_writers import END, OURS, TABLE, G, flight, matrix, own_table, write_csv
+from refusals import refuses
 
 from torchrl_quad.errors import UserError, UserValueError
-from torchrl_quad.identification import (
-    LAYOUTS,
-    Columns,
-    LogError,
-    MissingColumns,
-    NoFlight,
-    UnreadableLog,
-    WrongFrame,
-    WrongQuaternion,
-    WrongUnit,
-    read_log,
-)
+from torchrl_quad.identification import LAYOUTS, Columns, LogError, MissingColumns, NoFlight, read_log
+from torchrl_quad.identification.errors import UnreadableLog, WrongFrame, WrongQuaternion, WrongUnit
 
 FLIGHT = Path(__file__).parent.parent / "examples" / "data" / "figure8.csv.gz"
 GYRO = ("imu_gyro_x", "imu_gyro_y", "imu_gyro_z")
@@ -55,8 +46,7 @@ def scaled(table, names, factor):
 
 def test_a_real_flight_is_read_in_our_units_frames_and_orders(table):
     log = read_log(FLIGHT)
-    assert log.name == "figure8"
-    assert log.dt == pytest.approx(0.01)
+    assert log.name == "figure8" and log.dt == pytest.approx(0.01)
     np.testing.assert_allclose(np.diff(log.time), 0.01, rtol=0, atol=1e-9)
     assert all(x.dtype == np.float64 for x in (log.position, log.quaternion, log.motor_command))
     k = 700
@@ -208,15 +198,10 @@ def test_what_holds_no_flight_or_not_what_was_asked_for_is_refused_by_name(read)
         (NoFlight, "share 0.14 s", {"rows": slice(0, 15)}),
         (NoFlight, "never for 60 s", {"min_duration": 60.0}),
         (MissingColumns, "Unknown layout 'betaflight'. Choose from: nanobench", {"columns": "betaflight"}),
-        (
-            MissingColumns,
-            "no column volts, named for battery_voltage",
-            {"columns": {"battery_voltage": "volts"}},
-        ),
+        (MissingColumns, "no column volts, named for battery_voltage", {"columns": {"battery_voltage": "volts"}}),
         (MissingColumns, "no column s of the time. There are: t, ", {"columns": {"time": "s"}}),
     ):
-        with pytest.raises(error, match=message):
-            read(**options)
+        refuses(message, read, error=error, **options)
 
 
 # -- tables of a flight whose every quantity is known ------------------------------------------------------------------
@@ -258,8 +243,7 @@ def test_a_mapping_reads_any_table_and_rates_are_matched(tmp_path):
         (MissingColumns, "has no motor_command", path, without),
         (UnreadableLog, "twice.csv has several columns of one name: wy. Rename them", twice, twin),
     ):
-        with pytest.raises(error, match=message):
-            read_log(file, columns)
+        refuses(message, read_log, file, columns, error=error)
 
 
 def test_what_is_faster_than_the_log_does_not_alias(tmp_path):
@@ -298,14 +282,12 @@ def test_euler_angles_and_velocities_of_the_body_become_ours(tmp_path):
     log = read_log(path, {**turned, "velocity_body": OURS["velocity"], "euler": euler})
     np.testing.assert_allclose(log.velocity, true["velocity"], atol=1e-6)
     np.testing.assert_allclose(np.abs((log.quaternion * true["quaternion"]).sum(-1)), 1.0, atol=1e-7)
-    with pytest.raises(WrongFrame, match='"velocity_body"'):
-        read_log(path, TABLE)
+    refuses('"velocity_body"', read_log, path, TABLE, error=WrongFrame)
     rates = np.einsum("nij,nj->ni", r, true["angular_velocity"])
     with pytest.raises(WrongFrame, match="in the world frame"):
         read_log(write_csv(path, own_table(t, angular_velocity=rates)), TABLE)
     write_csv(path, own_table(t, motor_command=2000.0 * true["motor_command"]))
-    with pytest.raises(WrongUnit, match="offset=1000"):
-        read_log(path, TABLE)
+    refuses("offset=1000", read_log, path, TABLE, error=WrongUnit)
     few = {k: v for k, v in TABLE.items() if k in ("time", "position", "quaternion")}
     log = read_log(path, few | {"motor_command": Columns(OURS["motor_command"], scale=1 / 2000)})
     inside = slice(*log.segments[0])
@@ -351,8 +333,7 @@ def test_columns_and_layouts_say_which_of_their_fields_is_wrong():
         for value in values:
             with pytest.raises(UserValueError, match=f"Columns: {field} of a, b, c must be a number, or one for each"):
                 Columns(("a", "b", "c"), **{field: value})
-    with pytest.raises(UserValueError, match="names must be the names of columns, got 5"):
-        Columns(5)
+    refuses("names must be the names of columns, got 5", Columns, 5, error=UserValueError)
     for changes, message in (
         ({"columns": {"position": ("x", "y", "z")}}, "position takes 3 column.* got 1: x"),
         ({"columns": {"position": (5,)}}, "columns: 'position' takes the name of a column"),
@@ -360,5 +341,4 @@ def test_columns_and_layouts_say_which_of_their_fields_is_wrong():
         ({"convention": "px4"}, "convention must be one of torchrl_quad.deploy.frames, got 'px4'"),
         ({"time": Columns(("s", "ns"))}, "time takes 1 column.* got 2: s, ns"),
     ):
-        with pytest.raises(UserError, match=message):
-            replace(LAYOUTS["nanobench"], **changes)
+        refuses(message, replace, LAYOUTS["nanobench"], error=UserError, **changes)

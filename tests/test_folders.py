@@ -16,6 +16,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
+from refusals import refuses
 from small_runs import SMALL, stop_at_save
 
 from torchrl_quad import BPTTLoss
@@ -126,5 +127,4 @@ def test_what_environment_and_loss_refuse_ends_in_one_line_and_leaves_no_folder(
 
 def test_a_bug_keeps_its_traceback(launch, no_pictures, tmp_path, monkeypatch):
     monkeypatch.setattr(BPTTLoss, "loss_actor", lambda self, rollout: {}["missing"])
-    with pytest.raises(KeyError, match="missing"):
-        launch("bptt", *SMALL, f"hydra.run.dir={tmp_path}")
+    refuses("missing", launch, "bptt", *SMALL, f"hydra.run.dir={tmp_path}", error=KeyError)

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from refusals import cases
 from tensordict import TensorDict
 
 from torchrl_quad import ForestEnv, HoveringEnv
@@ -68,8 +69,7 @@ def test_a_flight_through_the_forest_ends_where_the_docstring_says():
 def test_the_metrics_of_the_forest_are_measured_by_the_way_to_the_target():
     env, state = forest([4.0, 0.0, 1.5], [-2.0, 0.0, 1.5], [31.0, 0.0, 1.5], velocity=[3.0, 2.0, 1.0])
     measured = {name: value.flatten().tolist() for name, value in env.metrics(state).items()}
-    assert measured["distance"] == [4.0, 0.0, 30.0]
-    assert measured["flown_speed"] == pytest.approx(3 * [3.0])
+    assert measured["distance"] == [4.0, 0.0, 30.0] and measured["flown_speed"] == pytest.approx(3 * [3.0])
     radius = env.scene.radius
     assert measured["clearance"] == pytest.approx([0.8 - radius, 1.5 - radius, 1.5 - radius])  # pole, ground, ground
 
@@ -96,13 +96,10 @@ def test_an_episode_of_the_forest_has_the_mean_speed_and_the_least_clearance_unt
     assert {name: value.tolist() for name, value in metrics.items()} == expected
 
 
-@pytest.mark.parametrize(
-    ("kind", "size"),
-    [
-        ("cylinders", {"radius": [0.1, 0.3], "height": 5.0}),
-        ("spheres", {"radius": [0.1, 0.3]}),
-        ("boxes", {"size": [[0.2, 0.2, 0.2], [0.6, 0.6, 0.6]], "yaw": [-3.0, 3.0]}),
-    ],
+@cases(
+    ("cylinders", {"radius": [0.1, 0.3], "height": 5.0}),
+    ("spheres", {"radius": [0.1, 0.3]}),
+    ("boxes", {"size": [[0.2, 0.2, 0.2], [0.6, 0.6, 0.6]], "yaw": [-3.0, 3.0]}),
 )
 def test_random_obstacles_keep_clear_of_the_start_and_of_the_target(kind, size):
     scene = {kind: [{"count": 8, "low": [-2.0, -2.0, 0.0], "high": [2.0, 2.0, 3.0], **size}], "clearance": 0.5}

@@ -7,6 +7,7 @@ import weakref
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
 from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
@@ -31,8 +32,7 @@ def test_torchrl_records_videos_of_every_task(task, tmp_path):
     filmed.transform.dump()
     video = torch.load(tmp_path / "run/videos/flight_1.pt")
     assert video.shape == (1, 9, 3, 128, 128)  # the reset, and eight steps
-    assert video.dtype == torch.uint8
-    assert (video[0, 0] != video[0, -1]).any()
+    assert video.dtype == torch.uint8 and (video[0, 0] != video[0, -1]).any()
     frame = torch.as_tensor(rollout["next"][..., -1].get("pixels").tolist()[0])
     assert torch.equal(video[0, -1], frame.permute(2, 0, 1))  # upright
 
@@ -139,14 +139,11 @@ def test_the_chosen_drones_are_drawn_in_the_chosen_size_and_a_view_follows_who_l
 
 def test_rendering_before_a_reset_or_of_unknown_drones_is_refused():
     env = HoveringEnv(num_envs=2)
-    with pytest.raises(ValueError, match=r"after the last reset or step. Call env.reset\(\) first."):
-        env.render()
+    refuses(r"after the last reset or step. Call env.reset\(\) first.", env.render)
     env.reset()
     for drones in ([2], [-1], []):
-        with pytest.raises(ValueError, match=r"indices from 0 to 1, at least one, such as drones=\[0\]"):
-            env.render(drones)
-    with pytest.raises(ValueError, match="size must be at least 100 pixels, got 20"):
-        env.render(size=20)
+        refuses(r"indices from 0 to 1, at least one, such as drones=\[0\]", env.render, drones)
+    refuses("size must be at least 100 pixels, got 20", env.render, size=20)
 
 
 def test_an_environment_that_has_been_rendered_is_copied_and_forgotten():

@@ -8,22 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 
 from benchmarks import identification as benchmark
 from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.dynamics import MotorCommand
 from torchrl_quad.errors import UserError
-from torchrl_quad.identification import (
-    NoFlight,
-    TooShort,
-    estimation,
-    fitting,
-    identify,
-    prediction,
-    prediction_error,
-    read_log,
-)
+from torchrl_quad.identification import NoFlight, TooShort, estimation, fitting, identify, prediction, read_log
 from torchrl_quad.identification.parameters import UNKNOWNS, Model
+from torchrl_quad.identification.prediction import prediction_error
 
 ROOT = Path(__file__).parents[1]
 REAL = ROOT / "examples/data/figure8.csv.gz"
@@ -233,16 +226,10 @@ def test_arguments_of_fits_and_predictions_are_refused_in_one_line(real):
         (TooShort, "figure8 has no piece in flight", prediction_error, flown(), "visfly"),
         (NoFlight, "its motor commands are zero", prediction_error, still, no_motors),
         (UserError, "missing key 'nominal_voltage'", load_drone, plain | {"motor_command": {"speed_per_volt": 500.0}}),
-        (
-            UserError,
-            "unknown key 'gain'. Allowed: speed",
-            load_drone,
-            plain | {"motor_command": {"gain": 1.0}},
-        ),
+        (UserError, "unknown key 'gain'. Allowed: speed", load_drone, plain | {"motor_command": {"gain": 1.0}}),
         (UserError, "command must be a mapping .*; got 500.0", load_drone, plain | {"motor_command": 500.0}),
     ):
-        with pytest.raises(error, match=message):
-            call(*arguments)
+        refuses(message, call, *arguments, error=error)
 
 
 def test_a_flight_of_ones_own_making_must_be_whole(real):
@@ -251,8 +238,7 @@ def test_a_flight_of_ones_own_making_must_be_whole(real):
     bad += [("segments", x) for x in (None, 5, ((5, 3),), ((0, 10**9),), ((-1, 5),), (("a", 5),))]
     bad += [("setpoint", 5), ("name", 5), ("quaternion", real.position), ("onboard", "gyro")]
     for name, value in bad:
-        with pytest.raises(UserError, match=name):
-            dataclasses.replace(real, **{name: value})
+        refuses(name, dataclasses.replace, real, error=UserError, **{name: value})
 
 
 BROKEN = ("{", "[]", "5", '{"stages": 5}', "[" * 100_000, "\xff", '{"fingerprint": "F", "stages": 5}')

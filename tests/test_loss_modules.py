@@ -6,6 +6,7 @@ import textwrap
 
 import pytest
 import torch
+from refusals import cases, refuses
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from test_objectives import GAMMA, make_networks, make_rollout
 from torch import nn
@@ -13,21 +14,10 @@ from torchrl.envs import PendulumEnv
 from torchrl.modules import MLP
 from torchrl.objectives import SoftUpdate, ValueEstimators
 
-from torchrl_quad import (
-    ABPTLoss,
-    AHACLoss,
-    BPTTLoss,
-    HoveringEnv,
-    HybridLoss,
-    SAPOLoss,
-    SHACLoss,
-    VisitedStateBuffer,
-    differentiable_rollout,
-    make_actor,
-    make_qvalue,
-    make_value,
-)
+from torchrl_quad import HoveringEnv, VisitedStateBuffer, differentiable_rollout
 from torchrl_quad.errors import UserError
+from torchrl_quad.modules import make_actor, make_qvalue, make_value
+from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
 
 
 @pytest.fixture
@@ -82,8 +72,7 @@ def test_keys_can_be_renamed():
     for old, new in (("reward", "gain"), ("terminated", "crashed"), ("done", "over")):
         rollout.rename_key_(("next", old), ("next", new))
     result = loss(rollout)
-    assert result["loss_actor"] == expected["loss_actor"]
-    assert result["loss_value"] == expected["loss_value"]
+    assert result["loss_actor"] == expected["loss_actor"] and result["loss_value"] == expected["loss_value"]
     assert "goal" in loss.write_value_target(rollout)
 
 
@@ -132,59 +121,51 @@ def test_the_example_of_a_loss_is_short_and_runs(loss):
 # -- what they refuse -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("cls", "options", "message"),
-    [
-        (ABPTLoss, {"alpha": -1.0}, "alpha must be at least 0 or be 'auto', got -1.0. The coefficient of the entropy"),
-        (ABPTLoss, {"alpha": float("inf")}, "alpha must be a finite number or be 'auto', got inf"),
-        (ABPTLoss, {"alpha": "automatic"}, "alpha must be a number or be 'auto', got 'automatic'"),
-        (ABPTLoss, {"alpha_init": 0.0}, "alpha_init must be greater than 0, got 0.0. What alpha=auto starts"),
-        (ABPTLoss, {"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
-        (ABPTLoss, {"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
-        (ABPTLoss, {"n_step_return": "abc"}, "n_step_return must be true or false, got 'abc'. Whether J includes J_N"),
-        (ABPTLoss, {"num_qvalue_nets": 0}, "num_qvalue_nets must be at least 1, got 0. The critics made from it"),
-        (ABPTLoss, {"num_qvalue_nets": 2.5}, "num_qvalue_nets must be a whole number, got 2.5"),
-        (ABPTLoss, {"simulated_steps": -1}, "simulated_steps must be at least 0, got -1. Control steps"),
-        (SAPOLoss, {"alpha": 0.0}, "alpha must be greater than 0 or be 'auto', got 0.0. .* without .* take SHACLoss"),
-        (SAPOLoss, {"target_entropy": 1.0}, "must be at most -0.001 or be 'auto', got 1.0. .* a negative number"),
-        (SAPOLoss, {"target_entropy": "low"}, "target_entropy must be a number or be 'auto', got 'low'"),
-        (SAPOLoss, {"num_value_nets": 0}, "num_value_nets must be at least 1, got 0"),
-        (SAPOLoss, {"delay_value": True}, "SAPOLoss sets delay_value itself: leave it out, or take SHACLoss"),
-        (AHACLoss, {"horizon": 4, "min_horizon": 8}, "horizon=4 must lie between min_horizon=8 and max_horizon=8"),
-        (AHACLoss, {"horizon": 0}, "horizon must be at least 1, got 0. Control steps of the first rollout"),
-        (AHACLoss, {"max_stiffness": 1.0}, "max_stiffness must be greater than 1, got 1.0. .*1.5 to 5 are usual"),
-        (AHACLoss, {"horizon_lr": 1.0}, "horizon_lr must be less than 1, got 1.0"),
-        (HybridLoss, {"gradient_lmbda": 0.0}, "gradient_lmbda must be greater than 0"),
-        (HybridLoss, {"clip_epsilon": 1.0}, "clip_epsilon must be less than 1"),
-        (HybridLoss, {"entropy_coeff": -0.1}, "entropy_coeff must be at least 0"),
-        (HybridLoss, {"decay": 1.0}, "decay must be less than 1"),
-    ],
+@cases(
+    (ABPTLoss, {"alpha": -1.0}, "alpha must be at least 0 or be 'auto', got -1.0. The coefficient of the entropy"),
+    (ABPTLoss, {"alpha": float("inf")}, "alpha must be a finite number or be 'auto', got inf"),
+    (ABPTLoss, {"alpha": "automatic"}, "alpha must be a number or be 'auto', got 'automatic'"),
+    (ABPTLoss, {"alpha_init": 0.0}, "alpha_init must be greater than 0, got 0.0. What alpha=auto starts"),
+    (ABPTLoss, {"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
+    (ABPTLoss, {"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
+    (ABPTLoss, {"n_step_return": "abc"}, "n_step_return must be true or false, got 'abc'. Whether J includes J_N"),
+    (ABPTLoss, {"num_qvalue_nets": 0}, "num_qvalue_nets must be at least 1, got 0. The critics made from it"),
+    (ABPTLoss, {"num_qvalue_nets": 2.5}, "num_qvalue_nets must be a whole number, got 2.5"),
+    (ABPTLoss, {"simulated_steps": -1}, "simulated_steps must be at least 0, got -1. Control steps"),
+    (SAPOLoss, {"alpha": 0.0}, "alpha must be greater than 0 or be 'auto', got 0.0. .* without .* take SHACLoss"),
+    (SAPOLoss, {"target_entropy": 1.0}, "must be at most -0.001 or be 'auto', got 1.0. .* a negative number"),
+    (SAPOLoss, {"target_entropy": "low"}, "target_entropy must be a number or be 'auto', got 'low'"),
+    (SAPOLoss, {"num_value_nets": 0}, "num_value_nets must be at least 1, got 0"),
+    (SAPOLoss, {"delay_value": True}, "SAPOLoss sets delay_value itself: leave it out, or take SHACLoss"),
+    (AHACLoss, {"horizon": 4, "min_horizon": 8}, "horizon=4 must lie between min_horizon=8 and max_horizon=8"),
+    (AHACLoss, {"horizon": 0}, "horizon must be at least 1, got 0. Control steps of the first rollout"),
+    (AHACLoss, {"max_stiffness": 1.0}, "max_stiffness must be greater than 1, got 1.0. .*1.5 to 5 are usual"),
+    (AHACLoss, {"horizon_lr": 1.0}, "horizon_lr must be less than 1, got 1.0"),
+    (HybridLoss, {"gradient_lmbda": 0.0}, "gradient_lmbda must be greater than 0"),
+    (HybridLoss, {"clip_epsilon": 1.0}, "clip_epsilon must be less than 1"),
+    (HybridLoss, {"entropy_coeff": -0.1}, "entropy_coeff must be at least 0"),
+    (HybridLoss, {"decay": 1.0}, "decay must be less than 1"),
 )
 def test_bad_arguments_say_what_is_allowed(cls, options, message):
     actor, value, qvalue = make_networks()
-    with pytest.raises(UserError, match=message):
-        cls(actor, qvalue if cls is ABPTLoss else value, **options)
+    refuses(message, cls, actor, qvalue if cls is ABPTLoss else value, error=UserError, **options)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda _, shac: shac.make_value_estimator(gamma=2.0), "gamma must be at most 1, got 2.0"),
-        (lambda _, shac: shac.make_value_estimator(lmbda=-0.1), "lmbda must be at least 0, got -0.1"),
-        (lambda bptt, _: bptt.make_value_estimator(lmbda=0.9), "BPTTLoss estimates .* TD1: .*argument 'lmbda'"),
-        (lambda _, shac: shac.make_value_estimator(lambda_=0.9), "by TDLambda: .*argument 'lambda_'"),
-        (lambda _, shac: shac.make_value_estimator("abc"), "not implemented for loss SHACLoss. Choose from: td0"),
-        (lambda _, shac: shac.set_keys(value_target=5), "value_target must be the name of an entry, .*, got 5"),
-        (lambda _, shac: shac.set_keys(rewards="gain"), "SHACLoss reads no 'rewards'. Choose from: "),
-        (lambda *_: BPTTLoss(nn.Linear(13, 4)), "actor_network must be a TensorDictModule, got Linear. Wrap a plain"),
-        (lambda bptt, _: SHACLoss(bptt.actor_network, nn.Linear(1, 1)), "value_network must be .*, got Linear"),
-        (lambda bptt, _: bptt((1, 2)), "BPTTLoss needs a rollout, the tensordict that .* returns; got tuple"),
-    ],
+@cases(
+    (lambda _, shac: shac.make_value_estimator(gamma=2.0), "gamma must be at most 1, got 2.0"),
+    (lambda _, shac: shac.make_value_estimator(lmbda=-0.1), "lmbda must be at least 0, got -0.1"),
+    (lambda bptt, _: bptt.make_value_estimator(lmbda=0.9), "BPTTLoss estimates .* TD1: .*argument 'lmbda'"),
+    (lambda _, shac: shac.make_value_estimator(lambda_=0.9), "by TDLambda: .*argument 'lambda_'"),
+    (lambda _, shac: shac.make_value_estimator("abc"), "not implemented for loss SHACLoss. Choose from: td0"),
+    (lambda _, shac: shac.set_keys(value_target=5), "value_target must be the name of an entry, .*, got 5"),
+    (lambda _, shac: shac.set_keys(rewards="gain"), "SHACLoss reads no 'rewards'. Choose from: "),
+    (lambda *_: BPTTLoss(nn.Linear(13, 4)), "actor_network must be a TensorDictModule, got Linear. Wrap a plain"),
+    (lambda bptt, _: SHACLoss(bptt.actor_network, nn.Linear(1, 1)), "value_network must be .*, got Linear"),
+    (lambda bptt, _: bptt((1, 2)), "BPTTLoss needs a rollout, the tensordict that .* returns; got tuple"),
 )
 def test_losses_and_estimators_take_what_fits_alone(call, message):
     actor, value, _ = make_networks()
-    with pytest.raises(UserError, match=message):
-        call(BPTTLoss(actor), SHACLoss(actor, value))
+    refuses(message, call, BPTTLoss(actor), SHACLoss(actor, value), error=UserError)
 
 
 def test_a_rollout_without_its_graph_is_refused_with_advice():
@@ -192,8 +173,7 @@ def test_a_rollout_without_its_graph_is_refused_with_advice():
     detached = make_rollout(actor).detach()
     abpt = ABPTLoss(actor, qvalue), ABPTLoss(actor, qvalue, n_step_return=False)
     for loss in (BPTTLoss(actor), SHACLoss(actor, value), *abpt):
-        with pytest.raises(RuntimeError, match="carries no gradient.*Use differentiable_rollout"):
-            loss.loss_actor(detached)
+        refuses("carries no gradient.*Use differentiable_rollout", loss.loss_actor, detached, error=RuntimeError)
         with torch.no_grad():
             loss.loss_actor(detached)
     with pytest.raises(RuntimeError, match="Build the actor with return_log_prob=True"):
@@ -206,8 +186,7 @@ def test_a_rollout_without_a_time_dimension_is_refused(env, flight):
     wrong = [(rollout[:, 0], "4,"), (rollout.reshape(-1), "12,"), (rollout[:, :0], "4, 0"), (carry, "4,")]
     for loss in losses(env):
         for data, shape in (*wrong, (rollout.transpose(0, 1), "3, 4")):
-            with pytest.raises(ValueError, match=message.format(type(loss).__name__, shape)):
-                loss(data)
+            refuses(message.format(type(loss).__name__, shape), loss, data)
         loss(rollout[0])  # a single flight, whose dimension has the name of time
 
 
@@ -218,8 +197,7 @@ def test_a_rollout_that_lacks_an_entry_is_refused(env, flight, key):
     for loss in losses(env):
         if key in loss.in_keys or key == "next":
             named = "reads .*'next'" if key == "next" else f"reads {key!r}".replace("(", r"\(").replace(")", r"\)")
-            with pytest.raises(ValueError, match=f"{type(loss).__name__} {named}.*not in the rollout.*set_keys"):
-                loss(flight[0].exclude(key))
+            refuses(f"{type(loss).__name__} {named}.*not in the rollout.*set_keys", loss, flight[0].exclude(key))
 
 
 def test_an_entry_of_another_shape_is_refused(env, flight):
@@ -227,19 +205,16 @@ def test_an_entry_of_another_shape_is_refused(env, flight):
         for key in ("reward", "done", "terminated"):
             wrong = flight[0].copy()
             wrong["next"] = wrong["next"].copy().set(key, wrong["next", key].squeeze(-1))
-            with pytest.raises(ValueError, match=rf"'{key}'\) of shape \(4, 3, 1\) in this rollout; got \(4, 3\)"):
-                loss(wrong)
+            refuses(rf"'{key}'\) of shape \(4, 3, 1\) in this rollout; got \(4, 3\)", loss, wrong)
     with pytest.raises(ValueError, match=r"'value_target' has shape \(4, 3\), and the critic's pred.* \(4, 3, 1\)"):
         losses(env)[1](flight[0].copy().set("value_target", torch.zeros(4, 3)))
 
 
 def test_a_wrong_tensor_key_and_a_rollout_on_another_device_are_refused(env, flight):
     for loss in losses(env):
-        with pytest.raises(ValueError, match="is on cpu, and the rollout on meta: loss.to.'meta'. moves it"):
-            loss(flight[0].to("meta"))
+        refuses("is on cpu, and the rollout on meta: loss.to.'meta'. moves it", loss, flight[0].to("meta"))
         loss.set_keys(reward="gain")
-        with pytest.raises(ValueError, match=r"reads \('next', 'gain'\), which is not in the rollout. If it has"):
-            loss(flight[0])
+        refuses(r"reads \('next', 'gain'\), which is not in the rollout. If it has", loss, flight[0])
 
 
 def test_swapped_networks_are_refused(env, flight):
@@ -249,8 +224,7 @@ def test_swapped_networks_are_refused(env, flight):
         (ABPTLoss(actor, value), "'state_action_value' of its qvalue_network", "state_value"),
         (SHACLoss(value, actor), "'state_value' of its value_network", "loc, scale, action"),
     ):
-        with pytest.raises(ValueError, match=f"reads {reads}, which writes {writes}. Give another network, or set"):
-            loss(flight[0])
+        refuses(f"reads {reads}, which writes {writes}. Give another network, or set", loss, flight[0])
 
 
 # -- another environment -----------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from refusals import cases, refuses
 
 from torchrl_quad import HoveringEnv, make_env
 from torchrl_quad.envs import TASKS
@@ -10,15 +11,12 @@ from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, describe_metric
 from torchrl_quad.render import animate_flight, canvas, plot_episode, plot_flight
 
 
-@pytest.mark.parametrize(
-    ("metric", "value", "text"),
-    [
-        (Metric("position error", "cm", 100.0, median=True), 0.03214, "3.21 cm (median)"),
-        (Metric("episodes solved", "%", 100.0), 1.0, "100 %"),
-        (Metric("return"), -23.456, "-23.5"),
-        (Metric("return"), 12345.6, "12346"),
-        (Metric("lap time", "s"), torch.inf, "inf s"),
-    ],
+@cases(
+    (Metric("position error", "cm", 100.0, median=True), 0.03214, "3.21 cm (median)"),
+    (Metric("episodes solved", "%", 100.0), 1.0, "100 %"),
+    (Metric("return"), -23.456, "-23.5"),
+    (Metric("return"), 12345.6, "12346"),
+    (Metric("lap time", "s"), torch.inf, "inf s"),
 )
 def test_a_metric_is_printed_in_its_unit(metric, value, text):
     assert metric.format(value) == text
@@ -79,22 +77,18 @@ def test_a_ring_is_a_circle_around_its_axis(axis):
     assert torch.linalg.matrix_rank(spokes, tol=1e-3).tolist() == [2, 2]
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Shape([(0, 0)]), r"Shape: points must be points \(n, 3\) \[m\], got shape \(1, 2\)"),
-        (lambda: Shape([(0, 0, 0)], [(0, 0, 1)]), "faces must be indices .* of its 1 points"),
-        (lambda: Shape([(0, 0, 0)], color="red"), "color must be written as #rrggbb, such as #c8452f, got 'red'"),
-        (lambda: Shape([(0, 0, 0)], opacity=0), "opacity must be greater than 0, got 0"),
-        (lambda: Markers(gates=[1, 2, 3]), "Markers: gates must be points"),
-        (lambda: Markers(gates=[(0, 0, 1)], gate_radius=torch.ones(2)), "one for all 1 gates or one each"),
-        (lambda: Markers(gates=[(0, 0, 1)], gate_axes=torch.ones(2, 3)), "2 directions for 1 gates"),
-        (lambda: Markers(shapes=["wall"]), "shapes must be a list of Shape"),
-    ],
+@cases(
+    (lambda: Shape([(0, 0)]), r"Shape: points must be points \(n, 3\) \[m\], got shape \(1, 2\)"),
+    (lambda: Shape([(0, 0, 0)], [(0, 0, 1)]), "faces must be indices .* of its 1 points"),
+    (lambda: Shape([(0, 0, 0)], color="red"), "color must be written as #rrggbb, such as #c8452f, got 'red'"),
+    (lambda: Shape([(0, 0, 0)], opacity=0), "opacity must be greater than 0, got 0"),
+    (lambda: Markers(gates=[1, 2, 3]), "Markers: gates must be points"),
+    (lambda: Markers(gates=[(0, 0, 1)], gate_radius=torch.ones(2)), "one for all 1 gates or one each"),
+    (lambda: Markers(gates=[(0, 0, 1)], gate_axes=torch.ones(2, 3)), "2 directions for 1 gates"),
+    (lambda: Markers(shapes=["wall"]), "shapes must be a list of Shape"),
 )
 def test_markers_that_are_none_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+    refuses(message, make)
 
 
 def test_figures_films_and_frames_show_everything_that_a_task_of_one_s_own_names(own_markers, monkeypatch, tmp_path):

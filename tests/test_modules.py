@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from refusals import cases, refuses
 from tensordict import TensorDict
 from torchrl.data import Unbounded
 from torchrl.envs import CatTensors, PendulumEnv, StepCounter, TransformedEnv, UnsqueezeTransform
@@ -37,8 +38,7 @@ def test_the_first_action_can_be_chosen_and_is_the_middle_of_the_range_elsewhere
     torch.testing.assert_close(actor(env.reset())["action"], wanted.expand(2, 4), atol=0.02, rtol=0)
     pendulum = make_pendulum()
     action = make_actor(pendulum)(pendulum.reset())["action"]
-    assert action.shape == (1,)
-    assert action.abs() < 0.1
+    assert action.shape == (1,) and action.abs() < 0.1
     pendulum.base_env.neutral_action = torch.tensor([1.5])
     assert make_actor(pendulum)(pendulum.reset())["action"].item() == pytest.approx(1.5, abs=0.1)
 
@@ -112,55 +112,45 @@ def test_every_network_has_the_precision_of_the_environment_and_may_read_whole_n
         (whole, "state_value"),
         (make_qvalue(env64), "state_action_value"),
     ):
-        assert network(td)[key].dtype is torch.float64
-        assert network(td)[key].shape == (4, 1)
+        assert network(td)[key].dtype is torch.float64 and network(td)[key].shape == (4, 1)
 
 
 # -- errors ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("make", [make_actor, make_value, make_qvalue])
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"num_cells": (0,)}, r"num_cells\[0\] must be at least 1, got 0. .*in a list: \[64, 64\]"),
-        ({"num_cells": (64, 2.5)}, r"num_cells\[1\] must be a whole number, got 2.5"),
-        ({"num_cells": 64}, r"num_cells must be a list, got 64. .*in a list: \[64, 64\]"),
-        ({"num_cells": [65_536] * 3}, "has 8,59.,...,... weights, more than 100,000,000: write smaller widths"),
-        ({"input_scale": nan}, "input_scale must be a finite number or be a list, got nan"),
-        ({"activation": "relu"}, "activation must be a class of activations of torch.nn without arguments, .*'relu'"),
-        ({"activation": torch.nn.GLU}, "activation must be a class of activations"),
-        ({"in_keys": "observation"}, "in_keys must be a list, got 'observation'"),
-        ({"in_keys": []}, "in_keys must have at least 1 item"),
-        ({"in_keys": [("state", "speed")]}, r"Unknown entry \('state', 'speed'\) in in_keys. Choose from: obs"),
-        ({"in_keys": ["state"]}, "Unknown entry 'state' in in_keys"),
-        ({"in_keys": [("state", "action_queue")]}, r"has shape \(4, 1, 4\) and a network reads vectors: flatten it"),
-    ],
+@cases(
+    ({"num_cells": (0,)}, r"num_cells\[0\] must be at least 1, got 0. .*in a list: \[64, 64\]"),
+    ({"num_cells": (64, 2.5)}, r"num_cells\[1\] must be a whole number, got 2.5"),
+    ({"num_cells": 64}, r"num_cells must be a list, got 64. .*in a list: \[64, 64\]"),
+    ({"num_cells": [65_536] * 3}, "has 8,59.,...,... weights, more than 100,000,000: write smaller widths"),
+    ({"input_scale": nan}, "input_scale must be a finite number or be a list, got nan"),
+    ({"activation": "relu"}, "activation must be a class of activations of torch.nn without arguments, .*'relu'"),
+    ({"activation": torch.nn.GLU}, "activation must be a class of activations"),
+    ({"in_keys": "observation"}, "in_keys must be a list, got 'observation'"),
+    ({"in_keys": []}, "in_keys must have at least 1 item"),
+    ({"in_keys": [("state", "speed")]}, r"Unknown entry \('state', 'speed'\) in in_keys. Choose from: obs"),
+    ({"in_keys": ["state"]}, "Unknown entry 'state' in in_keys"),
+    ({"in_keys": [("state", "action_queue")]}, r"has shape \(4, 1, 4\) and a network reads vectors: flatten it"),
 )
-def test_a_network_of_wrong_sizes_or_entries_is_refused(env, make, kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        make(env, **kwargs)
+def test_a_network_of_wrong_sizes_or_entries_is_refused(kwargs, message, env, make):
+    refuses(message, make, env, **kwargs)
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"in_keys": "obs"}, r"in_keys must be a list, got 'obs'. .*in a list: .\"observation\"."),
-        ({"in_keys": [3]}, r"in_keys\[0\] must be the name of an entry, such as .*, got 3"),
-        ({"action_init": [0.0, 0.0, 0.0]}, "action_init must be 4 numbers strictly between"),
-        ({"action_init": [1.0, 0.0, 0.0, 0.0]}, r"strictly between .* got \[1.0, 0.0, 0.0, 0.0\]"),
-        ({"action_init": [nan, 0.0, 0.0, 0.0]}, "strictly between"),
-        ({"action_init": ["a", 0.0, 0.0, 0.0]}, r"strictly between .* got \['a', 0.0, 0.0, 0.0\]"),
-        ({"scale_init": 1e300}, "scale_init must be at most 100, got 1e.300"),
-        ({"scale_init": 0.0}, "scale_init must be at least 0.0001, got 0.0. The standard deviation of the policy"),
-        ({"noise_correlation": -0.1}, "noise_correlation must be at least 0, got -0.1"),
-        ({"noise_correlation": 1.0}, "noise_correlation must be less than 1, got 1.0"),
-    ],
+@cases(
+    ({"in_keys": "obs"}, r"in_keys must be a list, got 'obs'. .*in a list: .\"observation\"."),
+    ({"in_keys": [3]}, r"in_keys\[0\] must be the name of an entry, such as .*, got 3"),
+    ({"action_init": [0.0, 0.0, 0.0]}, "action_init must be 4 numbers strictly between"),
+    ({"action_init": [1.0, 0.0, 0.0, 0.0]}, r"strictly between .* got \[1.0, 0.0, 0.0, 0.0\]"),
+    ({"action_init": [nan, 0.0, 0.0, 0.0]}, "strictly between"),
+    ({"action_init": ["a", 0.0, 0.0, 0.0]}, r"strictly between .* got \['a', 0.0, 0.0, 0.0\]"),
+    ({"scale_init": 1e300}, "scale_init must be at most 100, got 1e.300"),
+    ({"scale_init": 0.0}, "scale_init must be at least 0.0001, got 0.0. The standard deviation of the policy"),
+    ({"noise_correlation": -0.1}, "noise_correlation must be at least 0, got -0.1"),
+    ({"noise_correlation": 1.0}, "noise_correlation must be less than 1, got 1.0"),
 )
-def test_a_first_action_out_of_bounds_and_a_wrong_list_of_entries_are_refused(env, kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        make_actor(env, **kwargs)
+def test_a_first_action_out_of_bounds_and_a_wrong_list_of_entries_are_refused(kwargs, message, env):
+    refuses(message, make_actor, env, **kwargs)
     pendulum = PendulumEnv()
     pendulum.action_spec = Unbounded(pendulum.action_spec.shape)
-    with pytest.raises(ValueError, match="make_actor needs an action with bounds, a Bounded spec; got Unbounded"):
-        make_actor(pendulum)
+    refuses("make_actor needs an action with bounds, a Bounded spec; got Unbounded", make_actor, pendulum)

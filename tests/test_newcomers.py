@@ -2,19 +2,13 @@
 
 import pytest
 import torch
+from refusals import refuses
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import Compose, ExcludeTransform, MultiAction, ObservationNorm, SelectTransform, TransformedEnv
 
-from torchrl_quad import (
-    HoveringEnv,
-    HybridLoss,
-    LandingEnv,
-    SHACLoss,
-    differentiable_rollout,
-    make_actor,
-    make_value,
-    restart,
-)
+from torchrl_quad import HoveringEnv, HybridLoss, LandingEnv, SHACLoss
+from torchrl_quad.data import differentiable_rollout, restart
+from torchrl_quad.modules import make_actor, make_value
 
 
 def test_what_newcomers_stumble_over_is_said_where_they_stumble():
@@ -28,8 +22,7 @@ def test_what_newcomers_stumble_over_is_said_where_they_stumble():
     actor = make_actor(env)
     flown, carry = differentiable_rollout(env, actor, None, 5)
     masked = flown[:, -1]["next"].detach().set("_reset", torch.tensor([[True], [False], [False]]))
-    with pytest.raises(ValueError, match=r"set_state=False\); to set them to this state, set_state=True"):
-        env.reset(masked.clone())
+    refuses(r"set_state=False\); to set them to this state, set_state=True", env.reset, masked.clone())
     assert env.reset(masked.clone(), set_state=False)["state", "step"].flatten().tolist() == [0, 5, 5]
     assert env.reset(masked.clone(), set_state=True)["state", "step"].flatten().tolist() == [5, 5, 5]
 
@@ -45,8 +38,7 @@ def test_what_newcomers_stumble_over_is_said_where_they_stumble():
         (Compose(SelectTransform("observation")), "leaves out .* every step would start where the first one did"),
         (Compose(ObservationNorm(0.0, 1.0, in_keys=[velocity])), "ObservationNorm overwrites .* the flight"),
     ):
-        with pytest.raises(ValueError, match=message):
-            differentiable_rollout(TransformedEnv(env, transform), actor, None, 2)
+        refuses(message, differentiable_rollout, TransformedEnv(env, transform), actor, None, 2)
     with pytest.raises(TypeError, match=r"Write actor.compile\(\) instead"):
         differentiable_rollout(env, torch.compile(actor), None, 2)
     single = TransformedEnv(HoveringEnv(num_envs=3), ExcludeTransform(("reward_terms", "velocity")))
@@ -78,8 +70,7 @@ def test_losses_say_what_a_critic_must_write():
     actor = make_actor(env)
     rollout, _ = differentiable_rollout(env, actor, None, 3)
     flat = TensorDictModule(lambda x: x.sum(-1), ["observation"], ["state_value"])
-    with pytest.raises(ValueError, match=r"value_network must write .* 'state_value' of shape \(4, 1\); got \(4,\)"):
-        SHACLoss(actor, flat)(rollout)
+    refuses(r"value_network must write .* 'state_value' of shape \(4, 1\); got \(4,\)", SHACLoss(actor, flat), rollout)
     with pytest.raises(ValueError, match=r"SHACLoss needs a V\(s\), which reads no action"):
         SHACLoss(actor, TensorDictModule(torch.nn.Linear(4, 1), ["action"], ["state_value"]))
     loss = HybridLoss(actor, make_value(env))  # somebody else's advantage is not what its own targets are

@@ -66,8 +66,7 @@ def test_every_recipe_trains_on_its_tasks_and_leaves_what_it_promises(launch, no
         may_be_missing = {"eval/lap_time", "eval/landing_speed"}
         assert all(math.isfinite(float(row[name])) for row in rows for name in set(row) - may_be_missing)
         summary = json.loads((folder / "summary.json").read_text())
-        assert summary["episodes"] == 256
-        assert summary["steps"] == steps[-1]
+        assert summary["episodes"] == 256 and summary["steps"] == steps[-1]
         report = printed.split(f"{recipe} on {task}, seed 0, 256 fresh episodes:\n")[1].split("results in")[0]
         assert f"  episodes solved       {EPISODE_METRICS['solved'].format(summary['solved'])}\n" in report
         assert set(TASKS[task].metric_info) <= set(summary)

@@ -9,18 +9,12 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 from PIL import Image
+from refusals import cases, refuses
 from torchrl.envs import RewardSum, TransformedEnv
 
 from torchrl_quad import ActionSequence, HoveringEnv, differentiable_rollout, envs, make_actor, make_env
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric
-from torchrl_quad.render import (
-    animate_flight,
-    plot_episode,
-    plot_flight,
-    plot_learning_curve,
-    video,
-    write_replay,
-)
+from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, video, write_replay
 from torchrl_quad.render.video import View
 
 TASKS = ["hovering", "landing", "racing", "tracking"]
@@ -146,8 +140,7 @@ def test_the_environment_provides_the_control_step_the_markers_and_the_units(tra
     named = TransformedEnv(env, RewardSum()) if transformed else env
     space, over_time = plot_flight(flight, env=named).axes
     animate_flight(flight, tmp_path / "flight.gif", env=named)
-    assert over_time.get_ylabel() == "gates passed"
-    assert over_time.lines[0].get_xdata()[-1] == pytest.approx(0.8)
+    assert over_time.get_ylabel() == "gates passed" and over_time.lines[0].get_xdata()[-1] == pytest.approx(0.8)
     (marks,) = [marks for marks in space.collections if marks.get_label() == "gate"]
     rims = np.asarray(marks._segments3d)
     np.testing.assert_allclose(rims[:, :-1].mean(1), env.gates, atol=1e-5)
@@ -214,10 +207,7 @@ def test_a_target_that_is_no_position_is_not_drawn(shape, tmp_path):
     assert (env.render() != before).any()
 
 
-@pytest.mark.parametrize(
-    ("cls", "given", "name"),
-    [(Climbing, True, "reward"), (Measured, False, "vertical speed"), (Measured, True, "climb rate [cm/s]")],
-)
+@cases((Climbing, True, "reward"), (Measured, False, "vertical speed"), (Measured, True, "climb rate [cm/s]"))
 def test_a_task_without_targets_shows_its_metrics_or_its_reward(cls, given, name, tmp_path):
     env = cls(num_envs=2, max_episode_steps=20)
     flight = env.rollout(20, break_when_any_done=False)
@@ -351,9 +341,6 @@ def test_a_learning_curve_has_gaps_where_cells_are_empty(draw):
     assert np.isnan(axes[1].lines[0].get_ydata()).tolist() == [True, False]
 
 
-@pytest.mark.parametrize(
-    ("rows", "message"), [(["steps,eval/return"], "has no row yet"), (["steps", "1"], "needs the columns .* has steps")]
-)
-def test_a_learning_curve_of_nothing_is_refused(draw, rows, message):
-    with pytest.raises(ValueError, match=message):
-        draw(*rows)
+@cases((["steps,eval/return"], "has no row yet"), (["steps", "1"], "needs the columns .* has steps"))
+def test_a_learning_curve_of_nothing_is_refused(rows, message, draw):
+    refuses(message, draw, *rows)

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 
 import imageio_ffmpeg
 import pytest
+from refusals import refuses
 from small_runs import SMALL
 
 from torchrl_quad import HoveringEnv
@@ -43,8 +44,7 @@ def test_what_cannot_be_drawn_is_named(tmp_path):
             (draw, flight, {"env": "hovering"}, f"{name}: env must be the quadrotor environment .* got str"),
         ]
     for draw, rollout, options, message in calls:
-        with pytest.raises((ValueError, TypeError, IndexError), match=message):
-            draw(rollout, **options)
+        refuses(message, draw, rollout, error=(ValueError, TypeError, IndexError), **options)
     assert not list(tmp_path.iterdir())
 
 
@@ -60,8 +60,7 @@ def test_drawing_leaves_the_user_s_matplotlib_alone():
         draw(flight)
     env.render()
     assert not pyplot.get_fignums()
-    assert matplotlib.get_backend() == "svg"
-    assert dict(matplotlib.rcParams) == settings
+    assert matplotlib.get_backend() == "svg" and dict(matplotlib.rcParams) == settings
 
 
 def test_without_matplotlib_or_ffmpeg_it_says_what_to_install(monkeypatch):
@@ -73,8 +72,7 @@ def test_without_matplotlib_or_ffmpeg_it_says_what_to_install(monkeypatch):
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
     for draw in (plot_flight, plot_episode, film, lambda _: env.render()):
-        with pytest.raises(ImportError, match=r"pip install '.\[render\]'"):
-            draw(flight)
+        refuses(r"pip install '.\[render\]'", draw, flight, error=ImportError)
 
 
 # -- an ffmpeg that does not work --------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from browsing import TIMEOUT
+from refusals import refuses
 from torchrl.envs import RewardSum, TransformedEnv
 
 from torchrl_quad import HoveringEnv, RacingEnv, differentiable_rollout, make_actor, make_env
@@ -55,8 +56,7 @@ def opened(open_page, folder, env, rollout, goal="target"):
     np.testing.assert_allclose(replay.bodies()[:, 0], rollout["state", "position"][:, 0], atol=1e-6)
     success = "  dashed: success below it" if isinstance(env, HoveringEnv) else ""
     panels = ["reward, sum", "action [-1, 1], thrust", "speed [m/s]", f"distance to the {goal} [m]{success}"]
-    assert replay.series()[1] == panels
-    assert replay.layout("yaxis4.type") == ("linear" if goal == "next gate" else "log")
+    assert replay.series()[1] == panels and replay.layout("yaxis4.type") == ("linear" if goal == "next gate" else "log")
     if success:
         low, high = replay.layout("yaxis4.range")
         assert low < -1 < high and replay.layout("shapes.0.y0") == pytest.approx(0.1)
@@ -354,5 +354,4 @@ def test_a_page_of_twelve_long_flights_is_small():
 
 def test_a_machine_without_plotly_is_told_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
-    with pytest.raises(ImportError, match=r"pip install '.\[render\]'"):
-        write_replay(HoveringEnv(num_envs=2).rollout(3))
+    refuses(r"pip install '.\[render\]'", write_replay, HoveringEnv(num_envs=2).rollout(3), error=ImportError)

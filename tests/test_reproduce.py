@@ -12,6 +12,7 @@ import time
 import numpy as np
 import pytest
 import torch
+from refusals import cases, refuses
 from scipy.stats import mannwhitneyu
 
 from benchmarks.paper import elsewhere, flights, gradients, matrix, reproduce, results, running, tables
@@ -127,8 +128,7 @@ side_by_side(1, [(command, [sys.executable, "-c", {sleeper!r}], folder / str(i))
 def test_a_run_that_fails_is_told_and_stops_no_other(tmp_path, capsys):
     codes = ("raise OSError(1) #0", "#1")
     jobs = [(running.command, [sys.executable, "-c", code], tmp_path / code[-1]) for code in codes]
-    with pytest.raises(SystemExit, match="1 of 2 runs failed"):
-        running.side_by_side(1, jobs)
+    refuses("1 of 2 runs failed", running.side_by_side, 1, jobs, error=SystemExit)
     assert "ended with 1: OSError: 1 See log.txt there" in capsys.readouterr().err
     assert (tmp_path / "1/log.txt").exists()
 
@@ -305,9 +305,7 @@ def test_a_task_of_your_own_is_flown_with_all_that_the_paper_flies_on_each_of_it
 RANGE = {"pendulum": (-4 * 16.3, 0.0), "balance": (-20.0, 20.0)}  # returns that four steps can have
 
 
-@pytest.mark.parametrize(
-    ("environment", "losses"), [("pendulum", elsewhere.NAMES), ("balance", ("shac", "hybrid", "ppo"))]
-)
+@cases(("pendulum", elsewhere.NAMES), ("balance", ("shac", "hybrid", "ppo")))
 def test_a_loss_trains_on_another_environment_once_and_has_a_row_in_the_table(
     environment, losses, monkeypatch, tmp_path
 ):
@@ -320,8 +318,7 @@ def test_a_loss_trains_on_another_environment_once_and_has_a_row_in_the_table(
     low, high = RANGE[environment]
     assert low < float(rows[0]["before"]) < high
     table = tables.elsewhere_table(tmp_path)
-    assert [row["loss"] for row in table] == list(losses)
-    assert all(environment in row for row in table)
+    assert [row["loss"] for row in table] == list(losses) and all(environment in row for row in table)
     monkeypatch.setattr(elsewhere, "learn", lambda *_: pytest.fail("It has been trained."))
     run_main(monkeypatch, reproduce, *arguments)
 

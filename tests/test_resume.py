@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from refusals import cases
 from small_runs import EVERYTHING, SMALL, assert_equal, rows, stop_at_save
 
 from torchrl_quad.training import loop
@@ -22,13 +23,10 @@ SEEING = [  # and remembering: a memory, images on their way, and noise that goe
 ]
 
 
-@pytest.mark.parametrize(
-    ("recipe", "options"),
-    [
-        *((recipe, [*EVERYTHING, *ENTROPY]) for recipe in ("abpt", "ahac", "shac", "sapo")),
-        *((recipe, EVERYTHING) for recipe in ("hybrid", "ppo")),
-        ("bptt", [*SEEING, *ENTROPY]),
-    ],
+@cases(
+    *((recipe, [*EVERYTHING, *ENTROPY]) for recipe in ("abpt", "ahac", "shac", "sapo")),
+    *((recipe, EVERYTHING) for recipe in ("hybrid", "ppo")),
+    ("bptt", [*SEEING, *ENTROPY]),
 )
 def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(recipe, options, train, refused, tmp_path, monkeypatch):
     short = "total_steps=96"
@@ -83,8 +81,7 @@ def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint_although_it_left
     assert [row["iteration"] for row in rows(folder)] == ["1", "2"]
     assert f"process {process.pid} on" in (folder / "run.lock").read_text()
     assert_equal(straight, train("abpt", folder, *options, "resume=auto"))
-    assert rows(folder) == rows(tmp_path / "straight")
-    assert not (folder / "run.lock").exists()
+    assert rows(folder) == rows(tmp_path / "straight") and not (folder / "run.lock").exists()
 
 
 def test_resume_auto_starts_goes_on_and_leaves_alone_what_is_finished(train, launch, tmp_path, monkeypatch):

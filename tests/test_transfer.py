@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from deploying import pilot
+from refusals import cases, refuses
 
 from torchrl_quad import load_drone, make_env
 from torchrl_quad.deploy import load_bundle
@@ -97,14 +98,11 @@ def test_mujoco_moves_a_drone_as_our_simulator_does(hovering):
 
 @pytest.mark.slow  # both are optional, and slow to start
 @pytest.mark.filterwarnings("ignore:Attaching a spec with an empty prefix:UserWarning")  # of Crazyflow's own model
-@pytest.mark.parametrize(
-    ("simulator", "changes"),
-    [
-        ("crazyflow", {"quadratic_drag": [0.0, 0.0, 0.0]}),
-        ("rotorpy", {"quadratic_drag": [0.0] * 3, "linear_drag": [0.0] * 3, "thrust_map": [4.1e-7, 0.0, 0.0]}),
-    ],
+@cases(
+    ("crazyflow", {"quadratic_drag": [0.0, 0.0, 0.0]}),
+    ("rotorpy", {"quadratic_drag": [0.0] * 3, "linear_drag": [0.0] * 3, "thrust_map": [4.1e-7, 0.0, 0.0]}),
 )
-def test_other_simulators_move_a_drone_as_ours_does_where_their_models_agree(hovering, simulator, changes):
+def test_other_simulators_move_a_drone_as_ours_does_where_their_models_agree(simulator, changes, hovering):
     pytest.importorskip(simulator)
     contract = in_small_steps(hovering)
     contract |= {"drone": {**contract["drone"], **changes}, "plant": {"mass": 0.47, "motor_time_constant": 0.03}}
@@ -164,8 +162,7 @@ def test_a_drone_that_no_simulator_can_fly_is_refused_with_the_name_of_its_bundl
         ({"motor_time_constant": [0.1, 0.2]}, "mujoco", "Third-party simulators do not fly drones with two motor"),
     ):
         monkeypatch.setitem(bundle.contract, "plant", changes)
-        with pytest.raises(UserValueError, match=f"^{hovering}: {why}"):
-            fly(bundle, simulator)
+        refuses(f"^{hovering}: {why}", fly, bundle, simulator, error=UserValueError)
     monkeypatch.setitem(bundle.contract["simulator"], "dynamics", "balloon")
     with pytest.raises(UserValueError, match=f"^{hovering}: The simulator lacks the dynamics 'balloon'. Known are qu"):
         fly(bundle, "torchrl_quad")
@@ -176,8 +173,7 @@ def test_a_drone_that_no_simulator_can_fly_is_refused_with_the_name_of_its_bundl
         ({"mutant": "yaw"}, "mutant must be one of MUTANTS.values.., got 'yaw'"),
         ({"loop": ["pid"]}, "mujoco has no rate loop"),
     ):
-        with pytest.raises(UserError, match=f"^{hovering}: {why}"):
-            fly(bundle, "mujoco", **options)
+        refuses(f"^{hovering}: {why}", fly, bundle, "mujoco", error=UserError, **options)
 
 
 def test_a_state_that_is_not_a_number_is_a_crash(hovering):
@@ -243,8 +239,7 @@ def test_a_mistake_of_ours_keeps_its_traceback(hovering, tmp_path, monkeypatch, 
         raise ValueError("of ours")
 
     monkeypatch.setattr("torchrl_quad.deploy.transfer.machine", mistake)
-    with pytest.raises(ValueError, match="^of ours$"):
-        launch("transfer", f"bundle={hovering}", f"folder={tmp_path}")
+    refuses("^of ours$", launch, "transfer", f"bundle={hovering}", f"folder={tmp_path}")
 
 
 WRONG_SETTINGS = {

@@ -4,6 +4,7 @@ import pytest
 import yaml
 from conftest import RECIPES
 from omegaconf import OmegaConf
+from refusals import cases
 
 from torchrl_quad.training.configuration import hydra_argument
 
@@ -26,16 +27,13 @@ def test_a_sweep_hands_over_mappings_and_null_as_people_write_them(train, tmp_pa
     assert cfg.env.randomize == values["env.randomize"] == (None if last == 0 else {"mass": {"scale": [0.8, 1.2]}})
 
 
-@pytest.mark.parametrize(
-    ("written", "read"),
-    [
-        ('env.wind={"mean": [1, 0.5, -1e-05], "gust": null}', "env.wind={mean: [1, 0.5, -1e-05], gust: null}"),
-        ("+a={'b c': \"it's\", 'd': True}", r"""+a={b\ c: "it's", d: True}"""),
-        ("a=None,{'b': [1, 2]}", "a=null,{b: [1, 2]}"),  # a sweep of hydra's
-        ("--actor.num_cells=[32, 32]", "actor.num_cells=[32, 32]"),
-        ("env.wind={mean: [1, 0, 0]}", "env.wind={mean: [1, 0, 0]}"),
-        *((x, x) for x in ("env.drone=None_of_them", "--config-name=abpt", "--cfg=job", "--multirun", "~env.wind")),
-    ],
+@cases(
+    ('env.wind={"mean": [1, 0.5, -1e-05], "gust": null}', "env.wind={mean: [1, 0.5, -1e-05], gust: null}"),
+    ("+a={'b c': \"it's\", 'd': True}", r"""+a={b\ c: "it's", d: True}"""),
+    ("a=None,{'b': [1, 2]}", "a=null,{b: [1, 2]}"),  # a sweep of hydra's
+    ("--actor.num_cells=[32, 32]", "actor.num_cells=[32, 32]"),
+    ("env.wind={mean: [1, 0, 0]}", "env.wind={mean: [1, 0, 0]}"),
+    *((x, x) for x in ("env.drone=None_of_them", "--config-name=abpt", "--cfg=job", "--multirun", "~env.wind")),
 )
 def test_arguments_come_in_the_grammar_of_hydra(written, read):
     from hydra.core.override_parser.overrides_parser import OverridesParser

@@ -71,8 +71,7 @@ def test_the_benchmark_of_exported_policies_writes_a_table(run, monkeypatch):
 def test_the_benchmark_of_controllers_writes_a_table(run):
     rows = run("controllers", "--tasks hovering --starts 2 --mpc-starts 1 --steps 2 --calls 1")
     assert [row["policy"] for row in rows] == ["geometric", "mpc"]
-    module = importlib.import_module("benchmarks.controllers")
-    assert module.table(rows).count("\n") == 3
+    assert importlib.import_module("benchmarks.controllers").table(rows).count("\n") == 3
 
 
 def test_the_results_that_are_published_name_their_machine():

@@ -200,8 +200,7 @@ def test_a_policy_without_noise_may_still_move():
     with torch.no_grad():
         actor[0].module.mlp[-1].bias[0] += 0.01
     found = [TrustRegion(actor, 1.0, min_scale=x).divergence(rollout).item() for x in (0.0, 0.1)]
-    expected = [0.01**2 / (2 * scale**2) for scale in (1e-3, 0.1)]
-    assert found == pytest.approx(expected, rel=1e-3)
+    assert found == pytest.approx([0.01**2 / (2 * scale**2) for scale in (1e-3, 0.1)], rel=1e-3)
 
 
 def test_a_trust_region_knows_what_it_needs(env):

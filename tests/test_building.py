@@ -159,19 +159,11 @@ def test_a_state_dict_goes_on_bit_for_bit_also_through_a_file(tmp_path):
 
 def trainer(collector, folder):
     loss = BPTTLoss(collector.policy).make_value_estimator(gamma=0.99)
-    trainer = Trainer(
-        collector=collector,
-        total_frames=4 * FRAMES,
-        frame_skip=1,
-        optim_steps_per_batch=1,
-        loss_module=loss,
-        optimizer=torch.optim.Adam(collector.policy.parameters(), 1e-2),
-        optimization_stepper=DefaultOptimizationStepper(),
-        checkpoint=Checkpoint(),
-        save_trainer_file=folder,
-        progress_bar=False,
-        seed=3,
-    )
+    adam = torch.optim.Adam(collector.policy.parameters(), 1e-2)
+    options = {"frame_skip": 1, "optim_steps_per_batch": 1, "progress_bar": False, "seed": 3}
+    options |= {"total_frames": 4 * FRAMES, "checkpoint": Checkpoint(), "save_trainer_file": folder}
+    options["optimization_stepper"] = DefaultOptimizationStepper()
+    trainer = Trainer(collector=collector, loss_module=loss, optimizer=adam, **options)
     UpdateWeights(collector).register(trainer)
     return trainer
 

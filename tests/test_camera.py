@@ -24,13 +24,8 @@ from torchrl_quad.render import animate_flight, plot_flight, write_replay
 from torchrl_quad.vision import Primitives, nearest
 from torchrl_quad.vision.primitives import distances
 
-PILLARS = {
-    "ground": True,
-    "cylinders": [
-        {"base": [3.0, 0.0, 0.0], "radius": 0.2, "height": 3.0},
-        {"count": 4, "low": [-3, -3, 0], "high": [4, 3, 0], "radius": [0.1, 0.3], "height": [2, 4]},
-    ],
-}
+PILLARS = {"ground": True, "cylinders": [{"base": [3.0, 0.0, 0.0], "radius": 0.2, "height": 3.0}]}
+PILLARS["cylinders"] += [{"count": 4, "low": [-3, -3, 0], "high": [4, 3, 0], "radius": [0.1, 0.3], "height": [2, 4]}]
 OPTIONS = {"wind": {"gust": 0.5}, "randomize": {"mass": {"scale": [0.9, 1.1]}}, "observation_noise": {"velocity": 0.1}}
 
 
@@ -53,8 +48,7 @@ def test_a_compiled_step_sees_what_an_eager_one_sees_with_the_same_gradients():
         env = ForestEnv(**made, compile=compiled)
         actions = commands(env, 9)
         rollout = fly(env, actions)
-        objective = rollout["next", "reward"].sum() + (rollout["next", "depth"] * torch.arange(6)).sum()
-        objective.backward()
+        (rollout["next", "reward"].sum() + (rollout["next", "depth"] * torch.arange(6)).sum()).backward()
         flown.append((rollout.detach(), actions.grad))
     (eager, slope), (fused, fused_slope) = flown
     assert eager["next", "done"].any()
@@ -98,8 +92,7 @@ def test_gradients_of_rewards_and_images_are_those_of_finite_differences():
 
 
 def test_images_are_taken_at_the_rate_and_seen_after_the_delay():
-    camera = {"width": 5, "height": 4, "rate": 3, "delay": 4}
-    late = HoveringEnv(num_envs=2, scene=PILLARS, camera=camera)
+    late = HoveringEnv(num_envs=2, scene=PILLARS, camera={"width": 5, "height": 4, "rate": 3, "delay": 4})
     prompt = HoveringEnv(num_envs=2, scene=PILLARS, camera={"width": 5, "height": 4})
     actions = commands(late, 20).detach()
     start = late.reset()
@@ -270,15 +263,10 @@ def test_the_reward_of_the_forest_is_its_formula():
     def gentle(x):
         return math.sqrt(x * x + 0.25) - 0.5
 
-    expected = {
-        "speed": 0.1 * (1.0 - gentle(1.0) / gentle(4.0)),
-        "clearance": -0.1 * math.log(1.0 + math.exp((0.3 - distance) / 0.1)),
-        "closing": -0.15 * 3.0 * math.exp(-distance / 0.5),
-        "smoothness": -0.005 * 0.25,
-        "heading": -0.05 * (1.0 - math.cos(turn)),
-        "collision": 0.0,
-        "finish": 0.0,
-    }
+    expected = {"speed": 0.1 * (1.0 - gentle(1.0) / gentle(4.0)), "heading": -0.05 * (1.0 - math.cos(turn))}
+    expected["clearance"] = -0.1 * math.log(1.0 + math.exp((0.3 - distance) / 0.1))
+    expected["closing"] = -0.15 * 3.0 * math.exp(-distance / 0.5)
+    expected |= {"smoothness": -0.005 * 0.25, "collision": 0.0, "finish": 0.0}
     terms = {name: term.item() for name, term in env.reward_terms(state).items()}
     assert terms == pytest.approx(expected, rel=1e-9)
     away = env.reward_terms({**state, "velocity": -state["velocity"]})  # from the pole, which costs nothing
@@ -313,18 +301,11 @@ def test_an_episode_of_the_forest_has_the_mean_speed_and_the_least_clearance_unt
     """Of two drones: one crashes in its third step, and what follows counts no more; one flies to the end."""
     env = ForestEnv(num_envs=2, camera=None, density=0.0, dtype=torch.float64)
     crash = torch.tensor([[False, False, True, False], [False, False, False, False]]).unsqueeze(-1)
-    ends = {
-        "reward": torch.ones(2, 4, 1, dtype=torch.float64),
-        "done": crash,
-        "crash": crash,
-        "success": torch.tensor([[True] * 4, [False, False, False, True]]).unsqueeze(-1),
-        "metrics": {
-            "distance": [[1, 2, 3, 0], [4, 5, 6, 30]],
-            "flown_speed": [[1, 2, 6, 50], [2, 4, 6, 8]],
-            "clearance": [[0.9, 0.4, 0.7, 0.1], [0.8, 0.6, 0.5, 0.3]],
-        },
-    }
-    ends["metrics"] = {name: env.tensor(x).unsqueeze(-1) for name, x in ends["metrics"].items()}
+    success = torch.tensor([[True] * 4, [False, False, False, True]]).unsqueeze(-1)
+    ends = {"reward": torch.ones(2, 4, 1, dtype=torch.float64), "done": crash, "crash": crash, "success": success}
+    measured = {"distance": [[1, 2, 3, 0], [4, 5, 6, 30]], "flown_speed": [[1, 2, 6, 50], [2, 4, 6, 8]]}
+    measured["clearance"] = [[0.9, 0.4, 0.7, 0.1], [0.8, 0.6, 0.5, 0.3]]
+    ends["metrics"] = {name: env.tensor(x).unsqueeze(-1) for name, x in measured.items()}
     metrics = env.episode_metrics(TensorDict({"next": ends}, [2, 4]))
     expected = {"return": [3, 4], "crash": [1, 0], "solved": [0, 1], "distance": [3, 30]}
     expected |= {"flown_speed": [3.0, 5.0], "clearance": [0.4, 0.3]}
@@ -340,8 +321,7 @@ def test_random_obstacles_keep_clear_of_the_start_and_of_the_target(kind, size):
     scene = {kind: [{"count": 8, "low": [-2.0, -2.0, 0.0], "high": [2.0, 2.0, 3.0], **size}], "clearance": 0.5}
     env = HoveringEnv(num_envs=50, scene=scene, dtype=torch.float64)
     state = dict(env.sample_start(50)["state"].items(include_nested=True, leaves_only=True))
-    kept = torch.stack((state["position"], state["target"]), 1)
-    gaps = distances(env.scene.solids(state), kept).min()
+    gaps = distances(env.scene.solids(state), torch.stack((state["position"], state["target"]), 1)).min()
     assert env.scene.radius + 0.5 <= gaps < env.scene.radius + 0.55  # some stand as near as they may
 
 

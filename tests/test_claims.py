@@ -32,9 +32,6 @@ def ends_higher(r, best, *others, task="hovering"):
     return try_claim(Claim("A", "", lambda r: claims.higher_end(r, [task], best, others)), r)
 
 
-# -- claims ------------------------------------------------------------------------------------------------------------
-
-
 def test_the_statistics_are_those_worked_by_hand():
     a, b = np.array([1.0, 2.0, 3.0]), np.array([0.0, 2.0])
     assert probability(a, b) == pytest.approx((1 + 0 + 1 + 0.5 + 1 + 1) / 6)
@@ -161,9 +158,6 @@ def test_claims_compare_visited_states_under_the_same_dynamics_and_shac_as_xu_wh
             assert {variant for _, variant in r.used} == {"abpt-now", "abpt-no-visited"}
     assert used["C8"] == {("hovering", "shac-cut"), ("tracking", "shac-cut")}
     assert used["C11"] == used["C12"] == {("landing", "shac-xu")} and used["C13"] == {("racing", "shac-xu")}
-
-
-# -- the page ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_page_is_made_of_other_results_and_the_pages_of_the_project_stay_as_they_are(quick, monkeypatch, tmp_path):

@@ -163,8 +163,6 @@ def test_under_torchrun_no_gpu_is_named_for_all_processes(monkeypatch):
         raise AssertionError("It is refused before anything is joined.")
 
 
-# -- YAML --------------------------------------------------------------------------------------------------------------
-
 ALIASES = "a0: &a0 [1, 1]\n" + "".join(f"a{i + 1}: &a{i + 1} [*a{i}, *a{i}]\n" for i in range(40))
 
 

@@ -301,9 +301,6 @@ def test_states_of_other_tasks_and_options_are_neither_mixed_nor_broadcast(fligh
         visited(flight[2], state_keys=["th"])
 
 
-# -- restarts ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("wrap", [False, True])
 def test_a_restart_begins_a_fraction_of_the_flights_afresh_and_lets_the_others_go_on(wrap):
     env = HoveringEnv(num_envs=1000)

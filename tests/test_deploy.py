@@ -33,9 +33,6 @@ def hovering(export_once):
     return export_once("hovering")[2]
 
 
-# -- the same policy ---------------------------------------------------------------------------------------------------
-
-
 def test_torch_onnx_and_c_agree_and_the_contract_fits_its_schema(exported, tmp_path):
     env, actor, folder = exported
     vectors = dict(np.load(folder / "vectors.npz"))
@@ -190,9 +187,6 @@ def test_c_answers_what_is_not_finite_with_the_hover_action_and_decodes_commands
     thrust, rates = ctypes.c_float(), (ctypes.c_float * 3)()
     library.policy_command((ctypes.c_float * 4)(-1 / 3, 0.5, -1.0, 0.25), ctypes.byref(thrust), rates)
     assert [thrust.value, *rates] == pytest.approx([0.46 * 9.81, 1.0, -2.0, 0.5])
-
-
-# -- the folder --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", ["landing", "forest"])

@@ -5,15 +5,14 @@ import copy
 import json
 import math
 import re
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from deploying import FLOWN, build, measured, resting
 from refusals import cases
+from small_runs import run
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import PendulumEnv, RewardSum, TransformedEnv
@@ -25,8 +24,6 @@ from torchrl_quad.deploy.contract import MissingQuantity, NegativeDepth, NotFini
 from torchrl_quad.envs import TASKS
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.training.drawing import environment_beside
-
-ROOT = Path(__file__).parent.parent
 
 
 def far(value):
@@ -186,9 +183,6 @@ def test_a_normalizer_is_that_of_the_transforms_or_is_given_beside_a_bare_enviro
     assert marks[0] != marks[1] == marks[2]
 
 
-# -- steps that fail ---------------------------------------------------------------------------------------------------
-
-
 class Failing:
     """A session that fails or answers something else, once."""
 
@@ -248,8 +242,7 @@ def test_a_step_that_failed_and_is_repeated_equals_one_that_never_failed(export_
         graph.session = session
         if fails:
             np.testing.assert_equal(content(failing), before)
-        given = failing(state) if fails else failing.command(failing.action)
-        np.testing.assert_equal(given, untouched(state))
+        np.testing.assert_equal(failing(state) if fails else failing.command(failing.action), untouched(state))
     np.testing.assert_equal(content(failing), content(untouched))
     assert task != "racing" or failing.progress["gate"] == 1
     if kind is not KeyboardInterrupt:
@@ -276,8 +269,6 @@ def test_a_start_that_makes_no_sense_is_refused_and_changes_nothing(task, progre
     np.testing.assert_equal(bundle.progress, before)
 
 
-# -- without torch -----------------------------------------------------------------------------------------------------
-
 BLOCKED = """
 import sys
 
@@ -291,9 +282,7 @@ sys.meta_path.insert(0, Blocked())
 
 
 def python(program):
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return run(sys.executable, "-c", program)
 
 
 def test_flying_needs_numpy_onnxruntime_and_jsonschema_alone(export_once):
@@ -327,9 +316,6 @@ def test_the_package_imports_its_parts_when_they_are_asked_for():
         assert getattr(torchrl_quad, name).__module__.startswith("torchrl_quad"), name
     assert not hasattr(torchrl_quad, "Nothing") and not hasattr(torchrl_quad.deploy, "Nothing")
     python("import sys, torchrl_quad; assert 'torch' not in sys.modules")
-
-
-# -- recipe and page ---------------------------------------------------------------------------------------------------
 
 
 def test_the_recipe_exports_the_best_policy_of_a_run_with_its_results(train, launch, refused, tmp_path, export_once):

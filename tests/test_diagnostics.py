@@ -15,8 +15,6 @@ from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_e
 from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
 from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss
 
-# -- by hand -----------------------------------------------------------------------------------------------------------
-
 
 class Weigh(nn.Module):
     """The weighted sum of all entries of its inputs."""
@@ -38,19 +36,11 @@ def make_rollout(states=((1.0, 2.0, 3.0), (1.0, 2.0, 3.0)), weight=2.0):
     actor = module(Weigh(weight), ["observation"], "action")
     state = torch.tensor(states).unsqueeze(-1)
     steps = [actor(TensorDict({"observation": s}, s.shape[:1])) for s in state.unbind(1)]
-    terms = [
-        {
-            "linear": 3.0 * td["action"],
-            "quadratic": -td["action"].square(),
-            "bonus": 5.0 * (td["observation"] > 2.5),
-            "alive": torch.ones_like(td["action"]),
-            "crash": torch.zeros_like(td["action"]),
-        }
-        for td in steps
-    ]
-    for td, paid in zip(steps, terms, strict=True):
-        no = torch.zeros_like(td["action"], dtype=torch.bool)
-        ends = {"reward": sum(paid.values()), "reward_terms": paid, "observation": td["observation"] + td["action"]}
+    for td in steps:
+        s, a = td["observation"], td["action"]
+        paid = {"linear": 3.0 * a, "quadratic": -a.square(), "bonus": 5.0 * (s > 2.5), "alive": torch.ones_like(a)}
+        paid["crash"], no = torch.zeros_like(a), torch.zeros_like(a, dtype=torch.bool)
+        ends = {"reward": sum(paid.values()), "reward_terms": paid, "observation": s + a}
         td["next"] = TensorDict({**ends, "done": no, "terminated": no}, td.batch_size)
     return torch.stack(steps, 1), actor
 
@@ -97,13 +87,9 @@ def test_the_actions_of_a_rollout_may_be_the_inputs():
 
 def test_a_gradient_that_is_not_finite_is_no_gradient():
     rollout, actor = make_rollout()
-    root = (rollout["action"] - rollout["action"].detach()).sqrt()
-    rollout["next", "reward_terms", "root"] = root
+    rollout["next", "reward_terms", "root"] = (rollout["action"] - rollout["action"].detach()).sqrt()
     assert audit_reward(rollout, actor)["root"].verdict == "not finite"
     assert audit_reward(rollout, actor).without_gradient == ["bonus", "root"]
-
-
-# -- the paper's column DIFF -------------------------------------------------------------------------------------------
 
 
 def fly(task, horizon=24, **options):
@@ -147,9 +133,6 @@ def test_the_audit_finds_which_rewards_are_fully_and_which_are_partially_differe
     for key in ("action", ("state", "quaternion")):  # the first state has no graph
         by_entry = audit_reward(rollout, rollout[key])
         assert [term.verdict for term in by_entry.values()] == [term.verdict for term in audit.values()]
-
-
-# -- simulator against critic ------------------------------------------------------------------------------------------
 
 
 def shac(rollout_and_actor, critic, **options):
@@ -197,9 +180,6 @@ def test_the_cosine_is_nan_where_one_of_the_two_gradients_is_missing():
     assert alone.value_norm > 0 and math.isnan(alone.first_order_norm) and math.isnan(alone.cosine)
 
 
-# -- norm and variance -------------------------------------------------------------------------------------------------
-
-
 def test_the_spread_of_the_gradients_is_that_worked_by_hand():
     rollout, actor = reward_is_action(make_rollout(states=((1.0, 1.0), (2.0, 4.0), (0.0, 1.0), (9.0, 9.0))))
     loss = BPTTLoss(actor).make_value_estimator(gamma=1.0)
@@ -244,9 +224,6 @@ def test_the_variance_is_that_of_a_loop_with_backward_and_leaves_no_grad_behind(
             assert gradient_by_horizon(env, actor, loss, [horizon], start=start) == {horizon: statistics}
 
 
-# -- other environments ------------------------------------------------------------------------------------------------
-
-
 def test_diagnostics_look_at_the_pendulum_of_torchrl():
     env = PendulumEnv(seed=0)
     actor, value, qvalue = pendulum_networks(env)
@@ -262,8 +239,6 @@ def test_diagnostics_look_at_the_pendulum_of_torchrl():
         grown = gradient_by_horizon(env, actor, loss, (2, 8), start=start, max_envs=4)
         assert grown[8].norm > grown[2].norm and all(x.variance > 0 for x in grown.values())
 
-
-# -- errors ------------------------------------------------------------------------------------------------------------
 
 AUDITS = {
     r"do not add up to the reward: they are off by up to 12": lambda r, a: audit_reward(r, a, reward_key="scaled"),

@@ -12,17 +12,13 @@ from torchrl_quad.dynamics import quaternion
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.disturbances import Disturbance, Sensors
 
+RANDOMIZE = {"mass": {"scale": [0.8, 1.2]}, "inertia": {"scale": [0.9, 1.1]}}
+RANDOMIZE |= {"motor_time_constant": {"uniform": [0.02, 0.05]}, "linear_drag": {"normal": [0.005, 0.001]}}
 EVERYTHING = {
     "wind": {"mean": [1.0, 0.0, 0.0], "spread": [0.5, 0.5, 0.0], "gust": 0.5},
     "observation_noise": {"position": 0.01, "attitude": 0.01, "velocity": 0.05, "angular_velocity": 0.02},
-    "observation_delay": 2,
-    "randomize": {
-        "mass": {"scale": [0.8, 1.2]},
-        "inertia": {"scale": [0.9, 1.1]},
-        "motor_time_constant": {"uniform": [0.02, 0.05]},
-        "linear_drag": {"normal": [0.005, 0.001]},
-    },
     "random_start": {"tilt": 0.5, "yaw": 3.1, "velocity": 1.0, "angular_velocity": 0.5},
+    **{"observation_delay": 2, "randomize": RANDOMIZE},
 }
 
 
@@ -56,8 +52,7 @@ def test_gradients_with_every_disturbance_agree_with_finite_differences(task):
         env.set_seed(5)
         state = start.clone(recurse=True)
         state["position"], state["drone", "mass"], state["wind"] = position, mass, wind
-        td = env.reset(TensorDict({"state": state}, [2]), set_state=True)
-        ends = fly(env, td, actions.unbind(1))["next"]
+        ends = fly(env, env.reset(TensorDict({"state": state}, [2]), set_state=True), actions.unbind(1))["next"]
         return torch.cat((ends["reward"].flatten(), ends["observation"].flatten()))
 
     inputs = (actions, position, mass, wind)
@@ -66,12 +61,10 @@ def test_gradients_with_every_disturbance_agree_with_finite_differences(task):
 
 def test_drones_are_drawn_at_reset_within_their_bounds_and_stay_for_an_episode():
     env = HoveringEnv(num_envs=2000, randomize=EVERYTHING["randomize"], max_episode_steps=3)
-    td = env.reset()
-    drone, nominal = td["state", "drone"], env.nominal
+    drone, nominal = env.reset()["state", "drone"], env.nominal
     assert set(drone.keys()) == set(EVERYTHING["randomize"])
     ratio = drone["mass"] / nominal.mass
-    assert 0.8 <= ratio.min() < 0.82
-    assert 1.18 < ratio.max() <= 1.2
+    assert 0.8 <= ratio.min() < 0.82 and 1.18 < ratio.max() <= 1.2
     assert 0.02 <= drone["motor_time_constant"].min() < 0.021
     assert (drone["inertia"] / nominal.inertia).std(0).min() > 0.05
     assert abs(drone["linear_drag"].std().item() - 0.001) < 1e-4
@@ -128,8 +121,7 @@ def test_wind_has_the_strength_the_memory_and_the_spread_asked_for():
     wind = fly(env, env.reset(), hold(env, 6))["next", "state", "wind"] - torch.tensor([2.0, 0.0, 0.0])
     for t in (0, 5):
         assert wind[:, t].std(0).tolist() == pytest.approx([1.5] * 3, rel=0.05)
-    correlation = (wind[:, 0] * wind[:, 5]).mean(0) / 1.5**2
-    assert correlation.tolist() == pytest.approx([0.368] * 3, abs=0.06)
+    assert ((wind[:, 0] * wind[:, 5]).mean(0) / 1.5**2).tolist() == pytest.approx([0.368] * 3, abs=0.06)
     mean = HoveringEnv(num_envs=1000, wind={"spread": [3.0, 0.0, 1.0]}).reset()["state", "wind"]
     assert mean.abs().amax(0).tolist() == pytest.approx([3.0, 0.0, 1.0], abs=0.05)
 
@@ -162,16 +154,13 @@ def test_the_noise_has_the_size_asked_for_and_rewards_do_not_see_it():
 
 
 def test_random_starts_tilt_turn_and_push_within_their_bounds():
-    env = HoveringEnv(num_envs=4000, random_start=EVERYTHING["random_start"])
-    state = env.reset()["state"]
+    state = HoveringEnv(num_envs=4000, random_start=EVERYTHING["random_start"]).reset()["state"]
     up = quaternion.rotate(state["quaternion"], torch.tensor([0.0, 0.0, 1.0]).expand(4000, 3))
     tilt = torch.acos(up[:, 2].clamp(max=1.0))
-    assert 0.48 < tilt.max() <= 0.5 + 1e-3
-    assert tilt.mean().item() == pytest.approx(0.25, abs=0.02)
+    assert 0.48 < tilt.max() <= 0.5 + 1e-3 and tilt.mean().item() == pytest.approx(0.25, abs=0.02)
     ahead = quaternion.rotate(state["quaternion"], torch.tensor([1.0, 0.0, 0.0]).expand(4000, 3))
     assert torch.atan2(ahead[:, 1], ahead[:, 0]).abs().max() > 3.0
-    assert 0.95 < state["velocity"].abs().max() <= 1.0
-    assert 0.47 < state["angular_velocity"].abs().max() <= 0.5
+    assert 0.95 < state["velocity"].abs().max() <= 1.0 and 0.47 < state["angular_velocity"].abs().max() <= 0.5
     assert state["quaternion"].norm(dim=-1).tolist() == pytest.approx([1.0] * 4000, abs=1e-5)
 
 
@@ -259,8 +248,7 @@ def test_a_weight_may_be_changed_and_an_unknown_one_is_named():
     state = usual.rollout(5)["next", "state"][:, -1]
     before, after = usual.reward_terms(state), other.reward_terms(state)
     torch.testing.assert_close(after["position"], 9 / 0.1 * before["position"])
-    assert (after["velocity"] == 0).all()
-    assert torch.equal(after["survival"], before["survival"])
+    assert (after["velocity"] == 0).all() and torch.equal(after["survival"], before["survival"])
     assert make_env("racing", num_envs=1, gate_bonus="log", weights={"gate": 3.0}).weights["gate"] == 3.0
     with pytest.raises(ValueError, match="weights: unknown term speed. Choose from: survival, position"):
         HoveringEnv(num_envs=1, weights={"speed": 1.0})

@@ -36,7 +36,6 @@ def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
     ({"mass": None}, r"mine.yaml: missing field 'mass'. Required: mass, inertia"),
     ({"colour": 3.0}, r"mine.yaml: unknown field 'colour'. Allowed: mass, inertia"),
     ({"mass": -1.0}, r"mine.yaml: field 'mass' must be between 0.001 and 1000, in SI units; got \[-1.0\]"),
-    ({"mass": float("nan")}, r"mine.yaml: field 'mass' must be between"),
     ({"inertia": [1e-3, float("inf"), 1e-3]}, r"mine.yaml: field 'inertia' must be between 1e-08 and 1000"),
     ({"inertia": [1e-3, 1e-3]}, r"mine.yaml: field 'inertia' has shape \(2,\); it must be \(3,\)"),
     ({"linear_drag": [0.0, -0.1, 0.0]}, r"mine.yaml: field 'linear_drag' must be between 0 and 100"),

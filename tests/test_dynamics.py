@@ -63,8 +63,7 @@ def test_free_fall_follows_the_parabola():
 
 def test_terminal_velocity_is_where_drag_balances_weight():
     params = drone()
-    end = fly_body(body(), params, NO_WRENCH, 60.0, 0.05)
-    speed = -end.velocity[0, 2]
+    speed = -fly_body(body(), params, NO_WRENCH, 60.0, 0.05).velocity[0, 2]
     force = params.linear_drag[2] * speed + params.quadratic_drag[2] * speed**2
     torch.testing.assert_close(force, (params.mass * params.gravity)[0], rtol=1e-6, atol=0)
 
@@ -145,8 +144,7 @@ def test_allocation_is_r_cross_f_for_any_layout():
     params = drone(rotor_positions=positions, rotor_spin=[1.0, 1.0, -1.0, -1.0])
     thrust = torch.tensor([1.0, 2.0, 0.5, 1.5], dtype=F64)
     arms = torch.nn.functional.pad(params.rotor_positions, (0, 1))
-    forces = torch.nn.functional.pad(thrust.unsqueeze(-1), (2, 0))
-    torque = torch.linalg.cross(arms, forces).sum(0)
+    torque = torch.linalg.cross(arms, torch.nn.functional.pad(thrust.unsqueeze(-1), (2, 0))).sum(0)
     torque[2] += (params.yaw_torque_coefficient * params.rotor_spin * thrust).sum()
     torch.testing.assert_close(rigid_body.allocation_matrix(params) @ thrust, torch.cat((thrust.sum()[None], torque)))
 
@@ -263,8 +261,7 @@ def speeds(controller, setpoint):
 
 def setpoints(controller, n, size):
     """Random setpoints (n) of thrusts about hovering, and body rates up to a size times the greatest."""
-    weight = controller.nominal.mass * controller.nominal.gravity
-    thrust = weight * (0.7 + 0.6 * torch.rand(n, 1, dtype=F64))
+    thrust = controller.nominal.mass * controller.nominal.gravity * (0.7 + 0.6 * torch.rand(n, 1, dtype=F64))
     return Setpoint(thrust, size * (2 * torch.rand(n, 3, dtype=F64) - 1) * controller.nominal.max_body_rate)
 
 
@@ -294,8 +291,7 @@ def test_where_nothing_saturates_the_mixer_is_untouched_to_the_last_bit(controll
 
 @each_drone
 def test_no_command_asks_more_of_a_rotor_than_it_can_give(controller):
-    setpoint = setpoints(controller, 500, 30.0)
-    thrust = controller.rotors.thrust(speeds(controller, setpoint))
+    thrust = controller.rotors.thrust(speeds(controller, setpoints(controller, 500, 30.0)))
     slack = 1e-6 * controller.thrust_max
     assert ((thrust >= controller.thrust_min - slack) & (thrust <= controller.thrust_max + slack)).all()
 

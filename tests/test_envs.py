@@ -15,16 +15,11 @@ from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEn
 from torchrl_quad import HoveringEnv, QuadrotorParams, differentiable_rollout, load_drone, make_actor, make_env
 from torchrl_quad.envs import TASKS
 
+OTHER = {"integrator": "rk4", "drone": "small_racer", "control_dt": 0.01, "observe_last_action": True}
+
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"action_delay": 0},
-        {"action_delay": 3},
-        {"integrator": "rk4", "drone": "small_racer", "control_dt": 0.01, "observe_last_action": True},
-    ],
-)
+@pytest.mark.parametrize("options", [{"action_delay": 0}, {"action_delay": 3}, OTHER])
 def test_specs_hold_with_any_precision_delay_and_observation(dtype, options):
     env = HoveringEnv(num_envs=3, dtype=dtype, max_episode_steps=7, **options)
     check_env_specs(env, break_when_any_done="both")
@@ -43,8 +38,7 @@ def test_a_drone_that_hovers_stays_and_succeeds(env64):
 
 def test_the_reward_is_the_paper_s_formula_and_the_observation_ten_times_the_paper_s(env64):
     flight = env64.rollout(5)
-    terms = flight["next", "reward_terms"]
-    torch.testing.assert_close(sum(terms.values()), flight["next", "reward"])
+    torch.testing.assert_close(sum(flight["next", "reward_terms"].values()), flight["next", "reward"])
     state = flight["next", "state"]
     level = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
@@ -76,8 +70,7 @@ def test_running_out_of_time_truncates_and_does_not_terminate():
     env = HoveringEnv(num_envs=2, max_episode_steps=5)
     flight = fly(env, env.reset(), hold(env, 5))["next"]
     assert flight["truncated"][..., 0].tolist() == [[False] * 4 + [True]] * 2
-    assert torch.equal(flight["done"], flight["truncated"])
-    assert not flight["terminated"].any()
+    assert torch.equal(flight["done"], flight["truncated"]) and not flight["terminated"].any()
 
 
 def test_leaving_the_box_terminates_and_does_not_truncate():
@@ -243,14 +236,10 @@ def test_an_environment_stays_compiled_where_it_moves_until_it_is_made_eager():
     assert_equal(fly_on(env, 3), fly_on(fresh, 3))
 
 
-RESTLESS = {  # flights that crash after some ten steps, each in its own time
-    "num_envs": 8,
-    "dtype": torch.float64,
-    "seed": 3,
-    "random_start": {"tilt": 3.0, "velocity": 20.0},
-    "wind": {"gust": 2.0},
-    "observation_noise": {"position": 0.1, "velocity": 0.1},
-}
+# Flights that crash after some ten steps, each in its own time.
+RESTLESS = {"num_envs": 8, "dtype": torch.float64, "seed": 3, "random_start": {"tilt": 3.0, "velocity": 20.0}}
+RESTLESS |= {"wind": {"gust": 2.0}, "observation_noise": {"position": 0.1, "velocity": 0.1}}
+ONCE = {"auto_reset": False, "break_when_any_done": False}
 POLICY = TensorDictModule(lambda x: x[:, :4].sin(), in_keys=["observation"], out_keys=["action"])
 STEPS = 80
 
@@ -267,21 +256,20 @@ def by_hand(env, start, steps):
 def test_one_seed_gives_one_flight_however_it_is_flown(device, monkeypatch):
     if device == "an accelerator":
         look_at_nothing(monkeypatch)
-    options = {"auto_reset": False, "break_when_any_done": False}
     env = HoveringEnv(**RESTLESS)
-    expected = env.rollout(STEPS, POLICY, tensordict=env.reset(), **options)
+    expected = env.rollout(STEPS, POLICY, tensordict=env.reset(), **ONCE)
     assert expected["next", "done"].sum() > 20
 
     other = HoveringEnv(**RESTLESS)
-    flights = {"TorchRL's loop": EnvBase.rollout(other, STEPS, POLICY, tensordict=other.reset(), **options)}
+    flights = {"TorchRL's loop": EnvBase.rollout(other, STEPS, POLICY, tensordict=other.reset(), **ONCE)}
     other = HoveringEnv(**RESTLESS)
     flights["by hand"] = by_hand(other, other.reset(), STEPS)
     other = TransformedEnv(HoveringEnv(**RESTLESS), Compose(StepCounter(), RewardSum()))
-    flights["transformed"] = other.rollout(STEPS, POLICY, tensordict=other.reset(), **options)
+    flights["transformed"] = other.rollout(STEPS, POLICY, tensordict=other.reset(), **ONCE)
     other = HoveringEnv(**RESTLESS)
     td, halves = other.reset(), []
     for steps in (13, STEPS - 13):
-        halves.append(other.rollout(steps, POLICY, tensordict=td, **options))
+        halves.append(other.rollout(steps, POLICY, tensordict=td, **ONCE))
         td = other.maybe_reset(other.step_mdp(halves[-1][:, -1]))
     flights["in two parts"] = torch.cat(halves, 1)
     for name, flight in flights.items():
@@ -294,23 +282,21 @@ def test_episodes_that_end_soon_start_at_another_state_each_time():
     td = env.reset()
     td["state", "step"] = torch.tensor([[0], [1], [2], [0], [1], [2]])  # they end in different steps
     start = env.reset(td, set_state=True)
-    flight = env.rollout(31, POLICY, tensordict=start, auto_reset=False, break_when_any_done=False)
+    flight = env.rollout(31, POLICY, tensordict=start, **ONCE)
     begins = flight["state", "step"][:, 1:, 0] == 0
     for positions, begin in zip(flight["state", "position"][:, 1:], begins, strict=True):
-        assert begin.sum() >= 10
-        assert len(positions[begin].unique(dim=0)) == begin.sum()
+        assert begin.sum() >= 10 and len(positions[begin].unique(dim=0)) == begin.sum()
 
 
 @pytest.mark.parametrize("steps", [5, 45])
 def test_a_flight_goes_on_bit_for_bit_from_a_saved_random_state(steps):
     env = TransformedEnv(HoveringEnv(**RESTLESS), StepCounter())
-    options = {"auto_reset": False, "break_when_any_done": False}
-    first = env.rollout(steps, POLICY, tensordict=env.reset(), **options)
+    first = env.rollout(steps, POLICY, tensordict=env.reset(), **ONCE)
     carry = env.maybe_reset(env.step_mdp(first[:, -1]))
     saved = io.BytesIO()
     torch.save({"random": env.random_state(), "state": carry["state"].to_dict()}, saved)
     saved.seek(0)
-    expected = env.rollout(50, POLICY, tensordict=carry.clone(), **options)
+    expected = env.rollout(50, POLICY, tensordict=carry.clone(), **ONCE)
 
     loaded = torch.load(saved, weights_only=True)
     again = TransformedEnv(HoveringEnv(**{**RESTLESS, "seed": 99}), StepCounter())
@@ -318,7 +304,7 @@ def test_a_flight_goes_on_bit_for_bit_from_a_saved_random_state(steps):
     start = again.reset(TensorDict({"state": loaded["state"]}, [8]), set_state=True)
     again.set_random_state(loaded["random"])
     for _ in range(2):  # what was loaded can be loaded again
-        flight = again.rollout(50, POLICY, tensordict=start.clone(), **options)
+        flight = again.rollout(50, POLICY, tensordict=start.clone(), **ONCE)
         for key in (("state", "position"), ("state", "wind"), "observation", ("next", "reward")):
             assert torch.equal(flight[key], expected[key]), key
         again.set_random_state(loaded["random"])

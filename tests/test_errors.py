@@ -150,8 +150,7 @@ def test_an_action_is_not_looked_at_where_nobody_can(env64, transform):
 
     action = env64.hover_action.repeat(4, 1)
     if transform == "compile":
-        compiled = torch.compile(reward, backend="eager")
-        torch.testing.assert_close(compiled(action), reward(action))
+        torch.testing.assert_close(torch.compile(reward, backend="eager")(action), reward(action))
     elif transform == "vmap":
         torch.testing.assert_close(torch.vmap(reward)(action.expand(2, 4, 4)), reward(action).expand(2))
     else:

@@ -49,8 +49,7 @@ STARTS = {"racing": racers, "landing": landers}
 
 def flight(env, state, actions):
     """What each step pays and leads to, with the state at its start, (n, STEPS)."""
-    td = env.reset(TensorDict({"state": state}, env.batch_size), set_state=True)
-    return fly(env, td, actions.unbind(1))
+    return fly(env, env.reset(TensorDict({"state": state}, env.batch_size), set_state=True), actions.unbind(1))
 
 
 def bisected(env, steps):
@@ -141,8 +140,7 @@ def test_gradients_in_actions_and_start_are_those_of_the_return_in_continuous_ti
                 values[i] = values[i] + step * size * direction.view_as(grad)
                 along[step] = reference(values)[part]
             expected = (8.0 * (along[1] - along[-1]) - (along[2] - along[-2])) / (12.0 * size)
-            slope = (grad.flatten(1) * direction).sum(1)
-            torch.testing.assert_close(slope, expected, rtol=1e-6, atol=1e-12)
+            torch.testing.assert_close((grad.flatten(1) * direction).sum(1), expected, rtol=1e-6, atol=1e-12)
 
 
 @each_task

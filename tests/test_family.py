@@ -65,8 +65,7 @@ def test_the_target_entropy_of_sapo_is_minus_half_the_size_of_the_action():
     loss, rollout = make_sapo(10.0, alpha="auto", target_entropy="auto")
     assert loss._target_entropy(rollout) == -0.5
     assert loss._normalized_entropy(rollout)[0, :, 0].tolist() == [x + 0.5 for x in ENTROPY]  # (h + 1/2) / (2 / 2)
-    loss_alpha = loss.loss_actor(rollout)[1]["loss_alpha"]
-    loss_alpha.backward()
+    loss.loss_actor(rollout)[1]["loss_alpha"].backward()
     assert loss.alpha == 1.0 and loss.log_alpha.grad == 0.5  # the mean entropy of 0 is too high: alpha falls
 
 
@@ -188,8 +187,7 @@ def test_a_clip_that_never_clips_leaves_the_gradient_of_the_simulated_start():
     for clip in (None, 1e9):
         torch.manual_seed(0)  # the critics, and the actions that are sampled anew
         loss = ABPTLoss(actor, make_qvalue(env), simulated_steps=2, clip_action_gradient=clip)
-        value = loss.loss_actor(rollout)[0]
-        grads = torch.autograd.grad(value, list(actor.parameters()), retain_graph=True)
+        grads = torch.autograd.grad(loss.loss_actor(rollout)[0], list(actor.parameters()), retain_graph=True)
         found.append(torch.cat([g.flatten() for g in grads]))
     assert (found[0] - found[1]).norm() < 2e-3 * found[0].norm()
 
@@ -224,8 +222,7 @@ def gradient(loss, value):
 def test_the_gradient_of_a_mean_is_that_of_its_own_return(env, correlation):
     """Finite differences: one innovation of one flight is pushed, and the lambda-return that starts there changes."""
     loss = make_loss(env, correlation, gradient_lmbda=HYBRID["lmbda"], clip_action_gradient=None)
-    rollout = flight(env, loss)
-    data = loss.write_targets(rollout)
+    data = loss.write_targets(flight(env, loss))
     weight, deviation = loss.pathwise_weight.clamp(0, 1), (data["value_target"] - value_of(loss, data)).std()
     push, drone, step = 1e-5, 1, 1
 

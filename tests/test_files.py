@@ -95,8 +95,7 @@ def test_threads_and_nested_writers_of_one_file_do_not_meet(tmp_path):
     with replacing(path) as outer:
         outer.write_text("outer")
         write_a_file(path)
-    assert path.read_text() == "outer"
-    assert list(tmp_path.iterdir()) == [path]
+    assert path.read_text() == "outer" and list(tmp_path.iterdir()) == [path]
 
 
 def test_leftovers_of_dead_processes_go_and_those_of_other_machines_and_the_living_stay(tmp_path, monkeypatch):

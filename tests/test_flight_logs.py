@@ -60,8 +60,7 @@ def test_a_real_flight_is_read_in_our_units_frames_and_orders(table):
     np.testing.assert_allclose(np.linalg.norm(log.quaternion, axis=-1), 1.0)
     assert ((log.quaternion[1:] * log.quaternion[:-1]).sum(-1) > 0.9).all()
     assert 2.9 < log.battery_voltage.min() < log.battery_voltage.max() < 4.3
-    assert np.abs(log.setpoint["yaw"]).max() < np.pi
-    assert log.setpoint["position"].shape == log.position.shape
+    assert np.abs(log.setpoint["yaw"]).max() < np.pi and log.setpoint["position"].shape == log.position.shape
     assert log.onboard == ("angular_velocity", "acceleration", "motor_command", "battery_voltage", "setpoint")
 
     # The ground, take-off and landing are cut out, and said.
@@ -131,8 +130,7 @@ def test_without_a_gyro_the_lean_of_the_drone_tells_a_wrong_quaternion(table, re
     log = read(drop=GYRO)
     assert "no gyro: angular_velocity was derived from the attitude" in log.notes
     assert "angular_velocity" not in log.onboard
-    measured = read().angular_velocity
-    assert np.corrcoef(log.angular_velocity[300:800, 1], measured[300:800, 1])[0, 1] > 0.7
+    assert np.corrcoef(log.angular_velocity[300:800, 1], read().angular_velocity[300:800, 1])[0, 1] > 0.7
     for fault in ("world to body", "scalar first"):
         with pytest.raises(LogError, match="leans where the drone accelerates") as caught:
             read(FAULTS[fault][0](table), drop=GYRO)
@@ -186,8 +184,7 @@ def test_a_mapping_replaces_entries_of_a_preset_and_nothing_else(table, read):
 
 def test_the_delay_of_the_on_board_clock_is_seen_and_left_to_the_fit(table, read):
     lag = 8  # samples
-    late = {name: np.roll(table[name], lag) for name in (*GYRO, *FORCE, *MOTORS)}
-    plain, shifted = read(), read(late)
+    plain, shifted = read(), read({name: np.roll(table[name], lag) for name in (*GYRO, *FORCE, *MOTORS)})
     told = [float(str(log).split("correlation")[1].split("ms late")[0].split()[1]) for log in (plain, shifted)]
     assert told[1] - told[0] == pytest.approx(80.0, abs=8.0)
     np.testing.assert_allclose(shifted.angular_velocity[lag:-lag], plain.angular_velocity[: -2 * lag], atol=1e-9)
@@ -299,16 +296,7 @@ HUGE = 10**400  # more than a float holds
 BAD_ARGUMENTS = {
     **dict.fromkeys(("clearance", "max_gap", "min_duration"), (np.nan, -1, True, "a", HUGE)),
     "dt": (np.nan, np.inf, 0, 1e-9, 0.5, HUGE, [1.0], np.array([1.0, 2.0])),
-    "columns": (
-        5,
-        b"px4",
-        ["x"],
-        {1: "x"},
-        {"time": 5},
-        {"position": [1, 2, 3]},
-        {"velocity": None},
-        {"euler": {"a": 1}},
-    ),
+    "columns": (5, b"px4", ["x"], {1: "x"}, {"time": 5}, {"position": [1, 2]}, {"velocity": None}, {"euler": {"a": 1}}),
     "convention": ("px4", 5, {}),
     "onboard": ("setpoint", 5, ["speed"], [None], {"position": 1}),
     "path": (None, 5, b"a.csv", ["a.csv"], "", "a\0b", "a" * 5000, "two\nlines.csv"),

@@ -3,7 +3,6 @@
 import copy
 import importlib
 import importlib.metadata
-import subprocess
 import sys
 from functools import partial
 from itertools import combinations
@@ -16,6 +15,7 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence, data_shares_objects
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from refusals import refuses
+from small_runs import run
 from torchrl import envs as torchrl_envs
 
 import torchrl_quad
@@ -46,9 +46,6 @@ def some_actions(steps, num_envs, seed=0):
     return np.random.default_rng(seed).uniform(-1, 1, (steps, num_envs, 4)).astype(np.float32)
 
 
-# -- registration ------------------------------------------------------------------------------------------------------
-
-
 def test_gymnasium_imports_the_package_by_its_prefix_environments_when_they_are_made_and_what_draws_not_before():
     program = (
         "import contextlib, sys, gymnasium\n"
@@ -60,8 +57,7 @@ def test_gymnasium_imports_the_package_by_its_prefix_environments_when_they_are_
         f"gymnasium.make_vec('torchrl_quad:{HOVERING}', num_envs=2).reset()\n"
         "assert not {'torchrl_quad.render', 'matplotlib'} & set(sys.modules)\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    run(sys.executable, "-c", program)
 
 
 def test_registering_again_changes_nothing_and_warns_of_nothing():
@@ -70,9 +66,6 @@ def test_registering_again_changes_nothing_and_warns_of_nothing():
     plugin.load()()
     importlib.reload(torchrl_quad)
     assert all(gymnasium.spec(name(task)) is specs[task] for task in TASKS)
-
-
-# -- one drone ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -86,9 +79,6 @@ def test_torchrl_can_wrap_the_gymnasium_environment():
         torchrl_envs.check_env_specs(env)
         env.set_seed(0)
         assert env.rollout(5)["next", "reward"].shape == (5, 1)
-
-
-# -- many drones -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -142,9 +132,6 @@ def test_a_reset_mask_leaves_the_other_drones_where_they_are():
     assert env.now["state", "step"].flatten().tolist() == [3, 0, 3]
 
 
-# -- pictures ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("mode", MODES)
 def test_many_drones_give_a_picture_each_of_where_they_are(mode):
     options = {"dtype": torch.float64, "max_episode_steps": 7, "render_mode": "rgb_array"}
@@ -174,9 +161,6 @@ def test_without_a_render_mode_or_an_episode_there_is_no_picture():
         assert env.render() is None
     for build in (GymEnv, GymVectorEnv):
         refuses(r"call reset\(\) first", build("hovering", render_mode="rgb_array").render, error=ResetNeeded)
-
-
-# -- random numbers, memory, gradients ---------------------------------------------------------------------------------
 
 
 def test_a_seed_repeats_the_flight_and_no_seed_goes_on_drawing():
@@ -237,9 +221,6 @@ def test_options_reach_the_torchrl_environment_and_no_gradient_is_kept():
     assert not any(x.requires_grad for x in env.now.values(True, True))
 
 
-# -- limits ------------------------------------------------------------------------------------------------------------
-
-
 def test_the_time_limit_is_the_task_s_own():
     limits = {task: gymnasium.spec(f"torchrl_quad/{task.capitalize()}-v0").max_episode_steps for task in TASKS}
     assert limits == {"hovering": 256, "landing": 256, "racing": 512, "tracking": 512, "forest": 900}
@@ -267,9 +248,6 @@ def test_the_space_of_the_observation_has_the_bounds_of_the_task():
     assert env.single_observation_space.high[-4:].tolist() == [1, 1, 1, 1]
     observation, _ = env.reset(seed=0)
     assert observation in env.observation_space and (abs(observation[0, :3]) == [5, 5, 6]).any()
-
-
-# -- errors ------------------------------------------------------------------------------------------------------------
 
 
 def made(*options, **more):

@@ -3,12 +3,12 @@
 import dataclasses
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from refusals import refuses
+from small_runs import ROOT
 
 from benchmarks import identification as benchmark
 from torchrl_quad import HoveringEnv, load_drone
@@ -18,7 +18,6 @@ from torchrl_quad.identification import NoFlight, TooShort, estimation, fitting,
 from torchrl_quad.identification.parameters import UNKNOWNS, Model
 from torchrl_quad.identification.prediction import prediction_error
 
-ROOT = Path(__file__).parents[1]
 REAL = ROOT / "examples/data/figure8.csv.gz"
 BRIEF = {"horizon": 0.2, "past": 0.1}
 pytestmark = pytest.mark.usefixtures("quick_fits")
@@ -49,8 +48,7 @@ def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(s
     found = {**result.parameters, **result.ratios}
     tolerance = {"k2/m": 0.01, "arm k2/Jx": 0.04, "arm k2/Jy": 0.04, "kappa k2/Jz": 0.06}
     for name, most in tolerance.items():
-        value = benchmark.truths(truth)[name]
-        assert found[name]["value"] == pytest.approx(value, rel=most), name
+        assert found[name]["value"] == pytest.approx(benchmark.truths(truth)[name], rel=most), name
         assert found[name]["low"] < found[name]["value"] < found[name]["high"]
     assert result.stream_delay[log.name]["value"] == pytest.approx(0.015, abs=0.005)
     assert found["command_delay"]["value"] == pytest.approx(0.010, abs=0.005)
@@ -119,16 +117,11 @@ def test_a_checkpoint_is_of_one_flight_only(real):
 
 def test_what_a_flight_does_not_tell_gets_no_number_but_a_reason(simulated):
     log, truth = simulated
-    hover = dataclasses.replace(
-        log,
-        velocity=0.0 * log.velocity,
-        position=0.0 * log.position + [0.0, 0.0, 1.0],
-        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time), 1)),
-        angular_velocity=0.0 * log.angular_velocity,
-        # What holds this drone: its hover speed over volts.
-        motor_command=np.repeat(1731.3 / (700.0 * log.battery_voltage[:, None]), 4, 1),
-        onboard=(),
-    )
+    level = {"quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time), 1)), "onboard": ()}
+    level |= {"velocity": 0.0 * log.velocity, "angular_velocity": 0.0 * log.angular_velocity}
+    # What holds this drone: its hover speed over volts.
+    held = np.repeat(1731.3 / (700.0 * log.battery_voltage[:, None]), 4, 1)
+    hover = dataclasses.replace(log, position=0.0 * log.position + [0.0, 0.0, 1.0], motor_command=held, **level)
     result = identify(hover, truth, fields=["thrust_map", "linear_drag", "inertia"], iterations=3, draws=0)
     assert set(result.ratios) == {"k2/m"}
     assert result.parameters == {}  # no mass, no numbers that scale with it
@@ -169,13 +162,8 @@ def test_predictions_of_a_drone_that_is_right_are_right_and_of_one_that_drifts_a
     # A flight along a parabola: constant velocity misses it by g t^2 / 2.
     time = real.time
     fall = np.stack((0.0 * time, 0.0 * time, -0.5 * 9.81 * time**2), 1)
-    falling = dataclasses.replace(
-        real,
-        position=fall,
-        velocity=np.gradient(fall, real.dt, axis=0),
-        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)),
-        angular_velocity=np.zeros_like(fall),
-    )
+    level = {"quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)), "angular_velocity": np.zeros_like(fall)}
+    falling = dataclasses.replace(real, position=fall, velocity=np.gradient(fall, real.dt, axis=0), **level)
     missed = prediction_error(falling, "constant_velocity", (0.4,))
     assert missed["position"][0.4] == pytest.approx(0.5 * 9.81 * 0.16, rel=1e-6)
     assert missed["velocity"][0.4] == pytest.approx(9.81 * 0.4, rel=1e-6)
@@ -263,8 +251,7 @@ def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
 
 def test_the_recipe_fits_a_real_flight_and_draws_it(launch, refused, tmp_path):
     arguments = [f"logs=[{REAL}]", "mass=0.027", "fields=[linear_drag]", "iterations=1", "draws=5"]
-    said = launch("identify", *arguments, f"folder={tmp_path}/fit")
-    assert "linear_drag.xy" in said
+    assert "linear_drag.xy" in launch("identify", *arguments, f"folder={tmp_path}/fit")
     names = "checkpoint.json drone.yaml prediction.png randomization.yaml report.json residuals.png"
     assert sorted(path.name for path in (tmp_path / "fit").iterdir()) == names.split()
     assert refused("identify", "logs=[none.csv]").startswith("Error: none.csv")

@@ -112,9 +112,6 @@ def test_what_is_taken_has_finite_losses(calls):
                 assert all(x.isfinite().all() for x in out.values()), (name, option, value)
 
 
-# -- losses of one's own, and copies -----------------------------------------------------------------------------------
-
-
 class Weighted(BPTTLoss):
     """A loss of a user.
 
@@ -143,9 +140,6 @@ def test_a_copy_of_a_loss_computes_the_same(env, way):
     rollout, _ = differentiable_rollout(env, loss.actor_network, None, 3)
     assert way(loss)(rollout)["loss_actor"] == loss(rollout)["loss_actor"]
     assert list(inspect.signature(Weighted).parameters) == ["actor_network", "weight", "kwargs"]
-
-
-# -- what does not fit -------------------------------------------------------------------------------------------------
 
 
 def test_an_actor_or_a_carry_of_another_environment_is_refused(env, env64):

@@ -147,8 +147,7 @@ def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
     assert log.battery_voltage is None
     log = type(log)(**{**vars(log), "battery_voltage": flight(log.time)["battery_voltage"]})
     same(log, quaternion=4e-3)
-    events = usd_events(t, times(10)) | {"second": (t, {"gyro.w": ("f", t)})}
-    path = write_usd(tmp_path / "log02", events, 2)
+    path = write_usd(tmp_path / "log02", usd_events(t, times(10)) | {"second": (t, {"gyro.w": ("f", t)})}, 2)
     with pytest.raises(UnreadableLog, match="different streams"):
         read_log(path, {"angular_velocity": ("gyro.x", "gyro.y", "gyro.w")})
 
@@ -232,8 +231,6 @@ def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path):
     with pytest.raises(MissingColumns, match="several topics for angular_velocity: /drone/imu, /drone/imu2. Say which"):
         read_log(twins, BATTERY)
 
-
-# -- damage ------------------------------------------------------------------------------------------------------------
 
 KINDS = {"a.ulg": None, "v1": None, "v2": None, "a.csv": TABLE, "a.csv.gz": TABLE, "a.bag": BATTERY, "a.db3": BATTERY}
 

@@ -140,9 +140,6 @@ def test_a_run_with_diagnostics_learns_the_same_bit_for_bit_and_logs_them(recipe
         assert float(second["grad/variance"]) > 0 and float(second["grad/cosine"]) <= 1
 
 
-# -- numbers that are not finite ---------------------------------------------------------------------------------------
-
-
 def test_an_update_that_is_not_finite_is_left_out_and_counted(train, tmp_path, monkeypatch):
     poison(monkeypatch, 0, 3, 4)
     checkpoint = train("bptt", tmp_path, "env.drone=small_racer")

@@ -58,8 +58,7 @@ def test_a_critic_may_see_more_than_the_actor():
     value = make_value(env, in_keys=["observation", ("state", "rotor_speed")])
     rollout, _ = differentiable_rollout(env, actor, None, 3)
     loss = SHACLoss(actor, value)
-    assert ("next", "state", "rotor_speed") in loss.in_keys
-    assert loss(rollout)["loss_value"].isfinite()
+    assert ("next", "state", "rotor_speed") in loss.in_keys and loss(rollout)["loss_value"].isfinite()
 
 
 def test_keys_can_be_renamed():
@@ -116,9 +115,6 @@ def test_the_example_of_a_loss_is_short_and_runs(loss):
     names = {}
     exec(program, names)
     assert all(p.grad.isfinite().all() and p.grad.any() for p in names["loss"].actor_network_params.parameters())
-
-
-# -- what they refuse -------------------------------------------------------------------------------------------------
 
 
 @cases(
@@ -227,9 +223,6 @@ def test_swapped_networks_are_refused(env, flight):
         refuses(f"reads {reads}, which writes {writes}. Give another network, or set", loss, flight[0])
 
 
-# -- another environment -----------------------------------------------------------------------------------------------
-
-
 def pendulum_networks(env):
     assert env.action_spec_unbatched.shape == (1,)
     angles, state = ["th", "thdot"], ["observation"]
@@ -249,8 +242,7 @@ def test_losses_train_the_pendulum_of_torchrl(name):
     env = PendulumEnv(seed=0)
     torch.manual_seed(0)
     actor, value, qvalue = pendulum_networks(env)
-    networks = {"bptt": (BPTTLoss, ()), "shac": (SHACLoss, (value,)), "abpt": (ABPTLoss, (qvalue,))}
-    cls, critics = networks[name]
+    cls, critics = {"bptt": (BPTTLoss, ()), "shac": (SHACLoss, (value,)), "abpt": (ABPTLoss, (qvalue,))}[name]
     loss = cls(actor, *critics)
     loss.make_value_estimator(gamma=0.95)
     updater = SoftUpdate(loss, tau=0.05) if name != "bptt" else None

@@ -32,8 +32,7 @@ def test_a_metric_is_printed_in_its_unit(metric, value, text):
 
 def test_episodes_without_a_value_do_not_count_and_a_metric_that_nobody_describes_goes_by_its_name():
     values = torch.tensor([1.0, torch.nan, 2.0, 9.0])
-    assert Metric("speed").summarise(values) == 4.0
-    assert Metric("error", median=True).summarise(values) == 2.0
+    assert Metric("speed").summarise(values) == 4.0 and Metric("error", median=True).summarise(values) == 2.0
     assert Metric("lap time", "s").format(Metric("lap time").summarise(values[1:2])) == "none"
     assert describe_metric("top_speed", {}) == Metric("top speed")
     assert describe_metric("solved", {}) is EPISODE_METRICS["solved"]
@@ -44,8 +43,7 @@ def test_episodes_without_a_value_do_not_count_and_a_metric_that_nobody_describe
 def test_a_task_describes_every_metric_that_it_gives(task):
     env = make_env(task, num_envs=2)
     rollout = env.rollout(3, break_when_any_done=False)
-    names = {*env.episode_metrics(rollout), *rollout["next", "metrics"].keys()}
-    assert names == set(env.metric_info)
+    assert {*env.episode_metrics(rollout), *rollout["next", "metrics"].keys()} == set(env.metric_info)
     assert all(values.shape == (2,) for values in env.episode_metrics(rollout).values())
 
 
@@ -174,8 +172,7 @@ def test_after_a_partial_reset_one_drone_starts_again_and_the_others_fly_on():
     begun = rollout[:, step + 1]
     assert begun["state", "step"].flatten().tolist() == [0, step + 1]
     env.reset(begun.clone(), set_state=True)
-    shown = filmed.transform[1].obs[frame].permute(1, 2, 0).numpy()
-    np.testing.assert_array_equal(shown, env.render())
+    np.testing.assert_array_equal(filmed.transform[1].obs[frame].permute(1, 2, 0).numpy(), env.render())
 
 
 def test_a_frame_shows_the_state_after_the_last_step_or_rollout():

@@ -123,9 +123,6 @@ def test_every_network_has_the_precision_of_the_environment_and_may_read_whole_n
         assert network(td)[key].dtype is torch.float64 and network(td)[key].shape == (4, 1)
 
 
-# -- errors ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("make", [make_actor, make_value, make_qvalue])
 @cases(
     ({"num_cells": (0,)}, r"num_cells\[0\] must be at least 1, got 0. .*in a list: \[64, 64\]"),
@@ -184,8 +181,7 @@ def test_the_noise_is_standard_normal_in_every_step_and_correlated_over_time():
     for part in (noise[:, 0], noise[:, 30], noise[:, -1]):
         assert part.std() == pytest.approx(1.0, abs=0.06)
     for lag in (1, 5, 20):
-        correlation = (noise[:, lag:] * noise[:, :-lag]).mean().item()
-        assert correlation == pytest.approx(RHO**lag, abs=0.06)
+        assert (noise[:, lag:] * noise[:, :-lag]).mean().item() == pytest.approx(RHO**lag, abs=0.06)
     mean = torch.atanh(rollout["action"]) - 0.2 * rollout["noise"]  # mu + sigma e, with mu nearly constant at the start
     assert mean.std(1).max() < 0.1
     more, _ = differentiable_rollout(env, actor, carry, 3)
@@ -200,8 +196,7 @@ def test_loc_scale_and_log_probability_are_those_given_the_noise_of_the_step_bef
     rollout, _ = differentiable_rollout(env64, actor, None, 20)
     with torch.no_grad():
         free = plain.get_dist_params(rollout.select("observation"))
-    rest = math.sqrt(1 - RHO**2)
-    torch.testing.assert_close(rollout["scale"], free["scale"] * rest)
+    torch.testing.assert_close(rollout["scale"], free["scale"] * math.sqrt(1 - RHO**2))
     torch.testing.assert_close(rollout["loc"], free["loc"] + RHO * free["scale"] * rollout["noise_before"])
     given = TransformedDistribution(Normal(rollout["loc"], rollout["scale"]), TanhTransform())
     torch.testing.assert_close(rollout["action_log_prob"], given.log_prob(rollout["action"]).sum(-1))

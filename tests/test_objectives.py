@@ -53,16 +53,8 @@ def make_rollout(actor, dtype=torch.float32):
     truncated[0, 1] = True
     terminated[1, 2] = True
     rollout = actor(TensorDict({"observation": observation}, [2, 4]))
-    rollout["next"] = TensorDict(
-        {
-            "observation": following,
-            "reward": rollout["action"] * 1.0,
-            "terminated": terminated,
-            "truncated": truncated,
-            "done": terminated | truncated,
-        },
-        [2, 4],
-    )
+    ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+    rollout["next"] = TensorDict({"observation": following, "reward": rollout["action"] * 1.0, **ends}, [2, 4])
     return rollout
 
 
@@ -113,8 +105,7 @@ def test_the_bootstrap_of_abpt_has_its_gradient_through_state_and_action_and_non
     rollout["next", "observation"] = rollout["next", "observation"] + shift
     loss.loss_actor(rollout)[0].backward()
     # d/d(next observation) = mean over envs, half weight, discount gamma^n, of d(10 s + 2 s)/ds; none at a termination
-    expected = [[0, 12 / 4, 0, 12 / 4], [0, 0, 0, 12 / 2]]
-    assert (-shift.grad[..., 0] * 2 * 2).tolist() == expected
+    assert (-shift.grad[..., 0] * 2 * 2).tolist() == [[0, 12 / 4, 0, 12 / 4], [0, 0, 0, 12 / 2]]
     # policy weight: rewards give s * discount, the bootstraps' actions their state, the 0-step returns' actions too
     rewards = sum(REWARDS) / 2
     bootstraps = 9 / 4 + 5 / 4 + 5 / 2
@@ -289,8 +280,7 @@ def test_without_delay_the_target_is_the_critic_itself():
 def test_the_entropy_bonus_is_alpha_times_the_mean_of_minus_log_prob():
     actor, *_ = make_networks()
     rollout = make_rollout(actor)
-    log_prob = -torch.arange(8.0).view(2, 4)
-    rollout["action_log_prob"] = log_prob
+    rollout["action_log_prob"] = -torch.arange(8.0).view(2, 4)
     plain = BPTTLoss(actor, reduction="none").make_value_estimator(gamma=GAMMA)(rollout)["loss_actor"]
     out = BPTTLoss(actor, reduction="none", alpha=0.5).make_value_estimator(gamma=GAMMA)(rollout)
     torch.testing.assert_close(out["loss_actor"], plain - 0.5 * torch.tensor([1.5, 5.5]))

@@ -8,13 +8,11 @@ import sys
 import tarfile
 import tomllib
 import zipfile
-from pathlib import Path
 
 import pytest
 import yaml
 from packaging.specifiers import SpecifierSet
-
-ROOT = Path(__file__).parent.parent
+from small_runs import ROOT, run
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +72,7 @@ def test_the_wheel_works_away_from_the_repository_and_so_does_a_recipe_of_your_o
     (tmp_path / "smooth.py").write_text(PROGRAM)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
     command = [sys.executable, "smooth.py", "--cfg", "job", "task=racing"]  # which shows the configuration
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    shown = yaml.safe_load(done.stdout)
+    shown = yaml.safe_load(run(*command, cwd=tmp_path, env=environment))
     assert (shown["algorithm"], shown["loss"]["smoothness"]) == ("smooth", 0.1)
     assert shown["env"]["max_episode_steps"] == 512
     assert shown["eval"]["interval"] == 20  # of bptt_racing.yaml

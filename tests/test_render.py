@@ -95,9 +95,6 @@ def flown(flight):
     return [torch.cat((s[:1], e[:n])) for s, e, n in zip(start, ends, steps, strict=True)]
 
 
-# -- pictures and films ------------------------------------------------------------------------------------------------
-
-
 def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(crashing):
     flight = crashing(HoveringEnv(num_envs=3, max_episode_steps=40), 60)
     assert flight["next", "terminated"][1].any()
@@ -221,9 +218,6 @@ def test_a_task_without_targets_shows_its_metrics_or_its_reward(cls, given, name
     assert image(tmp_path / "flight.gif").shape == env.render().shape == (336, 336, 3)
 
 
-# -- figures for papers ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_an_episode_of_every_task_is_drawn_with_what_flew(task, tmp_path):
     env = make_env(task, num_envs=3, max_episode_steps=40)
@@ -257,13 +251,11 @@ def test_an_episode_of_every_task_is_drawn_with_what_flew(task, tmp_path):
 @pytest.mark.parametrize("task", envs.TASKS)
 def test_an_episode_of_one_step_is_drawn(task):
     env = make_env(task, num_envs=1, max_episode_steps=1)
-    figure = plot_episode(env.rollout(1, break_when_any_done=False), env=env)
-    assert figure.axes[-1].get_xlim() == (0.0, 0.02)
+    assert plot_episode(env.rollout(1, break_when_any_done=False), env=env).axes[-1].get_xlim() == (0.0, 0.02)
 
 
 def test_without_rotors_in_the_state_there_is_no_panel_of_them():
-    flight = make_env("hovering", num_envs=1, dynamics="point_mass").rollout(3)
-    last = plot_episode(flight).axes[-1]
+    last = plot_episode(make_env("hovering", num_envs=1, dynamics="point_mass").rollout(3)).axes[-1]
     assert last.get_ylabel() == "action" and last.get_xlabel() == "time [s]"
 
 
@@ -294,9 +286,6 @@ def test_the_fonts_of_a_figure_are_embedded_as_truetype_and_it_is_as_wide_as_two
     assert image(tmp_path / "episode.png").shape[1] == 2148  # 300 dots per inch
 
 
-# -- notebooks ---------------------------------------------------------------------------------------------------------
-
-
 def test_without_a_path_a_figure_is_returned_and_shows_itself_in_a_notebook(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     env = make_env("forest", num_envs=2)
@@ -305,9 +294,6 @@ def test_without_a_path_a_figure_is_returned_and_shows_itself_in_a_notebook(tmp_
         assert isinstance(figure, Figure) and figure._repr_png_().startswith(b"\x89PNG")
     assert not list(tmp_path.iterdir())
     assert pickle.loads(pickle.dumps(figure))._repr_png_() == figure._repr_png_()
-
-
-# -- learning curves ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

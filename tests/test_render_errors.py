@@ -75,8 +75,6 @@ def test_without_matplotlib_or_ffmpeg_it_says_what_to_install(monkeypatch):
         refuses(r"pip install '.\[render\]'", draw, flight, error=ImportError)
 
 
-# -- an ffmpeg that does not work --------------------------------------------------------------------------------------
-
 WORKS = imageio_ffmpeg.get_ffmpeg_exe()
 BROKEN = {
     "missing": None,
@@ -133,8 +131,6 @@ def test_an_ffmpeg_that_cannot_be_found_is_installed_anew(monkeypatch, tmp_path)
     with pytest.raises(NoFfmpeg, match=r"No ffmpeg exe could be found.*pip install --force-reinstall"):
         animate_flight(HoveringEnv(num_envs=1).rollout(3), tmp_path / "flight.mp4")
 
-
-# -- results do not depend on pictures ---------------------------------------------------------------------------------
 
 FAILURES = {
     "disk full": (OSError(errno.ENOSPC, "No space left on device"), False),

@@ -197,7 +197,7 @@ def test_the_cursor_is_in_step_and_a_click_goes_to_a_time(replay):
     assert replay.step() == pytest.approx(300, abs=3)
 
 
-def test_the_keyboard_plays_steps_and_chooses(replay):
+def test_the_keyboard_plays_steps_and_chooses_and_keys_of_the_browser_are_left_to_it(replay):
     keyboard = replay.page.keyboard
     for key, step in (("ArrowRight", 1), ("ArrowRight", 2), ("ArrowLeft", 1)):
         keyboard.press(key)
@@ -210,10 +210,7 @@ def test_the_keyboard_plays_steps_and_chooses(replay):
     replay.wait(lambda step: step > 3)
     keyboard.press(" ")
     assert replay.page.inner_text("#play") == "Play"
-
-
-def test_keys_of_the_browser_are_left_to_it_and_those_of_the_page_work_after_a_choice(replay):
-    keyboard = replay.page.keyboard
+    replay.scrub(0)
     replay.page.evaluate("document.activeElement.blur()")  # the slider has keys of its own
     for key in ("Alt+ArrowRight", "Control+ArrowRight", "Meta+ArrowRight"):
         keyboard.press(key)
@@ -273,9 +270,6 @@ def test_a_drone_stays_where_its_episode_has_ended_and_the_page_says_how(open_pa
     assert options == ["all", "0: truncated at 0.60 s", f"1: crashed at {0.02 * (end + 1):.2f} s"]
     np.testing.assert_allclose(replay.trace("crash")[1], position[1, end], atol=1e-6)
     replay.close()
-
-
-# -- what a page holds -------------------------------------------------------------------------------------------------
 
 
 def written(rollout, **options):

@@ -71,8 +71,7 @@ def test_every_pixel_is_where_mujoco_sees_it_or_at_a_silhouette(dtype):
         assert not (wrong & ~silhouette).any()
         assert wrong.mean() < 1e-3, "hardly any pixel may differ at a silhouette"
         assert len(np.unique(truth.round(3))) > 500, "the picture shows something"
-        along = dataclasses.replace(camera, along_ray=True)
-        ray = along.depth(scene, position, attitude)[0, 0].numpy()
+        ray = dataclasses.replace(camera, along_ray=True).depth(scene, position, attitude)[0, 0].numpy()
         near = truth < 12.0
         np.testing.assert_allclose(ray[near], (truth * rays.norm(dim=-1).numpy().reshape(60, 80))[near], atol=1e-3)
 

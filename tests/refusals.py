@@ -16,6 +16,7 @@ def cases(*rows, ids=None):
 
 
 def refuses(message, call, /, *arguments, error=ValueError, **options):
-    """A call raises an error that says this; what it is given was made before."""
-    with pytest.raises(error, match=message):
+    """A call raises an error that says this; what it is given was made before. Returns all that it says."""
+    with pytest.raises(error, match=message) as refused:
         call(*arguments, **options)
+    return str(refused.value)

@@ -82,7 +82,7 @@ def test_the_runner_of_rsl_rl_trains_logs_saves_and_loads(tmp_path, capsys):
     assert torch.autograd.grad(reward.sum(), action)[0].abs().sum() > 0
 
 
-def test_rsl_rl_is_told_which_episodes_the_time_limit_has_ended():
+def test_rsl_rl_sets_episode_lengths_within_the_limit_and_is_told_which_episodes_it_has_ended():
     env = RslRlVecEnv(HoveringEnv(num_envs=3, seed=0, max_episode_steps=10))
     env.episode_length_buf = torch.tensor([0, 9, 0])
     env.drones.now["state", "position"][2, 2] = -1.0  # underground
@@ -90,6 +90,13 @@ def test_rsl_rl_is_told_which_episodes_the_time_limit_has_ended():
     assert done.tolist() == [False, True, True]
     assert extras["time_outs"].tolist() == [False, True, False] and extras["log"]["Episode/crash"] == 0.5
     assert env.episode_length_buf.tolist() == [1, 0, 0]
+    env = RslRlVecEnv(HoveringEnv(3, seed=0, max_episode_steps=10))
+    steps = torch.tensor([0, 5, 9])
+    env.episode_length_buf = steps
+    steps += 1
+    for wrong in (None, 3, [0, 0, 0], steps, -steps, steps.float(), steps[:2], steps[:, None], steps.to("meta")):
+        refused(setattr, env, "episode_length_buf", wrong)
+    assert env.episode_length_buf.tolist() == [0, 5, 9]
 
 
 def test_ppo_of_skrl_trains(tmp_path, monkeypatch):
@@ -199,16 +206,6 @@ def test_actions_of_stable_baselines3_wait_for_one_step():
     env.step_async(FLOWN.numpy())
     env.reset()  # what waited is forgotten
     refused(env.step_wait)
-
-
-def test_rsl_rl_sets_episode_lengths_within_the_limit_alone():
-    env = RslRlVecEnv(HoveringEnv(3, seed=0, max_episode_steps=10))
-    steps = torch.tensor([0, 5, 9])
-    env.episode_length_buf = steps
-    steps += 1
-    for wrong in (None, 3, [0, 0, 0], steps, -steps, steps.float(), steps[:2], steps[:, None], steps.to("meta")):
-        refused(setattr, env, "episode_length_buf", wrong)
-    assert env.episode_length_buf.tolist() == [0, 5, 9]
 
 
 @pytest.mark.parametrize("adapter", [TorchVectorEnv, SkrlEnv, RslRlVecEnv, DronesVecEnv])

@@ -87,21 +87,15 @@ def test_the_rate_adapts_to_how_far_the_policy_was_moved_within_its_bounds(moved
         optimizer(10, AdaptiveOptimizer, max_kl=None)
 
 
-def test_minibatches_are_random_steps_of_the_rollout():
+def test_minibatches_are_random_steps_or_each_once_in_an_epoch_and_horizons_of_a_policy_with_a_memory_stay_whole():
     cfg = OmegaConf.create({"updates": 3, "batch_size": 50})
     batches = [batch["step"] for batch in minibatches(numbered(3, 4), cfg)]
     assert [batch.shape for batch in batches] == [(50,)] * 3
     assert set(torch.cat(batches).tolist()) == set(range(12)) and not torch.equal(batches[0], batches[1])
-
-
-def test_shuffled_batches_hold_every_step_once_in_each_epoch():
     batches = [batch["step"] for batch in shuffled(numbered(3, 4), 5, 2)]
     assert [len(batch) for batch in batches] == [5, 5, 2, 5, 5, 2]
     epochs = [torch.cat(batches[:3]).tolist(), torch.cat(batches[3:]).tolist()]
     assert epochs[0] != epochs[1] and [sorted(epoch) for epoch in epochs] == [list(range(12))] * 2
-
-
-def test_the_horizons_of_a_policy_with_a_memory_stay_whole():
     rollout = numbered(3, 4)
     rollout["is_init"] = torch.zeros(3, 4, 1, dtype=torch.bool)
     batches = [batch["step"] for batch in shuffled(rollout, 8, 2)]

@@ -318,7 +318,7 @@ def test_the_package_imports_its_parts_when_they_are_asked_for():
     python("import sys, torchrl_quad; assert 'torch' not in sys.modules")
 
 
-def test_the_recipe_exports_the_best_policy_of_a_run_with_its_results(train, launch, refused, tmp_path, export_once):
+def test_the_recipe_exports_the_best_policy_with_results_and_a_page(train, launch, refused, tmp_path, export_once):
     train("bptt", tmp_path, "normalize=true", "task=forest", "env.camera={width: 6, height: 5}", "env.density=0.02")
     printed = launch("export", f"checkpoint={tmp_path}/checkpoint.pt")
     assert re.search(r"policy: flies forest; its actions differ by at most \d\.\de-0[6-9]", printed)
@@ -334,7 +334,4 @@ def test_the_recipe_exports_the_best_policy_of_a_run_with_its_results(train, lau
     )
     assert "folder is unknown" not in refused("export", f"checkpoint={tmp_path}/none.pt")
     assert "episodes=0" in refused("export", f"checkpoint={tmp_path}/checkpoint.pt", "episodes=0")
-
-
-def test_the_page_of_a_bundle_shows_every_field_of_the_contract(export_once):
     assert contract.schema_table() in (export_once("forest")[2] / "README.md").read_text()

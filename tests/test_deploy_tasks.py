@@ -251,13 +251,12 @@ def test_the_ranges_of_the_schema_lie_within_those_of_the_simulated_drones():
         assert least <= entry.get("minimum", entry.get("exclusiveMinimum")) < entry["maximum"] <= most, name
 
 
-def test_another_runtime_that_gives_different_results_is_found(copied):
+def test_another_runtime_is_found_and_a_graph_that_it_cannot_read_or_that_leaves_limits_or_shape_is_refused(
+    copied,
+):
     bundle = load_bundle(copied[0])
     bundle._vectors["action"] += np.float32(1e-3)
     refuses("policy/policy.onnx: the policy differs by 0.001", bundle.check, error=WrongActions)
-
-
-def test_a_graph_that_onnxruntime_cannot_read_or_that_leaves_its_limits_or_its_shape_is_refused(copied):
     folder, about = copied
 
     def load(*nodes, scale=1.0):
@@ -333,21 +332,16 @@ def test_no_simulator_flies_a_visual_policy_or_a_task_with_obstacles(export_once
 
 def test_a_visual_policy_that_was_built_for_another_camera_or_changed_is_refused(tmp_path):
     forest = ForestEnv(num_envs=2, camera={"width": 6, "height": 5})
-    seen, hooked, deeper = (make_visual_actor(forest) for _ in range(3))
-
-    def refuses(match, policy=seen, env=forest):
-        with pytest.raises(ValueError, match=match):
-            export_policy(policy, env, tmp_path / "policy")
-
-    refuses("for images of another size; the environment has no camera", env=HoveringEnv(num_envs=2))
+    seen, hooked, deeper, flatter = (make_visual_actor(forest) for _ in range(4))
     narrow = HoveringEnv(num_envs=2, camera={"width": 9, "height": 5})
-    refuses("for images of another size; the environment shows it 9 x 5 pixels", env=narrow)
+    for other, has in ((HoveringEnv(num_envs=2), "has no camera"), (narrow, "shows it 9 x 5 pixels")):
+        refuses(f"images of another size; the environment {has}", export_policy, seen, other, tmp_path / "policy")
     hooked[0][1].gru.register_forward_hook(lambda *_: None)
     deeper[0][1].gru = nn.GRU(64, 64, 2, batch_first=True)
-    for changed in (hooked, deeper):
-        refuses("exports what make_actor and make_visual_actor build, .* This VisualActor is something", changed)
     velocity = make_visual_actor(forest, in_keys=[("state", "velocity")])
-    refuses(r"reads \['depth', \('state', 'velocity'\)\]. A drone only has", velocity)
-    flatter = make_visual_actor(forest)
     flatter[0][0].module.convolutions[1] = nn.ELU(0.5)
-    refuses("cannot write ELU.alpha=0.5", flatter)
+    built = "exports what make_actor and make_visual_actor build, .* This VisualActor is something"
+    reads = r"reads \['depth', \('state', 'velocity'\)\]. A drone only has"
+    wrong = ((hooked, built), (deeper, built), (velocity, reads), (flatter, "cannot write ELU.alpha=0.5"))
+    for policy, message in wrong:
+        refuses(message, export_policy, policy, forest, tmp_path / "policy")

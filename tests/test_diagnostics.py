@@ -85,11 +85,13 @@ def test_the_actions_of_a_rollout_may_be_the_inputs():
     assert by_weights == audit_reward(rollout, actor) == audit_reward(rollout, BPTTLoss(actor))
 
 
-def test_a_gradient_that_is_not_finite_is_no_gradient():
+def test_an_audit_needs_no_gradient_mode_and_counts_no_gradient_that_is_not_finite():
     rollout, actor = make_rollout()
     rollout["next", "reward_terms", "root"] = (rollout["action"] - rollout["action"].detach()).sqrt()
     assert audit_reward(rollout, actor)["root"].verdict == "not finite"
     assert audit_reward(rollout, actor).without_gradient == ["bonus", "root"]
+    with torch.no_grad():
+        assert audit_reward(rollout, actor)["linear"].gradient_norm == 18.0
 
 
 def fly(task, horizon=24, **options):
@@ -259,9 +261,3 @@ def test_what_cannot_be_audited_is_refused_with_advice(message):
     rollout["scaled"] = 2.0 * rollout["next", "reward"]  # 6, -6 and -24
     rollout["own"] = TensorDict({"short": torch.ones(2, 3)}, [2, 3])
     refuses(message, AUDITS[message], rollout, actor, error=(ValueError, RuntimeError))
-
-
-def test_an_audit_needs_no_gradient_mode():
-    rollout, actor = make_rollout()
-    with torch.no_grad():
-        assert audit_reward(rollout, actor)["linear"].gradient_norm == 18.0

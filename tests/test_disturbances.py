@@ -93,7 +93,6 @@ def test_a_drone_that_is_heavier_or_weaker_than_its_controller_believes_flies_so
     ({"weight": {"scale": [0.9, 1.1]}}, "randomize: unknown field 'weight'. Choose from: mass, inertia"),
     ({"rate_gain": {"scale": [0.9, 1.1]}}, "'rate_gain' belongs to the flight controller, which keeps the nominal"),
     ({"mass": {"gamma": [1, 2]}}, "mass needs one distribution of: uniform: low and high; scale: .*; normal: "),
-    ({"mass": 0.5}, "mass needs one distribution of"),
     ({"mass": {"uniform": [-0.1, 1.0]}}, "drones that may be drawn are not all possible: .*'mass' must be between"),
     ({"mass": {"normal": [0.5, -0.1]}}, "mass needs two numbers, mean and standard deviation"),
     ({"rotor_spin": {"scale": [-1, 1]}}, "unknown field 'rotor_spin'"),
@@ -107,16 +106,13 @@ def test_impossible_drones_are_refused(randomize, message):
     refuses(message, HoveringEnv, num_envs=1, randomize=randomize)
 
 
-def test_in_the_wind_a_drone_drifts_until_it_moves_with_the_air():
+def test_wind_has_the_strength_the_memory_and_the_spread_asked_for_and_a_drone_drifts_until_it_moves_with_the_air():
     drone = load_drone("visfly").replace(linear_drag=[2.0, 2.0, 2.0])
     env = HoveringEnv(num_envs=1, drone=drone, wind={"mean": [1.0, -0.5, 0.0]})
     flight = fly(env, env.reset(), hold(env, 100))["next", "state", "velocity"][0]
     torch.testing.assert_close(flight[-1], torch.tensor([1.0, -0.5, 0.0]), atol=2e-2, rtol=0)
     calm = HoveringEnv(num_envs=1, drone=drone)
     assert fly(calm, calm.reset(), hold(calm, 10))["next", "state", "velocity"].abs().max() < 1e-5
-
-
-def test_wind_has_the_strength_the_memory_and_the_spread_asked_for():
     env = HoveringEnv(num_envs=4000, wind={"mean": [2.0, 0.0, 0.0], "gust": 1.5, "gust_time": 0.1})
     wind = fly(env, env.reset(), hold(env, 6))["next", "state", "wind"] - torch.tensor([2.0, 0.0, 0.0])
     for t in (0, 5):
@@ -162,20 +158,6 @@ def test_random_starts_tilt_turn_and_push_within_their_bounds():
     assert torch.atan2(ahead[:, 1], ahead[:, 0]).abs().max() > 3.0
     assert 0.95 < state["velocity"].abs().max() <= 1.0 and 0.47 < state["angular_velocity"].abs().max() <= 0.5
     assert state["quaternion"].norm(dim=-1).tolist() == pytest.approx([1.0] * 4000, abs=1e-5)
-
-
-@cases(
-    ({"wind": {"speed": 3}}, "wind: unknown key 'speed'. Allowed: mean, spread, gust, gust_time"),
-    ({"wind": {"mean": [1.0]}}, "wind: mean must have at least 3 items, not 1, got .* Along x, y and z"),
-    ({"wind": {"spread": [-1.0, 0.0, 0.0]}}, r"wind: spread\[0\] must be at least 0, got -1"),
-    ({"wind": {"mean": [-60, 0, 0], "spread": [25, 0, 0], "gust": 4.0}}, "add up to 105 m/s; .* to 100 m/s"),
-    ({"wind": 3.0}, "wind must be a mapping with any of mean"),
-    ({"observation_noise": {"delay": 1}}, "observation_noise: unknown key 'delay'"),
-    ({"observation_delay": -1}, "observation_delay must be at least 0, got -1. Control steps by which"),
-    ({"random_start": {"tilt": float("nan")}}, "random_start: tilt must be a finite number, got nan"),
-)
-def test_bad_options_say_what_is_allowed(kwargs, message):
-    refuses(message, HoveringEnv, num_envs=1, **kwargs)
 
 
 class GyroBias(Disturbance):

@@ -106,12 +106,9 @@ def look_at(site, browser):
     assert not wrong, "\n".join(sorted(wrong))
 
 
-def test_the_reference_begins_with_a_table_of_what_the_package_exports():
+def test_the_reference_lists_what_the_package_exports_and_every_example_is_listed_and_the_readme_is_short():
     (table,) = re.findall(r"\.\. autosummary::\n.*\n\n((?:   \w+\n)+)", (ROOT / "docs/api.md").read_text())
     assert sorted(table.split()) == sorted(importlib.import_module("torchrl_quad").__all__)
-
-
-def test_every_example_is_listed_and_the_readme_is_short():
     text = (ROOT / "examples/README.md").read_text()
     assert {example.name for example in EXAMPLES} == set(re.findall(r"\d\d_\w+\.py", text))
     assert len((ROOT / "README.md").read_text().splitlines()) <= 120

@@ -66,14 +66,11 @@ def test_starts_lie_in_their_box_level_and_at_rest():
     assert (td["state", "quaternion"] == torch.tensor([1.0, 0.0, 0.0, 0.0])).all()
 
 
-def test_running_out_of_time_truncates_and_does_not_terminate():
+def test_running_out_of_time_truncates_and_leaving_the_box_terminates():
     env = HoveringEnv(num_envs=2, max_episode_steps=5)
     flight = fly(env, env.reset(), hold(env, 5))["next"]
     assert flight["truncated"][..., 0].tolist() == [[False] * 4 + [True]] * 2
     assert torch.equal(flight["done"], flight["truncated"]) and not flight["terminated"].any()
-
-
-def test_leaving_the_box_terminates_and_does_not_truncate():
     outside = [(1, 0, -0.1), (1, 0, 6.1), (6.1, 0, 1.5), (-4.1, 0, 1.5), (1, 5.1, 1.5), (1, -5.1, 1.5)]
     env = HoveringEnv(num_envs=7)
     ends = fly(env, start(env, position=[*outside, (1, 0, 1.5)]), hold(env, 1))["next"][:, 0]

@@ -84,16 +84,13 @@ def test_aerospace_frames_by_hand(make):
         assert_to(enu, name, (1, 2, 3), (1, -2, -3))
 
 
-def test_body_rates_by_hand():
+def test_body_rates_and_worlds_with_z_up_by_hand():
     """On sticks roll right, nose down and turning right are positive, in degrees; so in cflib's send_setpoint."""
     for target in (frames.betaflight(), frames.crazyflie()):
         assert_to(target, "body_rate", (np.pi, np.pi, np.pi), (180, 180, -180))
     assert_to(frames.crazyflie(manual=True), "body_rate", (0, np.pi, np.pi), (0, 180, 180))
     for target in (frames.mavros(), frames.mujoco(), frames.rotorpy(), frames.crazyflow()):
         assert_to(target, "body_rate", (1, 2, 3), (1, 2, 3))
-
-
-def test_worlds_with_z_up_by_hand():
     for target in (frames.crazyflie(), frames.mavros(), frames.rotorpy(), frames.crazyflow()):
         for ours, theirs in ((ROLL, (S, 0, 0, S)), (NOSE_DOWN, (0, S, 0, S)), (LEFT, (0, 0, S, S))):
             assert_to(target, "quaternion", ours, theirs)

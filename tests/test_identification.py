@@ -191,7 +191,7 @@ REFUSED = {  # what a fit, or a prediction, says of an argument
 }  # fmt: skip
 
 
-def test_arguments_of_fits_and_predictions_are_refused_in_one_line(real):
+def test_arguments_of_fits_and_predictions_are_refused_in_one_line_and_a_flight_of_ones_own_must_be_whole(real):
     def flown(*segments):
         return dataclasses.replace(real, segments=segments)
 
@@ -218,9 +218,6 @@ def test_arguments_of_fits_and_predictions_are_refused_in_one_line(real):
         (UserError, "command must be a mapping .*; got 500.0", load_drone, plain | {"motor_command": 500.0}),
     ):
         refuses(message, call, *arguments, error=error)
-
-
-def test_a_flight_of_ones_own_making_must_be_whole(real):
     bad = [("position", x) for x in (None, 5, "a", np.zeros(3), np.nan * real.position)]
     bad += [("time", x) for x in (None, 5, "a", np.nan * real.time, real.time[::-1], 100.0 * real.time)]
     bad += [("segments", x) for x in (None, 5, ((5, 3),), ((0, 10**9),), ((-1, 5),), (("a", 5),))]

@@ -120,17 +120,14 @@ def test_the_example_of_a_loss_is_short_and_runs(loss):
 @cases(
     (ABPTLoss, {"alpha": -1.0}, "alpha must be at least 0 or be 'auto', got -1.0. The coefficient of the entropy"),
     (ABPTLoss, {"alpha": float("inf")}, "alpha must be a finite number or be 'auto', got inf"),
-    (ABPTLoss, {"alpha": "automatic"}, "alpha must be a number or be 'auto', got 'automatic'"),
     (ABPTLoss, {"alpha_init": 0.0}, "alpha_init must be greater than 0, got 0.0. What alpha=auto starts"),
     (ABPTLoss, {"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
     (ABPTLoss, {"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
     (ABPTLoss, {"n_step_return": "abc"}, "n_step_return must be true or false, got 'abc'. Whether J includes J_N"),
     (ABPTLoss, {"num_qvalue_nets": 0}, "num_qvalue_nets must be at least 1, got 0. The critics made from it"),
-    (ABPTLoss, {"num_qvalue_nets": 2.5}, "num_qvalue_nets must be a whole number, got 2.5"),
     (ABPTLoss, {"simulated_steps": -1}, "simulated_steps must be at least 0, got -1. Control steps"),
     (SAPOLoss, {"alpha": 0.0}, "alpha must be greater than 0 or be 'auto', got 0.0. .* without .* take SHACLoss"),
     (SAPOLoss, {"target_entropy": 1.0}, "must be at most -0.001 or be 'auto', got 1.0. .* a negative number"),
-    (SAPOLoss, {"target_entropy": "low"}, "target_entropy must be a number or be 'auto', got 'low'"),
     (SAPOLoss, {"num_value_nets": 0}, "num_value_nets must be at least 1, got 0"),
     (SAPOLoss, {"delay_value": True}, "SAPOLoss sets delay_value itself: leave it out, or take SHACLoss"),
     (AHACLoss, {"horizon": 4, "min_horizon": 8}, "horizon=4 must lie between min_horizon=8 and max_horizon=8"),
@@ -196,7 +193,7 @@ def test_a_rollout_that_lacks_an_entry_is_refused(env, flight, key):
             refuses(f"{type(loss).__name__} {named}.*not in the rollout.*set_keys", loss, flight[0].exclude(key))
 
 
-def test_an_entry_of_another_shape_is_refused(env, flight):
+def test_an_entry_of_another_shape_a_wrong_tensor_key_and_a_rollout_on_another_device_are_refused(env, flight):
     for loss in losses(env):
         for key in ("reward", "done", "terminated"):
             wrong = flight[0].copy()
@@ -204,9 +201,6 @@ def test_an_entry_of_another_shape_is_refused(env, flight):
             refuses(rf"'{key}'\) of shape \(4, 3, 1\) in this rollout; got \(4, 3\)", loss, wrong)
     with pytest.raises(ValueError, match=r"'value_target' has shape \(4, 3\), and the critic's pred.* \(4, 3, 1\)"):
         losses(env)[1](flight[0].copy().set("value_target", torch.zeros(4, 3)))
-
-
-def test_a_wrong_tensor_key_and_a_rollout_on_another_device_are_refused(env, flight):
     for loss in losses(env):
         refuses("is on cpu, and the rollout on meta: loss.to.'meta'. moves it", loss, flight[0].to("meta"))
         loss.set_keys(reward="gain")

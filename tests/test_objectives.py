@@ -208,7 +208,7 @@ def td_lambda(rewards, next_values, ends, terminations):
     return targets[::-1]
 
 
-def test_td_lambda_targets_come_from_the_target_network_and_respect_the_ends():
+def test_td_lambda_targets_respect_the_ends_and_come_from_the_target_network_and_for_abpt_from_the_least_critic():
     actor, value, _ = make_networks()
     loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
     value.module.weight.data.fill_(-3.0)  # the target network still says 10 s
@@ -223,10 +223,6 @@ def test_td_lambda_targets_come_from_the_target_network_and_respect_the_ends():
     # environment 1, step 2: 6; step 1: 4 + 0.5 (0.5 * 30 + 0.5 * 6) = 13
     assert expected[1][1:3] == [13.0, 6.0]
     torch.testing.assert_close(target[..., 0], torch.tensor(expected))
-
-
-def test_td_lambda_targets_of_abpt_take_the_least_critic_with_a_new_action():
-    actor, *_ = make_networks()
     target = make_abpt(actor, 10.0, 20.0).write_value_target(make_rollout(actor).detach())["value_target"]
     expected = td_lambda([2.0, 4.0, 6.0, 8.0], [24, 108, 48, 60], [False, True, False, True], [False] * 4)
     torch.testing.assert_close(target[0, :, 0], torch.tensor(expected))

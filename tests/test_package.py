@@ -33,14 +33,11 @@ def wheel(built):
     return next(built.glob("*.whl"))
 
 
-def test_the_source_distribution_holds_every_file_of_the_package(built):
+def test_the_source_distribution_holds_every_file_and_the_wheel_package_presets_and_types_alone(built, wheel):
     with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     ours = {str(p.relative_to(ROOT)) for p in (ROOT / "torchrl_quad").rglob("*") if p.suffix and p.is_file()}
     assert {path for path in ours if "__pycache__" not in path} | {"README.md", "LICENSE", "pyproject.toml"} <= names
-
-
-def test_the_wheel_holds_the_package_the_presets_and_its_types_and_nothing_else(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     own = {str(path.relative_to(ROOT)) for path in (ROOT / "torchrl_quad").rglob("*.yaml")}
     configuration = {path.relative_to(ROOT / "recipes") for path in (ROOT / "recipes/config").rglob("*.yaml")}

@@ -322,11 +322,8 @@ def test_metrics_are_drawn_in_their_units_in_the_order_of_the_task(draw):
     assert labels == ["return", "episodes solved [%]", "position error", "top speed"]
 
 
-def test_a_learning_curve_has_gaps_where_cells_are_empty(draw):
+def test_a_learning_curve_has_gaps_where_cells_are_empty_and_one_of_nothing_is_refused(draw):
     axes = draw("steps,time/seconds,eval/return,eval/solved,note", "0,0.0,5.0,,none", "100,1.0,6.0,0.5,none")
     assert np.isnan(axes[1].lines[0].get_ydata()).tolist() == [True, False]
-
-
-@cases((["steps,eval/return"], "has no row yet"), (["steps", "1"], "needs the columns .* has steps"))
-def test_a_learning_curve_of_nothing_is_refused(rows, message, draw):
-    refuses(message, draw, *rows)
+    refuses("has no row yet", draw, "steps,eval/return")
+    refuses("needs the columns .* has steps", draw, "steps", "1")

@@ -322,7 +322,7 @@ def test_randomised_drones_are_drawn_with_their_own_rotors():
     torch.testing.assert_close(numbers("lift", 3, 6, 4)[:, 0], 4 * thrust / (drone["mass"] * 9.81), rtol=1e-4, atol=0)
 
 
-def test_the_gate_of_a_frame_is_the_one_that_the_drone_flies_to():
+def test_the_gate_of_a_frame_is_the_one_that_the_drone_flies_to_and_rings_face_along_the_course():
     env = RacingEnv(num_envs=3)
     rollout = env.rollout(4, break_when_any_done=False)
     gates = written(rollout, env=env)[1]("gate", 3, 5)
@@ -330,9 +330,6 @@ def test_the_gate_of_a_frame_is_the_one_that_the_drone_flies_to():
     assert torch.equal(gates[:, 0], rollout["state", "gate"][:, 0, 0].float())
     content, _ = written(rollout)
     assert content["gates"] is content["gate"] is None
-
-
-def test_rings_face_along_the_course():
     env = RacingEnv(num_envs=1, track={"gates": [[0, 0, 2], [4, 0, 2], [4, 0, 6], [0, 0, 6]], "gate_radius": 0.5})
     rings = written(env.rollout(2), env=env)[1]("gates", 4, 33, 3) - env.gates[:, None]
     torch.testing.assert_close(rings.norm(dim=-1), torch.full((4, 33), 0.5))
@@ -340,12 +337,9 @@ def test_rings_face_along_the_course():
     torch.testing.assert_close((rings * along[:, None]).sum(-1), torch.zeros(4, 33), atol=1e-5, rtol=0)
 
 
-def test_a_page_of_twelve_long_flights_is_small():
+def test_a_page_of_twelve_long_flights_is_small_and_a_machine_without_plotly_is_told_what_to_install(monkeypatch):
     env = make_env("tracking", num_envs=14)
     content, _ = written(env.rollout(512, break_when_any_done=False), env=env)
     assert content["environments"] == 12 and len(json.dumps(content)) < 1_500_000
-
-
-def test_a_machine_without_plotly_is_told_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     refuses(r"pip install '.\[render\]'", write_replay, HoveringEnv(num_envs=2).rollout(3), error=ImportError)

@@ -223,10 +223,14 @@ def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
     assert printed.splitlines()[-1] == f"Stopped. Continue with: python {script} resume={folder}/checkpoint.pt"
 
 
-def test_ctrl_c_before_the_first_checkpoint_says_so(refused, no_pictures, tmp_path, monkeypatch):
+def test_ctrl_c_before_a_checkpoint_says_so_and_a_bug_keeps_its_traceback(
+    refused, no_pictures, tmp_path, monkeypatch, launch
+):
     stop_at_save(monkeypatch, 1)
     said = refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", status=130)
     assert said == "Stopped. Nothing was saved yet: the first evaluation writes a checkpoint."
+    monkeypatch.setattr(BPTTLoss, "loss_actor", lambda self, rollout: {}["missing"])
+    refuses("missing", launch, "bptt", *SMALL, f"hydra.run.dir={tmp_path}", error=KeyError)
 
 
 def test_what_environment_and_loss_refuse_ends_in_one_line_and_leaves_no_folder(refused, launch, tmp_path, monkeypatch):
@@ -238,11 +242,6 @@ def test_what_environment_and_loss_refuse_ends_in_one_line_and_leaves_no_folder(
     with pytest.raises(BaseException, match="Unknown drone 'hawk'") as error:
         launch("bptt", *SMALL, "env.drone=hawk")
     assert isinstance(error.value.__cause__, ValueError)  # the traceback starts where it was raised
-
-
-def test_a_bug_keeps_its_traceback(launch, no_pictures, tmp_path, monkeypatch):
-    monkeypatch.setattr(BPTTLoss, "loss_actor", lambda self, rollout: {}["missing"])
-    refuses("missing", launch, "bptt", *SMALL, f"hydra.run.dir={tmp_path}", error=KeyError)
 
 
 CONTENT = {"config": "task: hovering", "best": {"actor": {"weight": torch.ones(40, 40)}}, "version": "0.1"}

@@ -59,13 +59,16 @@ def test_a_benchmark_writes_a_table(name, arguments, rows, run, tmp_path, monkey
     assert len(run(name, arguments, quicker)) == rows
 
 
-def test_the_benchmarks_of_exported_policies_and_of_controllers_write_tables(run, monkeypatch):
+def test_the_benchmark_of_exported_policies_writes_a_table(run, monkeypatch):
     def shorter(module):
         monkeypatch.setattr(module, "make_env", functools.partial(module.make_env, max_episode_steps=40))
 
     rows = run("deployment", "--checkpoints racing --observations 20 --calls 2", shorter)
     assert [row["normalizer"] for row in rows] == ["False", "True"]
     assert all(float(row[pair]) <= 1e-5 for row in rows for pair in ("torch - ONNX", "torch - C", "ONNX - C"))
+
+
+def test_the_benchmark_of_controllers_writes_a_table(run):
     rows = run("controllers", "--tasks hovering --starts 2 --mpc-starts 1 --steps 2 --calls 1")
     assert [row["policy"] for row in rows] == ["geometric", "mpc"]
     assert importlib.import_module("benchmarks.controllers").table(rows).count("\n") == 3

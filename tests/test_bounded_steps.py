@@ -193,7 +193,7 @@ def test_an_update_is_shortened_to_the_bound():
     assert all(torch.equal(x, y) for x, y in zip(actor.parameters(), before, strict=True))
 
 
-def test_a_policy_without_noise_may_still_move():
+def test_a_policy_without_noise_may_still_move_and_a_trust_region_knows_what_it_needs():
     env = HoveringEnv(num_envs=64)
     actor = make_actor(env, scale_init=1e-3)
     rollout = env.rollout(8, actor, break_when_any_done=False)
@@ -201,9 +201,6 @@ def test_a_policy_without_noise_may_still_move():
         actor[0].module.mlp[-1].bias[0] += 0.01
     found = [TrustRegion(actor, 1.0, min_scale=x).divergence(rollout).item() for x in (0.0, 0.1)]
     assert found == pytest.approx([0.01**2 / (2 * scale**2) for scale in (1e-3, 0.1)], rel=1e-3)
-
-
-def test_a_trust_region_knows_what_it_needs(env):
     actor = make_actor(env)
     refuses("min_scale must be at least 0, got -1", TrustRegion, actor, 0.1, min_scale=-1)
     refuses("max_kl must be greater than 0, got 0.0. .* 0.01 to 0.1 are usual", TrustRegion, actor, 0.0)

@@ -200,9 +200,8 @@ def test_a_state_within_an_obstacle_is_not_restored():
 
 
 def test_stable_baselines3_learns_from_images_and_vectors_of_a_gymnasium_environment():
-    drones = gymnasium.make_vec(
-        "torchrl_quad/Forest-v0", num_envs=4, autoreset_mode="SameStep", max_episode_steps=3, camera={"rate": 2}
-    )
+    options = {"autoreset_mode": "SameStep", "max_episode_steps": 3, "camera": {"rate": 2}}
+    drones = gymnasium.make_vec("torchrl_quad/Forest-v0", num_envs=4, **options)
     observation, _ = drones.reset(seed=0)
     assert drones.observation_space.contains(observation)
     assert {name: x.shape for name, x in observation.items()} == {"observation": (4, 9), "depth": (4, 1, 12, 16)}

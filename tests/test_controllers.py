@@ -170,7 +170,7 @@ def test_derivatives_of_a_reference_are_those_of_its_curve():
         torch.testing.assert_close(got[..., 0] - 2.0 * (got is motion.position), x, atol=1e-3, rtol=0)
 
 
-def test_the_lap_passes_the_gates_within_the_limits_of_the_drone():
+def test_the_lap_passes_the_gates_within_the_limits_of_the_drone_and_a_landing_is_soft():
     env = RacingEnv(num_envs=1, **DOUBLE)
     lap = plan_lap(env.gates, env.nominal, 0.3)
     assert (lap.position(lap.passes) - env.gates).norm(dim=1).max() < 0.12
@@ -182,9 +182,6 @@ def test_the_lap_passes_the_gates_within_the_limits_of_the_drone():
     assert 2.5 < lap.period < 4.0
     flight = env.rollout(100, GeometricController(env, reference=racing(env)), break_when_any_done=False)
     assert flight["next", "state", "gates_passed"][0, -1] >= 1
-
-
-def test_it_comes_down_softly():
     env = LandingEnv(num_envs=2)
     env.start_centre, env.start_range = (2.0, 0.0, 1.0), 0.3
     flight = env.rollout(150, GeometricController(env), break_when_any_done=False)

@@ -102,7 +102,7 @@ def test_a_bundle_flies_the_environment_as_the_actor_does(exported):
     assert (torch.stack(actions).std(0) > 1e-3).any()
 
 
-def test_a_gate_that_is_passed_during_a_fault_counts_afterwards(export_once):
+def test_a_gate_that_is_passed_during_a_fault_counts_afterwards_and_the_time_of_a_task_goes_on(export_once):
     bundle = load_bundle(export_once("racing")[2], on_fault="hover")
     gates = export_once("racing")[0].base_env.gates.numpy()
     for faults in (1, 3):
@@ -113,9 +113,6 @@ def test_a_gate_that_is_passed_during_a_fault_counts_afterwards(export_once):
         assert (bundle.progress["gate"], bundle.progress["gates_passed"]) == (1, 0)
         bundle(resting(position=gates[1] + (1, 0, 0)))
         assert (bundle.progress["gate"], bundle.progress["gates_passed"]) == (2, 1)
-
-
-def test_the_time_of_a_task_goes_on_during_faults_once_a_flight_has_begun(export_once):
     env, _, folder = export_once("tracking")
     bundle, step = load_bundle(folder, on_fault="hover"), env.base_env.phase_rate * env.base_env.control_dt
     for begun in (False, True):
@@ -234,9 +231,8 @@ def test_the_rate_loop_of_a_contract_is_that_of_the_simulator(hovering):
     env = HoveringEnv(num_envs=1, dtype=torch.float64, dt=0.001, control_dt=0.001, action_delay=0)
     action = env.hover_action.clone().repeat(1, 1)
     action[0, 1:] = 0.02
-    rate = torch.stack(
-        [td["next", "state", "angular_velocity"] for td in fly(env, env.reset(), [action] * 150).unbind(1)]
-    )
+    flight = fly(env, env.reset(), [action] * 150)
+    rate = torch.stack([td["next", "state", "angular_velocity"] for td in flight.unbind(1)])
     t = 0.001 * np.arange(1, 151)
     for axis, found in enumerate(rate[:, 0].T.numpy() / 0.04):
         w, z = loop["natural_frequency"][axis], loop["damping_ratio"][axis]

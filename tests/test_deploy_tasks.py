@@ -307,10 +307,8 @@ def test_a_bundle_that_acts_or_remembers_differently_from_its_policy_is_not_writ
         *layers, last = network.layers
         return network._replace(layers=[*layers, last._replace(bias=last.bias + np.float32(1e-3))])
 
-    wrongs = (
-        (Bundle, "_read", forgets, ValueError, "acts differently"),
-        (export, "fold", off, WrongActions, "by 0.001"),
-    )
+    wrongs = [(Bundle, "_read", forgets, ValueError, "acts differently")]
+    wrongs.append((export, "fold", off, WrongActions, "by 0.001"))
     for owner, name, wrong, error, said in wrongs:
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, wrong)

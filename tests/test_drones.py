@@ -74,12 +74,17 @@ def test_what_is_no_drone_is_refused_by_name(tmp_path):
         load_drone(tmp_path / "none.yaml")
 
 
-def test_gradients_flow_through_replace_to_and_construction():
+def test_gradients_flow_through_replace_to_and_construction_and_a_drone_in_float64_may_lie_at_a_limit():
     mass = torch.full((5, 1), 0.5, requires_grad=True)
     params = load_drone().replace(mass=mass).to(dtype=torch.float64)
     QuadrotorParams(**params.fields()).mass.sum().backward()
     assert (mass.grad == 1.0).all() and params.mass.shape == (5, 1)
     assert not params.detach().mass.requires_grad
+    drone = {**VISFLY, "mass": 0.027, "inertia": [1e-8, 1e-8, 1e-8], "yaw_torque_coefficient": 1e-5}
+    env = HoveringEnv(num_envs=1, drone=drone, dtype=torch.float64)
+    assert (env.params.mass.item(), env.params.inertia[..., 0].item()) == (0.027, 1e-8)
+    rounded = load_drone(drone, torch.float32)  # whose 1e-8 is a little less
+    assert rounded.to(dtype=torch.float64).inertia[0] < 1e-8
 
 
 def test_a_drone_shows_itself_as_a_table_with_units():
@@ -113,11 +118,3 @@ def test_what_is_no_number_is_refused_in_every_field_however_a_drone_is_made(val
     motors = {"speed_per_volt": 500.0, "nominal_voltage": 3.7, "speed_at_zero": 0.0, "delay": 0.0}
     for name in motors:
         refuses(name, load_drone, {**VISFLY, "motor_command": {**motors, name: value}}, error=UserValueError)
-
-
-def test_a_drone_of_a_float64_environment_is_in_its_precision_and_may_lie_at_a_limit():
-    drone = {**VISFLY, "mass": 0.027, "inertia": [1e-8, 1e-8, 1e-8], "yaw_torque_coefficient": 1e-5}
-    env = HoveringEnv(num_envs=1, drone=drone, dtype=torch.float64)
-    assert (env.params.mass.item(), env.params.inertia[..., 0].item()) == (0.027, 1e-8)
-    rounded = load_drone(drone, torch.float32)  # whose 1e-8 is a little less
-    assert rounded.to(dtype=torch.float64).inertia[0] < 1e-8

@@ -55,24 +55,27 @@ def fly(state, action, params, controller, seconds, dt=0.005, integrator="semi_i
     return history
 
 
-def test_free_fall_follows_the_parabola():
+def test_free_fall_follows_the_parabola_and_with_drag_ends_where_that_balances_the_weight():
     end = fly_body(body(velocity=vector(1.0, 2.0, 3.0)), without_drag(), NO_WRENCH, 1.0, 0.01)
     torch.testing.assert_close(end.velocity, vector(1.0, 2.0, 3.0 - 9.81))
     torch.testing.assert_close(end.position, vector(1.0, 2.0, 3.0 - 9.81 / 2))
-
-
-def test_terminal_velocity_is_where_drag_balances_weight():
     params = drone()
     speed = -fly_body(body(), params, NO_WRENCH, 60.0, 0.05).velocity[0, 2]
     force = params.linear_drag[2] * speed + params.quadratic_drag[2] * speed**2
     torch.testing.assert_close(force, (params.mass * params.gravity)[0], rtol=1e-6, atol=0)
 
 
-def test_drag_opposes_motion_along_every_axis_in_both_directions():
+def test_drag_opposes_motion_along_every_axis_and_above_the_centre_of_mass_pitches_a_drone_up():
     params = drone(gravity=0.01)
     velocity = 5.0 * torch.cat((torch.eye(3, dtype=F64), -torch.eye(3, dtype=F64)))
     linear, _ = accelerations(body(velocity=velocity), NO_WRENCH, params)
     assert ((linear * velocity).sum(-1) < -0.05).all()
+    params = drone(drag_height=0.03, linear_drag=[0.2] * 3, quadratic_drag=[0.0] * 3)
+    velocity = torch.tensor([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0]], dtype=F64)
+    _, angular = accelerations(body(velocity=velocity), NO_WRENCH, params)
+    moment = 0.03 * 0.2 * 2.0  # about y where it flies along x (nose up), about x where it flies along y
+    about = torch.tensor([[0.0, -moment, 0.0], [moment, 0.0, 0.0]], dtype=F64)
+    torch.testing.assert_close(angular, about / params.inertia)
 
 
 def test_energy_is_conserved_without_drag_and_lost_with_it():
@@ -215,15 +218,6 @@ def test_rotations_agree_with_the_rotation_matrix_and_invert_each_other():
     torch.testing.assert_close(quaternion.rotate(quaternion.multiply(p, q), v), one_by_one)
 
 
-def test_drag_above_the_centre_of_mass_pitches_a_drone_that_flies_forward_up():
-    params = drone(drag_height=0.03, linear_drag=[0.2] * 3, quadratic_drag=[0.0] * 3)
-    velocity = torch.tensor([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0]], dtype=F64)
-    _, angular = accelerations(body(velocity=velocity), NO_WRENCH, params)
-    moment = 0.03 * 0.2 * 2.0  # about y where it flies along x (nose up), about x where it flies along y
-    about = torch.tensor([[0.0, -moment, 0.0], [moment, 0.0, 0.0]], dtype=F64)
-    torch.testing.assert_close(angular, about / params.inertia)
-
-
 @pytest.mark.parametrize("own", [False, True])
 def test_components_fly_as_tensors_do_with_two_time_constants_and_drag_above_the_centre_of_mass(own):
     params = drone(motor_time_constant=[0.03, 0.06], drag_height=0.02)
@@ -322,9 +316,8 @@ def flight(env, actions, state, steps=STEPS):
         step, td = env.step_and_maybe_reset(td.set("action", actions[:, t]))
         rewards.append(step["next", "reward"].flatten())
     last = step["next", "state"]
-    return torch.cat(
-        (*rewards, *(last[k].flatten() for k in ("position", "quaternion", "velocity", "angular_velocity")))
-    )
+    ends = (last[k].flatten() for k in ("position", "quaternion", "velocity", "angular_velocity"))
+    return torch.cat((*rewards, *ends))
 
 
 def setup(**kwargs):

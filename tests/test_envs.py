@@ -134,7 +134,7 @@ def test_every_field_of_the_drone_may_differ_between_environments(num_envs):
     refuses(f"is for {num_envs} environments, and num_envs=5", HoveringEnv, num_envs=5, drone=batched)
 
 
-def test_the_controller_keeps_its_drone_when_the_true_one_is_fitted_in_place():
+def test_the_controller_keeps_its_drone_and_the_one_that_flies_is_fitted_in_place_or_set_through_transforms(env64):
     mass = torch.nn.Parameter(torch.tensor([0.46]))
     env = HoveringEnv(num_envs=1, drone=load_drone().replace(mass=mass))
     assert env.params.mass is mass
@@ -142,9 +142,6 @@ def test_the_controller_keeps_its_drone_when_the_true_one_is_fitted_in_place():
     assert env.nominal.mass.item() == pytest.approx(0.46)
     others = [HoveringEnv(num_envs=1, drone=load_drone()) for _ in range(2)]
     assert others[0].params.mass is not others[1].params.mass
-
-
-def test_the_drone_that_flies_can_be_set_through_transforms_and_takes_precision_and_gradient(env64):
     wrapped = TransformedEnv(env64, StepCounter())
     mass = torch.tensor([0.9], requires_grad=True)
     wrapped.set_params(load_drone("visfly").replace(mass=mass))

@@ -315,14 +315,11 @@ def test_the_weight_tells_a_true_derivative_from_none(env):
     assert jumps.pathwise_weight < 0 and not data["location_gradient"].any()
 
 
-def test_a_single_flight_is_regressed_over_its_steps():
-    env = HoveringEnv(num_envs=1, dtype=torch.float64)
-    loss = make_loss(env)
-    data = loss.write_targets(flight(env, loss, 16))
+def test_a_single_flight_is_regressed_over_its_steps_and_weights_are_running_means_that_a_checkpoint_keeps(env):
+    single = HoveringEnv(num_envs=1, dtype=torch.float64)
+    loss = make_loss(single)
+    data = loss.write_targets(flight(single, loss, 16))
     assert loss.pathwise_weight != 0 and data["location_gradient"].isfinite().all()
-
-
-def test_weights_are_running_means_that_a_checkpoint_keeps(env):
     loss = make_loss(env, decay=0.5)
     rollout = flight(env, loss)
     loss.write_targets(rollout)

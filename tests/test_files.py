@@ -120,9 +120,8 @@ def test_processes_that_add_to_one_table_lose_no_row(tmp_path):
     )
     running = [subprocess.Popen([sys.executable, "-c", program, path, str(who)]) for who in range(4)]
     assert [process.wait() for process in running] == [0] * 4
-    assert sorted((row["who"], int(row["i"])) for row in read_rows(path)) == [
-        (str(w), i) for w in range(4) for i in range(20)
-    ]
+    wanted = [(str(w), i) for w in range(4) for i in range(20)]
+    assert sorted((row["who"], int(row["i"])) for row in read_rows(path)) == wanted
     assert list(tmp_path.iterdir()) == [path]
     add_rows(path, [{"who": "2", "i": 3, "own2": 5}], same=("who", "i"))
     assert [row["own2"] for row in read_rows(path) if (row["who"], row["i"]) == ("2", "3")] == ["5"]

@@ -131,7 +131,7 @@ def test_an_entry_of_another_kind_is_refused():
         refuses(f"state '{key}' must be {kind}, got {dtype}", env.reset, td, set_state=True)
 
 
-def test_a_state_that_is_not_whole_is_refused_by_a_step_a_rollout_and_a_reset(env):
+def test_a_state_that_is_not_whole_is_refused_by_a_step_a_rollout_a_reset_and_as_a_start(env):
     actor, td = make_actor(env), env.reset()
     short = td.clone()
     short["state", "velocity"] = torch.zeros(4, 2)
@@ -146,6 +146,12 @@ def test_a_state_that_is_not_whole_is_refused_by_a_step_a_rollout_and_a_reset(en
         if "state" in wrong:
             refuses(message, env.reset, wrong.copy(), set_state=True)
     refuses('needs a tensordict with the state to set in "state"; got none', env.reset, set_state=True)
+    with pytest.raises(ValueError, match="initial_state_source must be a function from a number n to n states.*got Te"):
+        env.set_initial_state_source(env.reset())
+    state = env.reset()["state"]
+    for wrong, message in ((state[:2], r"has shape \(2, 3\), expected \(4, 3\)"), (torch.zeros(4), "got Tensor")):
+        env.set_initial_state_source(lambda n, wrong=wrong: wrong)
+        refuses(f"initial_state_source: .*{message}", env.reset)
 
 
 def test_a_reset_copies_and_converts_a_state_of_a_precision_or_device_that_a_step_refuses(env):
@@ -163,12 +169,3 @@ def test_a_reset_copies_and_converts_a_state_of_a_precision_or_device_that_a_ste
     env.reset()["state", "position"][0] = 99.0
     env.reset(td.clone(recurse=False), set_state=True)["state", "position"][0] = 99.0
     assert (td["state"] == kept).all()
-
-
-def test_starts_come_from_a_function_that_gives_whole_states(env):
-    with pytest.raises(ValueError, match="initial_state_source must be a function from a number n to n states.*got Te"):
-        env.set_initial_state_source(env.reset())
-    state = env.reset()["state"]
-    for wrong, message in ((state[:2], r"has shape \(2, 3\), expected \(4, 3\)"), (torch.zeros(4), "got Tensor")):
-        env.set_initial_state_source(lambda n, wrong=wrong: wrong)
-        refuses(f"initial_state_source: .*{message}", env.reset)

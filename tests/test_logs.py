@@ -47,9 +47,8 @@ def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(lau
     assert all("steps" in row for row in history) and not any(name.endswith("/step") for row in history for name in row)
     curves = [row for row in history if "eval/return" in row]
     assert [row["steps"] for row in curves] == [48, 96, 144, 192]
-    names = {name for name in rows(tmp_path)[0] if "/" in name} | {
-        f"time/{name}" for name in ("seconds", "processor_seconds", "steps_per_second")
-    }
+    clock = {f"time/{name}" for name in ("seconds", "processor_seconds", "steps_per_second")}
+    names = {name for name in rows(tmp_path)[0] if "/" in name} | clock
     assert names <= set(curves[0])
     assert {name.split("/")[0] for name in names} == {"train", "eval", "reward", "grad", "time"}
     assert [row["eval/return"] for row in curves] == [row["eval/return"] for row in resumed["rows"][:4]]
@@ -60,12 +59,8 @@ def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(lau
     # The third evaluation and the final one draw the flight; the page comes with the final one alone.
     items = [item for record in first["history"] for item in record.history.item]
     media = [(item.nested_key[0], json.loads(item.value_json)) for item in items if item.nested_key[1:] == ["path"]]
-    kinds = {
-        "eval/flight": (2, b"\x89PNG"),
-        "eval/film": (2, b"\0\0\0 ftyp"),
-        "eval/learning_curve": (1, b"\x89PNG"),
-        "eval/replay": (1, b"<!doctype html>"),
-    }
+    kinds = {"eval/flight": (2, b"\x89PNG"), "eval/film": (2, b"\0\0\0 ftyp")}
+    kinds |= {"eval/learning_curve": (1, b"\x89PNG"), "eval/replay": (1, b"<!doctype html>")}
     assert Counter(name for name, path in media) == {name: count for name, (count, _) in kinds.items()}
     for name, path in media:
         assert (logs[0].parent / "files" / path).read_bytes().startswith(kinds[name][1]), name

@@ -1,5 +1,6 @@
 """What actions may command: every mode goes where it is told, on every drone, with exact derivatives."""
 
+import itertools
 import math
 
 import pytest
@@ -18,13 +19,9 @@ F64 = torch.float64
 DT, STEPS = 0.005, 4  # physics step [s], and how many make a control step
 each_mode = pytest.mark.parametrize("control", CONTROLS)
 each_drone = pytest.mark.parametrize("drone", available_drones())
-each_model = pytest.mark.parametrize(
-    ("control", "dynamics"),
-    [(name, model) for name in CONTROLS for model in DYNAMICS if (name, model) != ("rotor_thrusts", "point_mass")],
-)
-each_flight = pytest.mark.parametrize(
-    ("drone", "dynamics"), [*((name, "quadrotor") for name in available_drones()), ("visfly", "point_mass")]
-)
+MODELS = set(itertools.product(CONTROLS, DYNAMICS)) - {("rotor_thrusts", "point_mass")}
+each_model = pytest.mark.parametrize(("control", "dynamics"), sorted(MODELS))
+each_flight = cases(*((name, "quadrotor") for name in available_drones()), ("visfly", "point_mass"))
 
 
 def commanded(steps, *commands, control, drone="visfly", **options):

@@ -112,11 +112,8 @@ def test_each_entry_may_have_a_scale_of_its_own():
 def test_every_network_has_the_precision_of_the_environment_and_may_read_whole_numbers(env64):
     td = make_actor(env64)(env64.reset())
     whole = make_value(env64, in_keys=[("state", "step"), "success", "observation"])
-    for network, key in (
-        (make_value(env64), "state_value"),
-        (whole, "state_value"),
-        (make_qvalue(env64), "state_action_value"),
-    ):
+    values = [(network, "state_value") for network in (make_value(env64), whole)]
+    for network, key in (*values, (make_qvalue(env64), "state_action_value")):
         assert network(td)[key].dtype is torch.float64 and network(td)[key].shape == (4, 1)
 
 

@@ -187,9 +187,8 @@ def test_a_loss_has_the_precision_of_its_rollout():
     rollout = make_rollout(actor, torch.float64)
     rollout["action_log_prob"] = -torch.ones(2, 4, dtype=torch.float64)
     rewards = loss.objective_parts(rollout)["rewards"]
-    assert rewards.tolist() == pytest.approx(
-        [(2 + 4 * 0.99) + (6 + 8 * 0.99), 2 + 0.99 * (4 + 0.99 * 6) + 8], abs=1e-14
-    )
+    expected = [(2 + 4 * 0.99) + (6 + 8 * 0.99), 2 + 0.99 * (4 + 0.99 * 6) + 8]
+    assert rewards.tolist() == pytest.approx(expected, abs=1e-14)
     target = loss.write_value_target(rollout)["value_target"]
     assert target[0, 0].item() == pytest.approx(2 + 0.99 * (0.05 * 20 + 0.95 * (4 + 0.99 * 90)), rel=1e-15)
     default = BPTTLoss(actor, alpha="auto", alpha_init=0.3)
@@ -273,7 +272,7 @@ def test_without_delay_the_target_is_the_critic_itself():
         assert not torch.equal(loss.write_value_target(make_rollout(actor).detach())["value_target"], before)
 
 
-def test_the_entropy_bonus_is_alpha_times_the_mean_of_minus_log_prob():
+def test_the_entropy_bonus_is_alpha_times_the_mean_of_minus_log_prob_and_alpha_rises_where_that_is_too_low():
     actor, *_ = make_networks()
     rollout = make_rollout(actor)
     rollout["action_log_prob"] = -torch.arange(8.0).view(2, 4)
@@ -281,10 +280,6 @@ def test_the_entropy_bonus_is_alpha_times_the_mean_of_minus_log_prob():
     out = BPTTLoss(actor, reduction="none", alpha=0.5).make_value_estimator(gamma=GAMMA)(rollout)
     torch.testing.assert_close(out["loss_actor"], plain - 0.5 * torch.tensor([1.5, 5.5]))
     assert out["entropy"].item() == 3.5
-
-
-def test_the_automatic_alpha_rises_when_the_entropy_is_too_low_and_falls_when_too_high():
-    actor, *_ = make_networks()
     for log_prob, direction in ((3.0, -1.0), (-3.0, 1.0)):
         loss = BPTTLoss(actor, alpha="auto", alpha_init=0.2, target_entropy=0.0).make_value_estimator(gamma=GAMMA)
         rollout = make_rollout(actor)

@@ -126,9 +126,8 @@ def judged(actor, seed=99, **options):
     """The metrics of fresh episodes of hovering, flown by the mean action."""
     env = HoveringEnv(seed=seed, **options)
     with torch.no_grad():
-        flight, _ = differentiable_rollout(
-            env, actor, None, env.max_episode_steps, exploration_type=ExplorationType.DETERMINISTIC
-        )
+        mode = {"exploration_type": ExplorationType.DETERMINISTIC}
+        flight, _ = differentiable_rollout(env, actor, None, env.max_episode_steps, **mode)
     return env.episode_metrics(flight)
 
 

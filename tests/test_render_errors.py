@@ -125,9 +125,8 @@ def test_where_no_ffmpeg_works_the_film_is_a_gif_and_a_line_says_why(
 
 
 def test_an_ffmpeg_that_cannot_be_found_is_installed_anew(monkeypatch, tmp_path):
-    monkeypatch.setattr(
-        imageio_ffmpeg, "get_ffmpeg_exe", Mock(side_effect=RuntimeError("No ffmpeg exe could be found."))
-    )
+    missing = Mock(side_effect=RuntimeError("No ffmpeg exe could be found."))
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", missing)
     with pytest.raises(NoFfmpeg, match=r"No ffmpeg exe could be found.*pip install --force-reinstall"):
         animate_flight(HoveringEnv(num_envs=1).rollout(3), tmp_path / "flight.mp4")
 
@@ -175,9 +174,8 @@ def test_a_picture_takes_the_place_of_nothing_but_a_picture(capsys, tmp_path):
     (tmp_path / "episode.png").mkdir()
     drawing.publish_flight(env.rollout(3), tmp_path / "episode.png", tmp_path / "flight.html", env, "one")
     said = capsys.readouterr().err.splitlines()
-    assert [line.split(" is missing. ")[0] for line in said] == [
-        f"Warning: {tmp_path}/{name}" for name in ("episode.png", "flight.html")
-    ]
+    wanted = [f"Warning: {tmp_path}/{name}" for name in ("episode.png", "flight.html")]
+    assert [line.split(" is missing. ")[0] for line in said] == wanted
     assert kept.read_text() == "kept" and (tmp_path / "flight.html").is_symlink()
 
 

@@ -133,16 +133,13 @@ def test_a_run_that_fails_is_told_and_stops_no_other(tmp_path, capsys):
     assert (tmp_path / "1/log.txt").exists()
 
 
-def test_a_run_that_diverged_is_kept_as_one(tmp_path):
+def test_a_run_that_diverged_is_kept_as_one_and_the_best_learning_rate_ends_highest(tmp_path):
     finish(tmp_path / "run")
     (tmp_path / "run/failure.pt").write_text("")
     job = Job("hovering", "abpt", 100, 0.03)
     reproduce.keep(job, tmp_path / "run", tmp_path)
     assert running.kept(tmp_path / "final.csv", *reproduce.KEY) == {job.key} != {Job("hovering", "abpt", 100, 0.01).key}
     assert [row["return"] for row in read_rows(tmp_path / "search/hovering.csv")] == ["2.5", "nan"]
-
-
-def test_the_best_learning_rate_is_that_whose_curve_ends_highest(tmp_path):
     ends = {"0.001": 3.0, "0.01": 5.0, "0.1": math.nan}
     rows = [row | {"lr": lr} for lr, end in ends.items() for row in curve("abpt", 100, 9.0, end)]
     write_rows(tmp_path / "search/hovering.csv", rows)
@@ -171,7 +168,7 @@ def test_the_jobs_of_the_matrix_are_valid_runs_of_their_recipes_and_each_is_ther
         assert cfg.total_steps == matrix.STEPS[job.task][cfg.algorithm == "ppo"] * (0.25 if job.lr else 1)
 
 
-def test_without_visited_states_every_horizon_goes_on_where_the_last_one_ended():
+def test_without_visited_states_horizons_go_on_and_a_task_of_your_own_is_flown_with_all_that_the_paper_flies():
     def starts(task, variant):
         cfg = reproduce.configuration(Job(task, variant, 42), 1e-3)
         return cfg.buffer.fraction, cfg.restart_fraction
@@ -179,6 +176,10 @@ def test_without_visited_states_every_horizon_goes_on_where_the_last_one_ended()
     assert {starts(task, "abpt-no-visited") for task in matrix.TASKS} == {(None, 0)}
     assert starts("landing", "abpt-restarts") == (None, 0.2)
     assert starts("racing", "abpt-now") == starts("racing", "abpt") == (0.8, 0.2)
+    jobs = matrix.jobs(tuple(matrix.EXPERIMENTS), ("own_task.CornerEnv",), (42,))
+    assert {"abpt", "ppo", "bptt-episode", "abpt-no-0-step"} <= {job.variant for job in jobs}
+    cfg = reproduce.configuration(jobs[0], 1e-2)
+    assert (cfg.task, cfg.total_steps, cfg.env.reach) == ("own_task.CornerEnv", 491_520, 0.5)
 
 
 @pytest.fixture
@@ -293,13 +294,6 @@ def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom(tmp_p
     assert "| PPO | 1.00, 1 | 1.00, 1 |  |" in beaten and "| BPTT |  | 0.50, 1 | 0.00, 1 |" in beaten
 
 
-def test_a_task_of_your_own_is_flown_with_all_that_the_paper_flies_on_each_of_its_tasks():
-    jobs = matrix.jobs(tuple(matrix.EXPERIMENTS), ("own_task.CornerEnv",), (42,))
-    assert {"abpt", "ppo", "bptt-episode", "abpt-no-0-step"} <= {job.variant for job in jobs}
-    cfg = reproduce.configuration(jobs[0], 1e-2)
-    assert (cfg.task, cfg.total_steps, cfg.env.reach) == ("own_task.CornerEnv", 491_520, 0.5)
-
-
 RANGE = {"pendulum": (-4 * 16.3, 0.0), "balance": (-20.0, 20.0)}  # returns that four steps can have
 
 
@@ -321,7 +315,7 @@ def test_a_loss_trains_on_another_environment_once_and_has_a_row_in_the_table(
     run_main(monkeypatch, reproduce, *arguments)
 
 
-def test_balance_cuts_the_graph_between_horizons_and_lets_some_go_on():
+def test_balance_cuts_the_graph_between_horizons_and_at_a_reset_and_lets_some_go_on():
     torch.manual_seed(0)
     place = elsewhere.Balance(0, 16)
     actions = torch.zeros(16, 6, requires_grad=True)
@@ -331,9 +325,6 @@ def test_balance_cuts_the_graph_between_horizons_and_lets_some_go_on():
     start = place.go_on(end.detach())
     assert not any(entry.requires_grad for entry in start.values(True, True))
     assert 0 < (start["observation"] == end["observation"]).all(-1).sum() < 16
-
-
-def test_a_reset_at_the_end_of_a_horizon_leaves_no_graph_in_the_carry():
     place = elsewhere.Balance(0, 4)
     carry, scenario = place.starts(), place.env.base_env.scenario
     scenario.package.set_pos(torch.tensor([0.0, -2.0]), batch_index=0)  # one ball lies on the floor

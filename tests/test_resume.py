@@ -183,7 +183,7 @@ def test_a_named_folder_is_refused_while_its_holder_lives_and_taken_over_when_it
     assert not list(tmp_path.iterdir())
 
 
-def test_of_many_that_want_a_folder_at_once_one_gets_it(tmp_path):
+def test_of_many_that_want_a_folder_at_once_one_gets_it_and_without_locks_they_go_on(tmp_path, monkeypatch):
     def want(_):
         with contextlib.suppress(FileExistsError), own_folder(tmp_path, named=True):
             inside.append(1)
@@ -195,9 +195,6 @@ def test_of_many_that_want_a_folder_at_once_one_gets_it(tmp_path):
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(want, range(200)))
     assert max(most) == 1
-
-
-def test_a_file_system_without_locks_is_no_reason_to_stop(tmp_path, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", Mock(side_effect=OSError(errno.ENOLCK, "No locks available")))
     with own_folder(tmp_path, named=True) as folder:
         assert folder == tmp_path

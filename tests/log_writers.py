@@ -8,14 +8,9 @@ from scipy.spatial.transform import Rotation
 
 END = 10.0  # [s]
 G = 9.80665
-OURS = {
-    "position": ("x", "y", "z"),
-    "quaternion": ("qw", "qx", "qy", "qz"),
-    "velocity": ("vx", "vy", "vz"),
-    "angular_velocity": ("wx", "wy", "wz"),
-    "acceleration": ("fx", "fy", "fz"),
-    "motor_command": ("u0", "u1", "u2", "u3"),
-}
+OURS = {"position": ("x", "y", "z"), "quaternion": ("qw", "qx", "qy", "qz"), "velocity": ("vx", "vy", "vz")}
+OURS |= {"angular_velocity": ("wx", "wy", "wz"), "acceleration": ("fx", "fy", "fz")}
+OURS |= {"motor_command": ("u0", "u1", "u2", "u3")}
 TABLE = {"time": "t", **OURS}
 ULOG = b"ULog\x01\x12\x35\x01" + bytes(8)  # its header
 

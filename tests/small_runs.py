@@ -1,24 +1,27 @@
 """Small training runs, and how to compare them."""
 
+import subprocess
+from pathlib import Path
+
 import torch
 
 from torchrl_quad import BPTTLoss
 from torchrl_quad.files import read_rows
 
-SMALL = [
-    *("num_envs=4", "horizon=6", "total_steps=192", "env.max_episode_steps=15", "compile=false"),
-    *("eval.interval=2", "eval.episodes=null"),
-]
-EVERYTHING = [  # that draws random numbers or keeps a memory
-    "normalize=true",
-    "env.wind={mean: [1, 0, 0], gust: 0.5}",
-    "env.observation_noise={position: 0.01}",
-    "env.observation_delay=1",
-    "env.randomize={mass: {scale: [0.8, 1.2]}}",
-    "actor.noise_correlation=0.9",
-    "actor.max_kl=0.05",
-    "actor.average=0.5",
-]
+ROOT = Path(__file__).parent.parent
+SMALL = ["num_envs=4", "horizon=6", "total_steps=192", "env.max_episode_steps=15", "compile=false", "eval.interval=2"]
+SMALL += ["eval.episodes=null"]
+# All that draws random numbers or keeps a memory.
+EVERYTHING = ["normalize=true", "env.wind={mean: [1, 0, 0], gust: 0.5}", "env.observation_noise={position: 0.01}"]
+EVERYTHING += ["env.observation_delay=1", "env.randomize={mass: {scale: [0.8, 1.2]}}", "actor.noise_correlation=0.9"]
+EVERYTHING += ["actor.max_kl=0.05", "actor.average=0.5"]
+
+
+def run(*command, cwd=ROOT, timeout=300, **options):
+    """What a command prints, which must succeed."""
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False, **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 def rows(folder):

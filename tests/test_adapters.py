@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from rsl_rl.runners import OnPolicyRunner
 from skrl.agents.torch.ppo import PPO
 from skrl.memories.torch import RandomMemory
@@ -81,15 +82,21 @@ def test_the_runner_of_rsl_rl_trains_logs_saves_and_loads(tmp_path, capsys):
     assert torch.autograd.grad(reward.sum(), action)[0].abs().sum() > 0
 
 
-def test_rsl_rl_is_told_which_episodes_the_time_limit_has_ended():
+def test_rsl_rl_sets_episode_lengths_within_the_limit_and_is_told_which_episodes_it_has_ended():
     env = RslRlVecEnv(HoveringEnv(num_envs=3, seed=0, max_episode_steps=10))
     env.episode_length_buf = torch.tensor([0, 9, 0])
     env.drones.now["state", "position"][2, 2] = -1.0  # underground
     _, _, done, extras = env.step(torch.zeros(3, 4))
     assert done.tolist() == [False, True, True]
-    assert extras["time_outs"].tolist() == [False, True, False]
-    assert extras["log"]["Episode/crash"] == 0.5
+    assert extras["time_outs"].tolist() == [False, True, False] and extras["log"]["Episode/crash"] == 0.5
     assert env.episode_length_buf.tolist() == [1, 0, 0]
+    env = RslRlVecEnv(HoveringEnv(3, seed=0, max_episode_steps=10))
+    steps = torch.tensor([0, 5, 9])
+    env.episode_length_buf = steps
+    steps += 1
+    for wrong in (None, 3, [0, 0, 0], steps, -steps, steps.float(), steps[:2], steps[:, None], steps.to("meta")):
+        refused(setattr, env, "episode_length_buf", wrong)
+    assert env.episode_length_buf.tolist() == [0, 5, 9]
 
 
 def test_ppo_of_skrl_trains(tmp_path, monkeypatch):
@@ -120,15 +127,13 @@ def test_stable_baselines3_counts_successes_and_ends():
     env.reset()
     hover = np.tile(drones.torchrl_env.hover_action.numpy(), (2, 1))
     infos = [env.step(hover)[3] for _ in range(3)]
-    assert infos[0] == [{}, {}]
-    assert [info["is_success"] for info in infos[2]] == [True, False]
+    assert infos[0] == [{}, {}] and [info["is_success"] for info in infos[2]] == [True, False]
     assert all(info["TimeLimit.truncated"] for info in infos[2])
     np.testing.assert_allclose(infos[2][0]["terminal_observation"][:4], [0, 0, 0, 10], atol=0.1)
     assert [picture.shape for picture in env.get_images()] == 2 * [(336, 336, 3)]
     ppo = StablePPO("MlpPolicy", VecMonitor(env), n_steps=8, batch_size=16, n_epochs=1, device="cpu").learn(16)
     assert ppo.ep_success_buffer
-    with pytest.raises(NotImplementedError, match="share 'x'"):
-        env.set_attr("x", 1)
+    refuses("share 'x'", env.set_attr, "x", 1, error=NotImplementedError)
 
 
 def drones(**options):
@@ -201,16 +206,6 @@ def test_actions_of_stable_baselines3_wait_for_one_step():
     env.step_async(FLOWN.numpy())
     env.reset()  # what waited is forgotten
     refused(env.step_wait)
-
-
-def test_rsl_rl_sets_episode_lengths_within_the_limit_alone():
-    env = RslRlVecEnv(HoveringEnv(3, seed=0, max_episode_steps=10))
-    steps = torch.tensor([0, 5, 9])
-    env.episode_length_buf = steps
-    steps += 1
-    for wrong in (None, 3, [0, 0, 0], steps, -steps, steps.float(), steps[:2], steps[:, None], steps.to("meta")):
-        refused(setattr, env, "episode_length_buf", wrong)
-    assert env.episode_length_buf.tolist() == [0, 5, 9]
 
 
 @pytest.mark.parametrize("adapter", [TorchVectorEnv, SkrlEnv, RslRlVecEnv, DronesVecEnv])

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from refusals import cases
 
 from torchrl_quad.files import machine, read_rows
 
@@ -34,18 +35,15 @@ def run(tmp_path, monkeypatch):
     return run
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments", "rows"),
-    [
-        ("throughput", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 7),
-        ("memory", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 1),
-        pytest.param("camera", "--primitives 2 --scenes trees --images 2x4x3 --rounds 1", 1, marks=pytest.mark.slow),
-        ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),
-        ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
-        pytest.param("identification", "--seeds 1 --seconds 10", 10, marks=pytest.mark.slow),  # it simulates a flight
-        ("real_flights", "--flights flights --network-steps 2 --folder fits", 24),
-        ("identified_training", f"{ONE} --drones before=visfly --judge crazyflie --tasks hovering --no-compile", 2),
-    ],
+@cases(
+    ("throughput", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 7),
+    ("memory", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 1),
+    pytest.param("camera", "--primitives 2 --scenes trees --images 2x4x3 --rounds 1", 1, marks=pytest.mark.slow),
+    ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),
+    ("profile_recipes", f"--algorithms bptt --iterations 2 --skip 1 --overrides {SMALL}", 1),
+    pytest.param("identification", "--seeds 1 --seconds 10", 10, marks=pytest.mark.slow),  # it simulates a flight
+    ("real_flights", "--flights flights --network-steps 2 --folder fits", 24),
+    ("identified_training", f"{ONE} --drones before=visfly --judge crazyflie --tasks hovering --no-compile", 2),
 )
 @pytest.mark.usefixtures("quick_fits")
 def test_a_benchmark_writes_a_table(name, arguments, rows, run, tmp_path, monkeypatch):
@@ -73,8 +71,7 @@ def test_the_benchmark_of_exported_policies_writes_a_table(run, monkeypatch):
 def test_the_benchmark_of_controllers_writes_a_table(run):
     rows = run("controllers", "--tasks hovering --starts 2 --mpc-starts 1 --steps 2 --calls 1")
     assert [row["policy"] for row in rows] == ["geometric", "mpc"]
-    module = importlib.import_module("benchmarks.controllers")
-    assert module.table(rows).count("\n") == 3
+    assert importlib.import_module("benchmarks.controllers").table(rows).count("\n") == 3
 
 
 def test_the_results_that_are_published_name_their_machine():

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from refusals import refuses
 from tensordict.nn import TensorDictSequential
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -152,10 +153,8 @@ def test_what_cannot_be_clipped_is_refused(env):
     rollout = flight(env, actor)
     loss = BPTTLoss(actor, clip_action_gradient=5.0)
     for changed in (rollout[:2], torch.stack([flight(env, actor, steps=4) for _ in range(4)])):
-        with pytest.raises(ValueError, match="needs one rollout as differentiable_rollout returned it, whole"):
-            loss.loss_actor(changed)
-    with pytest.raises(ValueError, match="BPTTLoss needs a policy as make_actor builds it, .*no 'loc'"):
-        loss.loss_actor(rollout.exclude("loc"))
+        refuses("needs one rollout as differentiable_rollout returned it, whole", loss.loss_actor, changed)
+    refuses("BPTTLoss needs a policy as make_actor builds it, .*no 'loc'", loss.loss_actor, rollout.exclude("loc"))
     with torch.no_grad():
         loss.loss_actor(rollout)
     other = TensorDictSequential(actor)
@@ -194,27 +193,20 @@ def test_an_update_is_shortened_to_the_bound():
     assert all(torch.equal(x, y) for x, y in zip(actor.parameters(), before, strict=True))
 
 
-def test_a_policy_without_noise_may_still_move():
+def test_a_policy_without_noise_may_still_move_and_a_trust_region_knows_what_it_needs():
     env = HoveringEnv(num_envs=64)
     actor = make_actor(env, scale_init=1e-3)
     rollout = env.rollout(8, actor, break_when_any_done=False)
     with torch.no_grad():
         actor[0].module.mlp[-1].bias[0] += 0.01
     found = [TrustRegion(actor, 1.0, min_scale=x).divergence(rollout).item() for x in (0.0, 0.1)]
-    expected = [0.01**2 / (2 * scale**2) for scale in (1e-3, 0.1)]
-    assert found == pytest.approx(expected, rel=1e-3)
-
-
-def test_a_trust_region_knows_what_it_needs(env):
+    assert found == pytest.approx([0.01**2 / (2 * scale**2) for scale in (1e-3, 0.1)], rel=1e-3)
     actor = make_actor(env)
-    with pytest.raises(ValueError, match="min_scale must be at least 0, got -1"):
-        TrustRegion(actor, 0.1, min_scale=-1)
-    with pytest.raises(ValueError, match="max_kl must be greater than 0, got 0.0. .* 0.01 to 0.1 are usual"):
-        TrustRegion(actor, 0.0)
+    refuses("min_scale must be at least 0, got -1", TrustRegion, actor, 0.1, min_scale=-1)
+    refuses("max_kl must be greater than 0, got 0.0. .* 0.01 to 0.1 are usual", TrustRegion, actor, 0.0)
     free = TrustRegion(actor, None)
     with free.around(env.reset()):
         pass
     assert free.metrics == {}
     around = TrustRegion(actor, 0.1).around(env.reset())
-    with pytest.raises(ValueError, match="reads loc and scale, which are not in the rollout"):
-        around.__enter__()  # before the block runs
+    refuses("reads loc and scale, which are not in the rollout", around.__enter__)  # before the block runs

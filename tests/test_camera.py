@@ -1,4 +1,4 @@
-"""Scenes and cameras in tasks, and the forest: steps, gradients, restored states, refusals."""
+"""Scenes and cameras in tasks, and the forest: steps, gradients, restored states, rewards, metrics, refusals."""
 
 import base64
 import json
@@ -11,7 +11,9 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from PIL import Image
+from refusals import cases, refuses
 from stable_baselines3 import PPO
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import DoubleToFloat, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -20,14 +22,10 @@ from torchrl_quad import ActionSequence, DepthCamera, ForestEnv, HoveringEnv, La
 from torchrl_quad.adapters import DronesVecEnv
 from torchrl_quad.render import animate_flight, plot_flight, write_replay
 from torchrl_quad.vision import Primitives, nearest
+from torchrl_quad.vision.primitives import distances
 
-PILLARS = {
-    "ground": True,
-    "cylinders": [
-        {"base": [3.0, 0.0, 0.0], "radius": 0.2, "height": 3.0},
-        {"count": 4, "low": [-3, -3, 0], "high": [4, 3, 0], "radius": [0.1, 0.3], "height": [2, 4]},
-    ],
-}
+PILLARS = {"ground": True, "cylinders": [{"base": [3.0, 0.0, 0.0], "radius": 0.2, "height": 3.0}]}
+PILLARS["cylinders"] += [{"count": 4, "low": [-3, -3, 0], "high": [4, 3, 0], "radius": [0.1, 0.3], "height": [2, 4]}]
 OPTIONS = {"wind": {"gust": 0.5}, "randomize": {"mass": {"scale": [0.9, 1.1]}}, "observation_noise": {"velocity": 0.1}}
 
 
@@ -50,8 +48,7 @@ def test_a_compiled_step_sees_what_an_eager_one_sees_with_the_same_gradients():
         env = ForestEnv(**made, compile=compiled)
         actions = commands(env, 9)
         rollout = fly(env, actions)
-        objective = rollout["next", "reward"].sum() + (rollout["next", "depth"] * torch.arange(6)).sum()
-        objective.backward()
+        (rollout["next", "reward"].sum() + (rollout["next", "depth"] * torch.arange(6)).sum()).backward()
         flown.append((rollout.detach(), actions.grad))
     (eager, slope), (fused, fused_slope) = flown
     assert eager["next", "done"].any()
@@ -95,8 +92,7 @@ def test_gradients_of_rewards_and_images_are_those_of_finite_differences():
 
 
 def test_images_are_taken_at_the_rate_and_seen_after_the_delay():
-    camera = {"width": 5, "height": 4, "rate": 3, "delay": 4}
-    late = HoveringEnv(num_envs=2, scene=PILLARS, camera=camera)
+    late = HoveringEnv(num_envs=2, scene=PILLARS, camera={"width": 5, "height": 4, "rate": 3, "delay": 4})
     prompt = HoveringEnv(num_envs=2, scene=PILLARS, camera={"width": 5, "height": 4})
     actions = commands(late, 20).detach()
     start = late.reset()
@@ -132,8 +128,7 @@ def test_each_episode_has_another_forest_that_keeps_its_gaps_and_is_restored_wit
     assert (trees[present][:, :2] - torch.tensor([15.0, 0.0])).abs().amax(0).tolist() < [15.0, 8.0]
     rollout = env.rollout(5, break_when_any_done=False)
     forests = rollout["state", "scene", "cylinders"]
-    assert (forests[:, 0] == forests[:, 2]).all()
-    assert (forests[:, 3] != forests[:, 2]).any(-1).any(-1).all()
+    assert (forests[:, 0] == forests[:, 2]).all() and (forests[:, 3] != forests[:, 2]).any(-1).any(-1).all()
     back = env.reset(rollout[:, 1].select("state").clone(), set_state=True)
     torch.testing.assert_close(back["depth"], rollout["depth"][:, 1], atol=0, rtol=0)
 
@@ -149,8 +144,7 @@ def test_a_drone_crashes_into_what_stands_in_its_way_and_through_the_finish_it_s
     assert (step["state", "position"][0, 0] > 5.5).item(), "it is far behind the pole at the end of the step"
     assert step["crash"].flatten().tolist() == [True, False]
     assert step["state", "collided"].flatten().tolist() == [True, False]
-    assert step["success"].flatten().tolist() == [False, True]
-    assert step["terminated"].all()
+    assert step["success"].flatten().tolist() == [False, True] and step["terminated"].all()
     assert step["reward_terms", "collision"].flatten().tolist() == [-10.0, 0.0]
     assert step["reward_terms", "finish"].flatten().tolist() == [0.0, 10.0]
 
@@ -165,8 +159,7 @@ def test_a_camera_is_an_option_of_every_task_and_works_under_transforms():
     check_env_specs(env)
     policy = TensorDictModule(lambda x: x.mean((-1, -2)).expand(-1, 4) * 0.0, in_keys=["depth"], out_keys=["action"])
     rollout, _ = differentiable_rollout(env, policy, env.reset(), 3)
-    assert rollout["next", "depth"].dtype == torch.float32
-    assert rollout["next", "depth"].shape == (2, 3, 1, 12, 16)
+    assert rollout["next", "depth"].dtype == torch.float32 and rollout["next", "depth"].shape == (2, 3, 1, 12, 16)
 
 
 def test_a_fixed_scene_comes_from_a_file_and_stands_in_no_state(tmp_path):
@@ -181,40 +174,34 @@ def test_a_fixed_scene_comes_from_a_file_and_stands_in_no_state(tmp_path):
     assert nearest(solids, torch.tensor([[7.0, 5.0, 4.0]]))[0].item() == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: HoveringEnv(scene={"spheres": [{"centre": [1, 0, 1.5], "radius": 1.0}]}), "drones would start there"),
-        (lambda: HoveringEnv(camera={"position": (0.5, 0, 0)}), "the camera could be inside an obstacle"),
-        (lambda: ForestEnv(gap=0.2), "does not fit through gaps of 0.2 m"),
-        (lambda: ForestEnv(density=10.0), "density must be at most 2, got 10.0"),
-        (lambda: ForestEnv(speed=(5.0, 2.0)), "speed must be one speed"),
-        (lambda: ForestEnv(difficulty="wild"), "difficulty must be 'easy', 'middle' or 'hard', got 'wild'. How dense"),
-        (lambda: HoveringEnv(scene={}), "a scene needs an obstacle or the ground: give it one"),
-        (lambda: HoveringEnv(scene={"trees": []}), "scene: unknown key 'trees'. Allowed: ground"),
-        (lambda: HoveringEnv(scene={"spheres": [{"centre": [1, 0], "radius": 1}]}), "centre must be 3 numbers"),
-        (lambda: HoveringEnv(scene={"spheres": [{"centre": [1, 0, 1]}]}), "missing: radius"),
-        (lambda: HoveringEnv(camera={"fov": 1.0}), "camera: unknown key 'fov'. Allowed: width"),
-    ],
+@cases(
+    (lambda: HoveringEnv(scene={"spheres": [{"centre": [1, 0, 1.5], "radius": 1.0}]}), "drones would start there"),
+    (lambda: HoveringEnv(camera={"position": (0.5, 0, 0)}), "the camera could be inside an obstacle"),
+    (lambda: ForestEnv(gap=0.2), "does not fit through gaps of 0.2 m"),
+    (lambda: ForestEnv(density=10.0), "density must be at most 2, got 10.0"),
+    (lambda: ForestEnv(speed=(5.0, 2.0)), "speed must be one speed"),
+    (lambda: ForestEnv(difficulty="wild"), "difficulty must be 'easy', 'middle' or 'hard', got 'wild'. How dense"),
+    (lambda: HoveringEnv(scene={}), "a scene needs an obstacle or the ground: give it one"),
+    (lambda: HoveringEnv(scene={"trees": []}), "scene: unknown key 'trees'. Allowed: ground"),
+    (lambda: HoveringEnv(scene={"spheres": [{"centre": [1, 0], "radius": 1}]}), "centre must be 3 numbers"),
+    (lambda: HoveringEnv(scene={"spheres": [{"centre": [1, 0, 1]}]}), "missing: radius"),
+    (lambda: HoveringEnv(camera={"fov": 1.0}), "camera: unknown key 'fov'. Allowed: width"),
 )
 def test_scenes_that_cannot_be_flown_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+    refuses(message, make)
 
 
 def test_a_state_within_an_obstacle_is_not_restored():
     env = HoveringEnv(num_envs=2, scene=PILLARS)
     td = env.reset()
     td["state", "position"][1] = torch.tensor([3.0, 0.0, 1.0])
-    with pytest.raises(ValueError, match=r"environments 1: an obstacle stands within 0.128 m of 'position'"):
-        env.reset(td, set_state=True)
+    refuses(r"environments 1: an obstacle stands within 0.128 m of 'position'", env.reset, td, set_state=True)
     assert math.isclose(env.scene.radius, 0.128, abs_tol=1e-3)
 
 
 def test_stable_baselines3_learns_from_images_and_vectors_of_a_gymnasium_environment():
-    drones = gymnasium.make_vec(
-        "torchrl_quad/Forest-v0", num_envs=4, autoreset_mode="SameStep", max_episode_steps=3, camera={"rate": 2}
-    )
+    options = {"autoreset_mode": "SameStep", "max_episode_steps": 3, "camera": {"rate": 2}}
+    drones = gymnasium.make_vec("torchrl_quad/Forest-v0", num_envs=4, **options)
     observation, _ = drones.reset(seed=0)
     assert drones.observation_space.contains(observation)
     assert {name: x.shape for name, x in observation.items()} == {"observation": (4, 9), "depth": (4, 1, 12, 16)}
@@ -248,3 +235,100 @@ def test_pictures_show_the_obstacles_and_beside_the_flight_what_the_camera_saw(t
     before = env.render(size=150)
     env.reset()
     assert (env.render(size=150) != before).mean() > 0.01, "another episode, another forest"
+
+
+POLE = {"ground": True, "cylinders": [{"base": [5.0, 0.0, 0.0], "radius": 0.2, "height": 6.0}]}
+
+
+def forest(*positions, **entries):
+    """Drones of 4 m/s in a scene of one pole, at these places, and their state with some entries set."""
+    env = ForestEnv(num_envs=len(positions), scene=POLE, camera=None, speed=4.0, dtype=torch.float64)
+    state = dict(env.reset()["state"].items())
+    for key, value in {"position": positions, "target": [32.0, 0.0, 1.5], **entries}.items():
+        state[key] = torch.as_tensor(value, dtype=state[key].dtype).expand_as(state[key])
+    return env, state
+
+
+def test_the_reward_of_the_forest_is_its_formula():
+    turn = 0.3  # [rad], to the left
+    env, state = forest(
+        [4.0, 0.0, 1.5],  # 1 m before the middle of the pole
+        velocity=[3.0, 0.0, 0.0],
+        angular_velocity=[0.0, 0.5, 0.0],
+        quaternion=[math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)],
+    )
+    distance = 0.8 - env.scene.radius
+
+    def gentle(x):
+        return math.sqrt(x * x + 0.25) - 0.5
+
+    expected = {"speed": 0.1 * (1.0 - gentle(1.0) / gentle(4.0)), "heading": -0.05 * (1.0 - math.cos(turn))}
+    expected["clearance"] = -0.1 * math.log(1.0 + math.exp((0.3 - distance) / 0.1))
+    expected["closing"] = -0.15 * 3.0 * math.exp(-distance / 0.5)
+    expected |= {"smoothness": -0.005 * 0.25, "collision": 0.0, "finish": 0.0}
+    terms = {name: term.item() for name, term in env.reward_terms(state).items()}
+    assert terms == pytest.approx(expected, rel=1e-9)
+    away = env.reward_terms({**state, "velocity": -state["velocity"]})  # from the pole, which costs nothing
+    assert away["closing"].item() == 0.0
+    assert away["speed"].item() == pytest.approx(0.1 * (1.0 - gentle(7.0) / gentle(4.0)))
+
+
+def test_a_flight_through_the_forest_ends_where_the_docstring_says():
+    inside = [-4.9, 7.9, 3.9], [-4.9, -7.9, 0.2], [29.9, 0.0, 1.5]
+    outside = [-5.1, 0.0, 1.5], [3.0, 8.1, 1.5], [3.0, -8.1, 1.5], [3.0, 0.0, 4.1], [3.0, 0.0, 0.1], [31.0, 8.1, 1.5]
+    finished, touching = [30.0, -7.9, 1.5], [31.0, 0.0, 1.5]
+    places = [*inside, *outside, finished, touching]
+    env, state = forest(*places, collided=torch.tensor([place is touching for place in places]).unsqueeze(1))
+    assert 0.1 < env.scene.radius < 0.2
+    crash, success = env.is_crash(state).flatten(), env.is_success(state).flatten()
+    assert crash.tolist() == 3 * [False] + 6 * [True] + [False, True]
+    assert success.tolist() == 9 * [False] + [True, False]
+    terms = env.reward_terms(state)
+    assert terms["collision"].flatten().tolist() == pytest.approx((-10.0 * crash).tolist())
+    assert terms["finish"].flatten().tolist() == pytest.approx((10.0 * success).tolist())
+
+
+def test_the_metrics_of_the_forest_are_measured_by_the_way_to_the_target():
+    env, state = forest([4.0, 0.0, 1.5], [-2.0, 0.0, 1.5], [31.0, 0.0, 1.5], velocity=[3.0, 2.0, 1.0])
+    measured = {name: value.flatten().tolist() for name, value in env.metrics(state).items()}
+    assert measured["distance"] == [4.0, 0.0, 30.0] and measured["flown_speed"] == pytest.approx(3 * [3.0])
+    radius = env.scene.radius
+    assert measured["clearance"] == pytest.approx([0.8 - radius, 1.5 - radius, 1.5 - radius])  # pole, ground, ground
+
+
+def test_an_episode_of_the_forest_has_the_mean_speed_and_the_least_clearance_until_its_end():
+    """Of two drones: one crashes in its third step, and what follows counts no more; one flies to the end."""
+    env = ForestEnv(num_envs=2, camera=None, density=0.0, dtype=torch.float64)
+    crash = torch.tensor([[False, False, True, False], [False, False, False, False]]).unsqueeze(-1)
+    success = torch.tensor([[True] * 4, [False, False, False, True]]).unsqueeze(-1)
+    ends = {"reward": torch.ones(2, 4, 1, dtype=torch.float64), "done": crash, "crash": crash, "success": success}
+    measured = {"distance": [[1, 2, 3, 0], [4, 5, 6, 30]], "flown_speed": [[1, 2, 6, 50], [2, 4, 6, 8]]}
+    measured["clearance"] = [[0.9, 0.4, 0.7, 0.1], [0.8, 0.6, 0.5, 0.3]]
+    ends["metrics"] = {name: env.tensor(x).unsqueeze(-1) for name, x in measured.items()}
+    metrics = env.episode_metrics(TensorDict({"next": ends}, [2, 4]))
+    expected = {"return": [3, 4], "crash": [1, 0], "solved": [0, 1], "distance": [3, 30]}
+    expected |= {"flown_speed": [3.0, 5.0], "clearance": [0.4, 0.3]}
+    assert {name: value.tolist() for name, value in metrics.items()} == expected
+
+
+@cases(
+    ("cylinders", {"radius": [0.1, 0.3], "height": 5.0}),
+    ("spheres", {"radius": [0.1, 0.3]}),
+    ("boxes", {"size": [[0.2, 0.2, 0.2], [0.6, 0.6, 0.6]], "yaw": [-3.0, 3.0]}),
+)
+def test_random_obstacles_keep_clear_of_the_start_and_of_the_target(kind, size):
+    scene = {kind: [{"count": 8, "low": [-2.0, -2.0, 0.0], "high": [2.0, 2.0, 3.0], **size}], "clearance": 0.5}
+    env = HoveringEnv(num_envs=50, scene=scene, dtype=torch.float64)
+    state = dict(env.sample_start(50)["state"].items(include_nested=True, leaves_only=True))
+    gaps = distances(env.scene.solids(state), torch.stack((state["position"], state["target"]), 1)).min()
+    assert env.scene.radius + 0.5 <= gaps < env.scene.radius + 0.55  # some stand as near as they may
+
+
+def test_critics_read_how_far_the_nearest_obstacle_is_and_where_it_is_not():
+    half = math.sqrt(0.5)
+    env = HoveringEnv(num_envs=1, scene=POLE, dtype=torch.float64)
+    td = env.reset()
+    td["state", "position"] = torch.tensor([[4.0, 0.0, 2.0]], dtype=torch.float64)
+    td["state", "quaternion"] = torch.tensor([[half, 0.0, 0.0, half]], dtype=torch.float64)  # to the left, along y
+    seen = env.reset(td, set_state=True)["obstacle"]
+    assert seen.flatten().tolist() == pytest.approx([0.8 - env.scene.radius, 0.0, 1.0, 0.0], abs=1e-9)

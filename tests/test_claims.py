@@ -32,9 +32,6 @@ def ends_higher(r, best, *others, task="hovering"):
     return try_claim(Claim("A", "", lambda r: claims.higher_end(r, [task], best, others)), r)
 
 
-# -- claims ------------------------------------------------------------------------------------------------------------
-
-
 def test_the_statistics_are_those_worked_by_hand():
     a, b = np.array([1.0, 2.0, 3.0]), np.array([0.0, 2.0])
     assert probability(a, b) == pytest.approx((1 + 0 + 1 + 0.5 + 1 + 1) / 6)
@@ -56,8 +53,7 @@ def test_an_interval_draws_starts_too_and_what_they_shift_alike_is_no_difference
     def from_starts(values, method, **options):
         return judged(values, Starts(tmp_path).shift("landing", method, "return", **options))
 
-    assert interval(seeds) == (10.0, 10.0)
-    assert interval(from_starts(seeds, "abpt")) == pytest.approx(tuple(10.0 + wide))
+    assert interval(seeds) == (10.0, 10.0) and interval(from_starts(seeds, "abpt")) == pytest.approx(tuple(10.0 + wide))
     assert interval(from_starts(seeds, "abpt", starts=64)) == pytest.approx(tuple(10.0 + 2.0 * wide))
     not_flown = interval(from_starts(seeds, "ppo"))  # as any of those that were
     assert not_flown == pytest.approx(tuple(10.0 + wide))
@@ -81,8 +77,7 @@ def test_a_part_is_decided_when_its_interval_is_on_one_side_and_one_of_many_by_a
     for draws, verdict in both.items():
         assert part(*draws, low=-0.1, high=0.1).verdict() == verdict
     alone = part(0.0, 1.0, low=0.98)  # the middle 95 % end at 0.975
-    assert alone.interval() == pytest.approx((0.025, 0.975))
-    assert alone.interval(10) == pytest.approx((0.0025, 0.9975))
+    assert alone.interval() == pytest.approx((0.025, 0.975)) and alone.interval(10) == pytest.approx((0.0025, 0.9975))
     assert alone.verdict() == "refuted" and alone.verdict(10) == "undecided"
 
 
@@ -163,9 +158,6 @@ def test_claims_compare_visited_states_under_the_same_dynamics_and_shac_as_xu_wh
             assert {variant for _, variant in r.used} == {"abpt-now", "abpt-no-visited"}
     assert used["C8"] == {("hovering", "shac-cut"), ("tracking", "shac-cut")}
     assert used["C11"] == used["C12"] == {("landing", "shac-xu")} and used["C13"] == {("racing", "shac-xu")}
-
-
-# -- the page ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_page_is_made_of_other_results_and_the_pages_of_the_project_stay_as_they_are(quick, monkeypatch, tmp_path):

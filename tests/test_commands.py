@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 from markdown_it import MarkdownIt
 from packaging.requirements import Requirement
+from small_runs import ROOT, run
 from test_docs import PAGES, code, files, importable, name_of  # noqa: F401, a fixture
 from test_examples import EXAMPLES
-from test_recipes import RECIPES, ROOT, SMALL, run
+from test_recipes import RECIPES, SMALL
 
 from torchrl_quad.training.configuration import compose
 from torchrl_quad.training.schema import check
@@ -28,7 +29,7 @@ SMOKE = {  # the tests that run a program on a reduced budget
     "benchmarks/paper/results.py": "test_claims",
     **{f"benchmarks/{path.name}": "test_benchmarks" for path in ROOT.glob("benchmarks/*.py")},
     "python -m build": "test_package",
-    "wandb": "test_wandb_page",
+    "wandb": "test_logs",
     "tensorboard": "test_logs",
 }
 

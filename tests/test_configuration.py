@@ -3,6 +3,7 @@
 import pytest
 import yaml
 from omegaconf import OmegaConf
+from refusals import cases, refuses
 
 from torchrl_quad import load_drone
 from torchrl_quad.envs import TASKS
@@ -16,7 +17,6 @@ UNTUNED = {("abpt", "forest"), ("ahac", "forest"), ("sapo", "forest"), ("hybrid"
 
 REFUSED = [  # of ABPT, unless a recipe is named
     ("actor.max_grad_norm=-1", "actor.max_grad_norm=-1: it must be greater than 0. Longer gradients are shortened"),
-    ("actor.lr=0", "actor.lr=0: it must be greater than 0"),
     ("actor.betas=[0.9]", r"actor.betas=\[0.9\]: it must have at least 2 items, not 1. .* such as \[0.9, 0.999\]"),
     ("actor.betas=[0.9,1.0]", r"actor.betas\[1\]=1.0: it must be less than 1"),
     ("actor.num_cells=64", r"actor.num_cells=64: it must be a list. .* or \[64\] for one layer"),
@@ -24,11 +24,9 @@ REFUSED = [  # of ABPT, unless a recipe is named
     ("actor.final_lr=0 actor.schedule=exponential", "actor.final_lr=0: it must be above 0 with schedule=exponential"),
     ("actor.schedule=step", "actor.schedule=step: it must be 'constant', 'linear', 'exponential' or 'cosine'"),
     ("critic.updates=null", "critic.updates=null: it must be a whole number"),
-    ("shac loss.terminal_gradient=null", "loss.terminal_gradient=null: it must be true or false"),
     ("actor.scale_init=abc", "actor.scale_init=abc: it must be a number"),
     ("gamma=2", "gamma=2: it must be at most 1. .* 0.99 is usual"),
     ("gamma=nan", "gamma=nan: it must be a finite number"),
-    ("restart_fraction=5", "restart_fraction=5: it must be at most 1"),
     ("buffer.fraction=2", "buffer.fraction=2: it must be at most 1. .* null for none"),
     ("eval.interval=0", "eval.interval=0: it must be at least 1. Iterations between evaluations"),
     ("normalize=5", "normalize=5: it must be true or false"),
@@ -52,7 +50,6 @@ REFUSED = [  # of ABPT, unless a recipe is named
     ("critic=null", "critic=null: it must be a section with settings of its own"),
     ("~critic.tau", "critic.tau is missing: do not delete it"),
     ("env.control_dt=${nothing}", "env.control_dt: Interpolation key 'nothing' not found"),
-    ("+actor.rate=0.9", "actor.rate is unknown"),
     ("ppo loss.clip_epsilon=-1", "loss.clip_epsilon=-1: it must be greater than 0"),
     ("evaluate", "checkpoint is missing: write checkpoint=... on the command line"),
 ]
@@ -67,8 +64,7 @@ def test_a_setting_out_of_its_range_is_refused_with_what_to_write_instead(words,
     first, *rest = words.split()
     recipe, overrides = (first, rest) if first in (*RECIPES, "evaluate") else ("abpt", [first, *rest])
     cfg = composed(recipe, *overrides)
-    with pytest.raises(ValueError, match=message):
-        check(cfg)
+    refuses(message, check, cfg)
 
 
 IGNORED = {  # what a person wrote, which nothing would read
@@ -92,8 +88,7 @@ IGNORED = {  # what a person wrote, which nothing would read
 @pytest.mark.parametrize("words", IGNORED)
 def test_what_a_person_writes_takes_effect_or_is_refused(words):
     recipe, *overrides = words.split()
-    with pytest.raises(ValueError, match=IGNORED[words]):
-        check(composed(recipe, *overrides), overrides)
+    refuses(IGNORED[words], check, composed(recipe, *overrides), overrides)
     check(composed(recipe, *overrides[:-1]), overrides[:-1])
 
 
@@ -149,41 +144,32 @@ def test_every_number_that_ships_has_a_type_and_a_range(recipe):
         assert any(word in repr(field) for word in ("Ge(", "Gt(")), name
 
 
-def test_a_refused_run_leaves_no_folder_and_one_line(refused, tmp_path):
+def test_a_refused_run_leaves_no_folder_and_one_line_and_torchrun_takes_no_gpu_by_name(refused, tmp_path, monkeypatch):
     assert "Could not override 'nonsense'" in refused("bptt", "nonsense=1")
     line = refused("bptt", "gamma=2", f"hydra.run.dir={tmp_path}/outputs/run")
     assert line.startswith("Error: gamma=2: it must be at most 1.")
     assert not list(tmp_path.iterdir())
-
-
-def test_under_torchrun_no_gpu_is_named_for_all_processes(monkeypatch):
     monkeypatch.setenv("RANK", "0")
     said = "device=cuda:0: under torchrun each process takes its own GPU. Write device=cuda."
     with pytest.raises(ValueError, match=said), _joined(OmegaConf.create({"device": "cuda:0"})):
         raise AssertionError("It is refused before anything is joined.")
 
 
-# -- YAML --------------------------------------------------------------------------------------------------------------
-
 ALIASES = "a0: &a0 [1, 1]\n" + "".join(f"a{i + 1}: &a{i + 1} [*a{i}, *a{i}]\n" for i in range(40))
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (ALIASES.encode(), "line 2 uses the alias \\*a0. Write the values out instead"),
-        (b"mass: " + b"[" * 5000 + b"]" * 5000, "nests more than 20 lists or mappings"),
-        ("mass: 1  # Größe".encode("latin-1"), "not in UTF-8 .byte 13 is 0xf6.. Save it as UTF-8"),
-        (b"#" * 1_000_001, "has more than 1,000,000 bytes"),
-        (b"mass: 1\nmass: 2", "line 2 names 'mass' for the second time"),
-        (b"mass: !!int 1:30", "line 1 uses the tag"),
-        (b"1: 2", "line 1 names a value by 1, and a name must be a word"),
-        (b"mass: [1", "not a YAML file"),
-        (b"mass: " + b"9" * 5000, "line 1 has a number of 5000 digits"),
-    ],
+@cases(
+    (ALIASES.encode(), "line 2 uses the alias \\*a0. Write the values out instead"),
+    (b"mass: " + b"[" * 5000 + b"]" * 5000, "nests more than 20 lists or mappings"),
+    ("mass: 1  # Größe".encode("latin-1"), "not in UTF-8 .byte 13 is 0xf6.. Save it as UTF-8"),
+    (b"#" * 1_000_001, "has more than 1,000,000 bytes"),
+    (b"mass: 1\nmass: 2", "line 2 names 'mass' for the second time"),
+    (b"mass: !!int 1:30", "line 1 uses the tag"),
+    (b"1: 2", "line 1 names a value by 1, and a name must be a word"),
+    (b"mass: [1", "not a YAML file"),
+    (b"mass: " + b"9" * 5000, "line 1 has a number of 5000 digits"),
     ids=["aliases", "deep", "latin-1", "large", "twice", "tag", "no name", "cut off", "long number"],
 )
 def test_a_yaml_file_that_no_setting_needs_is_refused_by_name(content, message, tmp_path):
     (tmp_path / "mine.yaml").write_bytes(content)
-    with pytest.raises(ValueError, match=f"mine.yaml: {message}"):
-        load_drone(tmp_path / "mine.yaml")
+    refuses(f"mine.yaml: {message}", load_drone, tmp_path / "mine.yaml")

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from refusals import cases, refuses
 from small_runs import assert_equal
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, EnvBase, PendulumEnv, RewardSum, StepCounter, TransformedEnv
@@ -53,19 +54,15 @@ def test_it_equals_torchrl_s_own_loop():
     assert ours["next", "done"].sum() == 8
 
 
-def test_it_samples_by_default_and_is_deterministic_on_request(env):
+def test_it_samples_by_default_is_deterministic_on_request_and_resets_the_carry_of_a_finished_environment(env):
     actor, carry = make_actor(env), env.reset()
     for options, is_same in (({}, False), ({"exploration_type": ExplorationType.DETERMINISTIC}, True)):
         actions = [differentiable_rollout(env, actor, carry, 2, **options)[0]["action"] for _ in range(2)]
         assert torch.equal(*actions) == is_same
-
-
-def test_the_carry_of_a_finished_environment_is_reset():
     env = HoveringEnv(num_envs=2, max_episode_steps=3)
     rollout, carry = differentiable_rollout(env, make_actor(env), None, 3)
     assert rollout["next", "done"][:, -1].all()
-    assert not carry["done"].any()
-    assert (carry["state", "step"] == 0).all()
+    assert not carry["done"].any() and (carry["state", "step"] == 0).all()
 
 
 def test_it_flies_under_transforms_and_any_differentiable_environment(env):
@@ -89,7 +86,7 @@ def visited(rollout, *args, **options):
     return buffer
 
 
-def test_the_buffer_keeps_complete_detached_states(flight):
+def test_the_buffer_keeps_complete_detached_states_and_the_oldest_go_first(flight):
     env, _, rollout, _ = flight
     buffer = visited(rollout)
     assert len(buffer) == 20
@@ -97,6 +94,11 @@ def test_the_buffer_keeps_complete_detached_states(flight):
     assert set(stored["state"].keys()) == set(env.observation_spec["state"].keys())
     assert not any(value.requires_grad for value in stored.values(include_nested=True, leaves_only=True))
     assert torch.equal(stored["state", "position"], rollout["state", "position"].reshape(20, 3).detach())
+    buffer = visited(rollout[:2], capacity=8)
+    buffer.extend(rollout[2:, :3])
+    assert len(buffer) == 8
+    kept = {tuple(p.tolist()) for p in buffer[:]["state", "position"]}
+    assert {tuple(p.tolist()) for p in rollout[2:, :3]["state", "position"].reshape(6, 3)} <= kept
 
 
 def test_the_buffer_leaves_out_terminated_and_broken_states(flight):
@@ -108,17 +110,7 @@ def test_the_buffer_leaves_out_terminated_and_broken_states(flight):
     assert len(buffer) == 17
     assert all(value.isfinite().all() for value in buffer[:].values(include_nested=True, leaves_only=True))
     rollout["state", "velocity"][:] = float("nan")
-    assert buffer.extend(rollout).numel() == buffer.extend(rollout[:, :0]).numel() == 0
-    assert len(buffer) == 17
-
-
-def test_the_oldest_states_go_first(flight):
-    rollout = flight[2]
-    buffer = visited(rollout[:2], capacity=8)
-    buffer.extend(rollout[2:, :3])
-    assert len(buffer) == 8
-    kept = {tuple(p.tolist()) for p in buffer[:]["state", "position"]}
-    assert {tuple(p.tolist()) for p in rollout[2:, :3]["state", "position"].reshape(6, 3)} <= kept
+    assert buffer.extend(rollout).numel() == buffer.extend(rollout[:, :0]).numel() == 0 and len(buffer) == 17
 
 
 def test_a_fraction_of_the_environments_starts_in_visited_states():
@@ -222,31 +214,26 @@ def put(name, value):
     return lambda content: content["states"].update({name: value})
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda content: content.pop("cursor"), "does not fit this visited-state buffer of 30 states: 'cursor'"),
-        (lambda content: content["states"].pop(POSITION), "other states .*position.* differ in name"),
-        (put("state.extra", torch.ones(20, 1)), "other states .* 'extra'.* differ in name"),
-        (put(POSITION, torch.ones(20, 2)), "other states .*position"),
-        (put(POSITION, torch.ones(20, 3, dtype=torch.int64)), "other states .*position"),
-        (put(POSITION, torch.ones(19, 3)), "does not fit .* it has 19 states, and its cursor is 20"),
-        (lambda content: content.update(states={POSITION: torch.ones(31, 3)}), "of 30 states: it has 31 states"),
-        (lambda content: content.update(states=[1, 2]), "does not fit"),
-        (lambda content: content.update(cursor=21), "it has 20 states, and its cursor is 21"),
-        (lambda content: content.update(cursor=-1), "it has 20 states, and its cursor is -1"),
-        (lambda content: content.update(random=torch.ones(3)), "does not fit .*RNG state must be a torch.ByteTensor"),
-    ],
+@cases(
+    (lambda content: content.pop("cursor"), "does not fit this visited-state buffer of 30 states: 'cursor'"),
+    (lambda content: content["states"].pop(POSITION), "other states .*position.* differ in name"),
+    (put("state.extra", torch.ones(20, 1)), "other states .* 'extra'.* differ in name"),
+    (put(POSITION, torch.ones(20, 2)), "other states .*position"),
+    (put(POSITION, torch.ones(20, 3, dtype=torch.int64)), "other states .*position"),
+    (put(POSITION, torch.ones(19, 3)), "does not fit .* it has 19 states, and its cursor is 20"),
+    (lambda content: content.update(states={POSITION: torch.ones(31, 3)}), "of 30 states: it has 31 states"),
+    (lambda content: content.update(states=[1, 2]), "does not fit"),
+    (lambda content: content.update(cursor=21), "it has 20 states, and its cursor is 21"),
+    (lambda content: content.update(cursor=-1), "it has 20 states, and its cursor is -1"),
+    (lambda content: content.update(random=torch.ones(3)), "does not fit .*RNG state must be a torch.ByteTensor"),
 )
-def test_content_that_does_not_fit_is_refused_and_changes_nothing(flight, change, message):
+def test_content_that_does_not_fit_is_refused_and_changes_nothing(change, message, flight):
     env, _, rollout, _ = flight
     buffer = visited(rollout[:2], 30, env)
     content, before = visited(rollout, 30, env).state_dict(), buffer.state_dict()
     change(content)
     for target in (buffer, VisitedStateBuffer(30, env)):
-        with pytest.raises(UserValueError, match=message) as refused:
-            target.load_state_dict(content)
-        assert "\n" not in str(refused.value)
+        assert "\n" not in refuses(message, target.load_state_dict, content, error=UserValueError)
     assert_equal(buffer.state_dict(), before)
 
 
@@ -280,36 +267,24 @@ def test_fresh_starts_come_from_an_environment_that_samples_them():
         assert restart(env, start, 1.0 - fraction)["th"] == angle
 
 
-def test_an_empty_buffer_a_bad_fraction_and_a_bad_capacity_are_refused(env, flight):
+def test_an_empty_buffer_a_bad_fraction_or_capacity_and_states_of_other_tasks_are_refused(env, flight):
     buffer = VisitedStateBuffer()
     for use in (lambda: buffer.initial_state(env), lambda: buffer.source(env)(4)):
-        with pytest.raises(RuntimeError, match="The visited-state buffer is empty. Fly a first horizon"):
-            use()
+        refuses("The visited-state buffer is empty. Fly a first horizon", use, error=RuntimeError)
     buffer.extend(flight[2])
     for use in (buffer.initial_state, buffer.source, lambda env, fraction: restart(env, flight[3], fraction)):
         for fraction, must in ((1.5, "at most 1"), (-0.1, "at least 0"), (float("nan"), "a finite number")):
-            with pytest.raises(ValueError, match=f"fraction must be {must}, got {fraction}. The share of"):
-                use(env, fraction)
+            refuses(f"fraction must be {must}, got {fraction}. The share of", use, env, fraction)
     for capacity, must in ((0, "at least 1"), (2.5, "a whole number"), (10**400, "at most 10000000")):
-        with pytest.raises(
-            ValueError, match=f"capacity must be {must}, got .*. Visited states kept; the oldest go fir"
-        ):
-            VisitedStateBuffer(capacity)
-
-
-def test_states_of_other_tasks_and_options_are_neither_mixed_nor_broadcast(flight):
+        message = f"capacity must be {must}, got .*. Visited states kept; the oldest go fir"
+        refuses(message, VisitedStateBuffer, capacity)
     buffer, message = visited(flight[2]), "These are other states than those in the visited-state buffer: .*{}.* diff"
     for other, key in ((TrackingEnv(num_envs=4), "phase"), (HoveringEnv(num_envs=4, action_delay=2), "action_queue")):
-        with pytest.raises(ValueError, match=message.format(key)):
-            buffer.initial_state(other)
-        with pytest.raises(ValueError, match=message.format(key)):
-            buffer.extend(other.rollout(2))
+        refuses(message.format(key), buffer.initial_state, other)
+        refuses(message.format(key), buffer.extend, other.rollout(2))
     assert len(buffer) == 20
     with pytest.raises(ValueError, match="keeps .'th',., and the rollout lacks 'th'. Give the buffer the environment"):
         visited(flight[2], state_keys=["th"])
-
-
-# -- restarts ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("wrap", [False, True])
@@ -326,5 +301,4 @@ def test_a_restart_begins_a_fraction_of_the_flights_afresh_and_lets_the_others_g
         torch.testing.assert_close(after["observation"][~fresh], carry["observation"][~fresh])
     with pytest.raises(ValueError, match="restart needs the whole state, .*, and the carry lacks .*'action_queue'."):
         restart(env, carry.exclude("state"), 0.5)
-    with pytest.raises(ValueError, match=r"The carry has batch size \(10,\), and the environment \(1000,\)"):
-        restart(env, carry[:10], 0.5)
+    refuses(r"The carry has batch size \(10,\), and the environment \(1000,\)", restart, env, carry[:10], 0.5)

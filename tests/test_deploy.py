@@ -12,6 +12,7 @@ import pytest
 import torch
 from deploying import TASKS, build, by_hand, compiled, resting, run_c
 from flying import fly
+from refusals import refuses
 from torch import nn
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -30,9 +31,6 @@ def exported(request, export_once):
 @pytest.fixture
 def hovering(export_once):
     return export_once("hovering")[2]
-
-
-# -- the same policy ---------------------------------------------------------------------------------------------------
 
 
 def test_torch_onnx_and_c_agree_and_the_contract_fits_its_schema(exported, tmp_path):
@@ -104,7 +102,7 @@ def test_a_bundle_flies_the_environment_as_the_actor_does(exported):
     assert (torch.stack(actions).std(0) > 1e-3).any()
 
 
-def test_a_gate_that_is_passed_during_a_fault_counts_afterwards(export_once):
+def test_a_gate_that_is_passed_during_a_fault_counts_afterwards_and_the_time_of_a_task_goes_on(export_once):
     bundle = load_bundle(export_once("racing")[2], on_fault="hover")
     gates = export_once("racing")[0].base_env.gates.numpy()
     for faults in (1, 3):
@@ -115,9 +113,6 @@ def test_a_gate_that_is_passed_during_a_fault_counts_afterwards(export_once):
         assert (bundle.progress["gate"], bundle.progress["gates_passed"]) == (1, 0)
         bundle(resting(position=gates[1] + (1, 0, 0)))
         assert (bundle.progress["gate"], bundle.progress["gates_passed"]) == (2, 1)
-
-
-def test_the_time_of_a_task_goes_on_during_faults_once_a_flight_has_begun(export_once):
     env, _, folder = export_once("tracking")
     bundle, step = load_bundle(folder, on_fault="hover"), env.base_env.phase_rate * env.base_env.control_dt
     for begun in (False, True):
@@ -191,9 +186,6 @@ def test_c_answers_what_is_not_finite_with_the_hover_action_and_decodes_commands
     assert [thrust.value, *rates] == pytest.approx([0.46 * 9.81, 1.0, -2.0, 0.5])
 
 
-# -- the folder --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("task", ["landing", "forest"])
 def test_the_same_policy_gives_the_same_bytes_and_leaves_the_environment_as_it_was(
     export_once, task, tmp_path, monkeypatch
@@ -239,9 +231,8 @@ def test_the_rate_loop_of_a_contract_is_that_of_the_simulator(hovering):
     env = HoveringEnv(num_envs=1, dtype=torch.float64, dt=0.001, control_dt=0.001, action_delay=0)
     action = env.hover_action.clone().repeat(1, 1)
     action[0, 1:] = 0.02
-    rate = torch.stack(
-        [td["next", "state", "angular_velocity"] for td in fly(env, env.reset(), [action] * 150).unbind(1)]
-    )
+    flight = fly(env, env.reset(), [action] * 150)
+    rate = torch.stack([td["next", "state", "angular_velocity"] for td in flight.unbind(1)])
     t = 0.001 * np.arange(1, 151)
     for axis, found in enumerate(rate[:, 0].T.numpy() / 0.04):
         w, z = loop["natural_frequency"][axis], loop["damping_ratio"][axis]
@@ -280,8 +271,7 @@ def test_a_failed_export_leaves_the_old_bundle_and_no_leftovers(hovering, tmp_pa
             rename(source, target)
 
         patch.setattr("os.replace", replace)
-        with pytest.raises(OSError, match="no"):
-            export_policy(actor, env, folder)
+        refuses("no", export_policy, actor, env, folder, error=OSError)
     (aside,) = tmp_path.glob("*.old")
     assert (aside / "contract.json").read_bytes() == old
     export_policy(actor, env, folder)

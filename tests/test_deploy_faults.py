@@ -5,36 +5,25 @@ import copy
 import json
 import math
 import re
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from deploying import FLOWN, build, measured, resting
+from refusals import cases
+from small_runs import run
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import PendulumEnv, RewardSum, TransformedEnv
 
 import torchrl_quad
 from torchrl_quad import HoveringEnv, ObservationNormalizer, load_drone, make_actor, make_env
-from torchrl_quad.deploy import (
-    BrokenPolicy,
-    MissingQuantity,
-    NegativeDepth,
-    NotFinite,
-    NotUnitQuaternion,
-    StaleState,
-    contract,
-    export_policy,
-    load_bundle,
-)
+from torchrl_quad.deploy import BrokenPolicy, StaleState, contract, export_policy, load_bundle
+from torchrl_quad.deploy.contract import MissingQuantity, NegativeDepth, NotFinite, NotUnitQuaternion
 from torchrl_quad.envs import TASKS
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.training.drawing import environment_beside
-
-ROOT = Path(__file__).parent.parent
 
 
 def far(value):
@@ -72,11 +61,8 @@ FAULTS_OF_IMAGES = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("task", "kind", "message", "changes"),
-    [*(("tracking", *x) for x in FAULTS), *(("forest", *x) for x in FAULTS_OF_IMAGES)],
-)
-def test_each_fault_has_a_name_and_changes_nothing_or_hovers_and_is_counted(export_once, task, kind, message, changes):
+@cases(*(("tracking", *x) for x in FAULTS), *(("forest", *x) for x in FAULTS_OF_IMAGES))
+def test_each_fault_has_a_name_and_changes_nothing_or_hovers_and_is_counted(task, kind, message, changes, export_once):
     folder = export_once(task)[2]
     raising, hovering, untouched = load_bundle(folder), load_bundle(folder, on_fault="hover"), load_bundle(folder)
     good, state = measured(raising), changes
@@ -197,9 +183,6 @@ def test_a_normalizer_is_that_of_the_transforms_or_is_given_beside_a_bare_enviro
     assert marks[0] != marks[1] == marks[2]
 
 
-# -- steps that fail ---------------------------------------------------------------------------------------------------
-
-
 class Failing:
     """A session that fails or answers something else, once."""
 
@@ -259,8 +242,7 @@ def test_a_step_that_failed_and_is_repeated_equals_one_that_never_failed(export_
         graph.session = session
         if fails:
             np.testing.assert_equal(content(failing), before)
-        given = failing(state) if fails else failing.command(failing.action)
-        np.testing.assert_equal(given, untouched(state))
+        np.testing.assert_equal(failing(state) if fails else failing.command(failing.action), untouched(state))
     np.testing.assert_equal(content(failing), content(untouched))
     assert task != "racing" or failing.progress["gate"] == 1
     if kind is not KeyboardInterrupt:
@@ -268,29 +250,24 @@ def test_a_step_that_failed_and_is_repeated_equals_one_that_never_failed(export_
         assert failing.faults == {kind.__name__: count} and str(failing.last_fault).startswith(f"{failing.folder}: ")
 
 
-@pytest.mark.parametrize(
-    ("task", "progress", "wanted"),
-    [
-        ("hovering", {"target": "here"}, r"numbers of shape \(3,\), from -1e\+06 to 1e\+06; got 'here'"),
-        ("hovering", {"target": [1, 2]}, r"numbers of shape \(3,\)"),
-        ("hovering", {"target": [True, False, True]}, "numbers"),
-        ("tracking", {"phase": "late"}, r"numbers of shape \(1,\), from 0 to 6.28319; got 'late'"),
-        ("racing", {"gate": [0, 1]}, r"whole numbers of shape \(1,\), from 0 to 3; got \[0, 1\]"),
-        ("racing", {"gate": np.arange(2)}, "whole numbers"),
-        *(("racing", {"gate": gate}, "whole numbers") for gate in (4, -1, True, 0.5)),
-        ("forest", {"target": [1, 2, 3], "speed": np.nan}, r"numbers of shape \(1,\), from 0.1 to 30; got nan"),
-        *(("forest", {"speed": speed}, "numbers") for speed in (0, -1, math.inf, "fast", True)),
-    ],
+@cases(
+    ("hovering", {"target": "here"}, r"numbers of shape \(3,\), from -1e\+06 to 1e\+06; got 'here'"),
+    ("hovering", {"target": [1, 2]}, r"numbers of shape \(3,\)"),
+    ("hovering", {"target": [True, False, True]}, "numbers"),
+    ("tracking", {"phase": "late"}, r"numbers of shape \(1,\), from 0 to 6.28319; got 'late'"),
+    ("racing", {"gate": [0, 1]}, r"whole numbers of shape \(1,\), from 0 to 3; got \[0, 1\]"),
+    ("racing", {"gate": np.arange(2)}, "whole numbers"),
+    *(("racing", {"gate": gate}, "whole numbers") for gate in (4, -1, True, 0.5)),
+    ("forest", {"target": [1, 2, 3], "speed": np.nan}, r"numbers of shape \(1,\), from 0.1 to 30; got nan"),
+    *(("forest", {"speed": speed}, "numbers") for speed in (0, -1, math.inf, "fast", True)),
 )
-def test_a_start_that_makes_no_sense_is_refused_and_changes_nothing(export_once, task, progress, wanted):
+def test_a_start_that_makes_no_sense_is_refused_and_changes_nothing(task, progress, wanted, export_once):
     bundle = load_bundle(export_once(task)[2])
     before = bundle.progress
     with pytest.raises(UserValueError, match=f"^{bundle.folder}: {list(progress)[-1]} must be {wanted}"):
         bundle.reset(**progress)
     np.testing.assert_equal(bundle.progress, before)
 
-
-# -- without torch -----------------------------------------------------------------------------------------------------
 
 BLOCKED = """
 import sys
@@ -305,9 +282,7 @@ sys.meta_path.insert(0, Blocked())
 
 
 def python(program):
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return run(sys.executable, "-c", program)
 
 
 def test_flying_needs_numpy_onnxruntime_and_jsonschema_alone(export_once):
@@ -343,10 +318,7 @@ def test_the_package_imports_its_parts_when_they_are_asked_for():
     python("import sys, torchrl_quad; assert 'torch' not in sys.modules")
 
 
-# -- recipe and page ---------------------------------------------------------------------------------------------------
-
-
-def test_the_recipe_exports_the_best_policy_of_a_run_with_its_results(train, launch, refused, tmp_path, export_once):
+def test_the_recipe_exports_the_best_policy_with_results_and_a_page(train, launch, refused, tmp_path, export_once):
     train("bptt", tmp_path, "normalize=true", "task=forest", "env.camera={width: 6, height: 5}", "env.density=0.02")
     printed = launch("export", f"checkpoint={tmp_path}/checkpoint.pt")
     assert re.search(r"policy: flies forest; its actions differ by at most \d\.\de-0[6-9]", printed)
@@ -362,7 +334,4 @@ def test_the_recipe_exports_the_best_policy_of_a_run_with_its_results(train, lau
     )
     assert "folder is unknown" not in refused("export", f"checkpoint={tmp_path}/none.pt")
     assert "episodes=0" in refused("export", f"checkpoint={tmp_path}/checkpoint.pt", "episodes=0")
-
-
-def test_the_page_of_a_bundle_shows_every_field_of_the_contract(export_once):
     assert contract.schema_table() in (export_once("forest")[2] / "README.md").read_text()

@@ -1,26 +1,34 @@
-"""Any task exports: its rules, traced, observe, advance and judge as its environment does."""
+"""Any task exports, its rules traced; bundles that were changed and policies that cannot fly are refused."""
 
 import ast
+import ctypes
+import json
 import math
-from pathlib import Path
+import shutil
 
 import numpy as np
+import onnx
 import pytest
 import torch
-from deploying import pilot, resting
+from deploying import build, compiled, pilot, resting
+from onnx import TensorProto, helper
 from own_task import CornerEnv, RelayEnv
+from refusals import refuses
+from small_runs import ROOT
+from torch import nn
 from torchrl.envs.utils import ExplorationType
 
-from torchrl_quad import RacingEnv, TrackingEnv, differentiable_rollout, make_actor, make_env
-from torchrl_quad.deploy import export_policy, load_bundle
-from torchrl_quad.deploy.contract import MEASURED
+from torchrl_quad import ForestEnv, HoveringEnv, RacingEnv, TrackingEnv, differentiable_rollout, make_env
+from torchrl_quad.deploy import WrongActions, contract, export, export_policy, load_bundle, transfer
+from torchrl_quad.deploy.bundle import Bundle
+from torchrl_quad.deploy.contract import MEASURED, BrokenPolicy, TamperedBundle, UnknownContract
 from torchrl_quad.deploy.judging import Judge, judge
 from torchrl_quad.deploy.tracing import name_of, trace
 from torchrl_quad.deploy.transfer import fly
+from torchrl_quad.dynamics.parameters import LIMITS
 from torchrl_quad.envs.step import sample_state
 from torchrl_quad.errors import UserValueError
-
-ROOT = Path(__file__).parent.parent
+from torchrl_quad.modules import make_actor, make_visual_actor
 
 
 def ring_env():
@@ -38,8 +46,7 @@ HARDER = {  # so that some episodes succeed, some do not, and some crash
     "tracking": {"success_radius": 1.24, "ceiling": 1.15},
     "landing": {"success_speed": 0.28, "box_half_width": 0.9},
     "racing": {"success_gates": 1, "ceiling": 1.5},
-    "relay": {},
-    "ring": {},
+    **{"relay": {}, "ring": {}},
 }
 PILOTS = {"relay": {"after": 6}, "ring": {"beyond": 0.5}}
 
@@ -155,8 +162,7 @@ WRONGS = {
 @pytest.mark.parametrize("message", WRONGS)
 def test_a_rule_that_cannot_be_exported_is_refused_by_its_name_with_what_to_write(message):
     env = WRONGS[message](4)
-    with pytest.raises(UserValueError, match=f"^export_policy: Wrong: its {message}"):
-        trace(env, sample_state(env, 3))
+    refuses(f"^export_policy: Wrong: its {message}", trace, env, sample_state(env, 3), error=UserValueError)
 
 
 def test_a_task_that_cannot_be_judged_without_its_reward_still_flies(tmp_path):
@@ -171,5 +177,175 @@ def test_a_task_that_cannot_be_judged_without_its_reward_still_flies(tmp_path):
     assert bundle.contract["task"]["unjudged"] == why and bundle.graphs.keys() == {"policy", "observe"}
     with pytest.raises(UserValueError, match=f"cannot fly this bundle of the task .*: {why}. Fly it in the package's"):
         fly(bundle, "torchrl_quad")
-    with pytest.raises(UserValueError, match=f"cannot be judged here: {why}"):
+    refuses(f"cannot be judged here: {why}", Judge, bundle, bundle.starts(), error=UserValueError)
+
+
+@pytest.fixture
+def copied(export_once, tmp_path):
+    """A copy of a bundle, and its contract."""
+    folder = shutil.copytree(export_once("hovering")[2], tmp_path / "policy")
+    return folder, json.loads((folder / "contract.json").read_text())
+
+
+def fit(folder, about):
+    """Write a contract with checksums that fit, as somebody who changes a bundle does."""
+    about["sha256"] = {name: contract.sha256((folder / name).read_bytes()) for name in contract.files(about)}
+    (folder / "contract.json").write_text(json.dumps(about | {"digest": contract.digest(about)}))
+
+
+@pytest.mark.parametrize("name", [*contract.OTHERS, "policy.onnx", "observe.onnx", "episode.onnx", "contract.json"])
+def test_a_file_that_was_changed_or_is_missing_is_named(copied, name):
+    folder, _ = copied
+    assert load_bundle(folder).check() <= 1e-5
+    content = (folder / name).read_bytes()
+    damaged = content.replace(b"0.46", b"0.45") if name == "contract.json" else content[:-3] + b"abc"
+    (folder / name).write_bytes(damaged)
+    with pytest.raises(TamperedBundle, match=f"{name} was changed after the export: its checksum does not fit"):
+        load_bundle(folder)
+    (folder / name).unlink()
+    why = f"{name} cannot be read|No bundle at .* has no contract"
+    refuses(why, load_bundle, folder, error=(TamperedBundle, FileNotFoundError))
+
+
+@pytest.mark.parametrize("text", ["[]", "{", "{}", "", "[" * 100_000, '{"version": NaN, "digest": ""}'])
+def test_a_file_that_is_no_contract_is_refused(tmp_path, text):
+    (tmp_path / "contract.json").write_text(text)
+    refuses("contract.json is no contract of a policy, or is damaged", load_bundle, tmp_path, error=TamperedBundle)
+
+
+CHANGES = [  # of a contract whose checksums fit
+    ("version", 3, "has version 3, and this torchrl_quad reads version 4. It was written by torchrl_quad"),
+    ("smell", {}, r"/contract.json: it: .*'smell' was unexpected.* This torchrl_quad cannot fly it. It was written"),
+    ("output.thrust.range.1", 1e308, r"output.thrust.range\[1\]: 1e\+308 is greater than the maximum of 600000"),
+    ("drone.max_thrust_to_weight", 21, "drone.max_thrust_to_weight: 21 is greater than the maximum of 20"),
+    ("action_delay", 101, "action_delay: 101 is greater than the maximum of 100"),
+    ("output.order", ["thrust"] * 4, "output.order: .* was expected"),
+    ("simulator.integrator", "rk9", "simulator.integrator: 'rk9' is not one of"),
+    ("drone.thrust_map", [1e-9, 0, 0], "drone: to hover each rotor must give"),
+    ("drone.rotor_positions", [[0.1, 0.1]] * 4, "drone.rotor_positions and rotor_spin cannot make thrust"),
+    ("plant", {"mass": 0}, "plant.mass: 0 is less than the minimum of 0.001"),
+    ("plant", {"wings": 2}, "plant: .*'wings' was unexpected"),
+    ("plant", {"rotor_speed_min": 9000}, "plant.rotor_speed_min is 9000, and must be below"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "message"), CHANGES)
+def test_a_contract_that_this_package_does_not_fly_is_refused(copied, path, value, message):
+    folder, about = copied
+    *way, last = [int(x) if x.isdigit() else x for x in path.split(".")]
+    part = about
+    for key in way:
+        part = part[key]
+    part[last] = value
+    fit(folder, about)
+    refuses(f"^{folder}.*{message}", load_bundle, folder, error=UnknownContract)
+
+
+def test_the_ranges_of_the_schema_lie_within_those_of_the_simulated_drones():
+    fields = contract.schema()["properties"]["drone"]["properties"]
+    for name in LIMITS.keys() - {"rotor_spin"}:
+        entry = fields[name]
+        while "items" in entry and "minimum" not in entry:
+            entry = entry["items"]
+        least, most = LIMITS[name]
+        assert least <= entry.get("minimum", entry.get("exclusiveMinimum")) < entry["maximum"] <= most, name
+
+
+def test_another_runtime_is_found_and_a_graph_that_it_cannot_read_or_that_leaves_limits_or_shape_is_refused(
+    copied,
+):
+    bundle = load_bundle(copied[0])
+    bundle._vectors["action"] += np.float32(1e-3)
+    refuses("policy/policy.onnx: the policy differs by 0.001", bundle.check, error=WrongActions)
+    folder, about = copied
+
+    def load(*nodes, scale=1.0):
+        reads, writes = (
+            [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", n])]
+            for name, n in (("observation", 13), ("action", 4))
+        )
+        weight = onnx.numpy_helper.from_array(np.full((4, 13), scale, np.float32), "w")
+        graph = helper.make_graph(nodes, "policy", reads, writes, [weight])
+        model = helper.make_model(graph, ir_version=10, opset_imports=[helper.make_opsetid("", 20)])
+        (folder / "policy.onnx").write_bytes(model.SerializeToString())
+        fit(folder, about)
+        return load_bundle(folder)
+
+    def gemm(output):
+        return helper.make_node("Gemm", ["observation", "w"], [output], transB=1)
+
+    with pytest.raises(TamperedBundle, match=r"policy.onnx: onnxruntime cannot read it: .* Export the policy again"):
+        load(helper.make_node("Nonsense", ["observation"], ["action"]))
+    with pytest.raises(BrokenPolicy, match="policy: The action leaves -1 to 1, which no exported policy does"):
+        load(gemm("action"), scale=9.0)(resting())
+    twice = helper.make_node("Concat", ["sum", "sum"], ["action"], axis=0)  # onnxruntime believes what is declared
+    with pytest.raises(BrokenPolicy, match=r"policy: policy.onnx answered arrays of the shapes \(2, 4\)"):
+        load(gemm("sum"), twice)(resting())
+
+
+def test_c_leaves_the_memory_as_it_was_where_it_reads_what_is_not_finite(export_once, tmp_path):
+    library = compiled(export_once("forest")[2], tmp_path / "policy.so")
+    floats, inf = (lambda *x: (ctypes.c_float * len(x))(*x)), float("inf")
+    for observation, depth, kept in ((inf, 1.0, 0.5), (0.0, inf, 0.5), (0.0, float("nan"), 0.5), (0.0, 1.0, inf)):
+        memory, action = floats(0.1, 0.2, 0.3, kept), floats(0, 0, 0, 0)
+        images = floats(*29 * [1.0], depth)
+        assert library.policy_action(floats(*8 * [0.0], observation), images, memory, action) == 1
+        assert list(memory) == pytest.approx([0.1, 0.2, 0.3, kept]) and action[0] == pytest.approx(-1 / 3)
+    memory = floats(0.1, 0.2, 0.3, 0.5)
+    assert library.policy_action(floats(*9 * [0.0]), floats(*30 * [1.0]), memory, action) == 0 and memory[3] != 0.5
+
+
+def test_a_bundle_that_acts_or_remembers_differently_from_its_policy_is_not_written(tmp_path, monkeypatch, trace_once):
+    trace_once("forest")
+    env, actor = build("forest")
+
+    def forgets(self, *given, read=Bundle._read):
+        return read(self, *given) | {"memory": np.zeros_like(self.memory)}
+
+    def off(*arguments, fold=export.fold):
+        network = fold(*arguments)
+        *layers, last = network.layers
+        return network._replace(layers=[*layers, last._replace(bias=last.bias + np.float32(1e-3))])
+
+    wrongs = [(Bundle, "_read", forgets, ValueError, "acts differently")]
+    wrongs.append((export, "fold", off, WrongActions, "by 0.001"))
+    for owner, name, wrong, error, said in wrongs:
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, wrong)
+            with pytest.raises(error, match=said):
+                export_policy(actor, env, tmp_path / "policy")
+        assert not list(tmp_path.iterdir())
+    assert export_policy(actor, env, tmp_path / "policy").is_dir()
+
+
+def test_a_blind_policy_with_memory_is_exported_and_flies(export_once):
+    folder = export_once("hovering, with memory")[2]
+    assert load_bundle(folder).memory.shape == (4,)
+    assert len(transfer.fly(folder, "torchrl_quad", episodes=4)["action"]) == 4
+
+
+def test_no_simulator_flies_a_visual_policy_or_a_task_with_obstacles(export_once):
+    ways = (("forest", "images"), ("forest, blind", "obstacles"), ("hovering, without memory", "no camera"))
+    for task, why in ways:
+        with pytest.raises(ValueError, match=f"cannot fly this bundle of the task .*: .*{why}"):
+            transfer.fly(export_once(task)[2], "torchrl_quad")
+    bundle = load_bundle(export_once("forest, blind")[2])
+    with pytest.raises(ValueError, match="'forest' cannot be judged here: its drones crash into obstacles"):
         Judge(bundle, bundle.starts())
+
+
+def test_a_visual_policy_that_was_built_for_another_camera_or_changed_is_refused(tmp_path):
+    forest = ForestEnv(num_envs=2, camera={"width": 6, "height": 5})
+    seen, hooked, deeper, flatter = (make_visual_actor(forest) for _ in range(4))
+    narrow = HoveringEnv(num_envs=2, camera={"width": 9, "height": 5})
+    for other, has in ((HoveringEnv(num_envs=2), "has no camera"), (narrow, "shows it 9 x 5 pixels")):
+        refuses(f"images of another size; the environment {has}", export_policy, seen, other, tmp_path / "policy")
+    hooked[0][1].gru.register_forward_hook(lambda *_: None)
+    deeper[0][1].gru = nn.GRU(64, 64, 2, batch_first=True)
+    velocity = make_visual_actor(forest, in_keys=[("state", "velocity")])
+    flatter[0][0].module.convolutions[1] = nn.ELU(0.5)
+    built = "exports what make_actor and make_visual_actor build, .* This ComposedActor is something"
+    reads = r"reads \['depth', \('state', 'velocity'\)\]. A drone only has"
+    wrong = ((hooked, built), (deeper, built), (velocity, reads), (flatter, "cannot write ELU.alpha=0.5"))
+    for policy, message in wrong:
+        refuses(message, export_policy, policy, forest, tmp_path / "policy")

@@ -4,29 +4,16 @@ import math
 
 import pytest
 import torch
+from refusals import cases, refuses
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from test_loss_modules import pendulum_networks
 from torch import nn
 from torchrl.envs import PendulumEnv
 
-from torchrl_quad import (
-    ABPTLoss,
-    BPTTLoss,
-    HoveringEnv,
-    SHACLoss,
-    audit_reward,
-    compare_gradients,
-    differentiable_rollout,
-    gradient_by_horizon,
-    gradient_statistics,
-    make_actor,
-    make_env,
-    make_qvalue,
-    make_value,
-)
-
-# -- by hand -----------------------------------------------------------------------------------------------------------
+from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_env, make_qvalue, make_value
+from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
+from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss
 
 
 class Weigh(nn.Module):
@@ -49,19 +36,11 @@ def make_rollout(states=((1.0, 2.0, 3.0), (1.0, 2.0, 3.0)), weight=2.0):
     actor = module(Weigh(weight), ["observation"], "action")
     state = torch.tensor(states).unsqueeze(-1)
     steps = [actor(TensorDict({"observation": s}, s.shape[:1])) for s in state.unbind(1)]
-    terms = [
-        {
-            "linear": 3.0 * td["action"],
-            "quadratic": -td["action"].square(),
-            "bonus": 5.0 * (td["observation"] > 2.5),
-            "alive": torch.ones_like(td["action"]),
-            "crash": torch.zeros_like(td["action"]),
-        }
-        for td in steps
-    ]
-    for td, paid in zip(steps, terms, strict=True):
-        no = torch.zeros_like(td["action"], dtype=torch.bool)
-        ends = {"reward": sum(paid.values()), "reward_terms": paid, "observation": td["observation"] + td["action"]}
+    for td in steps:
+        s, a = td["observation"], td["action"]
+        paid = {"linear": 3.0 * a, "quadratic": -a.square(), "bonus": 5.0 * (s > 2.5), "alive": torch.ones_like(a)}
+        paid["crash"], no = torch.zeros_like(a), torch.zeros_like(a, dtype=torch.bool)
+        ends = {"reward": sum(paid.values()), "reward_terms": paid, "observation": s + a}
         td["next"] = TensorDict({**ends, "done": no, "terminated": no}, td.batch_size)
     return torch.stack(steps, 1), actor
 
@@ -93,8 +72,7 @@ def test_returns_are_discounted_anew_in_each_episode():
     rollout["next", "done"][0, 1] = True
     audit = audit_reward(rollout, actor, gamma=0.5)
     # s = 1, 2, 3 with discounts 1, 1/2, 1 and 1, 1/2, 1/4: sums of 5 and 2.75
-    assert audit["linear"].mean_return == 6 * (5 + 2.75) / 2
-    assert audit["linear"].gradient_norm == 3 * (5 + 2.75) / 2
+    assert audit["linear"].mean_return == 6 * (5 + 2.75) / 2 and audit["linear"].gradient_norm == 3 * (5 + 2.75) / 2
     assert audit["bonus"].mean_return == 5 * (1 + 0.25) / 2
 
 
@@ -107,15 +85,13 @@ def test_the_actions_of_a_rollout_may_be_the_inputs():
     assert by_weights == audit_reward(rollout, actor) == audit_reward(rollout, BPTTLoss(actor))
 
 
-def test_a_gradient_that_is_not_finite_is_no_gradient():
+def test_an_audit_needs_no_gradient_mode_and_counts_no_gradient_that_is_not_finite():
     rollout, actor = make_rollout()
-    root = (rollout["action"] - rollout["action"].detach()).sqrt()
-    rollout["next", "reward_terms", "root"] = root
+    rollout["next", "reward_terms", "root"] = (rollout["action"] - rollout["action"].detach()).sqrt()
     assert audit_reward(rollout, actor)["root"].verdict == "not finite"
     assert audit_reward(rollout, actor).without_gradient == ["bonus", "root"]
-
-
-# -- the paper's column DIFF -------------------------------------------------------------------------------------------
+    with torch.no_grad():
+        assert audit_reward(rollout, actor)["linear"].gradient_norm == 18.0
 
 
 def fly(task, horizon=24, **options):
@@ -136,17 +112,14 @@ def fly(task, horizon=24, **options):
     return rollout, actor
 
 
-@pytest.mark.parametrize(
-    ("task", "options", "without"),
-    [
-        ("hovering", {}, []),
-        ("tracking", {}, []),
-        ("landing", {}, ["success", "crash"]),
-        ("racing", {"reward": "position"}, ["gate"]),
-        ("racing", {"reward": "velocity"}, ["gate"]),
-        ("racing", {"gate_bonus": "log"}, []),
-        ("racing", {"reward": "velocity", "gate_bonus": "reciprocal"}, []),
-    ],
+@cases(
+    ("hovering", {}, []),
+    ("tracking", {}, []),
+    ("landing", {}, ["success", "crash"]),
+    ("racing", {"reward": "position"}, ["gate"]),
+    ("racing", {"reward": "velocity"}, ["gate"]),
+    ("racing", {"gate_bonus": "log"}, []),
+    ("racing", {"reward": "velocity", "gate_bonus": "reciprocal"}, []),
 )
 def test_the_audit_finds_which_rewards_are_fully_and_which_are_partially_differentiable(task, options, without):
     rollout, actor = fly(task, **options)
@@ -162,9 +135,6 @@ def test_the_audit_finds_which_rewards_are_fully_and_which_are_partially_differe
     for key in ("action", ("state", "quaternion")):  # the first state has no graph
         by_entry = audit_reward(rollout, rollout[key])
         assert [term.verdict for term in by_entry.values()] == [term.verdict for term in audit.values()]
-
-
-# -- simulator against critic ------------------------------------------------------------------------------------------
 
 
 def shac(rollout_and_actor, critic, **options):
@@ -197,8 +167,7 @@ def test_abpt_sets_the_0_step_return_against_the_n_step_return(critic, cosine):
     comparison = compare_gradients(loss, rollout)
     # Q = 4 a at s_0 = 1, and gamma^3 4 w s' with s' = (1 + w) s at s = 3, where a change of w changes s' as well
     n_step = 2.75 + critic * 4 * (9 + 2 * 3) / 8
-    assert comparison.first_order_norm == pytest.approx(abs(n_step) / 2)
-    assert comparison.value_norm == 4 / 2
+    assert comparison.first_order_norm == pytest.approx(abs(n_step) / 2) and comparison.value_norm == 4 / 2
     assert comparison.cosine == pytest.approx(cosine * math.copysign(1, n_step))
 
 
@@ -211,9 +180,6 @@ def test_the_cosine_is_nan_where_one_of_the_two_gradients_is_missing():
     qvalue = module(Weigh(1.0, 1.0), ["observation", "action"], "state_action_value")
     alone = compare_gradients(ABPTLoss(actor, qvalue, n_step_return=False), rollout)
     assert alone.value_norm > 0 and math.isnan(alone.first_order_norm) and math.isnan(alone.cosine)
-
-
-# -- norm and variance -------------------------------------------------------------------------------------------------
 
 
 def test_the_spread_of_the_gradients_is_that_worked_by_hand():
@@ -260,9 +226,6 @@ def test_the_variance_is_that_of_a_loop_with_backward_and_leaves_no_grad_behind(
             assert gradient_by_horizon(env, actor, loss, [horizon], start=start) == {horizon: statistics}
 
 
-# -- other environments ------------------------------------------------------------------------------------------------
-
-
 def test_diagnostics_look_at_the_pendulum_of_torchrl():
     env = PendulumEnv(seed=0)
     actor, value, qvalue = pendulum_networks(env)
@@ -278,8 +241,6 @@ def test_diagnostics_look_at_the_pendulum_of_torchrl():
         grown = gradient_by_horizon(env, actor, loss, (2, 8), start=start, max_envs=4)
         assert grown[8].norm > grown[2].norm and all(x.variance > 0 for x in grown.values())
 
-
-# -- errors ------------------------------------------------------------------------------------------------------------
 
 AUDITS = {
     r"do not add up to the reward: they are off by up to 12": lambda r, a: audit_reward(r, a, reward_key="scaled"),
@@ -299,11 +260,4 @@ def test_what_cannot_be_audited_is_refused_with_advice(message):
     rollout, actor = make_rollout()
     rollout["scaled"] = 2.0 * rollout["next", "reward"]  # 6, -6 and -24
     rollout["own"] = TensorDict({"short": torch.ones(2, 3)}, [2, 3])
-    with pytest.raises((ValueError, RuntimeError), match=message):
-        AUDITS[message](rollout, actor)
-
-
-def test_an_audit_needs_no_gradient_mode():
-    rollout, actor = make_rollout()
-    with torch.no_grad():
-        assert audit_reward(rollout, actor)["linear"].gradient_norm == 18.0
+    refuses(message, AUDITS[message], rollout, actor, error=(ValueError, RuntimeError))

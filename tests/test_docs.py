@@ -12,9 +12,9 @@ from urllib.parse import unquote
 import pytest
 import yaml
 from markdown_it import MarkdownIt
+from small_runs import ROOT, run
 from sphinx.util.inventory import InventoryFile
 from test_examples import EXAMPLES, reduced
-from test_recipes import ROOT, run
 
 from torchrl_quad.envs import TASKS
 
@@ -28,9 +28,6 @@ NOT_RUN = re.compile(r"(|text|yaml|\{(?!code|sourcecode)[\w-]+\}.*)")
 
 def name_of(path):
     return str(path.relative_to(ROOT))
-
-
-# -- the site ----------------------------------------------------------------------------------------------------------
 
 
 def public_names():
@@ -109,12 +106,9 @@ def look_at(site, browser):
     assert not wrong, "\n".join(sorted(wrong))
 
 
-def test_the_reference_begins_with_a_table_of_what_the_package_exports():
+def test_the_reference_lists_what_the_package_exports_and_every_example_is_listed_and_the_readme_is_short():
     (table,) = re.findall(r"\.\. autosummary::\n.*\n\n((?:   \w+\n)+)", (ROOT / "docs/api.md").read_text())
     assert sorted(table.split()) == sorted(importlib.import_module("torchrl_quad").__all__)
-
-
-def test_every_example_is_listed_and_the_readme_is_short():
     text = (ROOT / "examples/README.md").read_text()
     assert {example.name for example in EXAMPLES} == set(re.findall(r"\d\d_\w+\.py", text))
     assert len((ROOT / "README.md").read_text().splitlines()) <= 120
@@ -135,12 +129,8 @@ def test_every_row_of_how_to_add_names_files_that_exist():
         names = re.findall(r"`([\w./]+(?:\.py|\.yaml|/))`", row)
         deeper = [ROOT / part for part in ("torchrl_quad", "recipes", "docs", "examples", "benchmarks", "tests")]
         found = {name: [*ROOT.glob(name), *(x for part in deeper for x in part.glob(f"**/{name}"))] for name in names}
-        missing = [name for name in names if not found[name]]
-        assert names and missing == [], row
+        assert names and [name for name in names if not found[name]] == [], row
     assert len(rows) == 10
-
-
-# -- links -------------------------------------------------------------------------------------------------------------
 
 
 def headings(text):
@@ -161,9 +151,6 @@ def test_links_and_pictures_lead_to_files_and_headings_that_exist(page):
         target = (page.parent / path).resolve() if path else page
         assert target.exists() and target.is_relative_to(ROOT), f"{link}: there is no such file in the repository"
         assert not heading or heading in headings(target.read_text()), f"{link}: there is no such heading"
-
-
-# -- code --------------------------------------------------------------------------------------------------------------
 
 
 def blocks(text, first_line=0):

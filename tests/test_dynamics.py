@@ -1,24 +1,17 @@
-"""Physics against physics, in float64."""
+"""Physics against physics, and gradients through the simulator against finite differences, in float64."""
 
 import math
 
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from tensordict import TensorDict
 
-from torchrl_quad.dynamics import (
-    INTEGRATORS,
-    FlightController,
-    Quadrotor,
-    QuadrotorState,
-    RigidBodyState,
-    accelerations,
-    available_drones,
-    load_drone,
-    quaternion,
-)
+from torchrl_quad import HoveringEnv
+from torchrl_quad.dynamics import FlightController, Quadrotor, available_drones, load_drone, quaternion, rigid_body
 from torchrl_quad.dynamics.control import Setpoint
-from torchrl_quad.dynamics.rigid_body import Rotors, allocation_matrix, thrust_limits
+from torchrl_quad.dynamics.model import QuadrotorState
+from torchrl_quad.dynamics.rigid_body import INTEGRATORS, RigidBodyState, Rotors, accelerations
 from torchrl_quad.dynamics.vector import matvec
 
 F64 = torch.float64
@@ -62,25 +55,27 @@ def fly(state, action, params, controller, seconds, dt=0.005, integrator="semi_i
     return history
 
 
-def test_free_fall_follows_the_parabola():
+def test_free_fall_follows_the_parabola_and_with_drag_ends_where_that_balances_the_weight():
     end = fly_body(body(velocity=vector(1.0, 2.0, 3.0)), without_drag(), NO_WRENCH, 1.0, 0.01)
     torch.testing.assert_close(end.velocity, vector(1.0, 2.0, 3.0 - 9.81))
     torch.testing.assert_close(end.position, vector(1.0, 2.0, 3.0 - 9.81 / 2))
-
-
-def test_terminal_velocity_is_where_drag_balances_weight():
     params = drone()
-    end = fly_body(body(), params, NO_WRENCH, 60.0, 0.05)
-    speed = -end.velocity[0, 2]
+    speed = -fly_body(body(), params, NO_WRENCH, 60.0, 0.05).velocity[0, 2]
     force = params.linear_drag[2] * speed + params.quadratic_drag[2] * speed**2
     torch.testing.assert_close(force, (params.mass * params.gravity)[0], rtol=1e-6, atol=0)
 
 
-def test_drag_opposes_motion_along_every_axis_in_both_directions():
+def test_drag_opposes_motion_along_every_axis_and_above_the_centre_of_mass_pitches_a_drone_up():
     params = drone(gravity=0.01)
     velocity = 5.0 * torch.cat((torch.eye(3, dtype=F64), -torch.eye(3, dtype=F64)))
     linear, _ = accelerations(body(velocity=velocity), NO_WRENCH, params)
     assert ((linear * velocity).sum(-1) < -0.05).all()
+    params = drone(drag_height=0.03, linear_drag=[0.2] * 3, quadratic_drag=[0.0] * 3)
+    velocity = torch.tensor([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0]], dtype=F64)
+    _, angular = accelerations(body(velocity=velocity), NO_WRENCH, params)
+    moment = 0.03 * 0.2 * 2.0  # about y where it flies along x (nose up), about x where it flies along y
+    about = torch.tensor([[0.0, -moment, 0.0], [moment, 0.0, 0.0]], dtype=F64)
+    torch.testing.assert_close(angular, about / params.inertia)
 
 
 def test_energy_is_conserved_without_drag_and_lost_with_it():
@@ -152,10 +147,9 @@ def test_allocation_is_r_cross_f_for_any_layout():
     params = drone(rotor_positions=positions, rotor_spin=[1.0, 1.0, -1.0, -1.0])
     thrust = torch.tensor([1.0, 2.0, 0.5, 1.5], dtype=F64)
     arms = torch.nn.functional.pad(params.rotor_positions, (0, 1))
-    forces = torch.nn.functional.pad(thrust.unsqueeze(-1), (2, 0))
-    torque = torch.linalg.cross(arms, forces).sum(0)
+    torque = torch.linalg.cross(arms, torch.nn.functional.pad(thrust.unsqueeze(-1), (2, 0))).sum(0)
     torque[2] += (params.yaw_torque_coefficient * params.rotor_spin * thrust).sum()
-    torch.testing.assert_close(allocation_matrix(params) @ thrust, torch.cat((thrust.sum()[None], torque)))
+    torch.testing.assert_close(rigid_body.allocation_matrix(params) @ thrust, torch.cat((thrust.sum()[None], torque)))
 
 
 @pytest.mark.parametrize("name", available_drones())
@@ -189,7 +183,7 @@ def test_the_rate_loop_is_damped_as_its_gains_say(name):
 @pytest.mark.parametrize("name", available_drones())
 def test_the_thrust_map_and_its_inverse_agree_over_the_speed_range(name):
     rotors = Rotors(drone(name))
-    low, high = thrust_limits(drone(name))
+    low, high = rigid_body.thrust_limits(drone(name))
     thrust = low + torch.linspace(0.01, 1, 50, dtype=F64) * (high - low)
     torch.testing.assert_close(rotors.thrust(rotors.speed(thrust)), thrust)
 
@@ -222,15 +216,6 @@ def test_rotations_agree_with_the_rotation_matrix_and_invert_each_other():
     p = quaternion.normalize(torch.randn(5, 4, dtype=F64))
     one_by_one = quaternion.rotate(p, quaternion.rotate(q, v))
     torch.testing.assert_close(quaternion.rotate(quaternion.multiply(p, q), v), one_by_one)
-
-
-def test_drag_above_the_centre_of_mass_pitches_a_drone_that_flies_forward_up():
-    params = drone(drag_height=0.03, linear_drag=[0.2] * 3, quadratic_drag=[0.0] * 3)
-    velocity = torch.tensor([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0]], dtype=F64)
-    _, angular = accelerations(body(velocity=velocity), NO_WRENCH, params)
-    moment = 0.03 * 0.2 * 2.0  # about y where it flies along x (nose up), about x where it flies along y
-    about = torch.tensor([[0.0, -moment, 0.0], [moment, 0.0, 0.0]], dtype=F64)
-    torch.testing.assert_close(angular, about / params.inertia)
 
 
 @pytest.mark.parametrize("own", [False, True])
@@ -270,8 +255,7 @@ def speeds(controller, setpoint):
 
 def setpoints(controller, n, size):
     """Random setpoints (n) of thrusts about hovering, and body rates up to a size times the greatest."""
-    weight = controller.nominal.mass * controller.nominal.gravity
-    thrust = weight * (0.7 + 0.6 * torch.rand(n, 1, dtype=F64))
+    thrust = controller.nominal.mass * controller.nominal.gravity * (0.7 + 0.6 * torch.rand(n, 1, dtype=F64))
     return Setpoint(thrust, size * (2 * torch.rand(n, 3, dtype=F64) - 1) * controller.nominal.max_body_rate)
 
 
@@ -287,8 +271,7 @@ def test_thrust_roll_and_pitch_are_exact_where_yaw_alone_saturates(controller):
     arm = controller.nominal.rotor_positions.norm(dim=-1).max()
     error = (flown - asked)[feasible, :3] / torch.stack((torch.ones_like(arm), arm, arm))
     assert (error.abs() < 2e-6 * controller.thrust_max.max()).all()
-    assert (flown[:, 3] > -1e-9).all()
-    assert (flown[feasible, 3] < asked[feasible, 3]).all()
+    assert (flown[:, 3] > -1e-9).all() and (flown[feasible, 3] < asked[feasible, 3]).all()
     assert flown[feasible, 3].mean() > 0
 
 
@@ -302,8 +285,7 @@ def test_where_nothing_saturates_the_mixer_is_untouched_to_the_last_bit(controll
 
 @each_drone
 def test_no_command_asks_more_of_a_rotor_than_it_can_give(controller):
-    setpoint = setpoints(controller, 500, 30.0)
-    thrust = controller.rotors.thrust(speeds(controller, setpoint))
+    thrust = controller.rotors.thrust(speeds(controller, setpoints(controller, 500, 30.0)))
     slack = 1e-6 * controller.thrust_max
     assert ((thrust >= controller.thrust_min - slack) & (thrust <= controller.thrust_max + slack)).all()
 
@@ -320,3 +302,87 @@ def test_the_saturated_mixer_has_exact_derivatives(controller):
     plain = matvec(controller.mixer, asked_wrench(controller, setpoint))
     assert ((plain < controller.thrust_min) | (plain > controller.thrust_max)).any(-1).sum() > 5
     assert torch.autograd.gradcheck(commanded, inputs, eps=1e-7, atol=1e-5, rtol=1e-5)
+
+
+STEPS = 20
+
+
+def flight(env, actions, state, steps=STEPS):
+    """Rewards and final state of a flight that resets where it is done, as one vector."""
+    env.set_seed(0)
+    td = env.reset(TensorDict({"state": state}, env.batch_size), set_state=True)
+    rewards = []
+    for t in range(steps):
+        step, td = env.step_and_maybe_reset(td.set("action", actions[:, t]))
+        rewards.append(step["next", "reward"].flatten())
+    last = step["next", "state"]
+    ends = (last[k].flatten() for k in ("position", "quaternion", "velocity", "angular_velocity"))
+    return torch.cat((*rewards, *ends))
+
+
+def setup(**kwargs):
+    env = HoveringEnv(num_envs=3, dtype=torch.float64, seed=2, **kwargs)
+    actions = env.hover_action + 0.2 * torch.randn(3, STEPS, 4, dtype=torch.float64)
+    state = env.rollout(3)["next", "state"][:, -1].clone()
+    return env, actions.requires_grad_(), state
+
+
+def gradients_agree(function, *inputs):
+    return torch.autograd.gradcheck(function, inputs, fast_mode=True, atol=1e-6, rtol=1e-5)
+
+
+def test_with_respect_to_actions_with_each_integrator_and_delay():
+    for options in ({}, {"integrator": "euler", "action_delay": 0}, {"integrator": "rk4", "action_delay": 2}):
+        env, actions, state = setup(**options)
+        assert gradients_agree(lambda a, env=env, state=state: flight(env, a, state), actions)
+
+
+def test_with_respect_to_every_entry_of_the_initial_state_also_through_resets():
+    env, actions, state = setup(max_episode_steps=24)
+    state["step"] = torch.tensor([[15], [0], [19]])  # the second drone flies through
+    actions = actions.detach()
+    for key, value in state.items():
+        if not value.is_floating_point():
+            continue
+        value = value.clone().requires_grad_()
+        assert gradients_agree(lambda x, key=key: flight(env, actions, state.copy().set(key, x)), value), key
+
+
+@pytest.mark.parametrize(("limit", "lag"), [(256, [0.03, 0.05]), (12, 0.033)])  # at rest two constants have a kink
+def test_with_respect_to_every_parameter_of_the_drone_also_through_resets(limit, lag):
+    smooth = dict.fromkeys(("velocity", "angular_velocity", "attitude"), 0.0)  # at rest these terms have one, too
+    env, actions, state = setup(max_episode_steps=limit, weights=smooth)
+    actions = actions.detach()
+    if limit == 12:
+        state["step"] = torch.tensor([[3], [0], [7]])
+    drag = {"drag_height": 0.02, "linear_drag": [0.3] * 3, "quadratic_drag": [0.05] * 3}  # it turns the drone
+    own = env.params.replace(motor_time_constant=lag, rotor_speed_min=1300.0, rotor_speed_max=1850.0, **drag)
+    for name in sorted(set(env.dynamics.plant_fields) - {"rotor_spin"}):  # which is +1 or -1
+
+        def fly(x, name=name):
+            env.params = own.replace(**{name: x})
+            return flight(env, actions, state, steps=14)
+
+        value = getattr(own, name)
+        x = value.clone().requires_grad_()
+        out = fly(x)
+        weights, step = torch.rand_like(out), 1e-5 * value * torch.randn_like(value)
+        (grad,) = torch.autograd.grad((weights * out).sum(), x)
+        slope = (weights * (fly(value + step) - fly(value - step))).sum() / 2.0
+        assert slope != 0.0, name
+        torch.testing.assert_close(
+            (grad * step).sum(), slope, rtol=1e-5, atol=0.0, msg=lambda said, name=name: f"{name}: {said}"
+        )
+
+
+def test_through_a_partial_reset_the_gradient_is_cut_exactly_there():
+    env, actions, state = setup(max_episode_steps=12)
+    state["step"] = torch.tensor([[3], [0], [7]])
+    assert gradients_agree(lambda a: flight(env, a, state), actions)
+    # environment 0 is reset after 9 steps, environment 1 after 12, environment 2 after 5 and 17
+    rewards = flight(env, actions, state)[: 3 * STEPS].view(STEPS, 3)
+    for i, resets in enumerate(([9], [12], [5, 17])):
+        for reset in resets:
+            (grad,) = torch.autograd.grad(rewards[reset:, i].sum(), actions, retain_graph=True)
+            assert (grad[i, :reset] == 0).all() and (grad[i, reset : reset + 1] != 0).any()
+            assert (grad[[j for j in range(3) if j != i]] == 0).all()

@@ -1,27 +1,25 @@
-"""The environment: specs, resets, ends, seeds, delay, and what happens to broken states."""
+"""The environment: specs, resets, ends, seeds, delay, and what happens to broken states; one seed gives one flight."""
 
 import inspect
+import io
 import pickle
 
 import pytest
 import torch
-from flying import fly, hold, start
+from flying import fly, hold, look_at_nothing, start
+from refusals import refuses
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
+from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv, check_env_specs
 
 from torchrl_quad import HoveringEnv, QuadrotorParams, differentiable_rollout, load_drone, make_actor, make_env
 from torchrl_quad.envs import TASKS
 
+OTHER = {"integrator": "rk4", "drone": "small_racer", "control_dt": 0.01, "observe_last_action": True}
+
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"action_delay": 0},
-        {"action_delay": 3},
-        {"integrator": "rk4", "drone": "small_racer", "control_dt": 0.01, "observe_last_action": True},
-    ],
-)
+@pytest.mark.parametrize("options", [{"action_delay": 0}, {"action_delay": 3}, OTHER])
 def test_specs_hold_with_any_precision_delay_and_observation(dtype, options):
     env = HoveringEnv(num_envs=3, dtype=dtype, max_episode_steps=7, **options)
     check_env_specs(env, break_when_any_done="both")
@@ -34,15 +32,13 @@ def test_a_drone_that_hovers_stays_and_succeeds(env64):
     td = start(env64, position=env64.tensor(env64.target))
     flight = fly(env64, td, hold(env64, 100))
     torch.testing.assert_close(flight["next", "state", "position"][:, -1], td["state", "target"])
-    assert flight["next", "success"].all()
-    assert not flight["next", "done"].any()
+    assert flight["next", "success"].all() and not flight["next", "done"].any()
     torch.testing.assert_close(flight["next", "reward"], torch.full((4, 100, 1), 0.1, dtype=torch.float64))
 
 
 def test_the_reward_is_the_paper_s_formula_and_the_observation_ten_times_the_paper_s(env64):
     flight = env64.rollout(5)
-    terms = flight["next", "reward_terms"]
-    torch.testing.assert_close(sum(terms.values()), flight["next", "reward"])
+    torch.testing.assert_close(sum(flight["next", "reward_terms"].values()), flight["next", "reward"])
     state = flight["next", "state"]
     level = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
@@ -65,21 +61,16 @@ def test_the_reward_is_the_paper_s_formula_and_the_observation_ten_times_the_pap
 def test_starts_lie_in_their_box_level_and_at_rest():
     td = HoveringEnv(num_envs=2000, seed=3).reset()
     offset = (td["state", "position"] - torch.tensor([1.0, 0.0, 1.5])).abs().amax(0)
-    assert (offset <= torch.tensor([1.0, 1.0, 0.5])).all()
-    assert (offset > torch.tensor([0.98, 0.98, 0.49])).all()
+    assert (offset <= torch.tensor([1.0, 1.0, 0.5])).all() and (offset > torch.tensor([0.98, 0.98, 0.49])).all()
     assert (td["state", "velocity"] == 0).all()
     assert (td["state", "quaternion"] == torch.tensor([1.0, 0.0, 0.0, 0.0])).all()
 
 
-def test_running_out_of_time_truncates_and_does_not_terminate():
+def test_running_out_of_time_truncates_and_leaving_the_box_terminates():
     env = HoveringEnv(num_envs=2, max_episode_steps=5)
     flight = fly(env, env.reset(), hold(env, 5))["next"]
     assert flight["truncated"][..., 0].tolist() == [[False] * 4 + [True]] * 2
-    assert torch.equal(flight["done"], flight["truncated"])
-    assert not flight["terminated"].any()
-
-
-def test_leaving_the_box_terminates_and_does_not_truncate():
+    assert torch.equal(flight["done"], flight["truncated"]) and not flight["terminated"].any()
     outside = [(1, 0, -0.1), (1, 0, 6.1), (6.1, 0, 1.5), (-4.1, 0, 1.5), (1, 5.1, 1.5), (1, -5.1, 1.5)]
     env = HoveringEnv(num_envs=7)
     ends = fly(env, start(env, position=[*outside, (1, 0, 1.5)]), hold(env, 1))["next"][:, 0]
@@ -93,8 +84,7 @@ def test_an_action_takes_effect_after_the_delay(delay):
     push = env.hover_action + torch.tensor([0.5, 0.0, 0.0, 0.0], dtype=torch.float64)
     flight = fly(env, env.reset(), [push.expand(1, 4)] * (delay + 2))
     speed = flight["next", "state", "rotor_speed"][0, :, 0] - env.dynamics.controller.hover_speed[0]
-    assert (speed[:delay].abs() < 1e-9).all()
-    assert (speed[delay:] > 10).all()
+    assert (speed[:delay].abs() < 1e-9).all() and (speed[delay:] > 10).all()
 
 
 def test_a_partial_reset_leaves_the_others_alone(env):
@@ -141,11 +131,10 @@ def test_every_field_of_the_drone_may_differ_between_environments(num_envs):
     env = HoveringEnv(num_envs=num_envs, drone=batched, action_delay=2)
     flight = fly(env, env.reset(), hold(env, 30))
     torch.testing.assert_close(flight["next", "state", "velocity"], torch.zeros(num_envs, 30, 3), atol=1e-4, rtol=0)
-    with pytest.raises(ValueError, match=f"is for {num_envs} environments, and num_envs=5"):
-        HoveringEnv(num_envs=5, drone=batched)
+    refuses(f"is for {num_envs} environments, and num_envs=5", HoveringEnv, num_envs=5, drone=batched)
 
 
-def test_the_controller_keeps_its_drone_when_the_true_one_is_fitted_in_place():
+def test_the_controller_keeps_its_drone_and_the_one_that_flies_is_fitted_in_place_or_set_through_transforms(env64):
     mass = torch.nn.Parameter(torch.tensor([0.46]))
     env = HoveringEnv(num_envs=1, drone=load_drone().replace(mass=mass))
     assert env.params.mass is mass
@@ -153,9 +142,6 @@ def test_the_controller_keeps_its_drone_when_the_true_one_is_fitted_in_place():
     assert env.nominal.mass.item() == pytest.approx(0.46)
     others = [HoveringEnv(num_envs=1, drone=load_drone()) for _ in range(2)]
     assert others[0].params.mass is not others[1].params.mass
-
-
-def test_the_drone_that_flies_can_be_set_through_transforms_and_takes_precision_and_gradient(env64):
     wrapped = TransformedEnv(env64, StepCounter())
     mass = torch.tensor([0.9], requires_grad=True)
     wrapped.set_params(load_drone("visfly").replace(mass=mass))
@@ -199,8 +185,7 @@ def test_episode_metrics_judge_the_first_episode_by_its_last_second():
     hover = TensorDictModule(lambda _: env.hover_action.expand(3, 4), in_keys=["observation"], out_keys=["action"])
     flight, _ = differentiable_rollout(env, hover, env.reset(td, set_state=True), 60)
     metrics = env.episode_metrics(flight)
-    assert metrics["solved"].tolist() == [1.0, 0.0, 0.0]
-    assert metrics["crash"].tolist() == [0.0, 0.0, 1.0]
+    assert metrics["solved"].tolist() == [1.0, 0.0, 0.0] and metrics["crash"].tolist() == [0.0, 0.0, 1.0]
     assert metrics["position_error"].tolist() == pytest.approx([0.0, 0.2, 4.6], abs=0.1)
     assert metrics["return"].tolist() == pytest.approx([6.0, 60 * (0.1 - 0.2 * 0.1 / 9), 0.04], abs=0.01)
 
@@ -228,15 +213,13 @@ def test_an_environment_that_moves_keeps_its_drone_and_restarts_from_its_seed():
     for env in (moved, fresh):
         env.params = env.params.replace(mass=0.5)
     fly_on(moved, 3)
-    assert moved.to("cpu:0") is moved
-    assert moved.device == moved.randomness.device == torch.device("cpu:0")
+    assert moved.to("cpu:0") is moved and moved.device == moved.randomness.device == torch.device("cpu:0")
     assert moved.params.mass.item() == 0.5 != moved.nominal.mass.item() == fresh.nominal.mass.item()
     for _ in range(2):  # the second episode draws on
         assert_equal(fly_on(moved, 5), fly_on(fresh, 5))
     check_env_specs(moved)
     nominal = HoveringEnv(num_envs=2, max_episode_steps=7).to("cpu:0")
-    assert nominal.params is nominal.nominal
-    assert nominal.rollout(9)["next", "state", "step"].flatten().max() == 7
+    assert nominal.params is nominal.nominal and nominal.rollout(9)["next", "state", "step"].flatten().max() == 7
 
 
 def test_an_environment_stays_compiled_where_it_moves_until_it_is_made_eager():
@@ -245,3 +228,96 @@ def test_an_environment_stays_compiled_where_it_moves_until_it_is_made_eager():
     assert env.to("cpu:0").is_compiled and env.disturbances["camera"].is_compiled
     assert env.eager() is env and not (env.is_compiled or env.disturbances["camera"].is_compiled)
     assert_equal(fly_on(env, 3), fly_on(fresh, 3))
+
+
+# Flights that crash after some ten steps, each in its own time.
+RESTLESS = {"num_envs": 8, "dtype": torch.float64, "seed": 3, "random_start": {"tilt": 3.0, "velocity": 20.0}}
+RESTLESS |= {"wind": {"gust": 2.0}, "observation_noise": {"position": 0.1, "velocity": 0.1}}
+ONCE = {"auto_reset": False, "break_when_any_done": False}
+POLICY = TensorDictModule(lambda x: x[:, :4].sin(), in_keys=["observation"], out_keys=["action"])
+STEPS = 80
+
+
+def by_hand(env, start, steps):
+    flight, td = [], start
+    for _ in range(steps):
+        stepped, td = env.step_and_maybe_reset(POLICY(td))
+        flight.append(stepped)
+    return torch.stack(flight, 1)
+
+
+@pytest.mark.parametrize("device", ["a processor", "an accelerator"])
+def test_one_seed_gives_one_flight_however_it_is_flown(device, monkeypatch):
+    if device == "an accelerator":
+        look_at_nothing(monkeypatch)
+    env = HoveringEnv(**RESTLESS)
+    expected = env.rollout(STEPS, POLICY, tensordict=env.reset(), **ONCE)
+    assert expected["next", "done"].sum() > 20
+
+    other = HoveringEnv(**RESTLESS)
+    flights = {"TorchRL's loop": EnvBase.rollout(other, STEPS, POLICY, tensordict=other.reset(), **ONCE)}
+    other = HoveringEnv(**RESTLESS)
+    flights["by hand"] = by_hand(other, other.reset(), STEPS)
+    other = TransformedEnv(HoveringEnv(**RESTLESS), Compose(StepCounter(), RewardSum()))
+    flights["transformed"] = other.rollout(STEPS, POLICY, tensordict=other.reset(), **ONCE)
+    other = HoveringEnv(**RESTLESS)
+    td, halves = other.reset(), []
+    for steps in (13, STEPS - 13):
+        halves.append(other.rollout(steps, POLICY, tensordict=td, **ONCE))
+        td = other.maybe_reset(other.step_mdp(halves[-1][:, -1]))
+    flights["in two parts"] = torch.cat(halves, 1)
+    for name, flight in flights.items():
+        for key, x in expected.items(include_nested=True, leaves_only=True):
+            torch.testing.assert_close(flight[key], x, msg=f"{name}: {key}")
+
+
+def test_episodes_that_end_soon_start_at_another_state_each_time():
+    env = HoveringEnv(num_envs=6, max_episode_steps=3)
+    td = env.reset()
+    td["state", "step"] = torch.tensor([[0], [1], [2], [0], [1], [2]])  # they end in different steps
+    start = env.reset(td, set_state=True)
+    flight = env.rollout(31, POLICY, tensordict=start, **ONCE)
+    begins = flight["state", "step"][:, 1:, 0] == 0
+    for positions, begin in zip(flight["state", "position"][:, 1:], begins, strict=True):
+        assert begin.sum() >= 10 and len(positions[begin].unique(dim=0)) == begin.sum()
+
+
+@pytest.mark.parametrize("steps", [5, 45])
+def test_a_flight_goes_on_bit_for_bit_from_a_saved_random_state(steps):
+    env = TransformedEnv(HoveringEnv(**RESTLESS), StepCounter())
+    first = env.rollout(steps, POLICY, tensordict=env.reset(), **ONCE)
+    carry = env.maybe_reset(env.step_mdp(first[:, -1]))
+    saved = io.BytesIO()
+    torch.save({"random": env.random_state(), "state": carry["state"].to_dict()}, saved)
+    saved.seek(0)
+    expected = env.rollout(50, POLICY, tensordict=carry.clone(), **ONCE)
+
+    loaded = torch.load(saved, weights_only=True)
+    again = TransformedEnv(HoveringEnv(**{**RESTLESS, "seed": 99}), StepCounter())
+    again.rollout(7, POLICY, break_when_any_done=False)
+    start = again.reset(TensorDict({"state": loaded["state"]}, [8]), set_state=True)
+    again.set_random_state(loaded["random"])
+    for _ in range(2):  # what was loaded can be loaded again
+        flight = again.rollout(50, POLICY, tensordict=start.clone(), **ONCE)
+        for key in (("state", "position"), ("state", "wind"), "observation", ("next", "reward")):
+            assert torch.equal(flight[key], expected[key]), key
+        again.set_random_state(loaded["random"])
+
+
+def test_flights_repeat_with_the_seed_whatever_the_global_generator_does():
+    def starts(seed, disturb):
+        env = HoveringEnv(num_envs=4, seed=seed)
+        torch.manual_seed(disturb)
+        first = env.reset()["state", "position"]
+        torch.rand(disturb)
+        assert env.to("cpu") is env  # a move to where it is leaves the generator alone
+        second = env.reset()["state", "position"]
+        env.set_seed(seed)
+        assert torch.equal(env.reset()["state", "position"], first)
+        return torch.stack((first, second))
+
+    assert torch.equal(starts(5, 1), starts(5, 2))
+    assert not torch.equal(starts(5, 1), starts(6, 1)) and not torch.equal(*starts(5, 1))
+    before = torch.get_rng_state()
+    HoveringEnv(num_envs=4).reset()
+    assert torch.equal(torch.get_rng_state(), before)

@@ -49,8 +49,7 @@ STARTS = {"racing": racers, "landing": landers}
 
 def flight(env, state, actions):
     """What each step pays and leads to, with the state at its start, (n, STEPS)."""
-    td = env.reset(TensorDict({"state": state}, env.batch_size), set_state=True)
-    return fly(env, td, actions.unbind(1))
+    return fly(env, env.reset(TensorDict({"state": state}, env.batch_size), set_state=True), actions.unbind(1))
 
 
 def bisected(env, steps):
@@ -67,9 +66,8 @@ def bisected(env, steps):
         high = torch.ones_like(steps["next", "reward"])
 
         def inside(fraction):
-            ends = (
-                (key, steps["state", key], steps["next", "state", key]) for key in ("position", "velocity", "target")
-            )
+            keys = ("position", "velocity", "target")
+            ends = ((key, steps["state", key], steps["next", "state", key]) for key in keys)
             return env.is_success({key: torch.lerp(start, end, fraction) for key, start, end in ends})
 
     low, happened = torch.zeros_like(high), inside(high)
@@ -121,9 +119,8 @@ def test_gradients_in_actions_and_start_are_those_of_the_return_in_continuous_ti
         """The returns of another flight; all that the task pays is what its events pay, and its dense terms."""
         with torch.no_grad():
             moved = flight(env, state.clone().update(dict(zip(names, values[1:], strict=True))), values[0])
-            fraction, happened = bisected(
-                env, moved
-            )  # what events pay, and the dense terms at these rates in their steps
+            fraction, happened = bisected(env, moved)
+            # What events pay, and the dense terms at these rates in their steps.
             paid = EVENT_PAYS[task] * GAMMA**fraction + fraction * before + (1.0 - fraction) * after
             events = (counted(moved) * happened * paid).sum((1, 2))
             terms = moved["next", "reward_terms"].items()
@@ -141,8 +138,7 @@ def test_gradients_in_actions_and_start_are_those_of_the_return_in_continuous_ti
                 values[i] = values[i] + step * size * direction.view_as(grad)
                 along[step] = reference(values)[part]
             expected = (8.0 * (along[1] - along[-1]) - (along[2] - along[-2])) / (12.0 * size)
-            slope = (grad.flatten(1) * direction).sum(1)
-            torch.testing.assert_close(slope, expected, rtol=1e-6, atol=1e-12)
+            torch.testing.assert_close((grad.flatten(1) * direction).sum(1), expected, rtol=1e-6, atol=1e-12)
 
 
 @each_task

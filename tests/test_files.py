@@ -7,6 +7,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from refusals import refuses
 
 from torchrl_quad import files
 from torchrl_quad.files import add_rows, locked, make_folder, read_rows, replacing, replacing_folder, write_rows
@@ -69,8 +70,7 @@ def test_what_is_neither_file_nor_folder_is_refused_and_stays(write, make, tmp_p
     path = tmp_path / "place"
     make(path)
     before = everything_in(tmp_path)
-    with pytest.raises(FileExistsError, match=rf"{path} is a (pipe|socket|link|folder|file), and no"):
-        write(path)
+    refuses(rf"{path} is a (pipe|socket|link|folder|file), and no", write, path, error=FileExistsError)
     assert everything_in(tmp_path) == before
 
 
@@ -95,8 +95,7 @@ def test_threads_and_nested_writers_of_one_file_do_not_meet(tmp_path):
     with replacing(path) as outer:
         outer.write_text("outer")
         write_a_file(path)
-    assert path.read_text() == "outer"
-    assert list(tmp_path.iterdir()) == [path]
+    assert path.read_text() == "outer" and list(tmp_path.iterdir()) == [path]
 
 
 def test_leftovers_of_dead_processes_go_and_those_of_other_machines_and_the_living_stay(tmp_path, monkeypatch):
@@ -121,9 +120,8 @@ def test_processes_that_add_to_one_table_lose_no_row(tmp_path):
     )
     running = [subprocess.Popen([sys.executable, "-c", program, path, str(who)]) for who in range(4)]
     assert [process.wait() for process in running] == [0] * 4
-    assert sorted((row["who"], int(row["i"])) for row in read_rows(path)) == [
-        (str(w), i) for w in range(4) for i in range(20)
-    ]
+    wanted = [(str(w), i) for w in range(4) for i in range(20)]
+    assert sorted((row["who"], int(row["i"])) for row in read_rows(path)) == wanted
     assert list(tmp_path.iterdir()) == [path]
     add_rows(path, [{"who": "2", "i": 3, "own2": 5}], same=("who", "i"))
     assert [row["own2"] for row in read_rows(path) if (row["who"], row["i"]) == ("2", "3")] == ["5"]

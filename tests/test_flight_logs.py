@@ -6,20 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from log_writers import END, OURS, TABLE, G, flight, matrix, own_table, write_csv
+from refusals import refuses
 
 from torchrl_quad.errors import UserError, UserValueError
-from torchrl_quad.identification import (
-    LAYOUTS,
-    Columns,
-    LogError,
-    MissingColumns,
-    NoFlight,
-    UnreadableLog,
-    WrongFrame,
-    WrongQuaternion,
-    WrongUnit,
-    read_log,
-)
+from torchrl_quad.identification import LAYOUTS, Columns, LogError, MissingColumns, NoFlight, read_log
+from torchrl_quad.identification.errors import UnreadableLog, WrongFrame, WrongQuaternion, WrongUnit
 
 FLIGHT = Path(__file__).parent.parent / "examples" / "data" / "figure8.csv.gz"
 GYRO = ("imu_gyro_x", "imu_gyro_y", "imu_gyro_z")
@@ -55,8 +46,7 @@ def scaled(table, names, factor):
 
 def test_a_real_flight_is_read_in_our_units_frames_and_orders(table):
     log = read_log(FLIGHT)
-    assert log.name == "figure8"
-    assert log.dt == pytest.approx(0.01)
+    assert log.name == "figure8" and log.dt == pytest.approx(0.01)
     np.testing.assert_allclose(np.diff(log.time), 0.01, rtol=0, atol=1e-9)
     assert all(x.dtype == np.float64 for x in (log.position, log.quaternion, log.motor_command))
     k = 700
@@ -70,8 +60,7 @@ def test_a_real_flight_is_read_in_our_units_frames_and_orders(table):
     np.testing.assert_allclose(np.linalg.norm(log.quaternion, axis=-1), 1.0)
     assert ((log.quaternion[1:] * log.quaternion[:-1]).sum(-1) > 0.9).all()
     assert 2.9 < log.battery_voltage.min() < log.battery_voltage.max() < 4.3
-    assert np.abs(log.setpoint["yaw"]).max() < np.pi
-    assert log.setpoint["position"].shape == log.position.shape
+    assert np.abs(log.setpoint["yaw"]).max() < np.pi and log.setpoint["position"].shape == log.position.shape
     assert log.onboard == ("angular_velocity", "acceleration", "motor_command", "battery_voltage", "setpoint")
 
     # The ground, take-off and landing are cut out, and said.
@@ -141,8 +130,7 @@ def test_without_a_gyro_the_lean_of_the_drone_tells_a_wrong_quaternion(table, re
     log = read(drop=GYRO)
     assert "no gyro: angular_velocity was derived from the attitude" in log.notes
     assert "angular_velocity" not in log.onboard
-    measured = read().angular_velocity
-    assert np.corrcoef(log.angular_velocity[300:800, 1], measured[300:800, 1])[0, 1] > 0.7
+    assert np.corrcoef(log.angular_velocity[300:800, 1], read().angular_velocity[300:800, 1])[0, 1] > 0.7
     for fault in ("world to body", "scalar first"):
         with pytest.raises(LogError, match="leans where the drone accelerates") as caught:
             read(FAULTS[fault][0](table), drop=GYRO)
@@ -196,8 +184,7 @@ def test_a_mapping_replaces_entries_of_a_preset_and_nothing_else(table, read):
 
 def test_the_delay_of_the_on_board_clock_is_seen_and_left_to_the_fit(table, read):
     lag = 8  # samples
-    late = {name: np.roll(table[name], lag) for name in (*GYRO, *FORCE, *MOTORS)}
-    plain, shifted = read(), read(late)
+    plain, shifted = read(), read({name: np.roll(table[name], lag) for name in (*GYRO, *FORCE, *MOTORS)})
     told = [float(str(log).split("correlation")[1].split("ms late")[0].split()[1]) for log in (plain, shifted)]
     assert told[1] - told[0] == pytest.approx(80.0, abs=8.0)
     np.testing.assert_allclose(shifted.angular_velocity[lag:-lag], plain.angular_velocity[: -2 * lag], atol=1e-9)
@@ -208,15 +195,10 @@ def test_what_holds_no_flight_or_not_what_was_asked_for_is_refused_by_name(read)
         (NoFlight, "share 0.14 s", {"rows": slice(0, 15)}),
         (NoFlight, "never for 60 s", {"min_duration": 60.0}),
         (MissingColumns, "Unknown layout 'betaflight'. Choose from: nanobench", {"columns": "betaflight"}),
-        (
-            MissingColumns,
-            "no column volts, named for battery_voltage",
-            {"columns": {"battery_voltage": "volts"}},
-        ),
+        (MissingColumns, "no column volts, named for battery_voltage", {"columns": {"battery_voltage": "volts"}}),
         (MissingColumns, "no column s of the time. There are: t, ", {"columns": {"time": "s"}}),
     ):
-        with pytest.raises(error, match=message):
-            read(**options)
+        refuses(message, read, error=error, **options)
 
 
 # -- tables of a flight whose every quantity is known ------------------------------------------------------------------
@@ -258,8 +240,7 @@ def test_a_mapping_reads_any_table_and_rates_are_matched(tmp_path):
         (MissingColumns, "has no motor_command", path, without),
         (UnreadableLog, "twice.csv has several columns of one name: wy. Rename them", twice, twin),
     ):
-        with pytest.raises(error, match=message):
-            read_log(file, columns)
+        refuses(message, read_log, file, columns, error=error)
 
 
 def test_what_is_faster_than_the_log_does_not_alias(tmp_path):
@@ -298,14 +279,12 @@ def test_euler_angles_and_velocities_of_the_body_become_ours(tmp_path):
     log = read_log(path, {**turned, "velocity_body": OURS["velocity"], "euler": euler})
     np.testing.assert_allclose(log.velocity, true["velocity"], atol=1e-6)
     np.testing.assert_allclose(np.abs((log.quaternion * true["quaternion"]).sum(-1)), 1.0, atol=1e-7)
-    with pytest.raises(WrongFrame, match='"velocity_body"'):
-        read_log(path, TABLE)
+    refuses('"velocity_body"', read_log, path, TABLE, error=WrongFrame)
     rates = np.einsum("nij,nj->ni", r, true["angular_velocity"])
     with pytest.raises(WrongFrame, match="in the world frame"):
         read_log(write_csv(path, own_table(t, angular_velocity=rates)), TABLE)
     write_csv(path, own_table(t, motor_command=2000.0 * true["motor_command"]))
-    with pytest.raises(WrongUnit, match="offset=1000"):
-        read_log(path, TABLE)
+    refuses("offset=1000", read_log, path, TABLE, error=WrongUnit)
     few = {k: v for k, v in TABLE.items() if k in ("time", "position", "quaternion")}
     log = read_log(path, few | {"motor_command": Columns(OURS["motor_command"], scale=1 / 2000)})
     inside = slice(*log.segments[0])
@@ -317,16 +296,7 @@ HUGE = 10**400  # more than a float holds
 BAD_ARGUMENTS = {
     **dict.fromkeys(("clearance", "max_gap", "min_duration"), (np.nan, -1, True, "a", HUGE)),
     "dt": (np.nan, np.inf, 0, 1e-9, 0.5, HUGE, [1.0], np.array([1.0, 2.0])),
-    "columns": (
-        5,
-        b"px4",
-        ["x"],
-        {1: "x"},
-        {"time": 5},
-        {"position": [1, 2, 3]},
-        {"velocity": None},
-        {"euler": {"a": 1}},
-    ),
+    "columns": (5, b"px4", ["x"], {1: "x"}, {"time": 5}, {"position": [1, 2]}, {"velocity": None}, {"euler": {"a": 1}}),
     "convention": ("px4", 5, {}),
     "onboard": ("setpoint", 5, ["speed"], [None], {"position": 1}),
     "path": (None, 5, b"a.csv", ["a.csv"], "", "a\0b", "a" * 5000, "two\nlines.csv"),
@@ -351,8 +321,7 @@ def test_columns_and_layouts_say_which_of_their_fields_is_wrong():
         for value in values:
             with pytest.raises(UserValueError, match=f"Columns: {field} of a, b, c must be a number, or one for each"):
                 Columns(("a", "b", "c"), **{field: value})
-    with pytest.raises(UserValueError, match="names must be the names of columns, got 5"):
-        Columns(5)
+    refuses("names must be the names of columns, got 5", Columns, 5, error=UserValueError)
     for changes, message in (
         ({"columns": {"position": ("x", "y", "z")}}, "position takes 3 column.* got 1: x"),
         ({"columns": {"position": (5,)}}, "columns: 'position' takes the name of a column"),
@@ -360,5 +329,4 @@ def test_columns_and_layouts_say_which_of_their_fields_is_wrong():
         ({"convention": "px4"}, "convention must be one of torchrl_quad.deploy.frames, got 'px4'"),
         ({"time": Columns(("s", "ns"))}, "time takes 1 column.* got 2: s, ns"),
     ):
-        with pytest.raises(UserError, match=message):
-            replace(LAYOUTS["nanobench"], **changes)
+        refuses(message, replace, LAYOUTS["nanobench"], error=UserError, **changes)

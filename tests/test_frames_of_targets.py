@@ -4,6 +4,7 @@ import struct
 
 import numpy as np
 import pytest
+from refusals import cases, refuses
 
 from torchrl_quad.deploy import frames
 
@@ -83,16 +84,13 @@ def test_aerospace_frames_by_hand(make):
         assert_to(enu, name, (1, 2, 3), (1, -2, -3))
 
 
-def test_body_rates_by_hand():
+def test_body_rates_and_worlds_with_z_up_by_hand():
     """On sticks roll right, nose down and turning right are positive, in degrees; so in cflib's send_setpoint."""
     for target in (frames.betaflight(), frames.crazyflie()):
         assert_to(target, "body_rate", (np.pi, np.pi, np.pi), (180, 180, -180))
     assert_to(frames.crazyflie(manual=True), "body_rate", (0, np.pi, np.pi), (0, 180, 180))
     for target in (frames.mavros(), frames.mujoco(), frames.rotorpy(), frames.crazyflow()):
         assert_to(target, "body_rate", (1, 2, 3), (1, 2, 3))
-
-
-def test_worlds_with_z_up_by_hand():
     for target in (frames.crazyflie(), frames.mavros(), frames.rotorpy(), frames.crazyflow()):
         for ours, theirs in ((ROLL, (S, 0, 0, S)), (NOSE_DOWN, (0, S, 0, S)), (LEFT, (0, 0, S, S))):
             assert_to(target, "quaternion", ours, theirs)
@@ -106,14 +104,11 @@ def test_worlds_with_z_up_by_hand():
 FL, BL, BR, FR = range(4)
 
 
-@pytest.mark.parametrize(
-    ("targets", "places"),
-    [
-        ((frames.px4(), frames.ardupilot(), frames.betaflight(sitl=True)), (FR, BL, FL, BR)),
-        ((frames.betaflight(),), (BR, FR, BL, FL)),
-        ((frames.crazyflie(), frames.crazyflow()), (FR, BR, BL, FL)),
-        ((frames.rotorpy(),), (FL, FR, BR, BL)),
-    ],
+@cases(
+    ((frames.px4(), frames.ardupilot(), frames.betaflight(sitl=True)), (FR, BL, FL, BR)),
+    ((frames.betaflight(),), (BR, FR, BL, FL)),
+    ((frames.crazyflie(), frames.crazyflow()), (FR, BR, BL, FL)),
+    ((frames.rotorpy(),), (FL, FR, BR, BL)),
 )
 def test_one_motor_alone_lands_at_its_place(targets, places):
     for target in targets:
@@ -138,33 +133,26 @@ def test_thrust_by_hand():
     command = frames.crazyflie().thrust(0.2, 4 * 0.15)
     assert struct.unpack("<H", struct.pack("<H", command)) == (65535 // 3,)  # as cflib sends it
     assert frames.crazyflie().thrust([0.2, 0.6], 4 * 0.15).tolist() == [65535 // 3, 60000]
-    assert frames.crazyflie_percentage([10001, 60000]).tolist() == [0.0, 100.0]
-    assert frames.mujoco().thrust(1.25) == 1.25
+    assert frames.crazyflie_percentage([10001, 60000]).tolist() == [0.0, 100.0] and frames.mujoco().thrust(1.25) == 1.25
     assert frames.motor_thrust(0.5, 0.4) == pytest.approx(0.4 * 0.25 + 0.6 * 0.5)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: frames.px4("ned"), "Unknown world 'ned'"),
-        (lambda: frames.px4().to({"speed": 1.0}), "Unknown quantity 'speed'. Choose from: position"),
-        (lambda: frames.px4().back({"quaternion": [1, 0, 0]}), r"quaternion must have shape \(..., 4\), got \(3,\)"),
-        (lambda: frames.mujoco().to({"motors": [1, 2, 3, 4]}), "MuJoCo has no order of motors"),
-        (lambda: frames.mavros(thrust_scaling=0.0), "thrust_scaling must be above 0, got 0.0: .* Write its parameter"),
-        (lambda: frames.px4().thrust([1.0, np.nan], 10.0), "newtons must be finite: there is no command for"),
-        (lambda: frames.mujoco().thrust([1.0, np.nan], 10.0), "newtons must be finite: there is no command for"),
-    ],
+@cases(
+    (lambda: frames.px4("ned"), "Unknown world 'ned'"),
+    (lambda: frames.px4().to({"speed": 1.0}), "Unknown quantity 'speed'. Choose from: position"),
+    (lambda: frames.px4().back({"quaternion": [1, 0, 0]}), r"quaternion must have shape \(..., 4\), got \(3,\)"),
+    (lambda: frames.mujoco().to({"motors": [1, 2, 3, 4]}), "MuJoCo has no order of motors"),
+    (lambda: frames.mavros(thrust_scaling=0.0), "thrust_scaling must be above 0, got 0.0: .* Write its parameter"),
+    (lambda: frames.px4().thrust([1.0, np.nan], 10.0), "newtons must be finite: there is no command for"),
+    (lambda: frames.mujoco().thrust([1.0, np.nan], 10.0), "newtons must be finite: there is no command for"),
 )
 def test_what_has_no_meaning_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+    refuses(message, make)
 
 
 @pytest.mark.parametrize("translate", [frames.px4().thrust, frames.px4().newtons])
 def test_a_thrust_without_its_scale_is_refused(translate):
     for full_thrust in (None, 0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(ValueError, match=r"full_thrust must be the thrust \[N\] of the full command of PX4"):
-            translate(0.5, full_thrust)
+        refuses(r"full_thrust must be the thrust \[N\] of the full command of PX4", translate, 0.5, full_thrust)
     for factor in (-0.1, 1.1, np.nan):
-        with pytest.raises(ValueError, match="model_factor must lie from 0 to 1"):
-            translate(0.5, 10.0, factor)
+        refuses("model_factor must lie from 0 to 1", translate, 0.5, 10.0, factor)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from flying import fly
+from refusals import cases, refuses
 from tensordict import TensorDict
 
 from torchrl_quad import HoveringEnv, available_drones, differentiable_rollout, load_drone, make_actor, make_env
@@ -49,8 +50,7 @@ def test_a_neighbour_that_breaks_does_not_reach_what_all_share(drone, integrator
 def test_a_drone_whose_numbers_would_overflow_is_refused():
     tiny = {"mass": 0.0, "inertia": [1e-30] * 3, "motor_time_constant": 1e-9, "gravity": -9.81}
     for field, value in [("mass", 1e9), *tiny.items()]:
-        with pytest.raises(ValueError, match=f"field '{field}' must be between .*, in SI units; got"):
-            load_drone().replace(**{field: value})
+        refuses(f"field '{field}' must be between .*, in SI units; got", load_drone().replace, **{field: value})
 
 
 BROKEN = {"velocity": [nan, 1e30], "position": [float("inf"), 1e30], "target": [1e30], "angular_velocity": [-1e12]}
@@ -81,12 +81,10 @@ def test_a_broken_state_terminates_and_leaks_nothing_into_the_others(dtype, key,
     broken["state", key][2] = value
     flight, (broken_action, broken_mass) = gradients(broken)
     first = flight["next"][:, 0]
-    assert first["terminated"].flatten().tolist() == [False, False, True, False]
-    assert not first["success"][2]
+    assert first["terminated"].flatten().tolist() == [False, False, True, False] and not first["success"][2]
     assert first["reward"][2] == 0
     assert torch.equal(flight["next", "reward"][[0, 1, 3]], clean["next", "reward"][[0, 1, 3]])
-    assert torch.equal(broken_action[[0, 1, 3]], clean_action[[0, 1, 3]])
-    assert broken_action.isfinite().all()
+    assert torch.equal(broken_action[[0, 1, 3]], clean_action[[0, 1, 3]]) and broken_action.isfinite().all()
     torch.testing.assert_close(broken_mass, clean_mass)
 
 
@@ -101,30 +99,25 @@ def test_an_action_beyond_all_bounds_terminates_its_own_environment_only(env):
     assert grad.isfinite().all() and grad.any(1).tolist() == [True, False, True, True]
 
 
-@pytest.mark.parametrize(
-    ("task", "key", "value", "message"),
-    [
-        ("hovering", ("drone", "mass"), 0.0, r"\('drone', 'mass'\) must be finite and between 0.001 and 1000"),
-        ("hovering", "wind", 1e5, "'wind' must be finite and between -300 and 300"),
-        ("hovering", "position", nan, "'position' must be finite and between"),
-        ("hovering", "quaternion", 0.9, "'quaternion' must have unit norm"),
-        ("hovering", "rotor_speed", -1e5, "'rotor_speed' must be finite and between"),
-        ("hovering", "action_queue", nan, "'action_queue' must be finite and between"),
-        ("hovering", "step", LARGEST, "'step' must lie between 0 and 2147483648"),
-        ("racing", "gate", -1, "'gate' must lie between 0 and 3"),
-        ("racing", "pass_step", -2, "'pass_step' must lie between -1"),
-        ("tracking", "phase", 100.0, "'phase' must lie between 0 and 6.283"),
-    ],
+@cases(
+    ("hovering", ("drone", "mass"), 0.0, r"\('drone', 'mass'\) must be finite and between 0.001 and 1000"),
+    ("hovering", "wind", 1e5, "'wind' must be finite and between -300 and 300"),
+    ("hovering", "position", nan, "'position' must be finite and between"),
+    ("hovering", "quaternion", 0.9, "'quaternion' must have unit norm"),
+    ("hovering", "rotor_speed", -1e5, "'rotor_speed' must be finite and between"),
+    ("hovering", "action_queue", nan, "'action_queue' must be finite and between"),
+    ("hovering", "step", LARGEST, "'step' must lie between 0 and 2147483648"),
+    ("racing", "gate", -1, "'gate' must lie between 0 and 3"),
+    ("racing", "pass_step", -2, "'pass_step' must lie between -1"),
+    ("tracking", "phase", 100.0, "'phase' must lie between 0 and 6.283"),
 )
 def test_an_entry_out_of_its_range_is_refused_by_name_and_environment(task, key, value, message):
     env = make_env(task, num_envs=4, **RANDOM)
     td = env.reset()
     td["state", key][2] = value
-    with pytest.raises(ValueError, match=f"no drone can fly from the state of environments 2: {message}"):
-        env.reset(td.copy(), set_state=True)
+    refuses(f"no drone can fly from the state of environments 2: {message}", env.reset, td.copy(), set_state=True)
     env.set_initial_state_source(lambda n: td["state"])
-    with pytest.raises(ValueError, match=f"initial_state_source: no drone can fly .* environments 2: {message}"):
-        env.reset()
+    refuses(f"initial_state_source: no drone can fly .* environments 2: {message}", env.reset)
     others = torch.tensor([[True], [True], [False], [True]])
     env.reset(td.copy().set("_reset", others), set_state=True)  # nobody asks for environment 2
 
@@ -135,11 +128,10 @@ def test_an_entry_of_another_kind_is_refused():
     for key, dtype, kind in [*wrong, ("gate_passed", torch.int64, "bool"), ("velocity", torch.complex64, floating)]:
         td = env.reset()
         td["state", key] = td["state", key].to(dtype)
-        with pytest.raises(ValueError, match=f"state '{key}' must be {kind}, got {dtype}"):
-            env.reset(td, set_state=True)
+        refuses(f"state '{key}' must be {kind}, got {dtype}", env.reset, td, set_state=True)
 
 
-def test_a_state_that_is_not_whole_is_refused_by_a_step_a_rollout_and_a_reset(env):
+def test_a_state_that_is_not_whole_is_refused_by_a_step_a_rollout_a_reset_and_as_a_start(env):
     actor, td = make_actor(env), env.reset()
     short = td.clone()
     short["state", "velocity"] = torch.zeros(4, 2)
@@ -149,15 +141,17 @@ def test_a_state_that_is_not_whole_is_refused_by_a_step_a_rollout_and_a_reset(en
         (TensorDict({**td, "state": torch.zeros(4, 3)}, [4]), "a state is a tensordict, such as .* got Tensor"),
         (short, r"state 'velocity' has shape \(4, 2\), expected \(4, 3\)"),
     ):
-        with pytest.raises(ValueError, match=message):
-            env.step(wrong.copy().set("action", torch.zeros(4, 4)))
-        with pytest.raises(ValueError, match=message):
-            differentiable_rollout(env, actor, wrong, 2)
+        refuses(message, env.step, wrong.copy().set("action", torch.zeros(4, 4)))
+        refuses(message, differentiable_rollout, env, actor, wrong, 2)
         if "state" in wrong:
-            with pytest.raises(ValueError, match=message):
-                env.reset(wrong.copy(), set_state=True)
-    with pytest.raises(ValueError, match='needs a tensordict with the state to set in "state"; got none'):
-        env.reset(set_state=True)
+            refuses(message, env.reset, wrong.copy(), set_state=True)
+    refuses('needs a tensordict with the state to set in "state"; got none', env.reset, set_state=True)
+    with pytest.raises(ValueError, match="initial_state_source must be a function from a number n to n states.*got Te"):
+        env.set_initial_state_source(env.reset())
+    state = env.reset()["state"]
+    for wrong, message in ((state[:2], r"has shape \(2, 3\), expected \(4, 3\)"), (torch.zeros(4), "got Tensor")):
+        env.set_initial_state_source(lambda n, wrong=wrong: wrong)
+        refuses(f"initial_state_source: .*{message}", env.reset)
 
 
 def test_a_reset_copies_and_converts_a_state_of_a_precision_or_device_that_a_step_refuses(env):
@@ -166,8 +160,7 @@ def test_a_reset_copies_and_converts_a_state_of_a_precision_or_device_that_a_ste
     double = TensorDict({"state": state, "action": torch.zeros(4, 4)}, [4])
     elsewhere = TensorDict({"state": td["state"].to("meta"), "action": torch.zeros(4, 4)}, [4])
     for wrong, message in ((double, "torch.float64 on cpu"), (elsewhere, "torch.float32 on meta")):
-        with pytest.raises(ValueError, match=f"state 'position' is {message}, and this environment torch.float32 on"):
-            env.step(wrong)
+        refuses(f"state 'position' is {message}, and this environment torch.float32 on", env.step, wrong)
     with pytest.raises(ValueError, match="on meta, and that of the environment torch.float32 on cpu"):
         differentiable_rollout(env, make_actor(env), td.to("meta"), 2)
     assert env.reset(double, set_state=True)["state", "position"].dtype is torch.float32
@@ -176,13 +169,3 @@ def test_a_reset_copies_and_converts_a_state_of_a_precision_or_device_that_a_ste
     env.reset()["state", "position"][0] = 99.0
     env.reset(td.clone(recurse=False), set_state=True)["state", "position"][0] = 99.0
     assert (td["state"] == kept).all()
-
-
-def test_starts_come_from_a_function_that_gives_whole_states(env):
-    with pytest.raises(ValueError, match="initial_state_source must be a function from a number n to n states.*got Te"):
-        env.set_initial_state_source(env.reset())
-    state = env.reset()["state"]
-    for wrong, message in ((state[:2], r"has shape \(2, 3\), expected \(4, 3\)"), (torch.zeros(4), "got Tensor")):
-        env.set_initial_state_source(lambda n, wrong=wrong: wrong)
-        with pytest.raises(ValueError, match=f"initial_state_source: .*{message}"):
-            env.reset()

@@ -3,7 +3,6 @@
 import copy
 import importlib
 import importlib.metadata
-import subprocess
 import sys
 from functools import partial
 from itertools import combinations
@@ -15,6 +14,8 @@ import torch
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence, data_shares_objects
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from refusals import refuses
+from small_runs import run
 from torchrl import envs as torchrl_envs
 
 import torchrl_quad
@@ -45,9 +46,6 @@ def some_actions(steps, num_envs, seed=0):
     return np.random.default_rng(seed).uniform(-1, 1, (steps, num_envs, 4)).astype(np.float32)
 
 
-# -- registration ------------------------------------------------------------------------------------------------------
-
-
 def test_gymnasium_imports_the_package_by_its_prefix_environments_when_they_are_made_and_what_draws_not_before():
     program = (
         "import contextlib, sys, gymnasium\n"
@@ -59,8 +57,7 @@ def test_gymnasium_imports_the_package_by_its_prefix_environments_when_they_are_
         f"gymnasium.make_vec('torchrl_quad:{HOVERING}', num_envs=2).reset()\n"
         "assert not {'torchrl_quad.render', 'matplotlib'} & set(sys.modules)\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    run(sys.executable, "-c", program)
 
 
 def test_registering_again_changes_nothing_and_warns_of_nothing():
@@ -69,9 +66,6 @@ def test_registering_again_changes_nothing_and_warns_of_nothing():
     plugin.load()()
     importlib.reload(torchrl_quad)
     assert all(gymnasium.spec(name(task)) is specs[task] for task in TASKS)
-
-
-# -- one drone ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -87,16 +81,11 @@ def test_torchrl_can_wrap_the_gymnasium_environment():
         assert env.rollout(5)["next", "reward"].shape == (5, 1)
 
 
-# -- many drones -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_spaces_and_types_are_those_that_gymnasium_expects(task):
     env = gymnasium.make_vec(name(task), num_envs=3)
-    assert isinstance(env, GymVectorEnv)
-    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    assert env.single_action_space == gymnasium.spaces.Box(-1, 1, (4,))
-    assert env.action_space.shape == (3, 4)
+    assert isinstance(env, GymVectorEnv) and env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert env.single_action_space == gymnasium.spaces.Box(-1, 1, (4,)) and env.action_space.shape == (3, 4)
     observation, _ = env.reset(seed=0)
     assert observation in env.observation_space
     observation, reward, *flags, info = env.step(env.action_space.sample())
@@ -117,8 +106,7 @@ def test_episodes_end_and_begin_as_in_gymnasium_s_own_vector_environment(mode):
     singles = [partial(lambda z: sinking(GymEnv("hovering", **options), z), z) for z in heights]
     its = SyncVectorEnv(singles, autoreset_mode=mode)
     assert mine.metadata["autoreset_mode"] == its.metadata["autoreset_mode"]
-    assert mine.observation_space == its.observation_space
-    assert mine.action_space == its.action_space
+    assert mine.observation_space == its.observation_space and mine.action_space == its.action_space
     assert data_equivalence(mine.reset(), its.reset())
     ends = np.zeros((2, 5))
     for actions in some_actions(30, 5):
@@ -142,9 +130,6 @@ def test_a_reset_mask_leaves_the_other_drones_where_they_are():
     after, info = env.reset(options={"reset_mask": mask})
     assert (before != after).any(1).tolist() == info["_success"].tolist() == mask.tolist()
     assert env.now["state", "step"].flatten().tolist() == [3, 0, 3]
-
-
-# -- pictures ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -175,11 +160,7 @@ def test_without_a_render_mode_or_an_episode_there_is_no_picture():
     with pytest.warns(UserWarning, match='draws nothing without render_mode="rgb_array"'):
         assert env.render() is None
     for build in (GymEnv, GymVectorEnv):
-        with pytest.raises(ResetNeeded, match=r"call reset\(\) first"):
-            build("hovering", render_mode="rgb_array").render()
-
-
-# -- random numbers, memory, gradients ---------------------------------------------------------------------------------
+        refuses(r"call reset\(\) first", build("hovering", render_mode="rgb_array").render, error=ResetNeeded)
 
 
 def test_a_seed_repeats_the_flight_and_no_seed_goes_on_drawing():
@@ -190,8 +171,7 @@ def test_a_seed_repeats_the_flight_and_no_seed_goes_on_drawing():
         return np.stack([first, *(env.step(actions)[0] for actions in some_actions(5, 4)), env.reset()[0]])
 
     np.testing.assert_array_equal(fly(5), fly(5))
-    assert (fly(5) != fly(6))[:, :, :3].any((1, 2)).all()
-    assert (fly(5)[0] != fly(None)[0]).any()
+    assert (fly(5) != fly(6))[:, :, :3].any((1, 2)).all() and (fly(5)[0] != fly(None)[0]).any()
 
 
 @pytest.mark.parametrize("options", [{}, {"seed": 3}])
@@ -241,9 +221,6 @@ def test_options_reach_the_torchrl_environment_and_no_gradient_is_kept():
     assert not any(x.requires_grad for x in env.now.values(True, True))
 
 
-# -- limits ------------------------------------------------------------------------------------------------------------
-
-
 def test_the_time_limit_is_the_task_s_own():
     limits = {task: gymnasium.spec(f"torchrl_quad/{task.capitalize()}-v0").max_episode_steps for task in TASKS}
     assert limits == {"hovering": 256, "landing": 256, "racing": 512, "tracking": 512, "forest": 900}
@@ -270,11 +247,7 @@ def test_the_space_of_the_observation_has_the_bounds_of_the_task():
     env = GymVectorEnv("hovering", 1, observe_last_action=True, observation_noise={"position": 100.0})
     assert env.single_observation_space.high[-4:].tolist() == [1, 1, 1, 1]
     observation, _ = env.reset(seed=0)
-    assert observation in env.observation_space
-    assert (abs(observation[0, :3]) == [5, 5, 6]).any()
-
-
-# -- errors ------------------------------------------------------------------------------------------------------------
+    assert observation in env.observation_space and (abs(observation[0, :3]) == [5, 5, 6]).any()
 
 
 def made(*options, **more):
@@ -314,28 +287,24 @@ REFUSED = [
 
 @pytest.mark.parametrize(("call", "message"), REFUSED)
 def test_what_cannot_be_built_reset_or_flown_is_refused(call, message):
-    with pytest.raises(UserError, match=message):
-        call()
+    refuses(message, call, error=UserError)
 
 
 @pytest.mark.parametrize("build", [GymEnv, GymVectorEnv])
 def test_what_cannot_begin_an_episode_is_refused_and_nothing_begins_after_the_end(build):
     env = build("hovering")
     for options, message in (({"seed": -1}, "seed must be "), ({"options": {"seed": 0}}, "options: .* may hold")):
-        with pytest.raises(UserError, match=message):
-            env.reset(**options)
+        refuses(message, env.reset, error=UserError, **options)
     env.close()
     for call in (env.reset, lambda: env.step(env.action_space.sample()), env.render):
-        with pytest.raises(ClosedEnvironmentError, match="has been closed: make another one"):
-            call()
+        refuses("has been closed: make another one", call, error=ClosedEnvironmentError)
 
 
 def test_a_step_outside_an_episode_is_refused():
     env = GymVectorEnv("hovering", 2, autoreset_mode="Disabled", max_episode_steps=1)
     with pytest.raises(ResetNeeded, match=r"begin together: call reset\(\) without reset_mask first"):
         env.reset(options={"reset_mask": [True, False]})
-    with pytest.raises(ResetNeeded, match=r"call reset\(\) first"):
-        env.step(np.zeros((2, 4)))
+    refuses(r"call reset\(\) first", env.step, np.zeros((2, 4)), error=ResetNeeded)
     env.reset()
     env.step(np.zeros((2, 4)))
     env.reset(options={"reset_mask": np.array([True, False])})

@@ -3,29 +3,21 @@
 import dataclasses
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
+from small_runs import ROOT
 
 from benchmarks import identification as benchmark
 from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.dynamics import MotorCommand
 from torchrl_quad.errors import UserError
-from torchrl_quad.identification import (
-    NoFlight,
-    TooShort,
-    estimation,
-    fitting,
-    identify,
-    prediction,
-    prediction_error,
-    read_log,
-)
+from torchrl_quad.identification import NoFlight, TooShort, estimation, fitting, identify, prediction, read_log
 from torchrl_quad.identification.parameters import UNKNOWNS, Model
+from torchrl_quad.identification.prediction import prediction_error
 
-ROOT = Path(__file__).parents[1]
 REAL = ROOT / "examples/data/figure8.csv.gz"
 BRIEF = {"horizon": 0.2, "past": 0.1}
 pytestmark = pytest.mark.usefixtures("quick_fits")
@@ -56,8 +48,7 @@ def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(s
     found = {**result.parameters, **result.ratios}
     tolerance = {"k2/m": 0.01, "arm k2/Jx": 0.04, "arm k2/Jy": 0.04, "kappa k2/Jz": 0.06}
     for name, most in tolerance.items():
-        value = benchmark.truths(truth)[name]
-        assert found[name]["value"] == pytest.approx(value, rel=most), name
+        assert found[name]["value"] == pytest.approx(benchmark.truths(truth)[name], rel=most), name
         assert found[name]["low"] < found[name]["value"] < found[name]["high"]
     assert result.stream_delay[log.name]["value"] == pytest.approx(0.015, abs=0.005)
     assert found["command_delay"]["value"] == pytest.approx(0.010, abs=0.005)
@@ -126,16 +117,11 @@ def test_a_checkpoint_is_of_one_flight_only(real):
 
 def test_what_a_flight_does_not_tell_gets_no_number_but_a_reason(simulated):
     log, truth = simulated
-    hover = dataclasses.replace(
-        log,
-        velocity=0.0 * log.velocity,
-        position=0.0 * log.position + [0.0, 0.0, 1.0],
-        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time), 1)),
-        angular_velocity=0.0 * log.angular_velocity,
-        # What holds this drone: its hover speed over volts.
-        motor_command=np.repeat(1731.3 / (700.0 * log.battery_voltage[:, None]), 4, 1),
-        onboard=(),
-    )
+    level = {"quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time), 1)), "onboard": ()}
+    level |= {"velocity": 0.0 * log.velocity, "angular_velocity": 0.0 * log.angular_velocity}
+    # What holds this drone: its hover speed over volts.
+    held = np.repeat(1731.3 / (700.0 * log.battery_voltage[:, None]), 4, 1)
+    hover = dataclasses.replace(log, position=0.0 * log.position + [0.0, 0.0, 1.0], motor_command=held, **level)
     result = identify(hover, truth, fields=["thrust_map", "linear_drag", "inertia"], iterations=3, draws=0)
     assert set(result.ratios) == {"k2/m"}
     assert result.parameters == {}  # no mass, no numbers that scale with it
@@ -176,13 +162,8 @@ def test_predictions_of_a_drone_that_is_right_are_right_and_of_one_that_drifts_a
     # A flight along a parabola: constant velocity misses it by g t^2 / 2.
     time = real.time
     fall = np.stack((0.0 * time, 0.0 * time, -0.5 * 9.81 * time**2), 1)
-    falling = dataclasses.replace(
-        real,
-        position=fall,
-        velocity=np.gradient(fall, real.dt, axis=0),
-        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)),
-        angular_velocity=np.zeros_like(fall),
-    )
+    level = {"quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)), "angular_velocity": np.zeros_like(fall)}
+    falling = dataclasses.replace(real, position=fall, velocity=np.gradient(fall, real.dt, axis=0), **level)
     missed = prediction_error(falling, "constant_velocity", (0.4,))
     assert missed["position"][0.4] == pytest.approx(0.5 * 9.81 * 0.16, rel=1e-6)
     assert missed["velocity"][0.4] == pytest.approx(9.81 * 0.4, rel=1e-6)
@@ -210,7 +191,7 @@ REFUSED = {  # what a fit, or a prediction, says of an argument
 }  # fmt: skip
 
 
-def test_arguments_of_fits_and_predictions_are_refused_in_one_line(real):
+def test_arguments_of_fits_and_predictions_are_refused_in_one_line_and_a_flight_of_ones_own_must_be_whole(real):
     def flown(*segments):
         return dataclasses.replace(real, segments=segments)
 
@@ -233,26 +214,16 @@ def test_arguments_of_fits_and_predictions_are_refused_in_one_line(real):
         (TooShort, "figure8 has no piece in flight", prediction_error, flown(), "visfly"),
         (NoFlight, "its motor commands are zero", prediction_error, still, no_motors),
         (UserError, "missing key 'nominal_voltage'", load_drone, plain | {"motor_command": {"speed_per_volt": 500.0}}),
-        (
-            UserError,
-            "unknown key 'gain'. Allowed: speed",
-            load_drone,
-            plain | {"motor_command": {"gain": 1.0}},
-        ),
+        (UserError, "unknown key 'gain'. Allowed: speed", load_drone, plain | {"motor_command": {"gain": 1.0}}),
         (UserError, "command must be a mapping .*; got 500.0", load_drone, plain | {"motor_command": 500.0}),
     ):
-        with pytest.raises(error, match=message):
-            call(*arguments)
-
-
-def test_a_flight_of_ones_own_making_must_be_whole(real):
+        refuses(message, call, *arguments, error=error)
     bad = [("position", x) for x in (None, 5, "a", np.zeros(3), np.nan * real.position)]
     bad += [("time", x) for x in (None, 5, "a", np.nan * real.time, real.time[::-1], 100.0 * real.time)]
     bad += [("segments", x) for x in (None, 5, ((5, 3),), ((0, 10**9),), ((-1, 5),), (("a", 5),))]
     bad += [("setpoint", 5), ("name", 5), ("quaternion", real.position), ("onboard", "gyro")]
     for name, value in bad:
-        with pytest.raises(UserError, match=name):
-            dataclasses.replace(real, **{name: value})
+        refuses(name, dataclasses.replace, real, error=UserError, **{name: value})
 
 
 BROKEN = ("{", "[]", "5", '{"stages": 5}', "[" * 100_000, "\xff", '{"fingerprint": "F", "stages": 5}')
@@ -277,8 +248,7 @@ def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
 
 def test_the_recipe_fits_a_real_flight_and_draws_it(launch, refused, tmp_path):
     arguments = [f"logs=[{REAL}]", "mass=0.027", "fields=[linear_drag]", "iterations=1", "draws=5"]
-    said = launch("identify", *arguments, f"folder={tmp_path}/fit")
-    assert "linear_drag.xy" in said
+    assert "linear_drag.xy" in launch("identify", *arguments, f"folder={tmp_path}/fit")
     names = "checkpoint.json drone.yaml prediction.png randomization.yaml report.json residuals.png"
     assert sorted(path.name for path in (tmp_path / "fit").iterdir()) == names.split()
     assert refused("identify", "logs=[none.csv]").startswith("Error: none.csv")

@@ -7,35 +7,18 @@ import pickle
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from tensordict import TensorDict
 from torch import nn
 
-from torchrl_quad import (
-    ABPTLoss,
-    AHACLoss,
-    BPTTLoss,
-    DifferentiableCollector,
-    HoveringEnv,
-    HybridLoss,
-    ObservationNormalizer,
-    SAPOLoss,
-    SHACLoss,
-    TrustRegion,
-    VisitedStateBuffer,
-    audit_reward,
-    compare_gradients,
-    differentiable_rollout,
-    gradient_by_horizon,
-    gradient_statistics,
-    make_actor,
-    make_qvalue,
-    make_value,
-    make_visual_actor,
-    restart,
-)
+from torchrl_quad import DifferentiableCollector, HoveringEnv, ObservationNormalizer, TrustRegion, VisitedStateBuffer
+from torchrl_quad.data import differentiable_rollout, restart
+from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
 from torchrl_quad.engine import ActionSequence
 from torchrl_quad.envs import ForestEnv
 from torchrl_quad.errors import UserError, UserTypeError, UserValueError
+from torchrl_quad.modules import make_actor, make_qvalue, make_value, make_visual_actor
+from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
 from torchrl_quad.options import declared
 
 HOSTILE = [
@@ -129,9 +112,6 @@ def test_what_is_taken_has_finite_losses(calls):
                 assert all(x.isfinite().all() for x in out.values()), (name, option, value)
 
 
-# -- losses of one's own, and copies -----------------------------------------------------------------------------------
-
-
 class Weighted(BPTTLoss):
     """A loss of a user.
 
@@ -149,8 +129,7 @@ def test_a_loss_of_ones_own_is_checked_too(env):
     assert Weighted(actor, weight=np.int64(3)).weight == 3
     with pytest.raises(UserValueError, match="weight must be a whole number, got 'much'. Of everything.$"):
         Weighted(actor, weight="much")
-    with pytest.raises(UserValueError, match="alpha must be at least 0 or be 'auto', got -1"):
-        Weighted(actor, alpha=-1)
+    refuses("alpha must be at least 0 or be 'auto', got -1", Weighted, actor, error=UserValueError, alpha=-1)
     with pytest.raises(UserTypeError, match="Weighted got an unexpected .* 'weigth'. Did you mean 'weight'"):
         Weighted(actor, weigth=2)
 
@@ -163,9 +142,6 @@ def test_a_copy_of_a_loss_computes_the_same(env, way):
     assert list(inspect.signature(Weighted).parameters) == ["actor_network", "weight", "kwargs"]
 
 
-# -- what does not fit -------------------------------------------------------------------------------------------------
-
-
 def test_an_actor_or_a_carry_of_another_environment_is_refused(env, env64):
     actor = make_actor(env)
     forest = ForestEnv(num_envs=2, density=0.02)
@@ -174,8 +150,7 @@ def test_an_actor_or_a_carry_of_another_environment_is_refused(env, env64):
         (env, HoveringEnv(num_envs=2).reset(), r"carry has batch size \(2,\), and the environment \(4,\)"),
         (env, env64.reset(), "'observation' of the carry is torch.float64 on cpu, and that of the env"),
     ):
-        with pytest.raises(UserValueError, match=message):
-            differentiable_rollout(other, actor, carry, 1)
+        refuses(message, differentiable_rollout, other, actor, carry, 1, error=UserValueError)
     rollout, _ = differentiable_rollout(env64, make_actor(env64), None, 2)
     with pytest.raises(UserValueError, match="Critic computes in torch.float32 on cpu, and 'observation' is .*64"):
         SHACLoss(actor, make_value(env)).loss_value(rollout.detach())

@@ -11,17 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from log_writers import END, TABLE, ULOG, flight, matrix, ned, own_table, ulog_message, write_csv, write_ulog, write_usd
+from refusals import refuses
 
-from torchrl_quad.identification import (
-    GapsTooLarge,
-    LogError,
-    MissingColumns,
-    UnreadableLog,
-    WrongUnit,
-    read_log,
-    sources,
-)
+from torchrl_quad.identification import GapsTooLarge, LogError, MissingColumns, read_log, sources
 from torchrl_quad.identification.autopilots import decompress_quaternions, read_ulog
+from torchrl_quad.identification.errors import UnreadableLog, WrongUnit
 
 BATTERY = {"battery_voltage": "/drone/battery.x"}
 TOLERANCES = dict.fromkeys(("position", "quaternion", "motor_command", "battery_voltage"), 2e-3)
@@ -127,8 +121,7 @@ def test_a_usd_log_is_read_in_both_versions_and_without_its_end(version, tmp_pat
     with pytest.raises(WrongUnit, match=r"gyro.x.*degrees"):
         read_log(write_usd(path, events, version), {"angular_velocity": ("gyro.x", "gyro.y", "gyro.z")})
     path.write_bytes(whole.replace(b"gyro.x(f)", b"gyro.x(e)"))
-    with pytest.raises(UnreadableLog, match=r"a variable of unknown type, 'gyro.x\(e\)'.*export it as CSV"):
-        read_log(path)
+    refuses(r"a variable of unknown type, 'gyro.x\(e\)'.*export it as CSV", read_log, path, error=UnreadableLog)
 
 
 def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
@@ -154,8 +147,7 @@ def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
     assert log.battery_voltage is None
     log = type(log)(**{**vars(log), "battery_voltage": flight(log.time)["battery_voltage"]})
     same(log, quaternion=4e-3)
-    events = usd_events(t, times(10)) | {"second": (t, {"gyro.w": ("f", t)})}
-    path = write_usd(tmp_path / "log02", events, 2)
+    path = write_usd(tmp_path / "log02", usd_events(t, times(10)) | {"second": (t, {"gyro.w": ("f", t)})}, 2)
     with pytest.raises(UnreadableLog, match="different streams"):
         read_log(path, {"angular_velocity": ("gyro.x", "gyro.y", "gyro.w")})
 
@@ -234,14 +226,11 @@ def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path):
         ({"battery_voltage": "/drone/batt.x"}, "no topic /drone/batt. Name.*/drone/battery"),
         ({"battery_voltage": "/drone/battery.voltage"}, "lacks a field of .*Its messages have: x, y, z"),
     ):
-        with pytest.raises(MissingColumns, match=message):
-            read_log(file, columns)
+        refuses(message, read_log, file, columns, error=MissingColumns)
     twins = write_bag(tmp_path / "twins.bag", ros2=False, twin="imu")
     with pytest.raises(MissingColumns, match="several topics for angular_velocity: /drone/imu, /drone/imu2. Say which"):
         read_log(twins, BATTERY)
 
-
-# -- damage ------------------------------------------------------------------------------------------------------------
 
 KINDS = {"a.ulg": None, "v1": None, "v2": None, "a.csv": TABLE, "a.csv.gz": TABLE, "a.bag": BATTERY, "a.db3": BATTERY}
 
@@ -393,8 +382,7 @@ def test_a_clock_that_jumps_ahead_is_refused_before_it_is_put_on_a_grid(tmp_path
     write_csv(path, own_table(t)).write_text("t,x,y,z\n" + "".join(f"{x},0,0,0\n" for x in long))
     table = own_table(t)
     path = write_csv(path, {name: np.interp(long % 10.0, t, x) for name, x in table.items()} | {"t": long})
-    with pytest.raises(UnreadableLog, match="Cut it into shorter logs, or give a larger dt"):
-        read_log(path, TABLE, dt=0.001)
+    refuses("Cut it into shorter logs, or give a larger dt", read_log, path, TABLE, error=UnreadableLog, dt=0.001)
 
 
 def test_values_beyond_any_flight_count_as_missing_and_wide_tables_are_read(tmp_path):

@@ -1,4 +1,4 @@
-"""What a run logs, and what it does with numbers that are not finite."""
+"""What a run logs, what it does with numbers that are not finite, and how recipes read what wandb's agent writes."""
 
 import csv
 import json
@@ -7,11 +7,14 @@ from collections import Counter
 
 import pytest
 import yaml
+from conftest import RECIPES
 from omegaconf import OmegaConf
+from refusals import cases
 from small_runs import EVERYTHING, SMALL, assert_equal, poison, rows, stop_at_save
 
 from torchrl_quad.training import loop
 from torchrl_quad.training.checkpoints import read_checkpoint, revision
+from torchrl_quad.training.configuration import hydra_argument
 
 
 def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(launch, tmp_path):
@@ -44,9 +47,8 @@ def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(lau
     assert all("steps" in row for row in history) and not any(name.endswith("/step") for row in history for name in row)
     curves = [row for row in history if "eval/return" in row]
     assert [row["steps"] for row in curves] == [48, 96, 144, 192]
-    names = {name for name in rows(tmp_path)[0] if "/" in name} | {
-        f"time/{name}" for name in ("seconds", "processor_seconds", "steps_per_second")
-    }
+    clock = {f"time/{name}" for name in ("seconds", "processor_seconds", "steps_per_second")}
+    names = {name for name in rows(tmp_path)[0] if "/" in name} | clock
     assert names <= set(curves[0])
     assert {name.split("/")[0] for name in names} == {"train", "eval", "reward", "grad", "time"}
     assert [row["eval/return"] for row in curves] == [row["eval/return"] for row in resumed["rows"][:4]]
@@ -57,12 +59,8 @@ def test_wandb_gets_configuration_metrics_pictures_films_replay_and_artifact(lau
     # The third evaluation and the final one draw the flight; the page comes with the final one alone.
     items = [item for record in first["history"] for item in record.history.item]
     media = [(item.nested_key[0], json.loads(item.value_json)) for item in items if item.nested_key[1:] == ["path"]]
-    kinds = {
-        "eval/flight": (2, b"\x89PNG"),
-        "eval/film": (2, b"\0\0\0 ftyp"),
-        "eval/learning_curve": (1, b"\x89PNG"),
-        "eval/replay": (1, b"<!doctype html>"),
-    }
+    kinds = {"eval/flight": (2, b"\x89PNG"), "eval/film": (2, b"\0\0\0 ftyp")}
+    kinds |= {"eval/learning_curve": (1, b"\x89PNG"), "eval/replay": (1, b"<!doctype html>")}
     assert Counter(name for name, path in media) == {name: count for name, (count, _) in kinds.items()}
     for name, path in media:
         assert (logs[0].parent / "files" / path).read_bytes().startswith(kinds[name][1]), name
@@ -137,9 +135,6 @@ def test_a_run_with_diagnostics_learns_the_same_bit_for_bit_and_logs_them(recipe
         assert float(second["grad/variance"]) > 0 and float(second["grad/cosine"]) <= 1
 
 
-# -- numbers that are not finite ---------------------------------------------------------------------------------------
-
-
 def test_an_update_that_is_not_finite_is_left_out_and_counted(train, tmp_path, monkeypatch):
     poison(monkeypatch, 0, 3, 4)
     checkpoint = train("bptt", tmp_path, "env.drone=small_racer")
@@ -170,3 +165,37 @@ def test_a_run_draws_no_flight_twice(launch, no_pictures, monkeypatch, tmp_path)
     small = [*SMALL, "total_steps=48", "eval.interval=1", f"hydra.run.dir={tmp_path}"]
     launch("bptt", *small, "logger.flight_every=1")
     assert drawn == [4, 256]  # after the first iteration, and the best policy at the end
+
+
+@pytest.mark.parametrize("style", ["args", "args_no_hyphens"])
+def test_a_sweep_hands_over_mappings_and_null_as_people_write_them(train, tmp_path, style):
+    from wandb.sdk.launch.sweeps.utils import create_sweep_command_args
+
+    text = (RECIPES / "sweep.yaml").read_text().split("\n", 1)[1]
+    assert text in (RECIPES.parent / "docs/wandb.md").read_text()  # the page shows the file
+    sweep = yaml.safe_load(text)
+    assert sweep["program"] == "recipes/abpt.py" and sweep["metric"] == {"name": "best/return", "goal": "maximize"}
+    last = -1 if style == "args" else 0
+    values = {name: x.get("values", [x.get("value", 0.01)])[last] for name, x in sweep["parameters"].items()}
+    arguments = create_sweep_command_args({"args": {name: {"value": value} for name, value in values.items()}})[style]
+    arguments = [x for x in arguments if "logger." not in x]
+    checkpoint = train("abpt", tmp_path, *arguments, "total_steps=24", "horizon=6", "--logger.backend=None")
+    cfg = OmegaConf.create(checkpoint["config"])
+    assert cfg.env.wind == {"mean": [1.0, 0.0, 0.0], "gust": 0.5} and cfg.actor.lr == 0.01
+    assert cfg.env.randomize == values["env.randomize"] == (None if last == 0 else {"mass": {"scale": [0.8, 1.2]}})
+
+
+@cases(
+    ('env.wind={"mean": [1, 0.5, -1e-05], "gust": null}', "env.wind={mean: [1, 0.5, -1e-05], gust: null}"),
+    ("+a={'b c': \"it's\", 'd': True}", r"""+a={b\ c: "it's", d: True}"""),
+    ("a=None,{'b': [1, 2]}", "a=null,{b: [1, 2]}"),  # a sweep of hydra's
+    ("--actor.num_cells=[32, 32]", "actor.num_cells=[32, 32]"),
+    ("env.wind={mean: [1, 0, 0]}", "env.wind={mean: [1, 0, 0]}"),
+    *((x, x) for x in ("env.drone=None_of_them", "--config-name=abpt", "--cfg=job", "--multirun", "~env.wind")),
+)
+def test_arguments_come_in_the_grammar_of_hydra(written, read):
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    assert hydra_argument(written) == read == hydra_argument(read)
+    if not read.startswith("--"):
+        OverridesParser.create().parse_override(read)

@@ -6,28 +6,18 @@ import textwrap
 
 import pytest
 import torch
+from refusals import cases, refuses
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from test_objectives import GAMMA, make_networks, make_rollout
 from torch import nn
 from torchrl.envs import PendulumEnv
-from torchrl.modules import MLP
+from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SoftUpdate, ValueEstimators
 
-from torchrl_quad import (
-    ABPTLoss,
-    AHACLoss,
-    BPTTLoss,
-    HoveringEnv,
-    HybridLoss,
-    SAPOLoss,
-    SHACLoss,
-    VisitedStateBuffer,
-    differentiable_rollout,
-    make_actor,
-    make_qvalue,
-    make_value,
-)
+from torchrl_quad import HoveringEnv, VisitedStateBuffer, differentiable_rollout
 from torchrl_quad.errors import UserError
+from torchrl_quad.modules import make_actor, make_qvalue, make_value
+from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
 
 
 @pytest.fixture
@@ -121,8 +111,7 @@ def test_a_critic_may_see_more_than_the_actor():
     value = make_value(env, in_keys=["observation", ("state", "rotor_speed")])
     rollout, _ = differentiable_rollout(env, actor, None, 3)
     loss = SHACLoss(actor, value)
-    assert ("next", "state", "rotor_speed") in loss.in_keys
-    assert loss(rollout)["loss_value"].isfinite()
+    assert ("next", "state", "rotor_speed") in loss.in_keys and loss(rollout)["loss_value"].isfinite()
 
 
 def test_keys_can_be_renamed():
@@ -135,8 +124,7 @@ def test_keys_can_be_renamed():
     for old, new in (("reward", "gain"), ("terminated", "crashed"), ("done", "over")):
         rollout.rename_key_(("next", old), ("next", new))
     result = loss(rollout)
-    assert result["loss_actor"] == expected["loss_actor"]
-    assert result["loss_value"] == expected["loss_value"]
+    assert result["loss_actor"] == expected["loss_actor"] and result["loss_value"] == expected["loss_value"]
     assert "goal" in loss.write_value_target(rollout)
 
 
@@ -182,62 +170,48 @@ def test_the_example_of_a_loss_is_short_and_runs(loss):
     assert all(p.grad.isfinite().all() and p.grad.any() for p in names["loss"].actor_network_params.parameters())
 
 
-# -- what they refuse -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("cls", "options", "message"),
-    [
-        (ABPTLoss, {"alpha": -1.0}, "alpha must be at least 0 or be 'auto', got -1.0. The coefficient of the entropy"),
-        (ABPTLoss, {"alpha": float("inf")}, "alpha must be a finite number or be 'auto', got inf"),
-        (ABPTLoss, {"alpha": "automatic"}, "alpha must be a number or be 'auto', got 'automatic'"),
-        (ABPTLoss, {"alpha_init": 0.0}, "alpha_init must be greater than 0, got 0.0. What alpha=auto starts"),
-        (ABPTLoss, {"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
-        (ABPTLoss, {"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
-        (ABPTLoss, {"n_step_return": "abc"}, "n_step_return must be true or false, got 'abc'. Whether J includes J_N"),
-        (ABPTLoss, {"num_qvalue_nets": 0}, "num_qvalue_nets must be at least 1, got 0. The critics made from it"),
-        (ABPTLoss, {"num_qvalue_nets": 2.5}, "num_qvalue_nets must be a whole number, got 2.5"),
-        (ABPTLoss, {"simulated_steps": -1}, "simulated_steps must be at least 0, got -1. Control steps"),
-        (SAPOLoss, {"alpha": 0.0}, "alpha must be greater than 0 or be 'auto', got 0.0. .* without .* take SHACLoss"),
-        (SAPOLoss, {"target_entropy": 1.0}, "must be at most -0.001 or be 'auto', got 1.0. .* a negative number"),
-        (SAPOLoss, {"target_entropy": "low"}, "target_entropy must be a number or be 'auto', got 'low'"),
-        (SAPOLoss, {"num_value_nets": 0}, "num_value_nets must be at least 1, got 0"),
-        (SAPOLoss, {"delay_value": True}, "SAPOLoss sets delay_value itself: leave it out, or take SHACLoss"),
-        (AHACLoss, {"horizon": 4, "min_horizon": 8}, "horizon=4 must lie between min_horizon=8 and max_horizon=8"),
-        (AHACLoss, {"horizon": 0}, "horizon must be at least 1, got 0. Control steps of the first rollout"),
-        (AHACLoss, {"max_stiffness": 1.0}, "max_stiffness must be greater than 1, got 1.0. .*1.5 to 5 are usual"),
-        (AHACLoss, {"horizon_lr": 1.0}, "horizon_lr must be less than 1, got 1.0"),
-        (HybridLoss, {"gradient_lmbda": 0.0}, "gradient_lmbda must be greater than 0"),
-        (HybridLoss, {"clip_epsilon": 1.0}, "clip_epsilon must be less than 1"),
-        (HybridLoss, {"entropy_coeff": -0.1}, "entropy_coeff must be at least 0"),
-        (HybridLoss, {"decay": 1.0}, "decay must be less than 1"),
-    ],
+@cases(
+    (ABPTLoss, {"alpha": -1.0}, "alpha must be at least 0 or be 'auto', got -1.0. The coefficient of the entropy"),
+    (ABPTLoss, {"alpha": float("inf")}, "alpha must be a finite number or be 'auto', got inf"),
+    (ABPTLoss, {"alpha_init": 0.0}, "alpha_init must be greater than 0, got 0.0. What alpha=auto starts"),
+    (ABPTLoss, {"reduction": "median"}, "reduction must be 'mean', 'sum' or 'none', got 'median'"),
+    (ABPTLoss, {"n_step_return": False, "zero_step_return": False}, "with both off there is no objective"),
+    (ABPTLoss, {"n_step_return": "abc"}, "n_step_return must be true or false, got 'abc'. Whether J includes J_N"),
+    (ABPTLoss, {"num_qvalue_nets": 0}, "num_qvalue_nets must be at least 1, got 0. The critics made from it"),
+    (ABPTLoss, {"simulated_steps": -1}, "simulated_steps must be at least 0, got -1. Control steps"),
+    (SAPOLoss, {"alpha": 0.0}, "alpha must be greater than 0 or be 'auto', got 0.0. .* without .* take SHACLoss"),
+    (SAPOLoss, {"target_entropy": 1.0}, "must be at most -0.001 or be 'auto', got 1.0. .* a negative number"),
+    (SAPOLoss, {"num_value_nets": 0}, "num_value_nets must be at least 1, got 0"),
+    (SAPOLoss, {"delay_value": True}, "SAPOLoss sets delay_value itself: leave it out, or take SHACLoss"),
+    (AHACLoss, {"horizon": 4, "min_horizon": 8}, "horizon=4 must lie between min_horizon=8 and max_horizon=8"),
+    (AHACLoss, {"horizon": 0}, "horizon must be at least 1, got 0. Control steps of the first rollout"),
+    (AHACLoss, {"max_stiffness": 1.0}, "max_stiffness must be greater than 1, got 1.0. .*1.5 to 5 are usual"),
+    (AHACLoss, {"horizon_lr": 1.0}, "horizon_lr must be less than 1, got 1.0"),
+    (HybridLoss, {"gradient_lmbda": 0.0}, "gradient_lmbda must be greater than 0"),
+    (HybridLoss, {"clip_epsilon": 1.0}, "clip_epsilon must be less than 1"),
+    (HybridLoss, {"entropy_coeff": -0.1}, "entropy_coeff must be at least 0"),
+    (HybridLoss, {"decay": 1.0}, "decay must be less than 1"),
 )
 def test_bad_arguments_say_what_is_allowed(cls, options, message):
     actor, value, qvalue = make_networks()
-    with pytest.raises(UserError, match=message):
-        cls(actor, qvalue if cls is ABPTLoss else value, **options)
+    refuses(message, cls, actor, qvalue if cls is ABPTLoss else value, error=UserError, **options)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda _, shac: shac.make_value_estimator(gamma=2.0), "gamma must be at most 1, got 2.0"),
-        (lambda _, shac: shac.make_value_estimator(lmbda=-0.1), "lmbda must be at least 0, got -0.1"),
-        (lambda bptt, _: bptt.make_value_estimator(lmbda=0.9), "BPTTLoss estimates .* TD1: .*argument 'lmbda'"),
-        (lambda _, shac: shac.make_value_estimator(lambda_=0.9), "by TDLambda: .*argument 'lambda_'"),
-        (lambda _, shac: shac.make_value_estimator("abc"), "not implemented for loss SHACLoss. Choose from: td0"),
-        (lambda _, shac: shac.set_keys(value_target=5), "value_target must be the name of an entry, .*, got 5"),
-        (lambda _, shac: shac.set_keys(rewards="gain"), "SHACLoss reads no 'rewards'. Choose from: "),
-        (lambda *_: BPTTLoss(nn.Linear(13, 4)), "actor_network must be a TensorDictModule, got Linear. Wrap a plain"),
-        (lambda bptt, _: SHACLoss(bptt.actor_network, nn.Linear(1, 1)), "value_network must be .*, got Linear"),
-        (lambda bptt, _: bptt((1, 2)), "BPTTLoss needs a rollout, the tensordict that .* returns; got tuple"),
-    ],
+@cases(
+    (lambda _, shac: shac.make_value_estimator(gamma=2.0), "gamma must be at most 1, got 2.0"),
+    (lambda _, shac: shac.make_value_estimator(lmbda=-0.1), "lmbda must be at least 0, got -0.1"),
+    (lambda bptt, _: bptt.make_value_estimator(lmbda=0.9), "BPTTLoss estimates .* TD1: .*argument 'lmbda'"),
+    (lambda _, shac: shac.make_value_estimator(lambda_=0.9), "by TDLambda: .*argument 'lambda_'"),
+    (lambda _, shac: shac.make_value_estimator("abc"), "not implemented for loss SHACLoss. Choose from: td0"),
+    (lambda _, shac: shac.set_keys(value_target=5), "value_target must be the name of an entry, .*, got 5"),
+    (lambda _, shac: shac.set_keys(rewards="gain"), "SHACLoss reads no 'rewards'. Choose from: "),
+    (lambda *_: BPTTLoss(nn.Linear(13, 4)), "actor_network must be a TensorDictModule, got Linear. Wrap a plain"),
+    (lambda bptt, _: SHACLoss(bptt.actor_network, nn.Linear(1, 1)), "value_network must be .*, got Linear"),
+    (lambda bptt, _: bptt((1, 2)), "BPTTLoss needs a rollout, the tensordict that .* returns; got tuple"),
 )
 def test_losses_and_estimators_take_what_fits_alone(call, message):
     actor, value, _ = make_networks()
-    with pytest.raises(UserError, match=message):
-        call(BPTTLoss(actor), SHACLoss(actor, value))
+    refuses(message, call, BPTTLoss(actor), SHACLoss(actor, value), error=UserError)
 
 
 def test_a_rollout_without_its_graph_is_refused_with_advice():
@@ -245,8 +219,7 @@ def test_a_rollout_without_its_graph_is_refused_with_advice():
     detached = make_rollout(actor).detach()
     abpt = ABPTLoss(actor, qvalue), ABPTLoss(actor, qvalue, n_step_return=False)
     for loss in (BPTTLoss(actor), SHACLoss(actor, value), *abpt):
-        with pytest.raises(RuntimeError, match="carries no gradient.*Use differentiable_rollout"):
-            loss.loss_actor(detached)
+        refuses("carries no gradient.*Use differentiable_rollout", loss.loss_actor, detached, error=RuntimeError)
         with torch.no_grad():
             loss.loss_actor(detached)
     with pytest.raises(RuntimeError, match="Build the actor with return_log_prob=True"):
@@ -259,8 +232,7 @@ def test_a_rollout_without_a_time_dimension_is_refused(env, flight):
     wrong = [(rollout[:, 0], "4,"), (rollout.reshape(-1), "12,"), (rollout[:, :0], "4, 0"), (carry, "4,")]
     for loss in losses(env):
         for data, shape in (*wrong, (rollout.transpose(0, 1), "3, 4")):
-            with pytest.raises(ValueError, match=message.format(type(loss).__name__, shape)):
-                loss(data)
+            refuses(message.format(type(loss).__name__, shape), loss, data)
         loss(rollout[0])  # a single flight, whose dimension has the name of time
 
 
@@ -271,28 +243,21 @@ def test_a_rollout_that_lacks_an_entry_is_refused(env, flight, key):
     for loss in losses(env):
         if key in loss.in_keys or key == "next":
             named = "reads .*'next'" if key == "next" else f"reads {key!r}".replace("(", r"\(").replace(")", r"\)")
-            with pytest.raises(ValueError, match=f"{type(loss).__name__} {named}.*not in the rollout.*set_keys"):
-                loss(flight[0].exclude(key))
+            refuses(f"{type(loss).__name__} {named}.*not in the rollout.*set_keys", loss, flight[0].exclude(key))
 
 
-def test_an_entry_of_another_shape_is_refused(env, flight):
+def test_an_entry_of_another_shape_a_wrong_tensor_key_and_a_rollout_on_another_device_are_refused(env, flight):
     for loss in losses(env):
         for key in ("reward", "done", "terminated"):
             wrong = flight[0].copy()
             wrong["next"] = wrong["next"].copy().set(key, wrong["next", key].squeeze(-1))
-            with pytest.raises(ValueError, match=rf"'{key}'\) of shape \(4, 3, 1\) in this rollout; got \(4, 3\)"):
-                loss(wrong)
+            refuses(rf"'{key}'\) of shape \(4, 3, 1\) in this rollout; got \(4, 3\)", loss, wrong)
     with pytest.raises(ValueError, match=r"'value_target' has shape \(4, 3\), and the critic's pred.* \(4, 3, 1\)"):
         losses(env)[1](flight[0].copy().set("value_target", torch.zeros(4, 3)))
-
-
-def test_a_wrong_tensor_key_and_a_rollout_on_another_device_are_refused(env, flight):
     for loss in losses(env):
-        with pytest.raises(ValueError, match="is on cpu, and the rollout on meta: loss.to.'meta'. moves it"):
-            loss(flight[0].to("meta"))
+        refuses("is on cpu, and the rollout on meta: loss.to.'meta'. moves it", loss, flight[0].to("meta"))
         loss.set_keys(reward="gain")
-        with pytest.raises(ValueError, match=r"reads \('next', 'gain'\), which is not in the rollout. If it has"):
-            loss(flight[0])
+        refuses(r"reads \('next', 'gain'\), which is not in the rollout. If it has", loss, flight[0])
 
 
 def test_swapped_networks_are_refused(env, flight):
@@ -302,11 +267,7 @@ def test_swapped_networks_are_refused(env, flight):
         (ABPTLoss(actor, value), "'state_action_value' of its qvalue_network", "state_value"),
         (SHACLoss(value, actor), "'state_value' of its value_network", "loc, scale, action"),
     ):
-        with pytest.raises(ValueError, match=f"reads {reads}, which writes {writes}. Give another network, or set"):
-            loss(flight[0])
-
-
-# -- another environment -----------------------------------------------------------------------------------------------
+        refuses(f"reads {reads}, which writes {writes}. Give another network, or set", loss, flight[0])
 
 
 def pendulum_networks(env):
@@ -328,8 +289,7 @@ def test_losses_train_the_pendulum_of_torchrl(name):
     env = PendulumEnv(seed=0)
     torch.manual_seed(0)
     actor, value, qvalue = pendulum_networks(env)
-    networks = {"bptt": (BPTTLoss, ()), "shac": (SHACLoss, (value,)), "abpt": (ABPTLoss, (qvalue,))}
-    cls, critics = networks[name]
+    cls, critics = {"bptt": (BPTTLoss, ()), "shac": (SHACLoss, (value,)), "abpt": (ABPTLoss, (qvalue,))}[name]
     loss = cls(actor, *critics)
     loss.make_value_estimator(gamma=0.95)
     updater = SoftUpdate(loss, tau=0.05) if name != "bptt" else None
@@ -356,3 +316,88 @@ def test_losses_train_the_pendulum_of_torchrl(name):
             updater.step()
     assert len(buffer) == 40 * 32 * 30
     assert mean_reward() > before + 0.7  # from about -5.9 per step; the torque is too weak to swing up in one go
+
+
+IN_KEYS = ["observation", ("state", "rotor_speed")]
+
+
+def results(loss, rollout):
+    """All that a loss computes of a rollout, its gradients, and the next random number; the graph is kept."""
+    torch.manual_seed(1)
+    out = loss(rollout)
+    inputs = {"action": rollout["action"], "next": rollout["next", "observation"]}
+    inputs |= dict(loss.named_parameters())
+    losses = [value for key, value in out.items() if key.startswith("loss_")]
+    grads = {
+        f"{i}, {key}": torch.autograd.grad(value, x, retain_graph=True, allow_unused=True)[0]
+        for i, value in enumerate(losses)
+        for key, x in inputs.items()
+    }
+    target = loss.write_value_target(rollout.copy())["value_target"]
+    return {**dict(out.items()), **grads, "target": target}, torch.rand(1)
+
+
+@pytest.mark.parametrize("name", ["shac", "abpt"])
+def test_pure_functions_give_the_numbers_and_draw_the_random_numbers_of_the_networks(name):
+    env = HoveringEnv(num_envs=3, max_episode_steps=4, random_start={"tilt": 0.5, "velocity": 1.0}, seed=0)
+    make_critic, make = (make_value, SHACLoss) if name == "shac" else (make_qvalue, ABPTLoss)
+    actor, critic = make_actor(env, return_log_prob=True), make_critic(env, in_keys=IN_KEYS, input_scale=(1.0, 1e-3))
+    loss = make(actor, critic).make_value_estimator(gamma=0.9, lmbda=0.8)
+    critic, calls = getattr(loss, loss.critic_name), []
+    rollout, _ = differentiable_rollout(env, make_actor(env, return_log_prob=True), None, 6)
+    loss.actor_network_params.data.apply_(lambda x: x.add_(0.1 * torch.randn_like(x)))
+    assert critic.plain() is not None
+
+    pure, after_pure = results(loss, rollout)
+    for network in (critic, loss.actor_network):
+        network.register_forward_hook(lambda network, *_: calls.append(network))
+    called, after_called = results(loss, rollout)
+
+    assert critic in calls and (loss.actor_network in calls) == (name == "abpt")
+    assert after_pure == after_called
+    assert {key for key, x in pure.items() if x is None} == {key for key, x in called.items() if x is None}
+    assert sum(x is not None for x in pure.values()) >= 18
+    for key, x in called.items():
+        if x is not None:
+            torch.testing.assert_close(pure[key], x, msg=lambda message, key=key: f"{key}: {message}")
+
+
+class Doubled(nn.Module):
+    """A critic of the user's own."""
+
+    def __init__(self, network):
+        super().__init__()
+        self.network = network
+
+    def forward(self, *inputs):
+        return 2.0 * self.network(*inputs)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda critic: critic.register_forward_hook(lambda *arguments: None),
+        lambda critic: critic.module.mlp[3].register_full_backward_hook(lambda *arguments: None),
+        lambda critic: critic.module.mlp.__setitem__(2, nn.Dropout(0.5)),
+        lambda critic: critic.module.mlp.__setitem__(2, nn.PReLU()),
+        lambda critic: nn.utils.parametrizations.weight_norm(critic.module.mlp[0]),
+        lambda critic: critic.module.mlp.__setitem__(5, critic.module.mlp[2]),
+        lambda critic: setattr(critic.module, "head", nn.Softplus()),
+        lambda critic: setattr(critic, "module", Doubled(critic.module)),
+        lambda critic: setattr(critic, "__class__", type("Mine", (ValueOperator,), {})),
+    ],
+    ids=["hook", "backward", "dropout", "parameters", "parametrization", "shared", "head", "module", "class"],
+)
+def test_a_critic_that_somebody_has_changed_is_called_as_it_is(env, change):
+    critic = make_value(env)
+    change(critic)
+    assert not hasattr(critic, "plain") or critic.plain() is None
+    loss = SHACLoss(make_actor(env), critic)
+    rollout, _ = differentiable_rollout(env, make_actor(env), None, 3)
+    torch.manual_seed(0)
+    prediction = loss.loss_value(rollout)[1]["pred_value"]
+    torch.manual_seed(0)
+    loss.write_value_target(rollout)  # draws first
+    torch.testing.assert_close(prediction, critic(rollout.detach())["state_value"].mean())
+    loss(rollout)["loss_value"].backward()
+    assert all(x.grad is not None for x in loss.value_network_params.parameters())

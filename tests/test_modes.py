@@ -1,10 +1,12 @@
 """What actions may command: every mode goes where it is told, on every drone, with exact derivatives."""
 
+import itertools
 import math
 
 import pytest
 import torch
 from flying import fly
+from refusals import cases, refuses
 from scipy.spatial.transform import Rotation
 from torchrl.envs import check_env_specs
 
@@ -17,13 +19,9 @@ F64 = torch.float64
 DT, STEPS = 0.005, 4  # physics step [s], and how many make a control step
 each_mode = pytest.mark.parametrize("control", CONTROLS)
 each_drone = pytest.mark.parametrize("drone", available_drones())
-each_model = pytest.mark.parametrize(
-    ("control", "dynamics"),
-    [(name, model) for name in CONTROLS for model in DYNAMICS if (name, model) != ("rotor_thrusts", "point_mass")],
-)
-each_flight = pytest.mark.parametrize(
-    ("drone", "dynamics"), [*((name, "quadrotor") for name in available_drones()), ("visfly", "point_mass")]
-)
+MODELS = set(itertools.product(CONTROLS, DYNAMICS)) - {("rotor_thrusts", "point_mass")}
+each_model = pytest.mark.parametrize(("control", "dynamics"), sorted(MODELS))
+each_flight = cases(*((name, "quadrotor") for name in available_drones()), ("visfly", "point_mass"))
 
 
 def commanded(steps, *commands, control, drone="visfly", **options):
@@ -49,8 +47,7 @@ def test_roll_leans_right_pitch_leans_forward_and_yaw_turns_left(drone, dynamics
     # Drag above the centre of mass turns a drone that gains speed, and the rotors follow that late.
     atol = 5e-3 if load_drone(drone).drag_height > 0 else 2e-3
     torch.testing.assert_close(angles[:3, :2], torch.tensor(commands, dtype=F64)[:3, 1:3], atol=atol, rtol=0)
-    assert 0.5 * 2 * rate < angles[3, 2] <= 1.05 * 2 * rate
-    assert angles[3, :2].abs().max() < 1e-3
+    assert 0.5 * 2 * rate < angles[3, 2] <= 1.05 * 2 * rate and angles[3, :2].abs().max() < 1e-3
 
 
 @each_flight
@@ -77,8 +74,7 @@ def test_one_rotor_alone_rolls_and_pitches_away_from_itself_and_yaws_by_its_spin
     state = commanded(2, *commands, control="rotor_thrusts")[-1]
     x, y = drone.rotor_positions.unbind(-1)
     signs = torch.stack((y.sign(), -x.sign(), drone.rotor_spin), -1)
-    assert (state["angular_velocity"].sign() == signs).all()
-    assert (state["velocity"][:, 2] > 0).all()
+    assert (state["angular_velocity"].sign() == signs).all() and (state["velocity"][:, 2] > 0).all()
 
 
 @each_mode
@@ -149,29 +145,22 @@ def test_limits_can_be_chosen_and_gymnasium_takes_them():
     assert list(env.action_units.values()) == ["m/s", "m/s", "m/s", "rad/s"]
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"control": "thrust"}, "Unknown control 'thrust'. Choose from: rates, attitude, rotor_thrusts, velocity; or"),
-        ({"control": {"max_tilt": 0.5}}, r"control=\{'max_tilt': 0.5\} has no .mode. key. Choose from: rates, "),
-        ({"control": None}, "control must be a name, such as rates, or a mapping with limits, got None"),
-        ({"mode": "attitude", "max_speed": 1.0}, "'attitude' has no limit 'max_speed'. Choose from: max_tilt"),
-        ({"mode": "rates", "max_tilt": 1.0}, "'rates' has no limit 'max_tilt'. It has none; those of the drone hold"),
-        ({"mode": "attitude", "max_tilt": 30}, "control: max_tilt must be at most 1.5, got 30"),
-        ({"mode": "velocity", "max_speed": "5"}, "control: max_speed must be a number, got '5'"),
-        ({"control": "velocity", "dynamics": "own"}, "'own' takes no control: .* Leave out control='velocity'"),
-        ({"control": "rotor_thrusts", "dynamics": "point_mass"}, 'control="rotor_thrusts" commands nothing'),
-        ({"integrator": "rk4", "dynamics": "point_mass"}, 'supports only the integrator "semi_implicit_euler"'),
-        (
-            {"randomize": {"inertia": {"scale": [0.9, 1.1]}}, "dynamics": "point_mass"},
-            "unknown field 'inertia'. ",
-        ),
-    ],
+@cases(
+    ({"control": "thrust"}, "Unknown control 'thrust'. Choose from: rates, attitude, rotor_thrusts, velocity; or"),
+    ({"control": {"max_tilt": 0.5}}, r"control=\{'max_tilt': 0.5\} has no .mode. key. Choose from: rates, "),
+    ({"control": None}, "control must be a name, such as rates, or a mapping with limits, got None"),
+    ({"mode": "attitude", "max_speed": 1.0}, "'attitude' has no limit 'max_speed'. Choose from: max_tilt"),
+    ({"mode": "rates", "max_tilt": 1.0}, "'rates' has no limit 'max_tilt'. It has none; those of the drone hold"),
+    ({"mode": "attitude", "max_tilt": 30}, "control: max_tilt must be at most 1.5, got 30"),
+    ({"mode": "velocity", "max_speed": "5"}, "control: max_speed must be a number, got '5'"),
+    ({"control": "velocity", "dynamics": "own"}, "'own' takes no control: .* Leave out control='velocity'"),
+    ({"control": "rotor_thrusts", "dynamics": "point_mass"}, 'control="rotor_thrusts" commands nothing'),
+    ({"integrator": "rk4", "dynamics": "point_mass"}, 'supports only the integrator "semi_implicit_euler"'),
+    ({"randomize": {"inertia": {"scale": [0.9, 1.1]}}, "dynamics": "point_mass"}, "unknown field 'inertia'. "),
 )
 def test_a_mode_or_a_limit_that_makes_no_sense_or_that_a_model_does_not_have_is_refused(options, message, monkeypatch):
     monkeypatch.setitem(DYNAMICS, "own", lambda nominal, dt, substeps, integrator: None)
-    with pytest.raises(ValueError, match=message):
-        HoveringEnv(num_envs=1, **({"control": options} if "mode" in options else options))
+    refuses(message, HoveringEnv, num_envs=1, **({"control": options} if "mode" in options else options))
 
 
 # -- the point mass ----------------------------------------------------------------------------------------------------

@@ -1,13 +1,22 @@
-"""Networks that read their sizes from the environment."""
+"""Networks that read their sizes from the environment, and exploration noise that is correlated in time."""
+
+import math
 
 import pytest
 import torch
+from refusals import cases, refuses
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+from torch.distributions import Normal, TransformedDistribution
+from torch.distributions.transforms import TanhTransform
 from torchrl.data import Unbounded
-from torchrl.envs import CatTensors, PendulumEnv, StepCounter, TransformedEnv, UnsqueezeTransform
+from torchrl.envs import CatTensors, EnvBase, PendulumEnv, StepCounter, TransformedEnv, UnsqueezeTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import ClipPPOLoss
 
-from torchrl_quad import HoveringEnv, load_drone, make_actor, make_qvalue, make_value
+from torchrl_quad import ABPTLoss, BPTTLoss, HoveringEnv, differentiable_rollout, load_drone
+from torchrl_quad.modules import make_actor, make_qvalue, make_value
+from torchrl_quad.objectives.calls import sample_action
 
 nan = float("nan")
 
@@ -30,17 +39,19 @@ def test_a_policy_starts_close_to_hovering_with_a_little_noise(wrap):
     assert noise.std(0).tolist() == pytest.approx([0.09, 0.1, 0.1, 0.1], abs=0.02)
 
 
-def test_the_first_action_can_be_chosen_and_is_the_middle_of_the_range_elsewhere():
+def test_the_first_action_can_be_chosen_and_is_the_middle_of_the_range_or_the_mean_of_hovering_elsewhere():
     env = HoveringEnv(num_envs=2, dtype=torch.float64)
     wanted = torch.tensor([0.5, -0.5, 0.0, 0.9], dtype=torch.float64)
     actor = make_actor(env, action_init=wanted)
     torch.testing.assert_close(actor(env.reset())["action"], wanted.expand(2, 4), atol=0.02, rtol=0)
     pendulum = make_pendulum()
     action = make_actor(pendulum)(pendulum.reset())["action"]
-    assert action.shape == (1,)
-    assert action.abs() < 0.1
+    assert action.shape == (1,) and action.abs() < 0.1
     pendulum.base_env.neutral_action = torch.tensor([1.5])
     assert make_actor(pendulum)(pendulum.reset())["action"].item() == pytest.approx(1.5, abs=0.1)
+    env = HoveringEnv(num_envs=2, drone=load_drone("visfly").replace(max_thrust_to_weight=[[2.0], [4.0]]))
+    assert env.hover_action[:, 0].tolist() == pytest.approx([0.0, -0.5])
+    assert make_actor(env)(env.reset())["action"][:, 0].tolist() == pytest.approx([-0.25, -0.25], abs=0.03)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])
@@ -98,69 +109,170 @@ def test_each_entry_may_have_a_scale_of_its_own():
             make(env, in_keys=keys, input_scale=(1.0, 1.0, 1.0))
 
 
-def test_a_policy_for_drones_that_differ_starts_with_the_mean_of_their_hovering():
-    env = HoveringEnv(num_envs=2, drone=load_drone("visfly").replace(max_thrust_to_weight=[[2.0], [4.0]]))
-    assert env.hover_action[:, 0].tolist() == pytest.approx([0.0, -0.5])
-    assert make_actor(env)(env.reset())["action"][:, 0].tolist() == pytest.approx([-0.25, -0.25], abs=0.03)
-
-
 def test_every_network_has_the_precision_of_the_environment_and_may_read_whole_numbers(env64):
     td = make_actor(env64)(env64.reset())
     whole = make_value(env64, in_keys=[("state", "step"), "success", "observation"])
-    for network, key in (
-        (make_value(env64), "state_value"),
-        (whole, "state_value"),
-        (make_qvalue(env64), "state_action_value"),
-    ):
-        assert network(td)[key].dtype is torch.float64
-        assert network(td)[key].shape == (4, 1)
-
-
-# -- errors ------------------------------------------------------------------------------------------------------------
+    values = [(network, "state_value") for network in (make_value(env64), whole)]
+    for network, key in (*values, (make_qvalue(env64), "state_action_value")):
+        assert network(td)[key].dtype is torch.float64 and network(td)[key].shape == (4, 1)
 
 
 @pytest.mark.parametrize("make", [make_actor, make_value, make_qvalue])
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"num_cells": (0,)}, r"num_cells\[0\] must be at least 1, got 0. .*in a list: \[64, 64\]"),
-        ({"num_cells": (64, 2.5)}, r"num_cells\[1\] must be a whole number, got 2.5"),
-        ({"num_cells": 64}, r"num_cells must be a list, got 64. .*in a list: \[64, 64\]"),
-        ({"num_cells": [65_536] * 3}, "has 8,59.,...,... weights, more than 100,000,000: write smaller widths"),
-        ({"input_scale": nan}, "input_scale must be a finite number or be a list, got nan"),
-        ({"activation": "relu"}, "activation must be a class of activations of torch.nn without arguments, .*'relu'"),
-        ({"activation": torch.nn.GLU}, "activation must be a class of activations"),
-        ({"in_keys": "observation"}, "in_keys must be a list, got 'observation'"),
-        ({"in_keys": []}, "in_keys must have at least 1 item"),
-        ({"in_keys": [("state", "speed")]}, r"Unknown entry \('state', 'speed'\) in in_keys. Choose from: obs"),
-        ({"in_keys": ["state"]}, "Unknown entry 'state' in in_keys"),
-        ({"in_keys": [("state", "action_queue")]}, r"has shape \(4, 1, 4\) and a network reads vectors: flatten it"),
-    ],
+@cases(
+    ({"num_cells": (0,)}, r"num_cells\[0\] must be at least 1, got 0. .*in a list: \[64, 64\]"),
+    ({"num_cells": 64}, r"num_cells must be a list, got 64. .*in a list: \[64, 64\]"),
+    ({"num_cells": [65_536] * 3}, "has 8,59.,...,... weights, more than 100,000,000: write smaller widths"),
+    ({"input_scale": nan}, "input_scale must be a finite number or be a list, got nan"),
+    ({"activation": "relu"}, "activation must be a class of activations of torch.nn without arguments, .*'relu'"),
+    ({"activation": torch.nn.GLU}, "activation must be a class of activations"),
+    ({"in_keys": "observation"}, "in_keys must be a list, got 'observation'"),
+    ({"in_keys": []}, "in_keys must have at least 1 item"),
+    ({"in_keys": [("state", "speed")]}, r"Unknown entry \('state', 'speed'\) in in_keys. Choose from: obs"),
+    ({"in_keys": [("state", "action_queue")]}, r"has shape \(4, 1, 4\) and a network reads vectors: flatten it"),
 )
-def test_a_network_of_wrong_sizes_or_entries_is_refused(env, make, kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        make(env, **kwargs)
+def test_a_network_of_wrong_sizes_or_entries_is_refused(kwargs, message, env, make):
+    refuses(message, make, env, **kwargs)
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"in_keys": "obs"}, r"in_keys must be a list, got 'obs'. .*in a list: .\"observation\"."),
-        ({"in_keys": [3]}, r"in_keys\[0\] must be the name of an entry, such as .*, got 3"),
-        ({"action_init": [0.0, 0.0, 0.0]}, "action_init must be 4 numbers strictly between"),
-        ({"action_init": [1.0, 0.0, 0.0, 0.0]}, r"strictly between .* got \[1.0, 0.0, 0.0, 0.0\]"),
-        ({"action_init": [nan, 0.0, 0.0, 0.0]}, "strictly between"),
-        ({"action_init": ["a", 0.0, 0.0, 0.0]}, r"strictly between .* got \['a', 0.0, 0.0, 0.0\]"),
-        ({"scale_init": 1e300}, "scale_init must be at most 100, got 1e.300"),
-        ({"scale_init": 0.0}, "scale_init must be at least 0.0001, got 0.0. The standard deviation of the policy"),
-        ({"noise_correlation": -0.1}, "noise_correlation must be at least 0, got -0.1"),
-        ({"noise_correlation": 1.0}, "noise_correlation must be less than 1, got 1.0"),
-    ],
+@cases(
+    ({"in_keys": "obs"}, r"in_keys must be a list, got 'obs'. .*in a list: .\"observation\"."),
+    ({"in_keys": [3]}, r"in_keys\[0\] must be the name of an entry, such as .*, got 3"),
+    ({"action_init": [0.0, 0.0, 0.0]}, "action_init must be 4 numbers strictly between"),
+    ({"action_init": [1.0, 0.0, 0.0, 0.0]}, r"strictly between .* got \[1.0, 0.0, 0.0, 0.0\]"),
+    ({"action_init": ["a", 0.0, 0.0, 0.0]}, r"strictly between .* got \['a', 0.0, 0.0, 0.0\]"),
+    ({"scale_init": 1e300}, "scale_init must be at most 100, got 1e.300"),
+    ({"scale_init": 0.0}, "scale_init must be at least 0.0001, got 0.0. The standard deviation of the policy"),
+    ({"noise_correlation": -0.1}, "noise_correlation must be at least 0, got -0.1"),
+    ({"noise_correlation": 1.0}, "noise_correlation must be less than 1, got 1.0"),
 )
-def test_a_first_action_out_of_bounds_and_a_wrong_list_of_entries_are_refused(env, kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        make_actor(env, **kwargs)
+def test_a_first_action_out_of_bounds_and_a_wrong_list_of_entries_are_refused(kwargs, message, env):
+    refuses(message, make_actor, env, **kwargs)
     pendulum = PendulumEnv()
     pendulum.action_spec = Unbounded(pendulum.action_spec.shape)
-    with pytest.raises(ValueError, match="make_actor needs an action with bounds, a Bounded spec; got Unbounded"):
-        make_actor(pendulum)
+    refuses("make_actor needs an action with bounds, a Bounded spec; got Unbounded", make_actor, pendulum)
+
+
+RHO = 0.9
+ONCE = {"auto_reset": False, "break_when_any_done": False}
+
+
+@pytest.fixture
+def env64():
+    return HoveringEnv(num_envs=4, seed=1, dtype=torch.float64, max_episode_steps=7)
+
+
+def test_the_noise_is_standard_normal_in_every_step_and_correlated_over_time():
+    env = HoveringEnv(num_envs=512, max_episode_steps=90)
+    actor = make_actor(env, noise_correlation=RHO, scale_init=0.2)
+    start = env.reset()
+    start["state", "step"][::2] = 30  # these end with the horizon
+    rollout, carry = differentiable_rollout(env, actor, env.reset(start, set_state=True), 60)
+    noise = rollout["noise"].double()
+    assert noise.mean().abs() < 0.05  # four standard errors, as below
+    for part in (noise[:, 0], noise[:, 30], noise[:, -1]):
+        assert part.std() == pytest.approx(1.0, abs=0.06)
+    for lag in (1, 5, 20):
+        assert (noise[:, lag:] * noise[:, :-lag]).mean().item() == pytest.approx(RHO**lag, abs=0.06)
+    mean = torch.atanh(rollout["action"]) - 0.2 * rollout["noise"]  # mu + sigma e, with mu nearly constant at the start
+    assert mean.std(1).max() < 0.1
+    more, _ = differentiable_rollout(env, actor, carry, 3)
+    assert torch.equal(more["noise_before"][:, 0], rollout["noise"][:, -1])  # also over resets
+    assert 0 < rollout["next", "done"][:, -1].sum() < 512
+
+
+def test_loc_scale_and_log_probability_are_those_given_the_noise_of_the_step_before(env64):
+    actor = make_actor(env64, noise_correlation=RHO, scale_init=0.3, return_log_prob=True)
+    plain = make_actor(env64, scale_init=0.3)
+    plain.load_state_dict(actor.state_dict())
+    rollout, _ = differentiable_rollout(env64, actor, None, 20)
+    with torch.no_grad():
+        free = plain.get_dist_params(rollout.select("observation"))
+    torch.testing.assert_close(rollout["scale"], free["scale"] * math.sqrt(1 - RHO**2))
+    torch.testing.assert_close(rollout["loc"], free["loc"] + RHO * free["scale"] * rollout["noise_before"])
+    given = TransformedDistribution(Normal(rollout["loc"], rollout["scale"]), TanhTransform())
+    torch.testing.assert_close(rollout["action_log_prob"], given.log_prob(rollout["action"]).sum(-1))
+    marginal = torch.tanh(free["loc"] + free["scale"] * rollout["noise"])
+    torch.testing.assert_close(rollout["action"], marginal)
+
+
+def test_every_way_to_fly_gives_the_same_noise_values_and_gradients(env64):
+    actor = make_actor(env64, noise_correlation=RHO, scale_init=0.3, return_log_prob=True)
+    called = TensorDictSequential(actor)
+
+    def flight(roll, policy=actor, kind=ExplorationType.RANDOM):
+        env64.set_seed(0)
+        torch.manual_seed(0)
+        with set_exploration_type(kind):
+            rollout = roll(12, policy, tensordict=env64.reset(), **ONCE)
+            rest = roll(5, policy, tensordict=env64.maybe_reset(env64.step_mdp(rollout[:, -1].detach())), **ONCE)
+        total = sum(x["next", "reward"].sum() + x["action_log_prob"].sum() + x["noise"].sum() for x in (rollout, rest))
+        return dict(rest.items(True, True)), torch.autograd.grad(total, list(actor.parameters()))
+
+    expected = flight(lambda *a, **k: EnvBase.rollout(env64, *a, **k))
+    torch.testing.assert_close(flight(env64.rollout), expected)
+    torch.testing.assert_close(flight(env64.rollout, called), expected)
+    mode, _ = flight(env64.rollout, kind=ExplorationType.DETERMINISTIC)
+    assert not mode["noise"].any()
+    loss = BPTTLoss(actor, clip_action_gradient=1e9), BPTTLoss(actor)
+    rollout, _ = differentiable_rollout(env64, actor, None, 6)
+    grads = [torch.autograd.grad(x.loss_actor(rollout)[0], list(x.actor_network_params.parameters())) for x in loss]
+    torch.testing.assert_close(*grads)
+
+
+@pytest.mark.parametrize("bias", [0.3, 10.0])  # and far beyond where the tanh tells numbers apart
+def test_called_or_not_the_noise_is_the_same_also_where_the_action_is_saturated(env64, bias):
+    actor = make_actor(env64, noise_correlation=RHO, scale_init=0.3, return_log_prob=True)
+    actor[0].module.mlp[-1].bias.data[:4] = bias
+    td = env64.reset()
+    for kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
+        torch.manual_seed(3)
+        with set_exploration_type(kind):
+            written, plain = actor(td.copy()), actor.plain()
+        torch.manual_seed(3)
+        drawn = plain.drawn(1, 4, {})[0]
+        mine = plain.forward(plain.weights, [td["observation"]], drawn)[1]
+        torch.testing.assert_close({key: written[key] for key in mine}, mine)
+        torch.testing.assert_close(plain.drawn_again(written), drawn)
+        assert written["noise"].abs().max() < 5 and written["noise"].any() == (kind is ExplorationType.RANDOM)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):  # also after a random flight
+        again = actor(td.copy().set("noise", torch.ones(4, 4, dtype=env64.dtype)))
+    torch.testing.assert_close(again["action"], written["action"])
+
+
+def test_an_actor_can_be_called_with_its_entries(env):
+    td = env.reset()
+    for rho, before in ((0.0, {}), (RHO, {"noise_before": torch.zeros(4, 4)})):
+        actor = make_actor(env, noise_correlation=rho)
+        assert ("noise" in actor.out_keys) == bool(rho)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            written = actor(observation=td["observation"], **before)
+            torch.testing.assert_close(written[2], actor(td.copy())["action"])
+
+
+def test_ppo_s_ratio_is_that_of_the_new_part_of_the_noise():
+    env = HoveringEnv(num_envs=8)
+    actor = make_actor(env, noise_correlation=RHO, scale_init=0.3, return_log_prob=True)
+    loss = ClipPPOLoss(actor, make_value(env), entropy_bonus=False)
+    assert "noise_before" in loss.in_keys
+    rollout, _ = differentiable_rollout(env, actor, None, 5)
+    data = rollout.detach().select(*loss.in_keys, strict=False).reshape(-1)  # it names entries of "next" it never reads
+    data["advantage"] = data["value_target"] = torch.ones(40, 1)
+    assert loss(data)["kl_approx"].abs() < 1e-5  # nothing has changed yet: the ratio is one
+    with torch.no_grad():
+        actor[0].module.mlp[-1].bias[:4] += 0.05
+        new = actor.get_dist_params(data)
+    old, moved = (Normal(x["loc"], x["scale"]) for x in (rollout.detach().reshape(-1), new))
+    u = torch.atanh(data["action"])
+    expected = (old.log_prob(u) - moved.log_prob(u)).sum(-1).mean()
+    torch.testing.assert_close(loss(data)["kl_approx"], expected, rtol=1e-3, atol=1e-4)
+
+
+def test_a_new_action_at_the_end_of_a_horizon_has_the_noise_of_the_policy_itself():
+    env = HoveringEnv(num_envs=2000)
+    actor = make_actor(env, noise_correlation=RHO, scale_init=0.3)
+    loss = ABPTLoss(actor, make_qvalue(env))
+    rollout, _ = differentiable_rollout(env, actor, None, 2)
+    assert loss(rollout)["loss_actor"].isfinite()
+    states = rollout[:, 0].select("observation")
+    action = sample_action(actor, loss.actor_network_params, states)["action"].detach()
+    assert torch.atanh(action).std(0).mean() == pytest.approx(0.3, rel=0.05)

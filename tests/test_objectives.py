@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from refusals import refuses
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -52,16 +53,8 @@ def make_rollout(actor, dtype=torch.float32):
     truncated[0, 1] = True
     terminated[1, 2] = True
     rollout = actor(TensorDict({"observation": observation}, [2, 4]))
-    rollout["next"] = TensorDict(
-        {
-            "observation": following,
-            "reward": rollout["action"] * 1.0,
-            "terminated": terminated,
-            "truncated": truncated,
-            "done": terminated | truncated,
-        },
-        [2, 4],
-    )
+    ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+    rollout["next"] = TensorDict({"observation": following, "reward": rollout["action"] * 1.0, **ends}, [2, 4])
     return rollout
 
 
@@ -100,8 +93,7 @@ def test_abpt_averages_the_n_step_and_the_0_step_return():
     # The smaller critic wins: Q(s, pi(s)) = 10 s + 2 s. Segments start at s = 1 and 3 in environment 0, 1 and 4 in 1.
     n_step = [14 + 12 * 9 / 4 + 12 * 5 / 4, 13.5 + 12 * 5 / 2]
     zero_step = [12 * 1 + 12 * 3, 12 * 1 + 12 * 4]
-    assert objective(zero_step_return=False) == n_step
-    assert objective(n_step_return=False) == zero_step
+    assert objective(zero_step_return=False) == n_step and objective(n_step_return=False) == zero_step
     assert objective() == [(a + b) / 2 for a, b in zip(n_step, zero_step, strict=True)]
 
 
@@ -113,8 +105,7 @@ def test_the_bootstrap_of_abpt_has_its_gradient_through_state_and_action_and_non
     rollout["next", "observation"] = rollout["next", "observation"] + shift
     loss.loss_actor(rollout)[0].backward()
     # d/d(next observation) = mean over envs, half weight, discount gamma^n, of d(10 s + 2 s)/ds; none at a termination
-    expected = [[0, 12 / 4, 0, 12 / 4], [0, 0, 0, 12 / 2]]
-    assert (-shift.grad[..., 0] * 2 * 2).tolist() == expected
+    assert (-shift.grad[..., 0] * 2 * 2).tolist() == [[0, 12 / 4, 0, 12 / 4], [0, 0, 0, 12 / 2]]
     # policy weight: rewards give s * discount, the bootstraps' actions their state, the 0-step returns' actions too
     rewards = sum(REWARDS) / 2
     bootstraps = 9 / 4 + 5 / 4 + 5 / 2
@@ -167,8 +158,7 @@ def test_shac_as_published_by_xu_et_al_bootstraps_with_the_target_critic_and_div
     critic = ([14 + 35, 13.5 + 25], [[0, 10 / 4, 0, 10 / 4], [0, 0, 0, 10 / 2]])
     target = ([14 + 105, 13.5 + 75], [[0, 30 / 4, 0, 30 / 4], [0, 0, 0, 30 / 2]])
     divided = tuple((torch.tensor(x) / 4).tolist() for x in target)
-    assert fly() == critic
-    assert fly(target_bootstrap=True) == target
+    assert fly() == critic and fly(target_bootstrap=True) == target
     assert fly(target_bootstrap=True, average_over_horizon=True) == divided
     assert fly(target_bootstrap=True, delay_value=False) == critic  # there is no other network
 
@@ -188,8 +178,7 @@ def test_the_objective_is_the_sum_of_its_parts():
         assert {name: part.tolist() for name, part in found.items()} == expected
         assert torch.equal(sum(found.values()), -loss.loss_actor(rollout)[0])
         assert all(part.requires_grad for part in found.values())
-    with pytest.raises(ValueError, match="needs a rollout"):
-        shac.objective_parts(make_rollout(actor)[:, 0])
+    refuses("needs a rollout", shac.objective_parts, make_rollout(actor)[:, 0])
 
 
 def test_a_loss_has_the_precision_of_its_rollout():
@@ -198,9 +187,8 @@ def test_a_loss_has_the_precision_of_its_rollout():
     rollout = make_rollout(actor, torch.float64)
     rollout["action_log_prob"] = -torch.ones(2, 4, dtype=torch.float64)
     rewards = loss.objective_parts(rollout)["rewards"]
-    assert rewards.tolist() == pytest.approx(
-        [(2 + 4 * 0.99) + (6 + 8 * 0.99), 2 + 0.99 * (4 + 0.99 * 6) + 8], abs=1e-14
-    )
+    expected = [(2 + 4 * 0.99) + (6 + 8 * 0.99), 2 + 0.99 * (4 + 0.99 * 6) + 8]
+    assert rewards.tolist() == pytest.approx(expected, abs=1e-14)
     target = loss.write_value_target(rollout)["value_target"]
     assert target[0, 0].item() == pytest.approx(2 + 0.99 * (0.05 * 20 + 0.95 * (4 + 0.99 * 90)), rel=1e-15)
     default = BPTTLoss(actor, alpha="auto", alpha_init=0.3)
@@ -219,7 +207,7 @@ def td_lambda(rewards, next_values, ends, terminations):
     return targets[::-1]
 
 
-def test_td_lambda_targets_come_from_the_target_network_and_respect_the_ends():
+def test_td_lambda_targets_respect_the_ends_and_come_from_the_target_network_and_for_abpt_from_the_least_critic():
     actor, value, _ = make_networks()
     loss = SHACLoss(actor, value).make_value_estimator(gamma=GAMMA, lmbda=LAMBDA)
     value.module.weight.data.fill_(-3.0)  # the target network still says 10 s
@@ -234,10 +222,6 @@ def test_td_lambda_targets_come_from_the_target_network_and_respect_the_ends():
     # environment 1, step 2: 6; step 1: 4 + 0.5 (0.5 * 30 + 0.5 * 6) = 13
     assert expected[1][1:3] == [13.0, 6.0]
     torch.testing.assert_close(target[..., 0], torch.tensor(expected))
-
-
-def test_td_lambda_targets_of_abpt_take_the_least_critic_with_a_new_action():
-    actor, *_ = make_networks()
     target = make_abpt(actor, 10.0, 20.0).write_value_target(make_rollout(actor).detach())["value_target"]
     expected = td_lambda([2.0, 4.0, 6.0, 8.0], [24, 108, 48, 60], [False, True, False, True], [False] * 4)
     torch.testing.assert_close(target[0, :, 0], torch.tensor(expected))
@@ -288,19 +272,14 @@ def test_without_delay_the_target_is_the_critic_itself():
         assert not torch.equal(loss.write_value_target(make_rollout(actor).detach())["value_target"], before)
 
 
-def test_the_entropy_bonus_is_alpha_times_the_mean_of_minus_log_prob():
+def test_the_entropy_bonus_is_alpha_times_the_mean_of_minus_log_prob_and_alpha_rises_where_that_is_too_low():
     actor, *_ = make_networks()
     rollout = make_rollout(actor)
-    log_prob = -torch.arange(8.0).view(2, 4)
-    rollout["action_log_prob"] = log_prob
+    rollout["action_log_prob"] = -torch.arange(8.0).view(2, 4)
     plain = BPTTLoss(actor, reduction="none").make_value_estimator(gamma=GAMMA)(rollout)["loss_actor"]
     out = BPTTLoss(actor, reduction="none", alpha=0.5).make_value_estimator(gamma=GAMMA)(rollout)
     torch.testing.assert_close(out["loss_actor"], plain - 0.5 * torch.tensor([1.5, 5.5]))
     assert out["entropy"].item() == 3.5
-
-
-def test_the_automatic_alpha_rises_when_the_entropy_is_too_low_and_falls_when_too_high():
-    actor, *_ = make_networks()
     for log_prob, direction in ((3.0, -1.0), (-3.0, 1.0)):
         loss = BPTTLoss(actor, alpha="auto", alpha_init=0.2, target_entropy=0.0).make_value_estimator(gamma=GAMMA)
         rollout = make_rollout(actor)

@@ -10,6 +10,7 @@ import gymnasium
 import pytest
 from hydra.core.config_store import ConfigStore
 from own_task import CornerEnv
+from refusals import cases, refuses
 from small_runs import SMALL, rows
 from test_configuration import composed
 from test_docs import ROOT, files, importable  # noqa: F401, a fixture
@@ -33,8 +34,7 @@ def forget(monkeypatch):
 def test_one_line_makes_a_task_known_to_make_env_and_to_gymnasium():
     register_task("fly_to_corner", CornerEnv)
     register_task("fly_to_corner", CornerEnv)  # a cell of a notebook that runs again
-    assert "fly_to_corner" in available_tasks()
-    assert type(make_env("fly_to_corner", num_envs=2, reach=0.1)) is CornerEnv
+    assert "fly_to_corner" in available_tasks() and type(make_env("fly_to_corner", num_envs=2, reach=0.1)) is CornerEnv
     drones = gymnasium.make_vec("torchrl_quad/FlyToCorner-v0", num_envs=2, reach=0.1)
     assert drones.reset(seed=0)[0].shape == (2, 13)
     assert type(make_env("own_task.CornerEnv", num_envs=2)) is CornerEnv  # without any name
@@ -45,72 +45,57 @@ class UnfinishedEnv(QuadrotorEnv):
         return state["position"]
 
 
-@pytest.mark.parametrize(
-    ("name", "cls", "error", "message"),
-    [
-        ("Window", CornerEnv, ValueError, "small letters, digits and underscores, such as 'window'; got 'Window'"),
-        ("hovering", CornerEnv, ValueError, "is torchrl_quad.envs.hovering.HoveringEnv already. Choose another name"),
-        ("x", CornerEnv(num_envs=1), TypeError, "subclass of QuadrotorEnv, itself and not an instance; got CornerEnv"),
-        ("x", dict, TypeError, "a subclass of QuadrotorEnv, itself and not an instance; got the class dict"),
-        ("x", UnfinishedEnv, TypeError, "UnfinishedEnv lacks initial_state, is_crash, is_success, reward_terms. docs/"),
-    ],
+@cases(
+    ("Window", CornerEnv, ValueError, "small letters, digits and underscores, such as 'window'; got 'Window'"),
+    ("hovering", CornerEnv, ValueError, "is torchrl_quad.envs.hovering.HoveringEnv already. Choose another name"),
+    ("x", CornerEnv(num_envs=1), TypeError, "subclass of QuadrotorEnv, itself and not an instance; got CornerEnv"),
+    ("x", dict, TypeError, "a subclass of QuadrotorEnv, itself and not an instance; got the class dict"),
+    ("x", UnfinishedEnv, TypeError, "UnfinishedEnv lacks initial_state, is_crash, is_success, reward_terms. docs/"),
 )
 def test_what_is_no_task_is_refused_when_it_is_registered(name, cls, error, message):
-    with pytest.raises(error, match=message):
-        register_task(name, cls)
+    refuses(message, register_task, name, cls, error=error)
 
 
-@pytest.mark.parametrize(
-    ("task", "message"),
-    [
-        ("window", "Unknown task 'window'. Choose from: .*racing.* give the path .*, or call register_task"),
-        ("no_package.WindowEnv", "Python finds no module 'no_package'. Put its folder on PYTHONPATH, or install"),
-        ("own_task.Corner", "the module 'own_task' .* has no 'Corner'"),
-        ("own_task.norm", "a task is a subclass of QuadrotorEnv"),
-    ],
+@cases(
+    ("window", "Unknown task 'window'. Choose from: .*racing.* give the path .*, or call register_task"),
+    ("no_package.WindowEnv", "Python finds no module 'no_package'. Put its folder on PYTHONPATH, or install"),
+    ("own_task.Corner", "the module 'own_task' .* has no 'Corner'"),
+    ("own_task.norm", "a task is a subclass of QuadrotorEnv"),
 )
 def test_recipes_say_in_one_line_how_a_task_that_they_do_not_know_becomes_known(task, message, refused, tmp_path):
     assert re.search(message, refused("bptt", f"task={task}", f"hydra.run.dir={tmp_path}/run"))
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("env.reach=far", "env.reach=far: it must be a number"),
-        ("env.patience=0.5", "env.patience=0.5: it must be a whole number"),
-        ("+env.rech=1", "argument 'rech'. Did you mean 'reach'?"),
-        ("+env.seed=1", "env.seed: recipes set it for all environments. Write seed=..., without env"),
-    ],
+@cases(
+    ("env.reach=far", "env.reach=far: it must be a number"),
+    ("env.patience=0.5", "env.patience=0.5: it must be a whole number"),
+    ("+env.rech=1", "argument 'rech'. Did you mean 'reach'?"),
+    ("+env.seed=1", "env.seed: recipes set it for all environments. Write seed=..., without env"),
 )
 def test_the_settings_of_a_task_come_from_its_signature_and_are_checked_by_it(words, message):
     assert defaults(CornerEnv) == {"reach": 0.5, "patience": None, "dt": 0.01, "max_episode_steps": 256}
     assert defaults(HoveringEnv) == {"max_episode_steps": 256}
     task = "task._target_=own_task.CornerEnv"
     check(composed("bptt", task, "env.reach=1", "env.patience=3"))
-    with pytest.raises((ValueError, TypeError), match=re.escape(message)):
-        check(composed("bptt", task, words))
+    refuses(re.escape(message), check, composed("bptt", task, words), error=(ValueError, TypeError))
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("env.disturbances=[own_task.ABPTLoss]", "=own_task.ABPTLoss: it must be a subclass of Disturbance"),
-        ("env.disturbances=[own_task.Pull]", "'own_task.Pull': the module 'own_task' .* has no 'Pull'"),
-        ("env.disturbances=[Push]", "env.disturbances='Push': it must be the path of a class"),
-        ("env.disturbances=own_task.Push", "env.disturbances=own_task.Push: it must be a list"),
-        ("env.disturbances=[{_target_: own_task.Push, force: 1}]", "unknown key 'force'. Allowed: streng"),
-        ("loss._target_=own_task.Push", "loss._target_=own_task.Push: it must be a subclass of ABPTLoss"),
-        ("loss._target_=own_task.ThriftyLoss loss.efort=1", "loss.efort is unknown.* effort, "),
-        ("loss._target_=own_task.ThriftyLoss loss.effort=low", "loss.effort=low: it must be a number"),
-        ("loss._target_=own_task.ThriftyLoss loss.alpha=-1", "loss.alpha=-1: it must be at least 0"),
-    ],
+@cases(
+    ("env.disturbances=[own_task.ABPTLoss]", "=own_task.ABPTLoss: it must be a subclass of Disturbance"),
+    ("env.disturbances=[own_task.Pull]", "'own_task.Pull': the module 'own_task' .* has no 'Pull'"),
+    ("env.disturbances=[Push]", "env.disturbances='Push': it must be the path of a class"),
+    ("env.disturbances=own_task.Push", "env.disturbances=own_task.Push: it must be a list"),
+    ("env.disturbances=[{_target_: own_task.Push, force: 1}]", "unknown key 'force'. Allowed: streng"),
+    ("loss._target_=own_task.Push", "loss._target_=own_task.Push: it must be a subclass of ABPTLoss"),
+    ("loss._target_=own_task.ThriftyLoss loss.efort=1", "loss.efort is unknown.* effort, "),
+    ("loss._target_=own_task.ThriftyLoss loss.effort=low", "loss.effort=low: it must be a number"),
+    ("loss._target_=own_task.ThriftyLoss loss.alpha=-1", "loss.alpha=-1: it must be at least 0"),
 )
 def test_a_disturbance_or_a_loss_of_your_own_that_does_not_fit_is_refused(words, message):
     overrides = words.split(" loss")
     overrides = [overrides[0], *(f"loss{word}" for word in overrides[1:])]
-    with pytest.raises((ValueError, TypeError), match=message):
-        check(composed("abpt", *overrides), overrides)
+    refuses(message, check, composed("abpt", *overrides), overrides, error=(ValueError, TypeError))
 
 
 def test_what_is_your_own_trains_resumes_is_evaluated_and_exported_as_what_ships(train, launch, refused, tmp_path):
@@ -155,5 +140,4 @@ def test_a_metric_that_is_described_and_not_given_is_named():
         def metrics(self, state):
             return {}
 
-    with pytest.raises(ValueError, match=r"SilentEnv.metrics\(state\) lacks corner_error, which metric_info describes"):
-        SilentEnv()
+    refuses(r"SilentEnv.metrics\(state\) lacks corner_error, which metric_info describes", SilentEnv)

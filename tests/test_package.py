@@ -8,13 +8,11 @@ import sys
 import tarfile
 import tomllib
 import zipfile
-from pathlib import Path
 
 import pytest
 import yaml
 from packaging.specifiers import SpecifierSet
-
-ROOT = Path(__file__).parent.parent
+from small_runs import ROOT, run
 
 
 @pytest.fixture(scope="module")
@@ -35,14 +33,11 @@ def wheel(built):
     return next(built.glob("*.whl"))
 
 
-def test_the_source_distribution_holds_every_file_of_the_package(built):
+def test_the_source_distribution_holds_every_file_and_the_wheel_package_presets_and_types_alone(built, wheel):
     with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     ours = {str(p.relative_to(ROOT)) for p in (ROOT / "torchrl_quad").rglob("*") if p.suffix and p.is_file()}
     assert {path for path in ours if "__pycache__" not in path} | {"README.md", "LICENSE", "pyproject.toml"} <= names
-
-
-def test_the_wheel_holds_the_package_the_presets_and_its_types_and_nothing_else(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     own = {str(path.relative_to(ROOT)) for path in (ROOT / "torchrl_quad").rglob("*.yaml")}
     configuration = {path.relative_to(ROOT / "recipes") for path in (ROOT / "recipes/config").rglob("*.yaml")}
@@ -74,9 +69,7 @@ def test_the_wheel_works_away_from_the_repository_and_so_does_a_recipe_of_your_o
     (tmp_path / "smooth.py").write_text(PROGRAM)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
     command = [sys.executable, "smooth.py", "--cfg", "job", "task=racing"]  # which shows the configuration
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    shown = yaml.safe_load(done.stdout)
+    shown = yaml.safe_load(run(*command, cwd=tmp_path, env=environment))
     assert (shown["algorithm"], shown["loss"]["smoothness"]) == ("smooth", 0.1)
     assert shown["env"]["max_episode_steps"] == 512
     assert shown["eval"]["interval"] == 20  # of bptt_racing.yaml

@@ -9,18 +9,15 @@ import socket
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import redirect_stdout
-from pathlib import Path
 
 import pytest
 import torch
 import torch.distributed as dist
-from small_runs import EVERYTHING, SMALL, assert_equal
+from small_runs import EVERYTHING, ROOT, SMALL, assert_equal
 
 from torchrl_quad.training import drawing
 from torchrl_quad.training.checkpoints import read_checkpoint
 from torchrl_quad.training.loop import backward
-
-ROOT = Path(__file__).parent.parent
 
 
 def join(rank, port):

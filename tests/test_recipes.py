@@ -1,17 +1,20 @@
-"""Every recipe on a reduced budget."""
+"""Every recipe on a reduced budget, and training that is long enough to succeed."""
 
 import json
 import math
-import subprocess
-from pathlib import Path
+import re
+import sys
 
 import pytest
 import torch
 from omegaconf import OmegaConf
+from small_runs import ROOT, run
 from small_runs import SMALL as SMALL_RUN
 from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType
+from torchrl.objectives import SoftUpdate
 
-from torchrl_quad import LandingEnv, make_actor, restart
+from torchrl_quad import HoveringEnv, LandingEnv, SHACLoss, differentiable_rollout, make_actor, make_value, restart
 from torchrl_quad.envs import TASKS
 from torchrl_quad.envs.metrics import EPISODE_METRICS
 from torchrl_quad.files import read_rows
@@ -20,15 +23,8 @@ from torchrl_quad.training.checkpoints import read_checkpoint
 from torchrl_quad.training.evaluation import drawing_from, evaluate
 from torchrl_quad.training.schema import LOSSES, settings
 
-ROOT = Path(__file__).parent.parent
 SMALL = [*SMALL_RUN, "total_steps=96"]
 RECIPES = sorted(LOSSES)
-
-
-def run(*command, cwd=ROOT):
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
 
 
 @pytest.fixture
@@ -67,8 +63,7 @@ def test_every_recipe_trains_on_its_tasks_and_leaves_what_it_promises(launch, no
         may_be_missing = {"eval/lap_time", "eval/landing_speed"}
         assert all(math.isfinite(float(row[name])) for row in rows for name in set(row) - may_be_missing)
         summary = json.loads((folder / "summary.json").read_text())
-        assert summary["episodes"] == 256
-        assert summary["steps"] == steps[-1]
+        assert summary["episodes"] == 256 and summary["steps"] == steps[-1]
         report = printed.split(f"{recipe} on {task}, seed 0, 256 fresh episodes:\n")[1].split("results in")[0]
         assert f"  episodes solved       {EPISODE_METRICS['solved'].format(summary['solved'])}\n" in report
         assert set(TASKS[task].metric_info) <= set(summary)
@@ -122,8 +117,80 @@ def test_an_evaluation_of_more_episodes_than_drones_flies_rounds_from_starts_of_
     with drawing_from(env, 7):
         metrics, flight = evaluate(env, actor, episodes=9)  # 9 take 3 rounds of 4
     means = [single["eval/return"] for single, _ in rounds]
-    assert len(set(means)) == 3
-    assert metrics["eval/return"] == pytest.approx(sum(means) / 3, rel=1e-6)
+    assert len(set(means)) == 3 and metrics["eval/return"] == pytest.approx(sum(means) / 3, rel=1e-6)
     terms = [value for name, value in metrics.items() if name.startswith("reward/")]
     assert sum(terms) == pytest.approx(sum(means) / 3, rel=1e-5)
     torch.testing.assert_close(flight["state"].to_dict(), rounds[-1][1]["state"].to_dict(), rtol=0, atol=0)
+
+
+def judged(actor, seed=99, **options):
+    """The metrics of fresh episodes of hovering, flown by the mean action."""
+    env = HoveringEnv(seed=seed, **options)
+    with torch.no_grad():
+        mode = {"exploration_type": ExplorationType.DETERMINISTIC}
+        flight, _ = differentiable_rollout(env, actor, None, env.max_episode_steps, **mode)
+    return env.episode_metrics(flight)
+
+
+def test_shac_learns_to_hover_in_seconds():
+    coarse = {"num_envs": 64, "control_dt": 0.05, "dt": 0.025, "max_episode_steps": 100}  # few steps a second of flight
+    iterations = 64
+    env = HoveringEnv(seed=0, **coarse)
+    actor = make_actor(env, input_scale=0.5)
+    loss = SHACLoss(actor, make_value(env, input_scale=0.5))
+    target = SoftUpdate(loss, tau=0.05)
+    optimizer = torch.optim.Adam(actor.parameters(), 2e-2, betas=(0.7, 0.95))
+    critic_optimizer = torch.optim.Adam(loss.value_network_params.parameters(), 5e-3)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.01, iterations)
+    assert judged(actor, **coarse)["solved"].mean() < 0.1
+    carry = env.reset()
+    for _ in range(iterations):
+        rollout, carry = differentiable_rollout(env, actor, carry, 24)
+        optimizer.zero_grad()
+        loss.loss_actor(rollout)[0].backward()
+        torch.nn.utils.clip_grad_norm_(actor.parameters(), 0.5)
+        optimizer.step()
+        schedule.step()
+        data = loss.write_value_target(rollout.detach()).reshape(-1)
+        for batch in data[torch.randperm(len(data))].split(512):
+            critic_optimizer.zero_grad()
+            loss.loss_value(batch)[0].backward()
+            critic_optimizer.step()
+            target.step()
+        carry = restart(env, carry, 0.1)
+    assert judged(actor, **coarse)["solved"].mean() >= 0.9
+
+
+def summary(folder, recipe, *overrides):
+    command = [sys.executable, f"recipes/{recipe}.py", *overrides, f"hydra.run.dir={folder}"]
+    run(*command, timeout=None)
+    return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", ["abpt", "bptt", "shac", "sapo", "ahac"])
+def test_every_recipe_learns_to_hover(recipe, tmp_path):
+    found = summary(tmp_path, recipe)
+    assert found["solved"] >= 0.99 and found["position_error"] < 0.05
+
+
+@pytest.mark.slow
+def test_the_program_of_the_readme_learns_to_hover():
+    program = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
+    names = {}
+    exec(program, names)
+    metrics = judged(names["actor"], num_envs=256)
+    assert metrics["solved"].all() and metrics["position_error"].median() < 0.05
+
+
+@pytest.mark.slow
+def test_abpt_flies_two_laps(tmp_path):
+    assert summary(tmp_path, "abpt", "task=racing")["gates_passed"] >= 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["landing", "tracking"])
+def test_abpt_tracks_and_lands(task, tmp_path):
+    found = summary(tmp_path, "abpt", f"task={task}")
+    assert found["solved"] >= 0.95
+    assert task == "landing" or found["tracking_rmse"] < 0.05

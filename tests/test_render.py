@@ -9,18 +9,12 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 from PIL import Image
+from refusals import cases, refuses
 from torchrl.envs import RewardSum, TransformedEnv
 
 from torchrl_quad import ActionSequence, HoveringEnv, differentiable_rollout, envs, make_actor, make_env
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric
-from torchrl_quad.render import (
-    animate_flight,
-    plot_episode,
-    plot_flight,
-    plot_learning_curve,
-    video,
-    write_replay,
-)
+from torchrl_quad.render import animate_flight, plot_episode, plot_flight, plot_learning_curve, video, write_replay
 from torchrl_quad.render.video import View
 
 TASKS = ["hovering", "landing", "racing", "tracking"]
@@ -101,9 +95,6 @@ def flown(flight):
     return [torch.cat((s[:1], e[:n])) for s, e, n in zip(start, ends, steps, strict=True)]
 
 
-# -- pictures and films ------------------------------------------------------------------------------------------------
-
-
 def test_a_flight_with_crashes_and_fewer_environments_than_asked_for_is_drawn(crashing):
     flight = crashing(HoveringEnv(num_envs=3, max_episode_steps=40), 60)
     assert flight["next", "terminated"][1].any()
@@ -146,8 +137,7 @@ def test_the_environment_provides_the_control_step_the_markers_and_the_units(tra
     named = TransformedEnv(env, RewardSum()) if transformed else env
     space, over_time = plot_flight(flight, env=named).axes
     animate_flight(flight, tmp_path / "flight.gif", env=named)
-    assert over_time.get_ylabel() == "gates passed"
-    assert over_time.lines[0].get_xdata()[-1] == pytest.approx(0.8)
+    assert over_time.get_ylabel() == "gates passed" and over_time.lines[0].get_xdata()[-1] == pytest.approx(0.8)
     (marks,) = [marks for marks in space.collections if marks.get_label() == "gate"]
     rims = np.asarray(marks._segments3d)
     np.testing.assert_allclose(rims[:, :-1].mean(1), env.gates, atol=1e-5)
@@ -214,10 +204,7 @@ def test_a_target_that_is_no_position_is_not_drawn(shape, tmp_path):
     assert (env.render() != before).any()
 
 
-@pytest.mark.parametrize(
-    ("cls", "given", "name"),
-    [(Climbing, True, "reward"), (Measured, False, "vertical speed"), (Measured, True, "climb rate [cm/s]")],
-)
+@cases((Climbing, True, "reward"), (Measured, False, "vertical speed"), (Measured, True, "climb rate [cm/s]"))
 def test_a_task_without_targets_shows_its_metrics_or_its_reward(cls, given, name, tmp_path):
     env = cls(num_envs=2, max_episode_steps=20)
     flight = env.rollout(20, break_when_any_done=False)
@@ -229,9 +216,6 @@ def test_a_task_without_targets_shows_its_metrics_or_its_reward(cls, given, name
     scale = 100.0 if "cm" in name else 1.0
     np.testing.assert_allclose(line[1:, 1], scale * flight["next", "reward"][0, :, 0], rtol=1e-6)
     assert image(tmp_path / "flight.gif").shape == env.render().shape == (336, 336, 3)
-
-
-# -- figures for papers ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -267,13 +251,11 @@ def test_an_episode_of_every_task_is_drawn_with_what_flew(task, tmp_path):
 @pytest.mark.parametrize("task", envs.TASKS)
 def test_an_episode_of_one_step_is_drawn(task):
     env = make_env(task, num_envs=1, max_episode_steps=1)
-    figure = plot_episode(env.rollout(1, break_when_any_done=False), env=env)
-    assert figure.axes[-1].get_xlim() == (0.0, 0.02)
+    assert plot_episode(env.rollout(1, break_when_any_done=False), env=env).axes[-1].get_xlim() == (0.0, 0.02)
 
 
 def test_without_rotors_in_the_state_there_is_no_panel_of_them():
-    flight = make_env("hovering", num_envs=1, dynamics="point_mass").rollout(3)
-    last = plot_episode(flight).axes[-1]
+    last = plot_episode(make_env("hovering", num_envs=1, dynamics="point_mass").rollout(3)).axes[-1]
     assert last.get_ylabel() == "action" and last.get_xlabel() == "time [s]"
 
 
@@ -304,9 +286,6 @@ def test_the_fonts_of_a_figure_are_embedded_as_truetype_and_it_is_as_wide_as_two
     assert image(tmp_path / "episode.png").shape[1] == 2148  # 300 dots per inch
 
 
-# -- notebooks ---------------------------------------------------------------------------------------------------------
-
-
 def test_without_a_path_a_figure_is_returned_and_shows_itself_in_a_notebook(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     env = make_env("forest", num_envs=2)
@@ -315,9 +294,6 @@ def test_without_a_path_a_figure_is_returned_and_shows_itself_in_a_notebook(tmp_
         assert isinstance(figure, Figure) and figure._repr_png_().startswith(b"\x89PNG")
     assert not list(tmp_path.iterdir())
     assert pickle.loads(pickle.dumps(figure))._repr_png_() == figure._repr_png_()
-
-
-# -- learning curves ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -346,14 +322,8 @@ def test_metrics_are_drawn_in_their_units_in_the_order_of_the_task(draw):
     assert labels == ["return", "episodes solved [%]", "position error", "top speed"]
 
 
-def test_a_learning_curve_has_gaps_where_cells_are_empty(draw):
+def test_a_learning_curve_has_gaps_where_cells_are_empty_and_one_of_nothing_is_refused(draw):
     axes = draw("steps,time/seconds,eval/return,eval/solved,note", "0,0.0,5.0,,none", "100,1.0,6.0,0.5,none")
     assert np.isnan(axes[1].lines[0].get_ydata()).tolist() == [True, False]
-
-
-@pytest.mark.parametrize(
-    ("rows", "message"), [(["steps,eval/return"], "has no row yet"), (["steps", "1"], "needs the columns .* has steps")]
-)
-def test_a_learning_curve_of_nothing_is_refused(draw, rows, message):
-    with pytest.raises(ValueError, match=message):
-        draw(*rows)
+    refuses("has no row yet", draw, "steps,eval/return")
+    refuses("needs the columns .* has steps", draw, "steps", "1")

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 
 import imageio_ffmpeg
 import pytest
+from refusals import refuses
 from small_runs import SMALL
 
 from torchrl_quad import HoveringEnv
@@ -43,8 +44,7 @@ def test_what_cannot_be_drawn_is_named(tmp_path):
             (draw, flight, {"env": "hovering"}, f"{name}: env must be the quadrotor environment .* got str"),
         ]
     for draw, rollout, options, message in calls:
-        with pytest.raises((ValueError, TypeError, IndexError), match=message):
-            draw(rollout, **options)
+        refuses(message, draw, rollout, error=(ValueError, TypeError, IndexError), **options)
     assert not list(tmp_path.iterdir())
 
 
@@ -60,8 +60,7 @@ def test_drawing_leaves_the_user_s_matplotlib_alone():
         draw(flight)
     env.render()
     assert not pyplot.get_fignums()
-    assert matplotlib.get_backend() == "svg"
-    assert dict(matplotlib.rcParams) == settings
+    assert matplotlib.get_backend() == "svg" and dict(matplotlib.rcParams) == settings
 
 
 def test_without_matplotlib_or_ffmpeg_it_says_what_to_install(monkeypatch):
@@ -73,11 +72,8 @@ def test_without_matplotlib_or_ffmpeg_it_says_what_to_install(monkeypatch):
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
     for draw in (plot_flight, plot_episode, film, lambda _: env.render()):
-        with pytest.raises(ImportError, match=r"pip install '.\[render\]'"):
-            draw(flight)
+        refuses(r"pip install '.\[render\]'", draw, flight, error=ImportError)
 
-
-# -- an ffmpeg that does not work --------------------------------------------------------------------------------------
 
 WORKS = imageio_ffmpeg.get_ffmpeg_exe()
 BROKEN = {
@@ -129,14 +125,11 @@ def test_where_no_ffmpeg_works_the_film_is_a_gif_and_a_line_says_why(
 
 
 def test_an_ffmpeg_that_cannot_be_found_is_installed_anew(monkeypatch, tmp_path):
-    monkeypatch.setattr(
-        imageio_ffmpeg, "get_ffmpeg_exe", Mock(side_effect=RuntimeError("No ffmpeg exe could be found."))
-    )
+    missing = Mock(side_effect=RuntimeError("No ffmpeg exe could be found."))
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", missing)
     with pytest.raises(NoFfmpeg, match=r"No ffmpeg exe could be found.*pip install --force-reinstall"):
         animate_flight(HoveringEnv(num_envs=1).rollout(3), tmp_path / "flight.mp4")
 
-
-# -- results do not depend on pictures ---------------------------------------------------------------------------------
 
 FAILURES = {
     "disk full": (OSError(errno.ENOSPC, "No space left on device"), False),
@@ -181,9 +174,8 @@ def test_a_picture_takes_the_place_of_nothing_but_a_picture(capsys, tmp_path):
     (tmp_path / "episode.png").mkdir()
     drawing.publish_flight(env.rollout(3), tmp_path / "episode.png", tmp_path / "flight.html", env, "one")
     said = capsys.readouterr().err.splitlines()
-    assert [line.split(" is missing. ")[0] for line in said] == [
-        f"Warning: {tmp_path}/{name}" for name in ("episode.png", "flight.html")
-    ]
+    wanted = [f"Warning: {tmp_path}/{name}" for name in ("episode.png", "flight.html")]
+    assert [line.split(" is missing. ")[0] for line in said] == wanted
     assert kept.read_text() == "kept" and (tmp_path / "flight.html").is_symlink()
 
 

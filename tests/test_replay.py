@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from browsing import TIMEOUT
+from refusals import refuses
 from torchrl.envs import RewardSum, TransformedEnv
 
 from torchrl_quad import HoveringEnv, RacingEnv, differentiable_rollout, make_actor, make_env
@@ -55,8 +56,7 @@ def opened(open_page, folder, env, rollout, goal="target"):
     np.testing.assert_allclose(replay.bodies()[:, 0], rollout["state", "position"][:, 0], atol=1e-6)
     success = "  dashed: success below it" if isinstance(env, HoveringEnv) else ""
     panels = ["reward, sum", "action [-1, 1], thrust", "speed [m/s]", f"distance to the {goal} [m]{success}"]
-    assert replay.series()[1] == panels
-    assert replay.layout("yaxis4.type") == ("linear" if goal == "next gate" else "log")
+    assert replay.series()[1] == panels and replay.layout("yaxis4.type") == ("linear" if goal == "next gate" else "log")
     if success:
         low, high = replay.layout("yaxis4.range")
         assert low < -1 < high and replay.layout("shapes.0.y0") == pytest.approx(0.1)
@@ -197,7 +197,7 @@ def test_the_cursor_is_in_step_and_a_click_goes_to_a_time(replay):
     assert replay.step() == pytest.approx(300, abs=3)
 
 
-def test_the_keyboard_plays_steps_and_chooses(replay):
+def test_the_keyboard_plays_steps_and_chooses_and_keys_of_the_browser_are_left_to_it(replay):
     keyboard = replay.page.keyboard
     for key, step in (("ArrowRight", 1), ("ArrowRight", 2), ("ArrowLeft", 1)):
         keyboard.press(key)
@@ -210,10 +210,7 @@ def test_the_keyboard_plays_steps_and_chooses(replay):
     replay.wait(lambda step: step > 3)
     keyboard.press(" ")
     assert replay.page.inner_text("#play") == "Play"
-
-
-def test_keys_of_the_browser_are_left_to_it_and_those_of_the_page_work_after_a_choice(replay):
-    keyboard = replay.page.keyboard
+    replay.scrub(0)
     replay.page.evaluate("document.activeElement.blur()")  # the slider has keys of its own
     for key in ("Alt+ArrowRight", "Control+ArrowRight", "Meta+ArrowRight"):
         keyboard.press(key)
@@ -275,9 +272,6 @@ def test_a_drone_stays_where_its_episode_has_ended_and_the_page_says_how(open_pa
     replay.close()
 
 
-# -- what a page holds -------------------------------------------------------------------------------------------------
-
-
 def written(rollout, **options):
     """What the page of a flight shows, as it is stored."""
     text = write_replay(rollout, **options).html
@@ -328,7 +322,7 @@ def test_randomised_drones_are_drawn_with_their_own_rotors():
     torch.testing.assert_close(numbers("lift", 3, 6, 4)[:, 0], 4 * thrust / (drone["mass"] * 9.81), rtol=1e-4, atol=0)
 
 
-def test_the_gate_of_a_frame_is_the_one_that_the_drone_flies_to():
+def test_the_gate_of_a_frame_is_the_one_that_the_drone_flies_to_and_rings_face_along_the_course():
     env = RacingEnv(num_envs=3)
     rollout = env.rollout(4, break_when_any_done=False)
     gates = written(rollout, env=env)[1]("gate", 3, 5)
@@ -336,9 +330,6 @@ def test_the_gate_of_a_frame_is_the_one_that_the_drone_flies_to():
     assert torch.equal(gates[:, 0], rollout["state", "gate"][:, 0, 0].float())
     content, _ = written(rollout)
     assert content["gates"] is content["gate"] is None
-
-
-def test_rings_face_along_the_course():
     env = RacingEnv(num_envs=1, track={"gates": [[0, 0, 2], [4, 0, 2], [4, 0, 6], [0, 0, 6]], "gate_radius": 0.5})
     rings = written(env.rollout(2), env=env)[1]("gates", 4, 33, 3) - env.gates[:, None]
     torch.testing.assert_close(rings.norm(dim=-1), torch.full((4, 33), 0.5))
@@ -346,13 +337,9 @@ def test_rings_face_along_the_course():
     torch.testing.assert_close((rings * along[:, None]).sum(-1), torch.zeros(4, 33), atol=1e-5, rtol=0)
 
 
-def test_a_page_of_twelve_long_flights_is_small():
+def test_a_page_of_twelve_long_flights_is_small_and_a_machine_without_plotly_is_told_what_to_install(monkeypatch):
     env = make_env("tracking", num_envs=14)
     content, _ = written(env.rollout(512, break_when_any_done=False), env=env)
     assert content["environments"] == 12 and len(json.dumps(content)) < 1_500_000
-
-
-def test_a_machine_without_plotly_is_told_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
-    with pytest.raises(ImportError, match=r"pip install '.\[render\]'"):
-        write_replay(HoveringEnv(num_envs=2).rollout(3))
+    refuses(r"pip install '.\[render\]'", write_replay, HoveringEnv(num_envs=2).rollout(3), error=ImportError)

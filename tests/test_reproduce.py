@@ -12,6 +12,7 @@ import time
 import numpy as np
 import pytest
 import torch
+from refusals import cases, refuses
 from scipy.stats import mannwhitneyu
 
 from benchmarks.paper import elsewhere, flights, gradients, matrix, reproduce, results, running, tables
@@ -127,22 +128,18 @@ side_by_side(1, [(command, [sys.executable, "-c", {sleeper!r}], folder / str(i))
 def test_a_run_that_fails_is_told_and_stops_no_other(tmp_path, capsys):
     codes = ("raise OSError(1) #0", "#1")
     jobs = [(running.command, [sys.executable, "-c", code], tmp_path / code[-1]) for code in codes]
-    with pytest.raises(SystemExit, match="1 of 2 runs failed"):
-        running.side_by_side(1, jobs)
+    refuses("1 of 2 runs failed", running.side_by_side, 1, jobs, error=SystemExit)
     assert "ended with 1: OSError: 1 See log.txt there" in capsys.readouterr().err
     assert (tmp_path / "1/log.txt").exists()
 
 
-def test_a_run_that_diverged_is_kept_as_one(tmp_path):
+def test_a_run_that_diverged_is_kept_as_one_and_the_best_learning_rate_ends_highest(tmp_path):
     finish(tmp_path / "run")
     (tmp_path / "run/failure.pt").write_text("")
     job = Job("hovering", "abpt", 100, 0.03)
     reproduce.keep(job, tmp_path / "run", tmp_path)
     assert running.kept(tmp_path / "final.csv", *reproduce.KEY) == {job.key} != {Job("hovering", "abpt", 100, 0.01).key}
     assert [row["return"] for row in read_rows(tmp_path / "search/hovering.csv")] == ["2.5", "nan"]
-
-
-def test_the_best_learning_rate_is_that_whose_curve_ends_highest(tmp_path):
     ends = {"0.001": 3.0, "0.01": 5.0, "0.1": math.nan}
     rows = [row | {"lr": lr} for lr, end in ends.items() for row in curve("abpt", 100, 9.0, end)]
     write_rows(tmp_path / "search/hovering.csv", rows)
@@ -171,7 +168,7 @@ def test_the_jobs_of_the_matrix_are_valid_runs_of_their_recipes_and_each_is_ther
         assert cfg.total_steps == matrix.STEPS[job.task][cfg.algorithm == "ppo"] * (0.25 if job.lr else 1)
 
 
-def test_without_visited_states_every_horizon_goes_on_where_the_last_one_ended():
+def test_without_visited_states_horizons_go_on_and_a_task_of_your_own_is_flown_with_all_that_the_paper_flies():
     def starts(task, variant):
         cfg = reproduce.configuration(Job(task, variant, 42), 1e-3)
         return cfg.buffer.fraction, cfg.restart_fraction
@@ -179,6 +176,10 @@ def test_without_visited_states_every_horizon_goes_on_where_the_last_one_ended()
     assert {starts(task, "abpt-no-visited") for task in matrix.TASKS} == {(None, 0)}
     assert starts("landing", "abpt-restarts") == (None, 0.2)
     assert starts("racing", "abpt-now") == starts("racing", "abpt") == (0.8, 0.2)
+    jobs = matrix.jobs(tuple(matrix.EXPERIMENTS), ("own_task.CornerEnv",), (42,))
+    assert {"abpt", "ppo", "bptt-episode", "abpt-no-0-step"} <= {job.variant for job in jobs}
+    cfg = reproduce.configuration(jobs[0], 1e-2)
+    assert (cfg.task, cfg.total_steps, cfg.env.reach) == ("own_task.CornerEnv", 491_520, 0.5)
 
 
 @pytest.fixture
@@ -293,21 +294,10 @@ def test_methods_are_compared_by_interquartile_means_and_by_who_beats_whom(tmp_p
     assert "| PPO | 1.00, 1 | 1.00, 1 |  |" in beaten and "| BPTT |  | 0.50, 1 | 0.00, 1 |" in beaten
 
 
-def test_a_task_of_your_own_is_flown_with_all_that_the_paper_flies_on_each_of_its_tasks():
-    jobs = matrix.jobs(tuple(matrix.EXPERIMENTS), ("own_task.CornerEnv",), (42,))
-    assert {"abpt", "ppo", "bptt-episode", "abpt-no-0-step"} <= {job.variant for job in jobs}
-    cfg = reproduce.configuration(jobs[0], 1e-2)
-    assert (cfg.task, cfg.total_steps, cfg.env.reach) == ("own_task.CornerEnv", 491_520, 0.5)
-
-
-# -- other environments, and gradients ---------------------------------------------------------------------------------
-
 RANGE = {"pendulum": (-4 * 16.3, 0.0), "balance": (-20.0, 20.0)}  # returns that four steps can have
 
 
-@pytest.mark.parametrize(
-    ("environment", "losses"), [("pendulum", elsewhere.NAMES), ("balance", ("shac", "hybrid", "ppo"))]
-)
+@cases(("pendulum", elsewhere.NAMES), ("balance", ("shac", "hybrid", "ppo")))
 def test_a_loss_trains_on_another_environment_once_and_has_a_row_in_the_table(
     environment, losses, monkeypatch, tmp_path
 ):
@@ -320,13 +310,12 @@ def test_a_loss_trains_on_another_environment_once_and_has_a_row_in_the_table(
     low, high = RANGE[environment]
     assert low < float(rows[0]["before"]) < high
     table = tables.elsewhere_table(tmp_path)
-    assert [row["loss"] for row in table] == list(losses)
-    assert all(environment in row for row in table)
+    assert [row["loss"] for row in table] == list(losses) and all(environment in row for row in table)
     monkeypatch.setattr(elsewhere, "learn", lambda *_: pytest.fail("It has been trained."))
     run_main(monkeypatch, reproduce, *arguments)
 
 
-def test_balance_cuts_the_graph_between_horizons_and_lets_some_go_on():
+def test_balance_cuts_the_graph_between_horizons_and_at_a_reset_and_lets_some_go_on():
     torch.manual_seed(0)
     place = elsewhere.Balance(0, 16)
     actions = torch.zeros(16, 6, requires_grad=True)
@@ -335,11 +324,7 @@ def test_balance_cuts_the_graph_between_horizons_and_lets_some_go_on():
     assert (gradient != 0).any(0).all(), "each agent is moved by its own action"
     start = place.go_on(end.detach())
     assert not any(entry.requires_grad for entry in start.values(True, True))
-    kept = (start["observation"] == end["observation"]).all(-1)
-    assert 0 < kept.sum() < 16
-
-
-def test_a_reset_at_the_end_of_a_horizon_leaves_no_graph_in_the_carry():
+    assert 0 < (start["observation"] == end["observation"]).all(-1).sum() < 16
     place = elsewhere.Balance(0, 4)
     carry, scenario = place.starts(), place.env.base_env.scenario
     scenario.package.set_pos(torch.tensor([0.0, -2.0]), batch_index=0)  # one ball lies on the floor
@@ -374,7 +359,6 @@ def test_backpropagation_through_all_steps_knows_the_true_slopes():
     start = smooth.reset()
     rollout, _ = differentiable_rollout(smooth, loss.actor_network, start, 20)
     estimated = gradients.estimates(loss, rollout)["objective"]
-    action = rollout["action"][:, 0].detach()
-    true = gradients.slopes(smooth, loss, start, action, steps=20, size=1e-3)
+    true = gradients.slopes(smooth, loss, start, rollout["action"][:, 0].detach(), steps=20, size=1e-3)
     assert torch.nn.functional.cosine_similarity(estimated, true, dim=-1).min() > 0.99
     torch.testing.assert_close(estimated.norm(), true.norm(), rtol=0.02, atol=0.0)

@@ -1,20 +1,35 @@
-"""A run that was stopped goes on as if it had not been."""
+"""A run has its folder alone, says how to go on, and goes on as if it had not stopped; damage is found."""
 
+import contextlib
+import errno
+import fcntl
 import json
+import os
+import random
 import re
 import signal
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
-from small_runs import EVERYTHING, SMALL, assert_equal, rows, stop_at_save
+import yaml
+from omegaconf import OmegaConf
+from refusals import cases, refuses
+from small_runs import EVERYTHING, ROOT, SMALL, assert_equal, rows, stop_at_save
 
+from torchrl_quad import BPTTLoss
 from torchrl_quad.training import loop
-from torchrl_quad.training.checkpoints import read_checkpoint
+from torchrl_quad.training.building import average_policy
+from torchrl_quad.training.checkpoints import previous, read_checkpoint, write_checkpoint
+from torchrl_quad.training.launch import own_folder
 
-ROOT = Path(__file__).parent.parent
 ENTROPY = ["loss.alpha=auto", "loss.clip_action_gradient=3"]
 SEEING = [  # and remembering: a memory, images on their way, and noise that goes on
     *("task=forest", "env.density=0.02", "env.camera.width=6", "env.camera.height=4", "+env.camera.rate=2"),
@@ -22,13 +37,10 @@ SEEING = [  # and remembering: a memory, images on their way, and noise that goe
 ]
 
 
-@pytest.mark.parametrize(
-    ("recipe", "options"),
-    [
-        *((recipe, [*EVERYTHING, *ENTROPY]) for recipe in ("abpt", "ahac", "shac", "sapo")),
-        *((recipe, EVERYTHING) for recipe in ("hybrid", "ppo")),
-        ("bptt", [*SEEING, *ENTROPY]),
-    ],
+@cases(
+    *((recipe, [*EVERYTHING, *ENTROPY]) for recipe in ("abpt", "ahac", "shac", "sapo")),
+    *((recipe, EVERYTHING) for recipe in ("hybrid", "ppo")),
+    ("bptt", [*SEEING, *ENTROPY]),
 )
 def test_a_run_that_was_stopped_goes_on_as_if_it_had_not(recipe, options, train, refused, tmp_path, monkeypatch):
     short = "total_steps=96"
@@ -83,8 +95,7 @@ def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint_although_it_left
     assert [row["iteration"] for row in rows(folder)] == ["1", "2"]
     assert f"process {process.pid} on" in (folder / "run.lock").read_text()
     assert_equal(straight, train("abpt", folder, *options, "resume=auto"))
-    assert rows(folder) == rows(tmp_path / "straight")
-    assert not (folder / "run.lock").exists()
+    assert rows(folder) == rows(tmp_path / "straight") and not (folder / "run.lock").exists()
 
 
 def test_resume_auto_starts_goes_on_and_leaves_alone_what_is_finished(train, launch, tmp_path, monkeypatch):
@@ -131,3 +142,261 @@ def test_a_run_that_is_resumed_by_path_goes_on_in_the_folder_of_its_checkpoint(t
     launch("bptt", f"resume={path}", "total_steps=240")
     assert (saved["iteration"], read_checkpoint(path)["iteration"]) == (8, 10)
     assert not (tmp_path / "elsewhere").exists()
+
+
+def test_two_runs_of_one_second_get_folders_of_their_own(launch, no_pictures, tmp_path, monkeypatch):
+    moment = datetime(2030, 1, 1)
+    monkeypatch.setattr("hydra.core.utils.datetime", SimpleNamespace(now=lambda: moment))
+    monkeypatch.chdir(tmp_path)
+    hydras = tmp_path / "outputs/hovering/bptt/seed0/2030-01-01_00-00-00"
+    with own_folder(hydras, named=False):  # a run that has just started
+        launch("bptt", *SMALL, "actor.lr=0.01")
+        launch("bptt", *SMALL, "actor.lr=0.02")
+    for name, rate in (("_2", 0.01), ("_3", 0.02)):
+        folder = hydras.with_name(hydras.name + name)
+        checkpoint = read_checkpoint(folder / "checkpoint.pt")
+        assert f"  lr: {rate}\n" in checkpoint["config"]
+        assert json.loads((folder / "summary.json").read_text())["best_steps"] == checkpoint["best"]["steps"]
+
+
+def test_a_proposed_folder_that_another_run_has_or_had_gets_a_number(tmp_path):
+    proposed = tmp_path / "run"
+    with own_folder(proposed, named=False) as first, own_folder(proposed, named=False) as second:
+        assert (first.name, second.name) == ("run", "run_2")
+        (first / "summary.json").touch()
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]  # the empty one is gone
+    with own_folder(proposed, named=False) as third:
+        assert third.name == "run_2"
+    assert [path.name for path in first.iterdir()] == ["summary.json"]
+
+
+def test_a_named_folder_is_refused_while_its_holder_lives_and_taken_over_when_it_is_dead(tmp_path):
+    with (
+        own_folder(tmp_path, named=True),
+        pytest.raises(FileExistsError, match=rf"{tmp_path} is in use by process {os.getpid()} on .* since \d{{4}}-"),
+        own_folder(tmp_path, named=True),
+    ):
+        pass
+    (tmp_path / "run.lock").write_text("process 123 on another machine since 2020-01-01 00:00:00\n")
+    with own_folder(tmp_path, named=True):
+        assert f"process {os.getpid()}" in (tmp_path / "run.lock").read_text()
+    assert not list(tmp_path.iterdir())
+
+
+def test_of_many_that_want_a_folder_at_once_one_gets_it_and_without_locks_they_go_on(tmp_path, monkeypatch):
+    def want(_):
+        with contextlib.suppress(FileExistsError), own_folder(tmp_path, named=True):
+            inside.append(1)
+            most.append(len(inside))
+            time.sleep(0.002)
+            inside.pop()
+
+    inside, most = [], []
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(want, range(200)))
+    assert max(most) == 1
+    monkeypatch.setattr(fcntl, "flock", Mock(side_effect=OSError(errno.ENOLCK, "No locks available")))
+    with own_folder(tmp_path, named=True) as folder:
+        assert folder == tmp_path
+
+
+def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
+    script, folder = ROOT / "recipes/bptt.py", tmp_path / "run"
+    command = [sys.executable, script, *SMALL, "total_steps=1_000_000", f"hydra.run.dir={folder}"]
+    said, deadline = tmp_path / "said.txt", time.monotonic() + 120
+    options = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}  # ignored where tests run behind "&"
+    with said.open("w") as file, subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=file, **options) as run:
+        try:
+            while not (folder / "checkpoint.pt").exists():
+                assert run.poll() is None and time.monotonic() < deadline, said.read_text()
+                time.sleep(0.02)
+            run.send_signal(signal.SIGINT)
+            run.wait(timeout=60)
+        finally:
+            run.kill()
+    printed = said.read_text()
+    assert run.returncode == 130
+    assert "Traceback" not in printed
+    assert printed.splitlines()[-1] == f"Stopped. Continue with: python {script} resume={folder}/checkpoint.pt"
+
+
+def test_ctrl_c_before_a_checkpoint_says_so_and_a_bug_keeps_its_traceback(
+    refused, no_pictures, tmp_path, monkeypatch, launch
+):
+    stop_at_save(monkeypatch, 1)
+    said = refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", status=130)
+    assert said == "Stopped. Nothing was saved yet: the first evaluation writes a checkpoint."
+    monkeypatch.setattr(BPTTLoss, "loss_actor", lambda self, rollout: {}["missing"])
+    refuses("missing", launch, "bptt", *SMALL, f"hydra.run.dir={tmp_path}", error=KeyError)
+
+
+def test_what_environment_and_loss_refuse_ends_in_one_line_and_leaves_no_folder(refused, launch, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert refused("bptt", *SMALL, "env.drone=hawk").startswith("Error: Unknown drone 'hawk'. Choose from: crazyflie")
+    assert not list(tmp_path.glob("outputs/hovering/bptt/seed0/*"))
+    assert "env.curve=oval: it must be one of slow_circle" in refused("bptt", *SMALL, "task=tracking", "env.curve=oval")
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(BaseException, match="Unknown drone 'hawk'") as error:
+        launch("bptt", *SMALL, "env.drone=hawk")
+    assert isinstance(error.value.__cause__, ValueError)  # the traceback starts where it was raised
+
+
+CONTENT = {"config": "task: hovering", "best": {"actor": {"weight": torch.ones(40, 40)}}, "version": "0.1"}
+
+
+def test_no_flipped_bit_of_a_checkpoint_goes_unnoticed(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    write_checkpoint(path, CONTENT)
+    torch.testing.assert_close(read_checkpoint(path)["best"], CONTENT["best"])
+    whole, draw = path.read_bytes(), random.Random(0)
+    positions = [draw.randrange(len(whole)) for _ in range(200)] + list(range(len(whole) - 110, len(whole)))
+    for at in positions:
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << draw.randrange(8)
+        path.write_bytes(damaged)
+        refuses(r"checkpoint\.pt (is damaged|is cut off)", read_checkpoint, path)
+
+
+def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(train, refused, launch, tmp_path):
+    straight = train("bptt", tmp_path)
+    path = tmp_path / "checkpoint.pt"
+    damaged = bytearray(path.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    path.write_bytes(damaged)
+    said = refused("bptt", *SMALL, f"hydra.run.dir={tmp_path}", "resume=auto")
+    assert f"{path} is damaged: its checksum does not fit its content." in said
+    assert said.endswith(f"Continue from the checkpoint before it: resume={tmp_path}/checkpoint.previous.pt")
+    assert read_checkpoint(previous(path))["iteration"] == 6
+    launch("bptt", f"resume={previous(path)}")
+    assert read_checkpoint(path)["iteration"] == 8
+    torch.testing.assert_close(read_checkpoint(path)["best"]["actor"], straight["best"]["actor"], rtol=0, atol=0)
+    assert read_checkpoint(previous(path))["iteration"] == 6  # and not the damaged one
+
+
+def test_a_file_that_is_no_checkpoint_of_this_version_is_named_with_the_reason(refused, tmp_path):
+    path = tmp_path / "bad.pt"
+
+    def fails(match):
+        refuses(match, read_checkpoint, path, error=(ValueError, FileNotFoundError))
+
+    fails("No checkpoint at .*bad.pt. Train one first")
+    torch.save({"weights": torch.zeros(1)}, path)
+    fails("bad.pt is cut off, or no checkpoint of these recipes. There is none before it")
+    write_checkpoint(path, {**CONTENT, "config": Path("anything that is pickled")})
+    fails("anything else could run code, and is not loaded")
+    write_checkpoint(path, {**CONTENT, "format": 2})
+    fails("has checkpoint format 2, this version reads format 5. It was written by torchrl_quad 0.1 at .*:")
+    assert "bad.pt has checkpoint format 2" in refused("evaluate", f"checkpoint={path}")
+
+
+def test_a_full_disk_is_named_and_leaves_the_last_checkpoint_intact(refused, no_pictures, tmp_path, monkeypatch):
+    small = [*SMALL, f"hydra.run.dir={tmp_path}"]
+    full = OSError(errno.ENOSPC, "No space left on device", "checkpoint.pt")
+    with monkeypatch.context() as patch:
+        stop_at_save(patch, 1, full)
+        assert "the disk is full: checkpoint.pt. Nothing was saved yet" in refused("bptt", *small)
+
+    def write_half(path, data, write=Path.write_bytes):
+        write(path, data[: len(data) // 2])
+        raise full
+
+    with monkeypatch.context() as patch:
+        stop_at_save(patch, 3, full)
+        said = refused("bptt", *small)
+    assert "The last checkpoint is intact. Make room. Continue with: python " in said
+    assert said.endswith(f"recipes/bptt.py resume={tmp_path}/checkpoint.pt")
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", write_half)
+        assert "the disk is full" in refused("bptt", *small, "resume=auto")
+    assert (tmp_path / "checkpoint.pt").read_bytes() == before
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+EVIL = {  # what somebody else may have written into the configuration of a checkpoint
+    "task: evilmod.Evil": "names evilmod.Evil. Code that a file names is not run",
+    "env: {disturbances: [{_target_: evilmod.Evil}]}": "names evilmod.Evil. Code",
+    "env: {disturbances: evilmod.Evil}": "it must be a list",
+    "loss: {_target_: evilmod.Evil}": "names evilmod.Evil. Code",
+    "task: 5": "is no mapping with a task",
+    "task: &a hovering\ntags: [*a, *a]": "uses the alias",
+    "task: ${oc.env:HOME}": "refers to other values by",
+    "env: {control_dt: 1e400}": "env.control_dt",
+    "env: {evil: 1}": "unexpected keyword argument 'evil'",
+    "env: 5": "env=5: it must be a section",
+    "num_envs: abc": "num_envs=abc: it must be a whole number",
+    "algorithm: [1]": "algorithm=[1]: it must be a name",
+    "[": "not a YAML file",
+    "": "is no mapping with a task",
+}
+
+
+def write_own(path, content, **changes):
+    write_checkpoint(path, {**{k: v for k, v in content.items() if k != "format"}, **changes})
+
+
+def test_a_configuration_from_somebody_else_runs_no_code_and_passes_the_schema_or_is_refused(
+    train, refused, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "evilmod.py").write_text("open('ran', 'w')")
+    saved, path = train("bptt", tmp_path / "run"), tmp_path / "run/checkpoint.pt"
+    for text, message in EVIL.items():
+        values = yaml.safe_load(saved["config"])
+        try:
+            values |= yaml.safe_load(text) or {}
+        except (yaml.YAMLError, TypeError):
+            values = None
+        is_whole = values is None or "${" in text or "&" in text or not text
+        write_own(path, saved, config=text if is_whole else yaml.safe_dump(values))
+        recipes = [["evaluate", f"checkpoint={path}"], ["bptt", f"resume={path}", "total_steps=240"]]
+        for recipe, *words in recipes if "evilmod" in text else recipes[:1]:
+            said = refused(recipe, *words)
+            assert f"{path}: the configuration in it" in said and message in said, (text, said)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_content_that_does_not_fit_its_configuration_is_refused_in_one_line(train, refused, tmp_path):
+    saved, path = train("abpt", tmp_path), tmp_path / "checkpoint.pt"
+    weights = {name: x[:1] for name, x in saved["best"]["actor"].items()}
+    for change in (
+        {"best": {}},
+        {"best": {**saved["best"], "actor": weights}},
+        {"config": saved["config"].replace("normalize: false", "normalize: true")},
+    ):
+        write_own(path, saved, **change)
+        said = refused("evaluate", f"checkpoint={path}")
+        assert re.search(f"{path}(: the policy in it does not fit| holds no policy)", said)
+    unfit = "the state of the run in it does not fit its configuration"
+    for change, message in (
+        ({"processes": saved["processes"] * 2}, "was written by 2 processes, and 1 want to continue"),
+        ({"processes": [{}]}, unfit),
+        ({"stateful": saved["stateful"][::-1]}, unfit),
+        ({"rows": [{"a": "b"}]}, unfit),
+    ):
+        write_own(path, saved, **change)
+        said = refused("abpt", f"resume={path}", "total_steps=240")
+        assert str(path) in said and message in said, change
+
+
+def test_the_average_of_the_policy_spans_a_share_of_the_iterations_and_is_what_a_run_keeps(train, tmp_path):
+    policy = torch.nn.Linear(1, 1, bias=False)
+    average = average_policy(OmegaConf.create({"actor": {"average": 0.5}}), policy)
+    seen = []
+    for weight in (1.0, 2.0, 3.0):
+        torch.nn.init.constant_(policy.weight, weight)
+        average.update_parameters(policy)
+        seen.append(average.module.weight.item())
+    assert seen == pytest.approx([1.0, 7 / 4, 22 / 9])  # what was before counts (1 - 1/t)^2: 0, 1/4, 4/9
+
+    saved = train("bptt", tmp_path / "averaged", "actor.average=1", "eval.interval=8")  # a plain mean of the weights
+    plain = train("bptt", tmp_path / "plain", "eval.interval=8")
+    assert saved["stateful"][0].keys() == plain["stateful"][0].keys()
+    for name, weight in saved["stateful"][0].items():  # which the training does not see
+        torch.testing.assert_close(weight, plain["stateful"][0][name], rtol=0, atol=0)
+    best, last = (x["best"]["actor"] for x in (saved, plain))
+    mean = {k.removeprefix("module."): v for k, v in saved["stateful"][-1].items()}
+    assert mean.pop("n_averaged") == 8
+    torch.testing.assert_close(best, mean, rtol=0, atol=0)
+    assert any((best[name] - last[name]).abs().max() > 1e-3 for name in best)
+    assert rows(tmp_path / "averaged")[-1]["eval/return"] != rows(tmp_path / "plain")[-1]["eval/return"]

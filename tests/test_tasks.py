@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from flying import fly, hold, start
+from refusals import cases, refuses
 from torchrl.envs import check_env_specs
 
 from torchrl_quad import LandingEnv, RacingEnv, TrackingEnv, load_track
@@ -45,8 +46,7 @@ def test_an_episode_of_tracking_succeeds_below_ten_centimetres_without_a_crash()
     velocity = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 5.0]]
     td = start(env, position=[[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.0, 0.0, 5.99]], velocity=velocity)
     metrics = env.episode_metrics(fly(env, td, hold(env, 120)))
-    assert metrics["solved"].tolist() == [1.0, 0.0, 0.0]
-    assert metrics["crash"].tolist() == [0.0, 0.0, 1.0]
+    assert metrics["solved"].tolist() == [1.0, 0.0, 0.0] and metrics["crash"].tolist() == [0.0, 0.0, 1.0]
     assert metrics["tracking_rmse"][:2].tolist() == pytest.approx([0.0, 0.2], abs=2e-3)
 
 
@@ -54,10 +54,8 @@ def test_an_episode_of_tracking_succeeds_below_ten_centimetres_without_a_crash()
 def test_the_named_curves_start_near_their_point_and_inside_their_box(name):
     env = TrackingEnv(num_envs=500, curve=name, seed=2)
     state = env.reset()["state"]
-    assert ((state["position"] - state["target"]).abs().amax(0) <= 0.2).all()
-    assert state["phase"].min() < 0.1
-    assert state["phase"].max() > 2 * math.pi - 0.1
-    assert not env.is_crash(state).any()
+    assert ((state["position"] - state["target"]).abs().amax(0) <= 0.2).all() and state["phase"].min() < 0.1
+    assert state["phase"].max() > 2 * math.pi - 0.1 and not env.is_crash(state).any()
 
 
 def test_a_large_curve_gets_a_box_that_holds_it():
@@ -69,23 +67,19 @@ def test_a_large_curve_gets_a_box_that_holds_it():
     assert env.is_crash({"position": positions}).flatten().tolist() == [False, True, False]
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"curve": "square"}, "curve must be one of slow_circle, fast_circle, lemniscate, or a .* got 'square'"),
-        ({"curve": lambda p: p}, "needs a period in seconds"),
-        ({"curve": lambda p: p, "period": 5.0}, r"from shape \(2, 257\) it made \(2, 257\), torch.float32"),
-        ({"curve": lambda p: torch.stack((p, p, p), -1).double(), "period": 5.0}, "both torch.float32.* torch.float64"),
-        ({"curve": lambda p: [math.cos(p), 0, 1], "period": 5.0}, "it failed: "),
-        ({"curve": lambda p: [p, p, p], "period": 5.0}, "it made a list"),
-        ({"curve": lambda p: torch.stack((p, p, p + 1), -1), "period": 5.0}, "not periodic: .* moves by 10.9 m"),
-        ({"curve": lambda p: torch.stack((p.cos(), p.sin(), p.sin()), -1), "period": 5.0}, "goes down to z = -1 m"),
-        ({"curve": lambda p: torch.stack((p / 0, p, p), -1), "period": 5.0}, "not finite"),
-    ],
+@cases(
+    ({"curve": "square"}, "curve must be one of slow_circle, fast_circle, lemniscate, or a .* got 'square'"),
+    ({"curve": lambda p: p}, "needs a period in seconds"),
+    ({"curve": lambda p: p, "period": 5.0}, r"from shape \(2, 257\) it made \(2, 257\), torch.float32"),
+    ({"curve": lambda p: torch.stack((p, p, p), -1).double(), "period": 5.0}, "both torch.float32.* torch.float64"),
+    ({"curve": lambda p: [math.cos(p), 0, 1], "period": 5.0}, "it failed: "),
+    ({"curve": lambda p: [p, p, p], "period": 5.0}, "it made a list"),
+    ({"curve": lambda p: torch.stack((p, p, p + 1), -1), "period": 5.0}, "not periodic: .* moves by 10.9 m"),
+    ({"curve": lambda p: torch.stack((p.cos(), p.sin(), p.sin()), -1), "period": 5.0}, "goes down to z = -1 m"),
+    ({"curve": lambda p: torch.stack((p / 0, p, p), -1), "period": 5.0}, "not finite"),
 )
 def test_a_curve_that_cannot_be_flown_is_refused(kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        TrackingEnv(num_envs=1, **kwargs)
+    refuses(message, TrackingEnv, num_envs=1, **kwargs)
 
 
 def test_the_landing_reward_is_the_published_formula():
@@ -168,8 +162,7 @@ def test_a_lap_is_timed_from_a_gate_to_the_same_gate_and_eight_gates_succeed():
     assert ends["metrics", "lap_time"].flatten().tolist() == pytest.approx([0.0, 0.0] + [0.04] * 7)
     assert ends["success"].flatten().tolist() == [False] * 7 + [True] * 2
     metrics = env.episode_metrics(flight)
-    assert metrics["solved"].item() == 1.0
-    assert metrics["gates_passed"].item() == 9.0
+    assert metrics["solved"].item() == 1.0 and metrics["gates_passed"].item() == 9.0
     assert metrics["lap_time"].item() == pytest.approx(0.04)
     assert metrics["time_near_gate"].item() == pytest.approx(9 * 0.02)  # [s]; both gates are within 1 m all the time
     assert env.episode_metrics(flight[:, :2])["lap_time"].isnan().all()
@@ -198,8 +191,7 @@ def test_starts_face_each_gate_in_turn_and_two_gates_are_observed():
     track = load_track()
     for i in range(4):
         here = state["gate"].flatten() == i
-        assert here.sum() > 60
-        assert (state["target"][here] == torch.tensor(track["gates"][i])).all()
+        assert here.sum() > 60 and (state["target"][here] == torch.tensor(track["gates"][i])).all()
         assert ((state["position"][here] - torch.tensor(track["starts"][i])).abs() <= 0.2 + 1e-6).all()
     lap = sum(math.dist(track["gates"][i - 1], track["gates"][i]) for i in range(4))
     assert lap == pytest.approx(21.67, abs=0.01)
@@ -241,26 +233,21 @@ def test_only_the_relaxed_bonus_has_a_gradient():
 def test_a_track_comes_from_a_file_and_starts_lie_half_way_by_default(tmp_path):
     (tmp_path / "mine.yaml").write_text("gates: [[0, 0, 1], [4, 0, 2], [4, 4, 7]]\n")
     env = RacingEnv(num_envs=3, track=str(tmp_path / "mine.yaml"))
-    assert env.starts.tolist() == [[2.0, 2.0, 4.0], [2.0, 0.0, 1.5], [4.0, 2.0, 4.5]]
-    assert env.ceiling == 11.0
+    assert env.starts.tolist() == [[2.0, 2.0, 4.0], [2.0, 0.0, 1.5], [4.0, 2.0, 4.5]] and env.ceiling == 11.0
     check_env_specs(env)
 
 
-@pytest.mark.parametrize(
-    ("track", "message"),
-    [
-        ("monza", "Unknown track 'monza'. Choose from: six_gates, visfly; or give the path"),
-        ({"gates": [[0, 0, 1]]}, "track: a track has 2 to 1000 gates, got 1"),
-        ({"gate": []}, "unknown key 'gate'. Allowed: gates, starts, gate_radius"),
-        ({}, "gates must be a list of points"),
-        ({"gates": [[0, 0, 1], [1, 1, -1]]}, "in metres above ground"),
-        ({"gates": [[0, 0, 1], [1, 1, float("nan")]]}, "gates must be a list of points"),
-        ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1]]}, "one start before each gate, got 1 for 2"),
-        ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1], [9, 9, 1]]}, r"within 0.2 m of \[9.0, 9.0, 1.0\]"),
-        ({"gates": [[0, 0, 0.1], [1, 1, 0.1]]}, "not all inside the box"),
-        ({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": 0}, "gate_radius must be at least 0.01, got 0. Of all gates"),
-    ],
+@cases(
+    ("monza", "Unknown track 'monza'. Choose from: six_gates, visfly; or give the path"),
+    ({"gates": [[0, 0, 1]]}, "track: a track has 2 to 1000 gates, got 1"),
+    ({"gate": []}, "unknown key 'gate'. Allowed: gates, starts, gate_radius"),
+    ({}, "gates must be a list of points"),
+    ({"gates": [[0, 0, 1], [1, 1, -1]]}, "in metres above ground"),
+    ({"gates": [[0, 0, 1], [1, 1, float("nan")]]}, "gates must be a list of points"),
+    ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1]]}, "one start before each gate, got 1 for 2"),
+    ({"gates": [[0, 0, 1], [1, 1, 1]], "starts": [[0, 0, 1], [9, 9, 1]]}, r"within 0.2 m of \[9.0, 9.0, 1.0\]"),
+    ({"gates": [[0, 0, 0.1], [1, 1, 0.1]]}, "not all inside the box"),
+    ({"gates": [[0, 0, 1], [1, 1, 1]], "gate_radius": 0}, "gate_radius must be at least 0.01, got 0. Of all gates"),
 )
 def test_a_track_that_nobody_can_fly_is_refused(track, message):
-    with pytest.raises(ValueError, match=message):
-        RacingEnv(num_envs=1, track=track)
+    refuses(message, RacingEnv, num_envs=1, track=track)

@@ -3,14 +3,14 @@
 import copy
 import csv
 import re
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from deploying import pilot
+from refusals import cases, refuses
+from small_runs import run
 
 from torchrl_quad import load_drone, make_env
 from torchrl_quad.deploy import load_bundle
@@ -23,7 +23,6 @@ from torchrl_quad.errors import UserError, UserValueError
 
 NAMES = ("position", "quaternion", "velocity", "angular_velocity")
 STEPS = 110
-ROOT = Path(__file__).parent.parent
 
 
 def turned(name):
@@ -38,9 +37,6 @@ def turned(name):
 @pytest.fixture
 def hovering(export_once):
     return export_once("turned", turned)[2]
-
-
-# -- physics -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("drone", ["visfly", "crazyflie"])
@@ -97,14 +93,11 @@ def test_mujoco_moves_a_drone_as_our_simulator_does(hovering):
 
 @pytest.mark.slow  # both are optional, and slow to start
 @pytest.mark.filterwarnings("ignore:Attaching a spec with an empty prefix:UserWarning")  # of Crazyflow's own model
-@pytest.mark.parametrize(
-    ("simulator", "changes"),
-    [
-        ("crazyflow", {"quadratic_drag": [0.0, 0.0, 0.0]}),
-        ("rotorpy", {"quadratic_drag": [0.0] * 3, "linear_drag": [0.0] * 3, "thrust_map": [4.1e-7, 0.0, 0.0]}),
-    ],
+@cases(
+    ("crazyflow", {"quadratic_drag": [0.0, 0.0, 0.0]}),
+    ("rotorpy", {"quadratic_drag": [0.0] * 3, "linear_drag": [0.0] * 3, "thrust_map": [4.1e-7, 0.0, 0.0]}),
 )
-def test_other_simulators_move_a_drone_as_ours_does_where_their_models_agree(hovering, simulator, changes):
+def test_other_simulators_move_a_drone_as_ours_does_where_their_models_agree(simulator, changes, hovering):
     pytest.importorskip(simulator)
     contract = in_small_steps(hovering)
     contract |= {"drone": {**contract["drone"], **changes}, "plant": {"mass": 0.47, "motor_time_constant": 0.03}}
@@ -115,8 +108,7 @@ def test_other_simulators_move_a_drone_as_ours_does_where_their_models_agree(hov
 
 
 def test_the_pid_loop_follows_body_rates_without_reading_rotor_speeds(hovering):
-    contract = load_bundle(hovering).contract
-    world = make_simulator("mujoco", contract, "pid")
+    world = make_simulator("mujoco", load_bundle(hovering).contract, "pid")
     level = {"position": np.zeros((2, 3)), "quaternion": np.eye(4)[[0, 0]]}
     world.reset({**level, "velocity": np.zeros((2, 3)), "angular_velocity": np.zeros((2, 3))})
     rates = np.array([[0.5, 0.0, 0.2], [0.0, -0.5, -0.2]])
@@ -126,9 +118,6 @@ def test_the_pid_loop_follows_body_rates_without_reading_rotor_speeds(hovering):
     turning, memory = world.state()["angular_velocity"], copy.deepcopy(world.loop)
     slow, quick = (loop(np.full(2, 4.6), rates, turning, x) for loop, x in ((world.loop, 0.0), (memory, 2000.0)))
     np.testing.assert_array_equal(slow, quick)
-
-
-# -- flights -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_bundle_flies_in_mujoco_as_in_ours_and_as_the_environment_flew(hovering):
@@ -164,8 +153,7 @@ def test_a_drone_that_no_simulator_can_fly_is_refused_with_the_name_of_its_bundl
         ({"motor_time_constant": [0.1, 0.2]}, "mujoco", "Third-party simulators do not fly drones with two motor"),
     ):
         monkeypatch.setitem(bundle.contract, "plant", changes)
-        with pytest.raises(UserValueError, match=f"^{hovering}: {why}"):
-            fly(bundle, simulator)
+        refuses(f"^{hovering}: {why}", fly, bundle, simulator, error=UserValueError)
     monkeypatch.setitem(bundle.contract["simulator"], "dynamics", "balloon")
     with pytest.raises(UserValueError, match=f"^{hovering}: The simulator lacks the dynamics 'balloon'. Known are qu"):
         fly(bundle, "torchrl_quad")
@@ -176,8 +164,7 @@ def test_a_drone_that_no_simulator_can_fly_is_refused_with_the_name_of_its_bundl
         ({"mutant": "yaw"}, "mutant must be one of MUTANTS.values.., got 'yaw'"),
         ({"loop": ["pid"]}, "mujoco has no rate loop"),
     ):
-        with pytest.raises(UserError, match=f"^{hovering}: {why}"):
-            fly(bundle, "mujoco", **options)
+        refuses(f"^{hovering}: {why}", fly, bundle, "mujoco", error=UserError, **options)
 
 
 def test_a_state_that_is_not_a_number_is_a_crash(hovering):
@@ -185,13 +172,10 @@ def test_a_state_that_is_not_a_number_is_a_crash(hovering):
     starts = {name: x[:2] for name, x in bundle.starts().items()}
     follow = Judge(bundle, starts)
     for value in (1.0, np.nan):
-        state = starts | {"position": np.array([[1.0, 0.0, 1.5], [value, 0.0, 1.5]])}
-        follow.step(np.zeros((2, 4)), state)
+        follow.step(np.zeros((2, 4)), starts | {"position": np.array([[1.0, 0.0, 1.5], [value, 0.0, 1.5]])})
     assert follow.flight()["crash"].tolist() == [[False, False], [False, True]]
     assert follow.flight()["done"].tolist() == [[False, False], [False, True]]
 
-
-# -- recipe ------------------------------------------------------------------------------------------------------------
 
 WITHOUT_TORCH = """
 import runpy, sys
@@ -209,9 +193,7 @@ def rows(folder):
 
 def test_the_recipe_flies_without_torch_keeps_a_table_and_finds_mistakes_of_a_port(hovering, tmp_path, launch):
     settings = [f"bundle={hovering}", f"folder={tmp_path}", "loop=contract"]
-    command = [sys.executable, "-c", WITHOUT_TORCH, *settings]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    run(sys.executable, "-c", WITHOUT_TORCH, *settings)
     (first,) = rows(tmp_path)
     assert (first["mutant"], first["solved"], first["episodes"]) == ("none", "1.0000", "8")
     printed = launch("transfer", *settings, "mutants=true")
@@ -243,8 +225,7 @@ def test_a_mistake_of_ours_keeps_its_traceback(hovering, tmp_path, monkeypatch, 
         raise ValueError("of ours")
 
     monkeypatch.setattr("torchrl_quad.deploy.transfer.machine", mistake)
-    with pytest.raises(ValueError, match="^of ours$"):
-        launch("transfer", f"bundle={hovering}", f"folder={tmp_path}")
+    refuses("^of ours$", launch, "transfer", f"bundle={hovering}", f"folder={tmp_path}")
 
 
 WRONG_SETTINGS = {

@@ -81,6 +81,11 @@ def differentiable_rollout(
             rollout = _rollout(env, actor, carry, horizon)
     except KeyError as error:
         missing = [key for key in actor.in_keys if carry is not None and key not in carry]
+        if "not found in the environment outputs" in str(error):
+            raise UserValueError(
+                f"ExcludeTransform: {error.args[0]} It leaves out single entries, and no groups: name each, such as "
+                '("reward_terms", "velocity").'
+            ) from error
         if not missing:
             raise
         if set(missing) & {*memory_keys(actor), "is_init"}:

@@ -152,13 +152,16 @@ def run_c(library, given):
 
 def by_hand(actor, observation, depth=None, memory=None):
     """The mean action and the memory after it, from the weights; torch's own recurrent cell is not TorchRL's."""
-    if depth is None:
+    if depth is None and memory is None:
         return torch.tanh(actor[0].module.mlp(observation)[:, :4]), None
-    sight, x = actor[0][0].module, 1 / depth.clamp(min=0.3)
-    for eye in list(sight.convolutions)[:-1:2]:
-        x = nn.functional.elu(nn.functional.conv2d(x, eye.weight, eye.bias, 2, 1))
-    (layer,), last = sight.trunk.mlp, actor[0][-1].module.mlp[-1]
-    x = nn.functional.elu(layer(torch.cat((x.flatten(1), 0.3 * observation), 1)))
+    sight, last = actor[0][0].module, actor[0][-1].module.mlp[-1]
+    if depth is None:
+        x = nn.functional.elu(sight.trunk.mlp(observation))
+    else:
+        x = 1 / depth.clamp(min=0.3)
+        for eye in list(sight.convolutions)[:-1:2]:
+            x = nn.functional.elu(nn.functional.conv2d(x, eye.weight, eye.bias, 2, 1))
+        x = nn.functional.elu(sight.trunk.mlp(torch.cat((x.flatten(1), 0.3 * observation), 1)))
     if memory is not None:
         gru = actor[0][1].gru
         memory = torch.gru_cell(x, memory, gru.weight_ih_l0, gru.weight_hh_l0, gru.bias_ih_l0, gru.bias_hh_l0)

@@ -1,37 +1,19 @@
 """Differentiable quadrotor tasks and first-order policy losses for TorchRL."""
 
+# ruff: noqa: F403, F405 - type checkers know by __all__ which of these names the package has
 import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchrl_quad.controllers import MPC, GeometricController
-    from torchrl_quad.data import (
-        DifferentiableCollector,
-        ObservationNormalizer,
-        VisitedStateBuffer,
-        differentiable_rollout,
-        restart,
-    )
-    from torchrl_quad.diagnostics import audit_reward, compare_gradients, gradient_by_horizon, gradient_statistics
-    from torchrl_quad.dynamics import QuadrotorParams, available_drones, load_drone
-    from torchrl_quad.engine import ActionSequence
-    from torchrl_quad.envs import (
-        Forest,
-        ForestEnv,
-        HoveringEnv,
-        LandingEnv,
-        QuadrotorEnv,
-        RacingEnv,
-        Scene,
-        TrackingEnv,
-        available_tasks,
-        load_track,
-        make_env,
-        register_task,
-    )
-    from torchrl_quad.modules import make_actor, make_qvalue, make_value, make_visual_actor
-    from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss, TrustRegion
-    from torchrl_quad.vision import DepthCamera
+    from torchrl_quad.controllers import *
+    from torchrl_quad.data import *
+    from torchrl_quad.diagnostics import *
+    from torchrl_quad.dynamics import *
+    from torchrl_quad.engine import *
+    from torchrl_quad.envs import *
+    from torchrl_quad.modules import *
+    from torchrl_quad.objectives import *
+    from torchrl_quad.vision import *
 
 __version__ = "0.1.0"
 

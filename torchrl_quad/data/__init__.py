@@ -18,12 +18,13 @@ attribute           meaning
 
 from torchrl_quad.data.normalizer import ObservationNormalizer
 from torchrl_quad.data.rollout import DifferentiableCollector, differentiable_rollout
-from torchrl_quad.data.transforms import flight_mode
+from torchrl_quad.data.transforms import FlightMode, flight_mode
 from torchrl_quad.data.unwrap import base_env
 from torchrl_quad.data.visited_states import VisitedStateBuffer, restart
 
 __all__ = [
     "DifferentiableCollector",
+    "FlightMode",
     "ObservationNormalizer",
     "VisitedStateBuffer",
     "base_env",

@@ -251,8 +251,8 @@ def check_statistics(env: EnvBase) -> None:
 class FlightMode(NamedTuple):
     """How a policy flies, and why not faster."""
 
-    mode: Literal["inside", "called", "loop"]
-    reason: str
+    mode: Literal["inside", "called", "loop"]  #: see :func:`flight_mode`
+    reason: str  #: what prevents the next faster mode; empty for the fastest
 
 
 def flight_mode(env: EnvBase, actor: TensorDictModuleBase) -> FlightMode:
@@ -278,7 +278,7 @@ def flight_mode(env: EnvBase, actor: TensorDictModuleBase) -> FlightMode:
 def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
     """How a policy flies under the transforms of an environment as it does in the one inside, or why it cannot."""
     base, transforms = base_env(env), transforms_of(env)
-    if not hasattr(base, "flies_inside"):
+    if not hasattr(type(base), "flies_inside"):
         return f"{type(base).__name__} has only TorchRL's own loop"
     memory = {unravel_key(key) for key in memory_keys(actor)}
     inside = (*observed(base).keys(True, True), *cast(Any, base).done_keys)

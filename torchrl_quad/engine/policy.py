@@ -21,7 +21,7 @@ class PlainPolicy(Protocol):
 
     #: Policies with the same signature compute the same function of their tensors, and share what is compiled.
     signature: Hashable
-    in_keys: Sequence[Any]  #: the entries that it reads: observation, ("state", ...), other outputs, its memory
+    in_keys: Sequence[Any]  #: what it reads of observation, state, other outputs and its memory
     out_keys: Sequence[Any]  #: the entries that it writes
     weights: tuple[Tensor, ...]  #: the tensors that it learns, of which gradients are wanted
     size: int | None  #: the entries of an action, of those drawn; None for all of them

@@ -18,7 +18,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.envs import Compose, EnvBase, ObservationNorm, RewardScaling, RewardSum, StepCounter, TransformedEnv
 from tqdm import tqdm
 
 from benchmarks.report import command_line, save
@@ -82,6 +82,9 @@ def flights(task: str, options: dict[str, Any]) -> dict[str, Callable[[Tensor], 
     env = make_env(task, **options)
     actor, start = make_actor(env), env.reset()
     points = make_env(task, dynamics="point_mass", **options)
+    remembers, size = make_actor(env, (64,), recurrent=True), start["observation"].shape[-1]
+    norm = ObservationNorm(torch.zeros(size), torch.ones(size), in_keys=["observation"], standard_normal=True)
+    under = TransformedEnv(env, Compose(RewardScaling(0.0, 2.0), RewardSum(), StepCounter(), norm).to(env.device))
     as_is = {"tensordict": start, "auto_reset": False, "break_when_any_done": False}
 
     def return_of(rollout: TensorDictBase) -> Tensor:
@@ -96,6 +99,8 @@ def flights(task: str, options: dict[str, Any]) -> dict[str, Callable[[Tensor], 
         "env": lambda actions: fly(env, ActionSequence(actions), actions),
         "point mass": lambda actions: fly(points, ActionSequence(actions), actions),
         "actor": lambda actions: fly(env, actor, actions),
+        "transforms": lambda actions: fly(under, actor, actions),
+        "memory": lambda actions: fly(env, remembers, actions),
         "called": lambda actions: fly(env, TensorDictSequential(actor), actions),
         "torchrl": lambda actions: return_of(EnvBase.rollout(env, len(actions), actor, **as_is)),
     }

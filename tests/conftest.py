@@ -1,3 +1,4 @@
+import os
 import runpy
 import sys
 import threading
@@ -14,6 +15,7 @@ from deploying import export_once, trace_once  # noqa: E402, F401, fixtures
 from torchrl_quad import HoveringEnv  # noqa: E402
 from torchrl_quad.envs.markers import Markers, Shape  # noqa: E402
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the programs that tests start, which go side by side
 RECIPES = Path(__file__).parent.parent / "recipes"
 
 

@@ -36,7 +36,7 @@ def run(tmp_path, monkeypatch):
 
 
 @cases(
-    ("throughput", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 7),
+    ("throughput", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 9),
     ("memory", "--num-envs 4 --modes eager --horizon 2 --rounds 1", 1),
     pytest.param("camera", "--primitives 2 --scenes trees --images 2x4x3 --rounds 1", 1, marks=pytest.mark.slow),
     ("time_to_solve", f"--algorithms bptt --modes eager --overrides {SMALL} total_steps=16", 1),

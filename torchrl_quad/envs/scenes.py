@@ -122,9 +122,10 @@ class Scene(Disturbance):
         fixed = {kind: like.new_tensor(self.fixed[kind]).reshape(1, -1, size) for kind, size in SIZES.items()}
         own.constants = Primitives(**fixed)
         own.touchable = own.constants._replace(planes=own.constants.planes[:, int(self.ground) :])
-        # As large as propellers can be without touching each other.
-        rotors = nominal.rotor_positions.detach().reshape(-1, 4, 2)[0]
-        reach = (rotors.norm(dim=-1).max() + 0.5 * torch.pdist(rotors).min()).item()
+        # As large as propellers can be without touching each other; coaxial ones are above each other.
+        rotors = nominal.rotor_positions.detach()[..., :2].reshape(-1, nominal.rotor_spin.shape[-1], 2)[0]
+        arm, gaps = rotors.norm(dim=-1).max(), torch.pdist(rotors)
+        reach = (arm + 0.5 * gaps[gaps > 1e-2 * arm].min()).item()
         own.radius = reach if self.drone_radius is None else self.drone_radius
         return own
 

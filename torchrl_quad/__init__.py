@@ -58,6 +58,7 @@ __all__ = [
     "register_envs",
     "register_task",
     "restart",
+    "suggest_gains",
 ]
 
 

@@ -10,15 +10,13 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Nominal, RotorThrustController, make_controller
+from torchrl_quad.dynamics.gains import PhysicsStep
 from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import INTEGRATORS, Integrator, RigidBodyState, Rotors, accelerations, drag
 from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, clamp, stack
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import between, checked
 
-# [s]. In a shorter step a drone at 1 m/s does not move in single precision; with a longer one the rate loop of no drone
-# that ships is stable.
-PhysicsStep = Annotated[float, between(1e-6, 0.1)]
 Substeps = Annotated[int, between(1, 200)]
 
 

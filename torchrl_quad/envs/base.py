@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import QuadrotorParams, load_drone
-from torchrl_quad.dynamics.model import PhysicsStep
+from torchrl_quad.dynamics.gains import PhysicsStep
 from torchrl_quad.dynamics.rigid_body import Integrator
 from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compiler, nested
 from torchrl_quad.engine.simulation import State

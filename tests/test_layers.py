@@ -19,7 +19,7 @@ ALLOWED = {
     "dynamics": ({"allocation", "rate_loop"}, {"torch", "numpy", "yaml"}),
     "engine": (set(), {"torch", "tensordict"}),
     "vision": ({"dynamics", "engine"}, {"torch"}),
-    "envs": ({"dynamics", "engine", "vision"}, {*TORCHRL, "gymnasium", "numpy", "pydantic"}),
+    "envs": ({"dynamics", "engine", "rotations", "vision"}, {*TORCHRL, "gymnasium", "numpy", "pydantic"}),
     "controllers": ({"dynamics", "envs", UNWRAP}, TORCHRL),
     "render": (
         {"dynamics", "envs", "files", "vision", UNWRAP},

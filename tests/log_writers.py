@@ -96,17 +96,19 @@ def write_ulog(path, messages, parameters):
     ``messages`` maps a name to (times [s], {field: (type, array)}); arrays of shape (T, n) are fields of n.
     """
     out = [ULOG, ulog_message("B", bytes(40))]
-    letters = {"float": "f4", "uint64_t": "u8"}
+    letters = {"float": "f4", "uint64_t": "u8", "uint8_t": "u1"}
     for name, (_, fields) in messages.items():
         parts = ["uint64_t timestamp"]
         for field, (kind, values) in fields.items():
             parts.append(f"{kind}[{values.shape[1]}] {field}" if values.ndim == 2 else f"{kind} {field}")
-        out.append(ulog_message("F", f"{name}:{';'.join(parts)};".encode()))
+        out.append(ulog_message("F", f"{name.partition('#')[0]}:{';'.join(parts)};".encode()))
     for name, value in parameters.items():
-        key = f"float {name}".encode()
-        out.append(ulog_message("P", bytes([len(key)]) + key + struct.pack("<f", value)))
+        kind, letter = ("int32_t", "i") if isinstance(value, int) else ("float", "f")
+        key = f"{kind} {name}".encode()
+        out.append(ulog_message("P", bytes([len(key)]) + key + struct.pack(f"<{letter}", value)))
     for k, name in enumerate(messages):
-        out.append(ulog_message("A", bytes([0]) + struct.pack("<H", k) + name.encode()))
+        stem, _, instance = name.partition("#")
+        out.append(ulog_message("A", bytes([int(instance or 0)]) + struct.pack("<H", k) + stem.encode()))
     rows = []
     for k, (times, fields) in enumerate(messages.values()):
         stamps = np.round(times * 1e6).astype("<u8")

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -11,8 +12,11 @@ from tensordict import TensorDict
 
 from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.controllers import GeometricController
+from torchrl_quad.deploy import contract, frames
+from torchrl_quad.deploy.simulators import make_simulator, special
 from torchrl_quad.dynamics import FlightController, Quadrotor
 from torchrl_quad.envs import Disturbance
+from torchrl_quad.identification.prediction import columns
 
 F64 = torch.float64
 
@@ -222,11 +226,69 @@ def test_a_worn_drone_flies_worn_while_its_controller_believes_it_whole_and_othe
 
 
 def test_a_drone_with_tilted_rotors_comes_from_a_yaml_file_as_it_was_written(tmp_path):
-    visfly = {name: value.tolist() for name, value in load_drone("visfly", F64).fields().items()}
-    visfly = {name: value[0] if len(value) == 1 else value for name, value in visfly.items()}
-    (tmp_path / "six.yaml").write_text(yaml.safe_dump({**visfly, **LAYOUTS["tilted hexarotor"]}))
+    (tmp_path / "six.yaml").write_text(
+        yaml.safe_dump({**fields(load_drone("visfly", F64)), **LAYOUTS["tilted hexarotor"]})
+    )
     six = load_drone(tmp_path / "six.yaml", F64)
     assert torch.equal(
         six.rotor_direction, drone("tilted hexarotor").rotor_direction
     ) and six.rotor_positions.shape == (6, 3)
     assert six.replace(rotor_direction=None).rotor_direction is None
+
+
+def fields(params):
+    values = {name: value.tolist() for name, value in params.fields().items()}
+    return {name: value[0] if len(value) == 1 else value for name, value in values.items()}
+
+
+@pytest.mark.parametrize("name", ["hexarotor", "coaxial", "tilted hexarotor"])
+def test_a_drone_of_a_contract_flies_in_mujoco_as_in_the_package_also_with_a_dead_rotor(name):
+    pytest.importorskip("mujoco")
+    simulator = {"dt": 0.001, "dynamics": "quadrotor", "integrator": "semi_implicit_euler"}
+    flown = {
+        "control_dt": 0.02,
+        "simulator": simulator,
+        "origin": {"package": ""},
+        "task": {"name": "", "unjudged": ""},
+    }
+    plant = {"rotor_effectiveness": [0.0, *[1.0] * (len(LAYOUTS[name]["rotor_spin"]) - 1)]}
+    flown |= {"camera": None, "drone": fields(drone(name)), "plant": plant}
+    start = {"position": np.zeros((1, 3)), "quaternion": np.eye(4)[:1], "velocity": np.zeros((1, 3))}
+    start["angular_velocity"] = np.array([[0.5, -0.3, 0.2]])
+    ends = []
+    for kind in ("torchrl_quad", "mujoco"):
+        world = make_simulator(kind, flown)
+        world.reset(start)
+        for _ in range(10):
+            world.step(np.array([5.0]), np.array([[0.5, 1.0, -0.2]]))
+        ends.append(world.state())
+    assert abs(ends[0]["angular_velocity"]).max() > 0.3 and abs(ends[0]["velocity"][0, :2]).max() > 0.05
+    for key, x in ends[0].items():
+        np.testing.assert_allclose(x, ends[1][key], rtol=2e-3, atol=2e-4, err_msg=key)
+    assert special(flown["drone"] | plant) >= {"more than four rotors", "rotors that are not whole"}
+    assert ("tilted rotors" in special(flown["drone"])) == (name == "tilted hexarotor")
+
+
+def test_a_contract_of_any_rotors_fits_its_schema_and_one_whose_rotors_do_not_agree_is_refused():
+    tilted = fields(drone("tilted hexarotor"))
+    assert contract.drone_problem({"drone": tilted, "plant": {"rotor_effectiveness": [0.0] * 6}}) is None
+    for plant, message in (
+        ({"rotor_spin": [1, -1, 1, -1]}, "rotor_positions and the other fields of rotors must be equally long"),
+        ({"rotor_direction": [[0, 0, 0]] * 6}, "rotor_direction has a rotor without a direction"),
+        ({"rotor_spin": [1] * 6, "rotor_direction": [[0, 0, 1]] * 6}, "cannot control yaw independently"),
+    ):
+        assert message in contract.drone_problem({"drone": tilted, "plant": plant})
+
+
+@pytest.mark.parametrize("order", [(2, 0, 3, 1), (1, 2, 3, 0)])
+def test_the_motors_of_an_autopilot_and_of_a_log_belong_to_rotors_by_their_place_in_whatever_order(order):
+    usual = load_drone("crazyflie", F64)
+    other = usual.replace(rotor_positions=usual.rotor_positions[[*order]], rotor_spin=usual.rotor_spin[[*order]])
+    thrust = np.array([1.0, 2.0, 3.0, 4.0])  # front left, back left, back right, front right
+    theirs = frames.px4().to({"motors": thrust})["motors"]
+    known = frames.px4().of(other.rotor_positions)
+    assert known.to({"motors": thrust[[*order]]})["motors"].tolist() == theirs.tolist()
+    assert known.back({"motors": theirs})["motors"].tolist() == thrust[[*order]].tolist()
+    assert thrust[columns(other)].tolist() == thrust[[*order]].tolist() and columns(usual) == [0, 1, 2, 3]
+    for call in (lambda: frames.px4().of(LAYOUTS["plus"]["rotor_positions"]), lambda: columns(drone("hexarotor"))):
+        refuses("of an X.* has rotors at ", call)

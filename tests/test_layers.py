@@ -46,7 +46,7 @@ ALLOWED = {
     ),
     "adapters": ({"envs"}, {*TORCHRL, "gymnasium", "numpy", "rsl_rl", "skrl", "stable_baselines3"}),
     "identification": (
-        {"deploy.frames", "dynamics", "files", "render.canvas", "rotations"},
+        {"allocation", "deploy.frames", "dynamics", "files", "render.canvas", "rotations"},
         {"torch", "numpy", "yaml", "pydantic", "pydantic_core", "rosbags", "lz4", "backports", "compression"},
     ),
 }

@@ -240,7 +240,7 @@ WRONG_SETTINGS = {
     "scale={mass: 0}": "turned: scale: plant.mass: 0.0 is less than the minimum of 0.001. Choose other factors",
     "scale={rate_gain: 2}": "turned: scale: the drone has no 'rate_gain' to scale. Choose from: mass, ",
     "late=1 ; late=2": "late is given twice",
-    "scale={inertia: 1.0, rotor_positions: 0}": "turned: scale: plant.rotor_positions and rotor_spin cannot make",
+    "scale={inertia: 1.0, rotor_positions: 0}": "turned: scale: plant.rotor_positions .* cannot control roll and pitch",
     "simulator=torchrl_quad ; loop=pid": "turned: torchrl_quad has no rate loop 'pid'. Choose from: contract",
     "simulator=torchrl_quad ; mutants=true ; scale={inertia: 9}": "turned: torchrl_quad flies motors as they are",
     "hello": "unknown setting 'hello'. Choose from: bundle=...",

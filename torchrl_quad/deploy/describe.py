@@ -20,6 +20,7 @@ from torchrl_quad.deploy.network import fill_in
 from torchrl_quad.deploy.simulators.vehicle import bandwidth, damping_ratio
 from torchrl_quad.deploy.tracing import Rules
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
+from torchrl_quad.dynamics.parameters import LIMITS
 from torchrl_quad.envs import TASKS, QuadrotorEnv
 from torchrl_quad.envs.disturbances import DroneRandomization, Sensors, Wind
 from torchrl_quad.envs.metrics import describe_metric
@@ -58,7 +59,11 @@ def numbers(x: Any) -> Any:
 def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, ModelProto], memory: int, visual: bool) -> Fields:
     """What a contract says of an environment whose policy keeps ``memory`` numbers, before anything has flown."""
     camera = env.camera if visual else None
-    nominal, delay = _fields(env.nominal), getattr(env.disturbances.get("sensors"), "delay", 0)
+    nominal, believed, delay = (
+        _fields(env.nominal),
+        _fields(env.nominal, all=True),
+        getattr(env.disturbances.get("sensors"), "delay", 0),
+    )
     weight = nominal["mass"] * nominal["gravity"]
     most = float(np.float32(nominal["max_thrust_to_weight"] * weight))
     return {
@@ -86,7 +91,7 @@ def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, ModelProto], 
         "action_delay": env.action_delay,
         "observation_delay": delay,
         "drone": nominal,
-        "plant": {k: v for k, v in _fields(env.params).items() if v != nominal[k]},
+        "plant": {k: v for k, v in _fields(env.params, all=True).items() if v != believed[k]},
         "randomized": _randomized(env),
         "disturbances": _disturbances(env),
         "rate_loop": _rate_loop(env, nominal),
@@ -156,9 +161,10 @@ def _single(name: str, value: Tensor, dim: int) -> Tensor:
     return value[0]
 
 
-def _fields(params: QuadrotorParams) -> Fields:
+def _fields(params: QuadrotorParams, all: bool = False) -> Fields:
+    """Those that are given, or all, with what None stands for."""
     fields = {}
-    for name, value in params.fields().items():
+    for name, value in ((name, params.value(name)) for name in (LIMITS if all else params.fields())):
         one = numbers(_single(f"drone field {name!r}", value, QuadrotorParams.dim(name)))
         fields[name] = one[0] if len(one) == 1 else one
     return fields

@@ -36,6 +36,8 @@ class Dynamics(Protocol):
     plant_fields: tuple[str, ...]
     #: Greatest absolute values of its own entries, beyond which the numbers mean nothing and the episode ends.
     limits: dict[str, Tensor]
+    #: Entries that follow the command within a control step, so that nothing else can hold them; it may leave this out.
+    commanded: tuple[str, ...]
     nominal: QuadrotorParams  #: the drone that the controller is built for
     hover_action: Tensor  #: (k), holds the nominal drone where it is; (num_envs, k) where drones differ in it
     action_units: dict[str, str]  #: the entries of an action by name, with their units; a model may leave this out
@@ -72,6 +74,7 @@ class ControlledModel:
 
     sizes: dict[str, int]
     plant_fields: tuple[str, ...]
+    commanded: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -155,7 +158,7 @@ class Quadrotor(ControlledModel):
     """
 
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3, "rotor_speed": 4}
-    plant_fields = PLANT_FIELDS
+    plant_fields, commanded = PLANT_FIELDS, ("rotor_speed",)
 
     def finish(self) -> None:
         """Count the rotors, and limit their speeds."""
@@ -199,7 +202,7 @@ class PointMass(ControlledModel):
     """
 
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}
-    plant_fields = ("mass", "linear_drag", "quadratic_drag", "gravity")
+    plant_fields, commanded = ("mass", "linear_drag", "quadratic_drag", "gravity"), ("angular_velocity",)
 
     def finish(self) -> None:
         """Refuse what it cannot fly."""

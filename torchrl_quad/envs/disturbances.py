@@ -36,7 +36,8 @@ class Disturbance:
     """The protocol of all disturbances. A new one overrides some methods; ``disturbances=[MyOwn()]`` switches it on.
 
     Its memory is in entries of the state, each (n, ...), which are restored, stored and compiled with it.
-    An entry ``("drone", field)`` changes a parameter of the drone that flies, ``wind`` the air it flies in.
+    An entry ``("drone", field)`` changes a parameter of the drone that flies, from then on: a
+    ``("drone", "rotor_effectiveness")`` of 0 is a dead rotor. ``wind`` changes the air it flies in.
     """
 
     @property
@@ -49,7 +50,11 @@ class Disturbance:
         return {}
 
     def advance(self, state: State, noise: Tensor | None, dt: float) -> State:
-        """The entries that a control step of dt [s] changes, from the state after it and noise (n, noise_size)."""
+        """The entries that a control step of dt [s] changes, from the state after it and noise (n, noise_size).
+
+        It acts once per control step, and the physics goes on from there. What follows the command within a step, the
+        rotor speeds (with ``dynamics="point_mass"`` the body rates), is refused, as the change would be undone.
+        """
         return {}
 
     def observe(self, state: State) -> State:

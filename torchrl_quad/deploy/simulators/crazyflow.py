@@ -31,6 +31,7 @@ class Crazyflow(Simulator):
     float32, and hold drones above the ground. Physics and rate loop run at 1 kHz, by symplectic Euler.
     """
 
+    lacks = frozenset({"more than four rotors", "tilted rotors", "rotors that are not whole"})
     version, frame = f"Crazyflow {version('crazyflow')}", frames.crazyflow()
 
     def reset(self, starts: Mapping[str, Array]) -> None:
@@ -80,7 +81,7 @@ def _parameters(drone: Drone, frame: frames.Convention) -> Fields:
     order = list(frame.motors)
     k2, k1, k0 = drone.thrust_map
     curve = np.array([[k0, k1 / RPM, k2 / RPM**2]])
-    x, y = drone.rotor_positions[order].T
+    x, y = drone.rotor_positions[order, :2].T
     lag = 1.0 / drone.motor_time_constant
     return {
         "mass": drone.mass,

@@ -31,7 +31,7 @@ class RotorPy(Simulator):
     The loop "own" is its ``cmd_ctbr``, proportional, with the gain that gives the damping of the contract's loop.
     """
 
-    loops = (*LOOPS, "own")
+    loops, lacks = (*LOOPS, "own"), frozenset({"more than four rotors", "tilted rotors", "rotors that are not whole"})
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         self.version = f"RotorPy {version('rotorpy')}"
@@ -90,7 +90,7 @@ def _parameters(drone: Drone, frame: frames.Convention) -> Fields:
     """RotorPy's parameters of a drone."""
     k, order = float(drone.thrust_map[0]), list(frame.motors)
     at_hover = 4.0 * float(drone.hover_speed.mean())
-    places = np.c_[drone.rotor_positions[order], np.zeros(4)]
+    places = np.c_[drone.rotor_positions[order, :2], np.zeros(4)]
     return {
         "mass": drone.mass,
         **{f"I{a}{b}": float(np.diag(drone.inertia)[i, j]) for i, a in enumerate("xyz") for j, b in enumerate("xyz")},

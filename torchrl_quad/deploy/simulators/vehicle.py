@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.allocation import matrix
 from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.rotations import cross, rotate, rotate_inverse
@@ -16,13 +17,13 @@ Array = NDArray[np.float64]
 
 
 class Drone:
-    """A quadrotor from the fields of a contract's ``drone``: what :class:`~torchrl_quad.QuadrotorParams` documents.
+    """A drone from the fields of a contract's ``drone``: what :class:`~torchrl_quad.QuadrotorParams` documents.
 
     Attributes:
-        allocation: (4, 4), from four rotor thrusts [N] to collective thrust [N] and torque [N m].
-        mixer: its inverse.
+        allocation: (6, n), from rotor thrusts [N] to force and torque, see :func:`torchrl_quad.allocation.matrix`.
+        mixer: (n, 4), the pseudo-inverse of its first four rows.
         thrust_limits: the least and the greatest thrust [N] that may be commanded of one rotor.
-        hover_speed: of each rotor (4) [rad/s].
+        hover_speed: of each rotor (n) [rad/s].
 
     Raises:
         ValueError: its drag acts above its centre of mass, or its rotors have two time constants.
@@ -54,12 +55,12 @@ class Drone:
             )
         for name, value in arrays.items():
             setattr(self, name, value if value.ndim else float(value))
+        self.rotor_effectiveness = arrays.get("rotor_effectiveness", np.ones(len(self.rotor_spin)))
         k2, k1, k0 = self.thrust_map
         self.vertex_speed, self.vertex_thrust = -k1 / (2.0 * k2), k0 - k1 * k1 / (4.0 * k2)
         self.least_root = 1e-6 * (self.rotor_speed_max - self.vertex_speed) ** 2
-        x, y = self.rotor_positions.T
-        self.allocation = np.array([np.ones(4), y, -x, self.yaw_torque_coefficient * self.rotor_spin])
-        self.mixer = np.linalg.inv(self.allocation)
+        self.allocation, four = matrix(fields), len(self.rotor_spin) == 4
+        self.mixer = np.asarray((np.linalg.inv if four else np.linalg.pinv)(self.allocation[:4]), np.float64)
         least, greatest = self.thrust(np.array([self.rotor_speed_min, self.rotor_speed_max]))
         self.thrust_limits = max(least, 0.0), greatest
         self.weight = self.mass * self.gravity
@@ -98,17 +99,17 @@ class ContractLoop:
         self.yaw_share, self.tiny = drone.mixer[:, 3] * self.per_share, 1e-6 * drone.weight
 
     def __call__(self, thrust: Array, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
-        """Rotor speeds (n, 4) [rad/s] to command, for a collective thrust (n) [N] and body rates (n, 3) [rad/s], from
-        the body rates (n, 3) [rad/s] and rotor speeds (n, 4) [rad/s] of this moment."""
+        """Rotor speeds (n, m) [rad/s] to command, for a collective thrust (n) [N] and body rates (n, 3) [rad/s], from
+        the body rates (n, 3) [rad/s] and rotor speeds (n, m) [rad/s] of this moment."""
         drone = self.drone
         gyroscopic = cross(angular_velocity, drone.inertia * angular_velocity)
-        believed = drone.thrust(rotor_speed) @ drone.allocation[1:].T
+        believed = drone.thrust(rotor_speed) @ drone.allocation[1:4].T
         acceleration = (believed - gyroscopic) / drone.inertia
         torque = gyroscopic + self.gain * (rates - angular_velocity) - drone.rate_damping * acceleration
         return self.mix(thrust, torque)
 
     def mix(self, collective: Array, torque: Array) -> Array:
-        """Rotor speeds (n, 4) [rad/s] for a collective thrust (n) [N] and a torque (n, 3) [N m], within the limits."""
+        """Rotor speeds (n, m) [rad/s] for a collective thrust (n) [N] and a torque (n, 3) [N m], within the limits."""
         drone, collective = self.drone, collective[:, None]
         thrust = np.concatenate((collective, torque), 1) @ drone.mixer.T
         limited = np.clip(thrust, *drone.thrust_limits)

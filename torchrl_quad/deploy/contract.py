@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.airframe import contradictions
 from torchrl_quad.errors import MissingPackage, UserError, UserValueError, one_line, shown
 
 VERSION = 4  # of the contract; raise it when a reader of the older one would misunderstand the new one
@@ -143,10 +144,7 @@ def files(contract: Contract) -> tuple[str, ...]:
 def _contradictions(drone: Contract, name: str, hovers: bool = False) -> Iterator[str]:
     """Why these parts do not make a drone, or one that hovers."""
     (k2, k1, k0), low, high = drone["thrust_map"], drone["rotor_speed_min"], drone["rotor_speed_max"]
-    if not (k2 > 0 and k1 + 2 * k2 * low >= 0):
-        yield f"{name}.thrust_map is {drone['thrust_map']}, and must rise from rotor_speed_min on"
-    if not low < high:
-        yield f"{name}.rotor_speed_min is {low:g}, and must be below rotor_speed_max, {high:g}"
+    yield from (f"{name}.{why}" for why in contradictions({k: drone[k] for k in drone if k != "motor_command"}))
     x, y = np.array(drone["rotor_positions"], float).T
     allocation = np.array([np.ones(4), y, -x, drone["yaw_torque_coefficient"] * np.array(drone["rotor_spin"], float)])
     rows = allocation / np.maximum(np.linalg.norm(allocation, axis=1, keepdims=True), 1e-30)

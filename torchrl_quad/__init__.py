@@ -55,6 +55,7 @@ __all__ = [
     "make_qvalue",
     "make_value",
     "make_visual_actor",
+    "random_track",
     "register_envs",
     "register_task",
     "restart",

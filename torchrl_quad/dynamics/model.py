@@ -167,7 +167,7 @@ class Quadrotor(ControlledModel):
         self.sizes = {**self.sizes, "rotor_speed": self.nominal.rotor_spin.shape[-1]}
         self.limits = {"rotor_speed": 2.0 * self.nominal.rotor_speed_max}
         if not isinstance(self.controller, RotorThrustController):
-            check_gains(self.nominal, self.dt, self.substeps)
+            check_gains(self.controller, self.dt, self.substeps)
         asked, reach = self.nominal.max_thrust_to_weight, self.controller.reach()
         if (asked > reach * (1.0 + 1e-5)).any():
             warnings.warn(

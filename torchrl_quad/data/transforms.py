@@ -116,9 +116,10 @@ class Flown(NamedTuple):
         wanted = {*spec, *self.memory}
         for is_entry in (True, False):
             for key, value in self.known.items():
-                if value is not None and (value.kind == "entry") == is_entry and key in start:
-                    if not wanted.isdisjoint(value.sources()):
-                        value.undo(leaf(start, key), found, spec)
+                if value is None or (value.kind == "entry") != is_entry or wanted.isdisjoint(value.sources()):
+                    continue
+                if key in start:
+                    value.undo(leaf(start, key), found, spec)
         if STEPS in self.memory:
             left = [t.max_steps - leaf(start, key) for t in _limits(self.transforms) for key in written_by(t)]
             steps = min(t.max_steps for t in _limits(self.transforms)) - torch.stack(left).amin(0)
@@ -222,6 +223,18 @@ class _PlainUnder:
     def weights(self, weights: tuple[Tensor, ...]) -> None:
         self.inner = copy.copy(self.inner)
         self.inner.weights, self.constants = weights[: self.count], weights[self.count :]
+
+    @property
+    def without_gradient(self) -> frozenset[Any]:
+        """What the policy reads that is made of nothing but such entries, and of what was remembered of them."""
+        return self.inner.without_gradient
+
+    @without_gradient.setter
+    def without_gradient(self, names: frozenset[Any]) -> None:
+        free = {key for key in self.in_keys if (key if isinstance(key, str) else key[0]) in names}
+        free |= self.memory.keys() - self.inner.memory.keys()
+        pairs = zip(self.inner.in_keys, self.reads, strict=True)
+        self.inner.without_gradient = frozenset(unravel_key(key) for key, x in pairs if free.issuperset(x.sources()))
 
     def fits(self, inputs: Sequence[Tensor]) -> bool:
         """Whether the policy can read what the transforms make of these."""

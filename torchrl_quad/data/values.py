@@ -228,10 +228,9 @@ def _below(key: Any, groups: Sequence[NestedKey]) -> bool:
 
 def elementwise(transform: Any, x: Value) -> Value:
     """What a transform makes of an entry."""
-    if isinstance(transform, ObservationNorm):
-        if not transform.initialized or max(transform.loc.ndim, transform.scale.ndim) > 1:
-            raise NotImplementedError("statistics are vectors, or numbers; call init_stats")
     if isinstance(transform, ObservationNorm | RewardScaling):
+        if not getattr(transform, "initialized", True) or max(transform.loc.ndim, transform.scale.ndim) > 1:
+            raise NotImplementedError("statistics are vectors, or numbers; call init_stats")
         kind = "normalize" if transform.standard_normal else "scale"
         return Value(kind, None, (x,), (transform.loc, transform.scale))
     if isinstance(transform, RewardClipping):

@@ -215,8 +215,7 @@ def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | GivenActions | None:
     acts = make() if stepper.is_compiled and callable(make) else None
     if acts is None:
         return None
-    if hasattr(acts, "without_gradient"):
-        acts.without_gradient = stepper.simulation.constants
+    acts.without_gradient = stepper.simulation.constants
     known = {"observation", *acts.memory, *stepper.output_layout.place, *map(_in_state, stepper.layout.place)}
     if not set(map(unravel_key, acts.in_keys)) <= known:
         return None

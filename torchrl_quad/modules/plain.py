@@ -194,6 +194,8 @@ class TanhGaussianActor(ProbabilisticActor):
 class PlainTanhGaussian:
     """A tanh-Gaussian policy on plain tensors; see the engine's ``PlainPolicy``."""
 
+    without_gradient: frozenset[NestedKey] = frozenset()
+
     def __init__(self, actor: TanhGaussianActor) -> None:
         network, self.is_random = actor.last, actor.is_random
         self.scales, self.widths = network.scales, network.widths

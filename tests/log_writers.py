@@ -8,6 +8,8 @@ from scipy.spatial.transform import Rotation
 
 END = 10.0  # [s]
 G = 9.80665
+# By rotors front left, back left, back right, front right: how each turns the drone about x, y and z.
+TURNING = np.array([[1, 1, -1, -1], [-1, 1, 1, -1], [1, -1, 1, -1]])
 OURS = {"position": ("x", "y", "z"), "quaternion": ("qw", "qx", "qy", "qz"), "velocity": ("vx", "vy", "vz")}
 OURS |= {"angular_velocity": ("wx", "wy", "wz"), "acceleration": ("fx", "fy", "fz")}
 OURS |= {"motor_command": ("u0", "u1", "u2", "u3")}
@@ -43,14 +45,15 @@ def flight(t):
     attitude, size = _attitude(t)
     turned = _attitude(t - h)[0].inv() * _attitude(t + h)[0]
     on = ((t > 0.7) & (t < 9.3))[:, None]
-    k = np.arange(4)
+    rates = [(_attitude(x - h)[0].inv() * _attitude(x + h)[0]).as_rotvec() / (2.0 * h) for x in (t - h, t + h)]
+    thrust = 0.35 * size[:, None] / G + 0.004 * np.clip((rates[1] - rates[0]) / (2.0 * h), -20.0, 20.0) @ TURNING
     return {
         "position": _position(t),
         "quaternion": attitude.as_quat(scalar_first=True),
         "velocity": (_position(t + h) - _position(t - h)) / (2.0 * h),
         "angular_velocity": turned.as_rotvec() / (2.0 * h),
         "acceleration": size[:, None] * (0.0, 0.0, 1.0),
-        "motor_command": on * (0.5 + 0.05 * k + 0.03 * np.sin(t[:, None] * (k + 1))),
+        "motor_command": on * np.sqrt(np.clip(thrust, 0.01, 1.0)),
         "battery_voltage": 4.1 - 0.04 * t,
     }
 
@@ -93,17 +96,19 @@ def write_ulog(path, messages, parameters):
     ``messages`` maps a name to (times [s], {field: (type, array)}); arrays of shape (T, n) are fields of n.
     """
     out = [ULOG, ulog_message("B", bytes(40))]
-    letters = {"float": "f4", "uint64_t": "u8"}
+    letters = {"float": "f4", "uint64_t": "u8", "uint8_t": "u1"}
     for name, (_, fields) in messages.items():
         parts = ["uint64_t timestamp"]
         for field, (kind, values) in fields.items():
             parts.append(f"{kind}[{values.shape[1]}] {field}" if values.ndim == 2 else f"{kind} {field}")
-        out.append(ulog_message("F", f"{name}:{';'.join(parts)};".encode()))
+        out.append(ulog_message("F", f"{name.partition('#')[0]}:{';'.join(parts)};".encode()))
     for name, value in parameters.items():
-        key = f"float {name}".encode()
-        out.append(ulog_message("P", bytes([len(key)]) + key + struct.pack("<f", value)))
+        kind, letter = ("int32_t", "i") if isinstance(value, int) else ("float", "f")
+        key = f"{kind} {name}".encode()
+        out.append(ulog_message("P", bytes([len(key)]) + key + struct.pack(f"<{letter}", value)))
     for k, name in enumerate(messages):
-        out.append(ulog_message("A", bytes([0]) + struct.pack("<H", k) + name.encode()))
+        stem, _, instance = name.partition("#")
+        out.append(ulog_message("A", bytes([int(instance or 0)]) + struct.pack("<H", k) + stem.encode()))
     rows = []
     for k, (times, fields) in enumerate(messages.values()):
         stamps = np.round(times * 1e6).astype("<u8")

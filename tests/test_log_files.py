@@ -15,7 +15,7 @@ from refusals import refuses
 
 from torchrl_quad.identification import GapsTooLarge, LogError, MissingColumns, read_log, sources
 from torchrl_quad.identification.autopilots import decompress_quaternions, read_ulog
-from torchrl_quad.identification.errors import UnreadableLog, WrongUnit
+from torchrl_quad.identification.errors import NoFlight, UnreadableLog, WrongMotors, WrongUnit
 
 BATTERY = {"battery_voltage": "/drone/battery.x"}
 TOLERANCES = dict.fromkeys(("position", "quaternion", "motor_command", "battery_voltage"), 2e-3)
@@ -83,10 +83,43 @@ def test_a_ulog_is_read_in_our_frames_with_what_leaves_for_the_motors(tmp_path):
     messages["vehicle_attitude"] = (messages["vehicle_attitude"][0][~lost], {"q": ("float", q[~lost])})
     log = read_log(write_ulog(tmp_path / "old.ulg", messages, {}))
     same(log, pieces=2)
-    assert "no actuator_motors" in str(log) and "1 gap(s) of up to 0.5" in str(log)
+    assert "actuator_outputs, pulses from 1000 to 2000 us" in str(log) and "1 gap(s) of up to 0.5" in str(log)
     del messages["actuator_outputs"]
-    with pytest.raises(MissingColumns, match="has no motor_command: looked for actuator_motors"):
+    with pytest.raises(MissingColumns, match="has no motor_command or rotor_speed: looked for actuator_motors"):
         read_log(write_ulog(tmp_path / "none.ulg", messages, {}))
+
+
+PLACES = {f"CA_ROTOR{k}_P{x}": v for k, xy in enumerate(((1, -1), (1, 1), (-1, 1), (-1, -1)))
+          for x, v in zip("XY", xy, strict=True)} | {"CA_ROTOR_COUNT": 4}  # fmt: skip
+
+
+def test_the_parameters_of_a_ulog_say_which_outputs_are_motors_and_which_drones_are_none(tmp_path):
+    messages = px4_messages()
+    t, _ = messages.pop("actuator_motors")
+    signal = flight(t - 5.0)["motor_command"]
+    still = np.full((len(t), 8), 1500.0)
+    pulses = np.where(signal > 0.0, 1075.0 + 875.0 * signal, 900.0)
+    ours = pulses[:, [0, 3, 2, 1]]  # front left, front right, back right, back left
+    outputs = {"output": ("float", np.concatenate((0.0 * ours, ours), 1))}
+    messages |= {"actuator_outputs": (t, {"output": ("float", still)}), "actuator_outputs#1": (t, outputs)}
+    messages["actuator_armed"] = (t, {"armed": ("uint8_t", np.ones(len(t)))})
+    limits = {"PWM_MIN": 1075, "PWM_MAX": 1950, "PWM_DISARMED": 900}
+    functions = {f"PWM_AUX_FUNC{5 + k}": 101 + k for k in range(4)}
+    path = tmp_path / "flight.ulg"
+    log = read_log(write_ulog(path, messages, limits | functions | {k: float(v) for k, v in PLACES.items()}))
+    same(log)
+    assert "motor commands are in actuator_outputs#1, pulses from 1075 to 1950 us, placed by CA_ROTOR" in str(log)
+    asleep = messages | {"actuator_armed": (t, {"armed": ("uint8_t", 0.0 * t)})}
+    asleep["actuator_outputs#1"] = (t, {"output": ("float", 0.0 * still + 900.0)})
+    twelve = messages | {"actuator_motors": (t, {"control": ("float", np.tile(signal, 3))})}
+    for error, message, logged, parameters in (
+        (NoFlight, "never armed: its motors stay at PWM_DISARMED = 900 us", asleep, limits),
+        (WrongMotors, "a VTOL .MAV_TYPE 22; its lift motors are outputs 4 to 7", messages, {"MAV_TYPE": 22}),
+        (WrongMotors, "a hexacopter", messages, {"MAV_TYPE": 13}),
+        (WrongMotors, "a drone with 8 rotors .CA_ROTOR_COUNT", messages, {"CA_ROTOR_COUNT": 8}),
+        (WrongMotors, "a drone with 12 motors", twelve, {}),
+    ):
+        refuses(message, read_log, write_ulog(path, logged, parameters), error=error)
 
 
 def usd_events(t, slow):
@@ -371,18 +404,19 @@ def test_a_pipe_a_socket_and_a_device_are_refused_unopened(tmp_path, monkeypatch
     assert "is not a regular file" in refused(tmp_path / "pipe.csv")
 
 
-def test_a_clock_that_jumps_ahead_is_refused_before_it_is_put_on_a_grid(tmp_path):
+def test_a_clock_that_jumps_ahead_is_refused_before_it_is_put_on_a_grid(tmp_path, monkeypatch):
     t = times(100)
     path = write_csv(tmp_path / "a.csv", own_table(t) | {"t": t + 1e7 * (t > 5.0)})
     with pytest.raises(GapsTooLarge, match=r"1e\+09 steps of 0.01 s; the maximum is 1,000,000. The clock of position"):
         read_log(path, TABLE)
     write_csv(path, own_table(t) | {"t": np.where(np.arange(len(t)) == 500, 1e300, t)})
     assert "1 samples of position (x, y, z) are not finite" in str(read_log(path, TABLE))  # damage, and no jump
-    long = np.linspace(0.0, 9000.0, 20_000)
+    monkeypatch.setattr("torchrl_quad.identification.log.MAX_STEPS", 10_000)
+    long = np.linspace(0.0, 90.0, 2000)
     write_csv(path, own_table(t)).write_text("t,x,y,z\n" + "".join(f"{x},0,0,0\n" for x in long))
     table = own_table(t)
     path = write_csv(path, {name: np.interp(long % 10.0, t, x) for name, x in table.items()} | {"t": long})
-    refuses("Cut it into shorter logs, or give a larger dt", read_log, path, TABLE, error=UnreadableLog, dt=0.001)
+    refuses("Cut it into shorter logs. Write dt=0.018", read_log, path, TABLE, error=UnreadableLog, dt=0.001)
 
 
 def test_values_beyond_any_flight_count_as_missing_and_wide_tables_are_read(tmp_path):

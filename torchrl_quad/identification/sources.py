@@ -20,7 +20,7 @@ import numpy as np
 from torchrl_quad.identification.autopilots import read_ulog, read_usd
 from torchrl_quad.identification.bags import MAGIC, read_bag
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
-from torchrl_quad.identification.layouts import LAYOUTS, Asked, Layout, choose, match
+from torchrl_quad.identification.layouts import LAYOUTS, NEEDED, Asked, Layout, choose, match
 from torchrl_quad.identification.signals import MAX_COLUMNS, Array, Stream, open_plain, too_many
 
 Read = tuple[list[Stream], Layout, list[str]]
@@ -94,11 +94,7 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
         raise UnreadableLog(f"{name} has fewer than two samples below its header. Give the log of a flight.")
     for k, row in enumerate(samples):  # before anything is said of its columns: it may be no table
         _cells(row, mark, len(header), name, k)
-    if columns is None:
-        layout = match(header, name)
-    else:  # a mapping without a position changes a preset; one with it describes the whole file
-        partial = isinstance(columns, Mapping) and "position" not in columns
-        layout = choose(columns, match(header, name) if partial else None)
+    layout = match(header, name) if columns is None else choose(columns, _preset(header, name, columns))
     (clock,) = layout.time.names
     if clock not in header:
         raise MissingColumns(
@@ -115,6 +111,18 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     values |= dict(zip(place, table.T, strict=True))
     time = (values[clock] - np.asarray(layout.time.offset)) * np.asarray(layout.time.scale)
     return [Stream("csv", time, values)], layout, []
+
+
+def _preset(header: list[str], name: str, columns: Asked) -> Layout | None:
+    """What a mapping changes; None for one that describes the whole file."""
+    if not isinstance(columns, Mapping) or all(set(columns) & set(quantities) for quantities in NEEDED):
+        return None
+    try:
+        return match(header, name)
+    except MissingColumns:
+        if "position" in columns:
+            return None  # of which it will be told what it lacks
+        raise
 
 
 def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:

@@ -195,6 +195,7 @@ class PlainTanhGaussian:
     """A tanh-Gaussian policy on plain tensors; see the engine's ``PlainPolicy``."""
 
     without_gradient: frozenset[NestedKey] = frozenset()
+    squashes = True  # the action is a tanh
 
     def __init__(self, actor: TanhGaussianActor) -> None:
         network, self.is_random = actor.last, actor.is_random
@@ -254,6 +255,10 @@ class PlainTanhGaussian:
             action = (2.0 * action - (high + low)) / (high - low)
         limit = 1.0 - torch.finfo(action.dtype).resolution
         return ((torch.atanh(action.clamp(-limit, limit)) - loc) / scale).flatten(0, -2)
+
+    def recorded(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """loc and scale (*, k), before the tanh, with which a rollout was flown."""
+        return leaf(tensordict, "loc"), leaf(tensordict, "scale")
 
     def distribution(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """loc and scale (*, k) in the states of a rollout (*), with gradients in the weights alone."""

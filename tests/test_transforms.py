@@ -179,6 +179,12 @@ def test_what_flies_in_torchrl_s_loop_says_why():
     assert reason(compile=False).reason.startswith("the environment is not compiled")
     assert reason(StepCounter(max_steps=5)) == ("inside", "")
     assert reason(RewardSum(), FrameSkipTransform(2)).reason.startswith("FrameSkipTransform is none of")
+    env, flights = HoveringEnv(num_envs=2), []
+    for flown in (env, TransformedEnv(env, FrameSkipTransform(3))):  # it flies no further, as docs/engine.md says
+        env.set_seed(0)
+        flights.append(flown.rollout(2, actions=env.hover_action.expand(2, 2, 4))["next"])
+    torch.testing.assert_close(flights[1]["state"].to_dict(), flights[0]["state"].to_dict(), rtol=0, atol=0)
+    torch.testing.assert_close(flights[1]["reward"], 3 * flights[0]["reward"])
     reads = TensorDictModule(lambda x, y: x[:, :4].tanh(), ["observation", "step_count"], ["action"])
     assert reason(StepCounter(), policy=reads).mode == "called"
     reads.in_keys[1] = "traj_count"

@@ -25,7 +25,7 @@ class PlainPolicy(Protocol):
     #: Policies with the same signature compute the same function of their tensors, and share what is compiled.
     signature: Hashable
     in_keys: Sequence[Any]  #: what it reads of observation, state, other outputs and its memory
-    out_keys: Sequence[Any]  #: the entries that it writes
+    out_keys: Sequence[Any]  #: the entries that it writes; ``"ends_episode"`` ends one where it is above zero
     weights: tuple[Tensor, ...]  #: the tensors that it learns, of which gradients are wanted
     size: int | None  #: the entries of an action, of those drawn; None for all of them
     #: What it reads as it was written below "next" in the step before, with the shape apart from n; an episode begins

@@ -36,7 +36,6 @@ from torchrl_quad.data.values import (
     ELEMENTWISE,
     OF_KEYS,
     OF_REWARDS,
-    STEPS,
     Followed,
     Known,
     Value,
@@ -45,7 +44,6 @@ from torchrl_quad.data.values import (
     inverse,
     written_by,
 )
-from torchrl_quad.engine.packing import like
 from torchrl_quad.engine.policy import ENDS
 from torchrl_quad.errors import UserValueError
 
@@ -80,8 +78,6 @@ class Flown(NamedTuple):
         memory = {key: after.pop(key) for key in ("is_init", *memory_keys(actor)) if key in after}
         if remembered and not memory_keys(actor):
             del written["is_init"], memory["is_init"]
-        elif remembered:
-            written["is_init"][:, 0] = leaf(start, "is_init")
         frames = iter(x for key, x in remembered.items() if self.memory[key].kind == "frames")
         for transform in self.transforms:
             if isinstance(transform, COUNTERS):
@@ -120,19 +116,11 @@ class Flown(NamedTuple):
                     continue
                 if key in start:
                     value.undo(leaf(start, key), found, spec)
-        if STEPS in self.memory:
-            left = [t.max_steps - leaf(start, key) for t in _limits(self.transforms) for key in written_by(t)]
-            steps = min(t.max_steps for t in _limits(self.transforms)) - torch.stack(left).amin(0)
-            found[STEPS] = steps.to(spec["observation"].dtype)
         if not spec.keys() <= found.keys():  # a transform leaves some out
             again = base.reset(entries.select("state"), set_state=True)
             found |= {key: leaf(again, key) for key in spec.keys() - found.keys()}
         own = {unravel_key(key) for key in (*self.policy.in_keys, *self.policy.out_keys)}
         kept = start.select(*(key for key in own if key not in found and key != "action"), strict=False)
-        if self.memory and "is_init" in kept:  # it would reset what transforms remember, too
-            is_init = kept.pop("is_init").flatten()
-            for key in set(memory_keys(self.policy)) - set(self.memory):
-                kept.set(key, torch.where(like(is_init, leaf(kept, key)), 0.0, leaf(kept, key)))
         found = {key: x for key, x in found.items() if key in {*spec, *own}}
         return TensorDict(cast(Any, found), start.batch_size, start.device).update(kept)
 
@@ -165,7 +153,7 @@ class PolicyUnder(TensorDictModuleBase):
         self.out_keys += [*(["action"] if changes else []), *writes]
         super().__init__()
         self.policy, self.reads, self.action, self.changes = policy, reads, action, changes
-        self.writes, self.memory = writes, memory
+        self.writes, self.transform_memory = writes, memory
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the policy writes, and the action inside; all else stays as it is."""
@@ -211,7 +199,7 @@ class _PlainUnder:
         self.command = OUTER if self.action else "action"
         values = [*self.reads, *self.writes.values(), *([self.action] if self.action else [])]
         self.signature = (inner.signature, *map(str, (self.out_keys, *(value.describe() for value in values))))
-        self.inner, self.count, self.memory = inner, len(inner.weights), {**inner.memory, **under.memory}
+        self.inner, self.count, self.memory = inner, len(inner.weights), {**inner.memory, **under.transform_memory}
         self.constants = tuple(x for value in values for x in value.tensors())
 
     @property
@@ -390,11 +378,9 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
     if (action := actions.get("action")) is None or action.sources()[0] not in map(unravel_key, actor.out_keys):
         return "the policy writes no action that the transforms pass on"
     writes, used = {}, {key for x in reads.values() for key in x.sources()}
-    if limits := _limits(transforms):
-        steps = Value("entry", STEPS)
-        remembered[STEPS] = Value("scale", None, (steps,), (1.0, 1.0))
-        writes[ENDS] = Value("limit", min(t.max_steps for t in limits), (steps,))
-    used |= {STEPS, *(key for key, x in remembered.items() if x.kind == "frames")}
+    if limits := followed.limits:
+        writes[ENDS] = Value("limit", tuple(limits.values()), tuple(Value("entry", key) for key in limits))
+    used |= {*limits, *(key for key, x in remembered.items() if x.kind == "frames")}
     for key in reversed(remembered):  # each is made of earlier ones
         used |= {*remembered[key].sources()} if key in used else set()
     remembered = {key: x for key, x in remembered.items() if key in used}
@@ -404,11 +390,6 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
     spec = dict(observed(base).items(True, True)) if remembered else {}
     sizes = {key: tuple(x.shape(spec)) for key, x in remembered.items()}
     return Flown(transforms, known, PolicyUnder(actor, reads, action, writes, sizes), remembered)
-
-
-def _limits(transforms: Sequence[Any]) -> list[Any]:
-    """The transforms that end episodes."""
-    return [t for t in transforms if isinstance(t, StepCounter) and t.max_steps is not None]
 
 
 def _parts(transform: Transform) -> list[Transform]:

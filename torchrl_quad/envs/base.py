@@ -26,8 +26,18 @@ from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, check_value, checked
 
 
+class _Build(type(EnvBase)):
+    def __call__(cls, *args: Any, auto_reset: bool = False, **kwargs: Any) -> Any:
+        if auto_reset:  # TorchRL would wrap it, and no episode would ever begin again
+            raise UserValueError(
+                "auto_reset=True is for environments that reset themselves in the step that ends an episode, and this "
+                "one waits for a reset. Leave it out: rollouts and collectors reset where an episode ends."
+            )
+        return super().__call__(*args, **kwargs)
+
+
 @checked
-class QuadrotorEnv(Task, EnvBase):
+class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
     """Base of all tasks: a batch of quadrotors, stateless and differentiable.
 
     A step is a pure function of its tensordict. The complete Markov state is in ``"state"``, and gradients flow from

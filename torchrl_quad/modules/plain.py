@@ -194,6 +194,7 @@ class TanhGaussianActor(ProbabilisticActor):
 class PlainTanhGaussian:
     """A tanh-Gaussian policy on plain tensors; see the engine's ``PlainPolicy``."""
 
+    without_gradient: frozenset[NestedKey] = frozenset()
     squashes = True  # the action is a tanh
 
     def __init__(self, actor: TanhGaussianActor) -> None:

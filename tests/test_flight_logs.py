@@ -245,7 +245,7 @@ def test_what_holds_no_flight_or_not_what_was_asked_for_is_refused_by_name(read)
         (NoFlight, "never for 60 s", {"min_duration": 60.0}),
         (MissingColumns, "Unknown layout 'betaflight'. Choose from: nanobench", {"columns": "betaflight"}),
         (MissingColumns, "no column volts, named for battery_voltage", {"columns": {"battery_voltage": "volts"}}),
-        (MissingColumns, "no column s of the time. There are: t, ", {"columns": {"time": "s"}}),
+        (MissingColumns, "no column s of the time. There are: imu_acc_x, ", {"columns": {"time": "s"}}),
     ):
         refuses(message, read, error=error, **options)
 

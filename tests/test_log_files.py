@@ -1,5 +1,6 @@
 """One flight as every kind of file is one FlightLog; files that are damaged, or never end, read or are refused."""
 
+import dataclasses
 import gzip
 import os
 import random
@@ -188,8 +189,10 @@ def test_compressed_states_of_a_crazyflie_are_unpacked(tmp_path):
 ACTUATORS = "std_msgs/Header header\nfloat64[] angles\nfloat64[] angular_velocities\nfloat64[] normalized\n"
 
 
-def ros_messages(store, stamped):
-    """Topics of a flight in motion capture: poses of the tracker, an IMU, the motors, odometry, and a battery."""
+def ros_messages(store, stamped, speeds):
+    """Topics of a flight in motion capture: poses of the tracker, an IMU, the motors, odometry, and a battery.
+
+    ``stamped`` is the first second of the stamps, None for none; of ``speeds`` each motor has this many [rad/s]."""
     make = {kind.rpartition("/")[2]: cls for kind, cls in reversed(store.types.items())}
     extra = {"seq": 0} if "seq" in make["Header"].__dataclass_fields__ else {}
     zeros, covariance = np.zeros(9), np.zeros(36)
@@ -205,7 +208,8 @@ def ros_messages(store, stamped):
         true["body"] = np.einsum("nji,nj->ni", matrix(true["quaternion"]), true["velocity"])
         for i, at in enumerate(t):
             now = {name: x[i] for name, x in true.items()}
-            stamp = make["Time"](1_700_000_000 + int(at) if stamped else 0, round(at % 1 * 1e9))
+            seconds = (stamped or 0) + (0 if stamped is None else int(at))
+            stamp = make["Time"](seconds, 0 if stamped is None else round(at % 1 * 1e9))
             header = make["Header"](stamp=stamp, frame_id="world", **extra)
             pose = make["Pose"](make["Point"](*now["position"]), make["Quaternion"](*np.roll(now["quaternion"], -1)))
             rates, speed, force = (make["Vector3"](*now[x]) for x in ("angular_velocity", "body", "acceleration"))
@@ -214,13 +218,15 @@ def ros_messages(store, stamped):
                 "pose": (header, pose),
                 "odom": (header, "drone", make["PoseWithCovariance"](pose, covariance), twist),
                 "imu": (header, pose.orientation, zeros, rates, zeros, force, zeros),
-                "motors": (header, zeros[:0], zeros[:0], now["motor_command"]),
+                "motors": (header, zeros[:0], zeros[:0], now["motor_command"])
+                if not len(speeds)
+                else (header, zeros[:0], np.resize(now["motor_command"], len(speeds)) * speeds, zeros[:0]),
                 "battery": (now["battery_voltage"], 0.0, 0.0),
             }
             yield topic, kind, int((1_700_000_000 + at) * 1e9), store.types[kind](*values[topic])
 
 
-def write_bag(path, ros2, storage="MCAP", twin=None, stamped=True):
+def write_bag(path, ros2, storage="MCAP", twin=None, stamped=1_700_000_000, speeds=()):
     """A bag of either version; ``twin`` is a topic that it has twice."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin
@@ -231,7 +237,7 @@ def write_bag(path, ros2, storage="MCAP", twin=None, stamped=True):
     store.register(get_types_from_msg(ACTUATORS, "mav_msgs/msg/Actuators"))
     connections = {}
     with Writer2(path, version=9, storage_plugin=StoragePlugin[storage]) if ros2 else Writer1(path) as writer:
-        for topic, kind, received, message in ros_messages(store, stamped):
+        for topic, kind, received, message in ros_messages(store, stamped, np.asarray(speeds)):
             raw = store.serialize_cdr(message, kind) if ros2 else bytes(store.serialize_ros1(message, kind))
             for name in (topic, *([f"{topic}2"] if topic == twin else [])):
                 if name not in connections:
@@ -245,7 +251,7 @@ def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path):
     same(log)
     assert log.onboard == ("angular_velocity", "acceleration", "motor_command", "battery_voltage")
     assert "messages of /drone/battery carry no stamp" in str(log)
-    folder = write_bag(tmp_path / "ros2", ros2=True, stamped=False)
+    folder = write_bag(tmp_path / "ros2", ros2=True, stamped=None)
     same(read_log(folder, BATTERY))
     (file,) = folder.glob("*.mcap")
     odometry = {
@@ -263,6 +269,16 @@ def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path):
     twins = write_bag(tmp_path / "twins.bag", ros2=False, twin="imu")
     with pytest.raises(MissingColumns, match="several topics for angular_velocity: /drone/imu, /drone/imu2. Say which"):
         read_log(twins, BATTERY)
+    # A simulator's clock begins at zero, and its motors are speeds, those of two rotors with a minus.
+    log = read_log(write_bag(tmp_path / "simulated.bag", ros2=False, stamped=0, speeds=(800, -800, 800, -800)), BATTERY)
+    assert log.battery_voltage is None and "rotor speeds as shares of 4000 rad/s, whatever the battery" in str(log)
+    assert log.dt == 0.01 and "stamp: their times" in str(log)
+    scaled = dataclasses.replace(
+        log, motor_command=5.0 * log.motor_command, battery_voltage=flight(log.time)["battery_voltage"]
+    )
+    same(scaled)
+    six = write_bag(tmp_path / "six.bag", ros2=False, speeds=(800,) * 6)
+    refuses("/drone/motors drives 6 motors", read_log, six, BATTERY, error=WrongMotors)
 
 
 KINDS = {"a.ulg": None, "v1": None, "v2": None, "a.csv": TABLE, "a.csv.gz": TABLE, "a.bag": BATTERY, "a.db3": BATTERY}
@@ -384,6 +400,21 @@ def test_limits_of_size_are_named_before_memory_is_full(tmp_path, monkeypatch):
     with open(tmp_path / "large.csv", "wb") as file:
         file.truncate(10**11)  # which takes no room on the disk
     assert "has more than 2,000,000,000 bytes, the maximum" in refused(tmp_path / "large.csv")
+
+
+def test_tables_of_other_separators_and_headers_that_begin_as_comments_are_read(tmp_path):
+    path = write_csv(tmp_path / "a.csv", own_table(times(100)))
+    plain, (head, *rows) = read_log(path, TABLE), path.read_text().splitlines()
+    for text in (
+        "\n".join(["# " + head, *rows]),
+        "\n".join(["# exported, today", "#", "# " + head.replace(",", ";"), *(x.replace(",", ";") for x in rows)]),
+        "\n".join(["#" + head.replace(",", "\t"), *(x.replace(",", "\t") for x in rows)]),
+        "\n".join(["% " + head.replace(",", " "), *(x.replace(",", "  ") for x in rows)]),  # as numpy.savetxt writes
+        "\n".join([head.replace(",", ";"), *(x.replace(",", ";").replace(".", ",") for x in rows)]),
+        "\n".join(["# a remark", head, *rows]),
+    ):
+        path.write_text(text)
+        np.testing.assert_array_equal(read_log(path, TABLE).position, plain.position)
 
 
 def test_a_pipe_a_socket_and_a_device_are_refused_unopened(tmp_path, monkeypatch):

@@ -91,6 +91,21 @@ def predict(
     return windows, windows.fly(plant, states_at(seen, 0), speed, windows.push(plant, speed)), seen
 
 
+@torch.no_grad()
+def trim(logs: Sequence[FlightLog], drone: QuadrotorParams, past: float = PAST) -> Push | None:
+    """What moves the flights beyond a drone with a ``motor_command``, on average over windows of ``past`` [s], (3)
+    each: as a share of its weight, and [rad/s2]; None where the flights are too short for a window."""
+    motors = drone.motor_command or MotorCommand(1.0, 1.0)
+    try:
+        windows = cut(logs, 0.1, past or PAST, 0.1, nominal_voltage=motors.nominal_voltage)
+    except TooShort:
+        return None
+    late = torch.tensor([stream_delay(log) for log in logs], dtype=torch.float64)[windows.log]
+    plant = plant_of(drone, motors, late)
+    force, torque = windows.push(plant, windows.rotor_speed(plant))
+    return Push(force.mean(0) / drone.gravity, torque.mean(0))
+
+
 def as_logs(log: FlightLog | Sequence[FlightLog], whose: str) -> list[FlightLog]:
     """One flight or several, as a list."""
     logs = [log] if isinstance(log, FlightLog) else list(log) if isinstance(log, Sequence) else [log]

@@ -20,7 +20,7 @@ import numpy as np
 from torchrl_quad.identification.autopilots import read_ulog, read_usd
 from torchrl_quad.identification.bags import MAGIC, read_bag
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
-from torchrl_quad.identification.layouts import LAYOUTS, NEEDED, Asked, Layout, choose, match
+from torchrl_quad.identification.layouts import LAYOUTS, NEEDED, Asked, Layout, choose, listed, match
 from torchrl_quad.identification.signals import MAX_COLUMNS, Array, Stream, open_plain, too_many
 
 Read = tuple[list[Stream], Layout, list[str]]
@@ -82,10 +82,10 @@ def _counted(parts: Iterator[bytes], name: str, most: int) -> Iterator[bytes]:
 def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     """Only the columns that are asked for become numbers; cells without a number become NaN."""
     rows = _rows(lines, name)
-    first = next(rows, "").removeprefix("\ufeff")
+    first = next(rows, "")
     if not first:
         raise UnreadableLog(f"{name} is empty. Give a log that has samples.")
-    mark = max(",;\t", key=first.count)
+    mark = _mark(first)
     header = [part.strip().strip('"') for part in first.split(mark)]
     if len(header) > MAX_COLUMNS:
         raise too_many(name, MAX_COLUMNS, "columns", "Leave some out.")
@@ -98,7 +98,7 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     (clock,) = layout.time.names
     if clock not in header:
         raise MissingColumns(
-            f"{name} has no column {clock} of the time. There are: {', '.join(header[:60])}. "
+            f"{name} has no column {clock} of the time. There are{listed(header, [clock, 'time', 'stamp'])}. "
             'Name it: columns={"time": ...}.'
         )
     asked = layout.names | {clock}
@@ -126,7 +126,9 @@ def _preset(header: list[str], name: str, columns: Asked) -> Layout | None:
 
 
 def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
-    """The rows of a table as text, without comments and empty ones."""
+    """The rows of a table as text, without comments and empty ones. The last comment above rows of numbers is the first
+    row, which names their columns."""
+    remark, begun = "", False
     for k, line in enumerate(lines):
         if k >= MAX_ROWS:
             raise too_many(name, MAX_ROWS, "lines", _CUT)
@@ -136,14 +138,26 @@ def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
             text = line.decode()
         except UnicodeDecodeError as error:
             raise UnreadableLog(f"{name}: line {k + 1} is not text in UTF-8. Export it as CSV again.") from error
-        if k and "#" in text:
-            text = text.partition("#")[0]
-        text = text.strip(" \r\n")
+        text = text.strip(" \r\n\ufeff")
+        if not begun and text[:1] in ("#", "%"):
+            remark = text.lstrip("#% ") or remark
+            continue
+        text = text.partition("#")[0].strip(" ") if begun and "#" in text else text
+        if not begun and text:
+            begun, mark = True, _mark(remark)
+            if remark and all(_number(x, mark) == _number(x, mark) for x in text.split(mark) if x.strip()):
+                yield remark
         if text:
             yield text
 
 
-def _numbers(rows: Iterator[str], mark: str, width: int, places: list[int], name: str) -> Array:
+def _mark(header: str) -> str | None:
+    """What separates the cells; None is white space."""
+    mark = max(",;\t", key=header.count)
+    return mark if mark in header else None
+
+
+def _numbers(rows: Iterator[str], mark: str | None, width: int, places: list[int], name: str) -> Array:
     """Some columns of a table (N, len(places))."""
     flat, pick = array("d"), itemgetter(*places, places[0])  # of a single place it would not give a tuple
     for k, row in enumerate(rows):
@@ -151,11 +165,11 @@ def _numbers(rows: Iterator[str], mark: str, width: int, places: list[int], name
         try:
             flat.extend([float(cell) for cell in picked])
         except ValueError:
-            flat.extend([_number(cell) for cell in picked])
+            flat.extend([_number(cell, mark) for cell in picked])
     return np.frombuffer(flat).reshape(-1, len(places))
 
 
-def _cells(row: str, mark: str, width: int, name: str, k: int) -> list[str]:
+def _cells(row: str, mark: str | None, width: int, name: str, k: int) -> list[str]:
     cells = row.split(mark)
     if len(cells) != width:
         raise UnreadableLog(
@@ -165,8 +179,8 @@ def _cells(row: str, mark: str, width: int, name: str, k: int) -> list[str]:
     return cells
 
 
-def _number(cell: str) -> float:
+def _number(cell: str, mark: str | None) -> float:
     try:
-        return float(cell)
+        return float(cell if mark == "," else cell.replace(",", "."))
     except ValueError:
         return np.nan

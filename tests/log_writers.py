@@ -134,3 +134,27 @@ def write_usd(path, events, version):
     data = b"".join(out + [row for _, row in sorted(rows, key=lambda row: row[0])])
     path.write_bytes(data + struct.pack("<I", zlib.crc32(data)))
     return path
+
+
+def write_dataflash(path, messages, parameters):
+    """A dataflash log: a message FMT of 89 bytes for each kind, then the messages, each behind a3 95 and its number.
+
+    ``messages`` maps a name to (times [s], format of its columns, {column: array})."""
+    sizes, out, rows = {"Q": 8, "f": 4, "B": 1, "H": 2, "N": 16, "c": 2}, [], []
+
+    def describe(number, name, letters, columns):
+        size = 3 + sum(sizes[letter] for letter in letters)
+        packed = struct.pack("<BB4s16s64s", number, size, name.encode(), letters.encode(), ",".join(columns).encode())
+        out.append(b"\xa3\x95\x80" + packed)
+
+    describe(1, "PARM", "QNf", ["TimeUS", "Name", "Value"])
+    out += [b"\xa3\x95\x01" + struct.pack("<Q16sf", 0, name.encode(), value) for name, value in parameters.items()]
+    for k, (name, (times, letters, columns)) in enumerate(messages.items(), 2):
+        describe(k, name, f"Q{letters}", ["TimeUS", *columns])
+        layout = "<Q" + letters.replace("c", "h")
+        for at, *row in zip(
+            np.round(1e6 * times).astype(int).tolist(), *(x.tolist() for x in columns.values()), strict=True
+        ):
+            rows.append((at, b"\xa3\x95" + bytes([k]) + struct.pack(layout, at, *row)))
+    path.write_bytes(b"".join(out + [row for _, row in sorted(rows, key=lambda row: row[0])]))
+    return path

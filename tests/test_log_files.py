@@ -11,8 +11,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from log_writers import END, TABLE, ULOG, flight, matrix, ned, own_table, ulog_message, write_csv, write_ulog, write_usd
+from log_writers import (
+    END,
+    TABLE,
+    ULOG,
+    flight,
+    matrix,
+    ned,
+    own_table,
+    ulog_message,
+    write_csv,
+    write_dataflash,
+    write_ulog,
+    write_usd,
+)
 from refusals import refuses
+from scipy.spatial.transform import Rotation
 
 from torchrl_quad.identification import GapsTooLarge, LogError, MissingColumns, read_log, sources
 from torchrl_quad.identification.autopilots import decompress_quaternions, read_ulog
@@ -88,6 +102,41 @@ def test_a_ulog_is_read_in_our_frames_with_what_leaves_for_the_motors(tmp_path):
     del messages["actuator_outputs"]
     with pytest.raises(MissingColumns, match="has no motor_command or rotor_speed: looked for actuator_motors"):
         read_log(write_ulog(tmp_path / "none.ulg", messages, {}))
+
+
+def dataflash_messages():
+    t, slow = times(100), times(10)
+    true, battery = flight(t), flight(slow)
+    theirs = ned(true)
+    angles = Rotation.from_quat(theirs["quaternion"], scalar_first=True).as_euler("ZYX", degrees=True)[:, ::-1]
+    pulses = np.round(1000.0 + 900.0 * true["motor_command"]).astype(int)
+    kf = dict(
+        zip(("PN", "PE", "PD", "VN", "VE", "VD"), np.hstack((theirs["position"], theirs["velocity"])).T, strict=True)
+    )
+    imu = np.hstack((theirs["angular_velocity"], theirs["acceleration"])).T
+    which = {"C": np.zeros(len(t), int)}
+    return {
+        "XKF1": (t, "Bffffff", which | kf),
+        "ATT": (t, "ccc", dict(zip(("Roll", "Pitch", "Yaw"), np.round(100.0 * angles.T).astype(int), strict=True))),
+        "IMU": (t, "ffffff", dict(zip(("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"), imu, strict=True))),
+        # Outputs 5 to 8 drive motors 1 to 4: front right, back left, front left, back right.
+        "RCOU": (t, "HHHH", {f"C{5 + k}": pulses[:, place] for k, place in enumerate((3, 1, 0, 2))}),
+        "BAT": (slow, "Bf", {"Inst": np.zeros(len(slow), int), "Volt": battery["battery_voltage"]}),
+    }
+
+
+SERVOS = {f"SERVO{5 + k}_FUNCTION": 33.0 + k for k in range(4)} | {"MOT_PWM_MIN": 1000.0, "MOT_PWM_MAX": 1900.0}
+
+
+def test_a_dataflash_log_of_ardupilot_is_read_in_our_frames(tmp_path):
+    path = write_dataflash(tmp_path / "00000001.BIN", dataflash_messages(), SERVOS)
+    same(read_log(path), quaternion=4e-3)
+    data = path.read_bytes()
+    path.write_bytes(data[:200_000] + b"\xa3\x95\xff" * 5 + data[200_000:-7])
+    assert "the dataflash log is damaged: " in str(read_log(path))
+    for parameters in ({"FRAME_CLASS": 2.0}, SERVOS | {"SERVO9_FUNCTION": 37.0}):
+        six = write_dataflash(path, dataflash_messages(), parameters)
+        refuses("drone with (six|5) rotors", read_log, six, error=WrongMotors)
 
 
 PLACES = {f"CA_ROTOR{k}_P{x}": v for k, xy in enumerate(((1, -1), (1, 1), (-1, 1), (-1, -1)))
@@ -362,6 +411,12 @@ def ulog_of(*formats, count=100):
 
 REFUSED = {  # what is no log, or what no reader should follow to its end: a file, and what its refusal says
     "empty.csv": (b"", "is empty"),
+    "zeros.bin": (b"\xa3\x95" + bytes(1000), "not a readable dataflash log"),
+    "flight.bbl": (b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n", "neither position nor attitude"),
+    "decoded.csv": (
+        b"loopIteration, time (us), gyroADC[0], motor[0]\n0, 0, 1, 2\n1, 1, 2, 3\n",
+        "a Betaflight blackbox",
+    ),
     "junk.bin": (bytes(range(128, 256)), "not a log of a known kind"),
     "text.csv": (b"Dear reader,\nthis is a letter.\n", "fewer than two samples"),
     "ragged.csv": (b"t,x\n1,2\n1,2,3\n", "not a table of numbers"),

@@ -19,8 +19,9 @@ import numpy as np
 
 from torchrl_quad.identification.autopilots import read_ulog, read_usd
 from torchrl_quad.identification.bags import MAGIC, read_bag
+from torchrl_quad.identification.dataflash import HEAD, read_dataflash
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
-from torchrl_quad.identification.layouts import LAYOUTS, NEEDED, Asked, Layout, choose, listed, match
+from torchrl_quad.identification.layouts import LAYOUTS, NEEDED, Asked, Layout, blackbox, choose, listed, match
 from torchrl_quad.identification.signals import MAX_COLUMNS, Array, Stream, open_plain, too_many
 
 Read = tuple[list[Stream], Layout, list[str]]
@@ -28,7 +29,9 @@ Read = tuple[list[Stream], Layout, list[str]]
 MAX_BYTES, MAX_UNPACKED = 2 * 10**9, 500 * 10**6
 MAX_LINE, MAX_ROWS = 4 * 10**6, 5 * 10**6  # bytes and lines of a CSV file
 _CUT = "Cut it into shorter logs."
-_READERS = {b"ULog\x01\x12\x35": (read_ulog, "px4"), b"\xbc": (read_usd, "crazyflie")}  # by the first bytes
+# By the first bytes.
+_READERS = {b"ULog\x01\x12\x35": (read_ulog, "px4"), b"\xbc": (read_usd, "crazyflie")}
+_READERS[HEAD] = (read_dataflash, "ardupilot")
 
 
 def read_streams(path: Path, columns: Asked) -> Read:
@@ -54,6 +57,8 @@ def read_streams(path: Path, columns: Asked) -> Read:
 
 def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) -> Read:
     start = file.peek(8192)
+    if start.startswith(b"H Product:Blackbox"):
+        raise blackbox(name)
     for magic, (reader, preset) in _READERS.items():
         if start.startswith(magic):
             layout = LAYOUTS[preset] if columns is None else choose(columns, LAYOUTS[preset])
@@ -64,8 +69,8 @@ def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) ->
         codecs.getincrementaldecoder("utf-8")().decode(start)
     except UnicodeDecodeError as error:
         raise UnreadableLog(
-            f"{name} is not a log of a known kind: it is not text, and does not begin like a ULog, ROS bag or uSD log "
-            "(versions 1 and 2). Export it as CSV."
+            f"{name} is not a log of a known kind: it is not text, and does not begin like a ULog, dataflash log, ROS "
+            "bag or uSD log (versions 1 and 2). Export it as CSV."
         ) from error
     return _read_csv(_counted(iter(lambda: file.readline(MAX_LINE + 1), b""), name, most), name, columns)
 

@@ -330,7 +330,16 @@ def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path):
     refuses("/drone/motors drives 6 motors", read_log, six, BATTERY, error=WrongMotors)
 
 
-KINDS = {"a.ulg": None, "v1": None, "v2": None, "a.csv": TABLE, "a.csv.gz": TABLE, "a.bag": BATTERY, "a.db3": BATTERY}
+KINDS = {
+    "a.ulg": None,
+    "a.bin": None,
+    "v1": None,
+    "v2": None,
+    "a.csv": TABLE,
+    "a.csv.gz": TABLE,
+    "a.bag": BATTERY,
+    "a.db3": BATTERY,
+}
 
 
 @pytest.fixture(scope="module")
@@ -338,6 +347,7 @@ def whole(tmp_path_factory):
     """The bytes of a log of each kind."""
     folder = tmp_path_factory.mktemp("logs")
     write_ulog(folder / "a.ulg", px4_messages(), {"THR_MDL_FAC": 0.3})
+    write_dataflash(folder / "a.bin", dataflash_messages(), SERVOS)
     for version in (1, 2):
         write_usd(folder / f"v{version}", usd_events(times(100), times(10)), version)
     table = write_csv(folder / "a.csv", own_table(times(100))).read_bytes()

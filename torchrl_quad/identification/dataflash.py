@@ -17,7 +17,7 @@ HEAD, _FMT = b"\xa3\x95", 128
 _TYPES = {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4", "q": "<i8", "Q": "<u8"}
 _TYPES |= {"f": "<f4", "d": "<f8", "g": "<f2", "n": "S4", "N": "S16", "Z": "S64", "a": "V64"}
 _TYPES |= {"c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "L": "<i4"}
-_SCALES = dict.fromkeys("cCeE", 0.01) | {"L": 1e-7}
+_SCALES: dict[str, float] = {**dict.fromkeys("cCeE", 0.01), "L": 1e-7}
 _FRAMES = {2: "six", 3: "eight", 4: "eight", 5: "six", 6: "one", 7: "three", 12: "twelve", 14: "ten"}  # FRAME_CLASS
 
 

@@ -210,9 +210,9 @@ def match(header: Sequence[str], name: str) -> Layout:
 def blackbox(name: str) -> MissingColumns:
     """The error of a log of Betaflight, or of its decoder."""
     return MissingColumns(
-        f"{name} is a Betaflight blackbox log: it has gyro, accelerometer and motors, and neither position nor attitude. "
-        "Every log needs them: fly in motion capture, decode the log with blackbox_decode, add the poses at its times, and "
-        "name all columns."
+        f"{name} is a Betaflight blackbox log: it has gyro, accelerometer and motors, and neither position nor "
+        "attitude, which every log needs. Fly in motion capture, decode the log with blackbox_decode, add the poses at "
+        "its times, and name all columns."
     )
 
 

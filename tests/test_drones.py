@@ -63,7 +63,7 @@ def test_what_is_no_drone_is_refused_by_name(tmp_path):
         (lambda: load_drone(tmp_path / "bad.yaml"), "bad.yaml: not a YAML file"),
         (
             lambda: FlightController(drone.replace(rotor_spin=[1.0] * 4)),
-            "cannot make thrust and torque about each axis",
+            "its 4 rotors cannot control yaw independently",
         ),
         (lambda: drone.replace(weight=1.0), "QuadrotorParams has no field 'weight'. Choose from: mass,"),
         (lambda: drone.replace(mass=torch.ones(5)), r"field 'mass' has shape \(5,\); it must be \(1,\) for one drone"),

@@ -17,6 +17,7 @@ from torchrl_quad.dynamics.vector import matvec
 F64 = torch.float64
 LEVEL = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=F64)
 ZERO = torch.zeros(1, 3, dtype=F64)
+TILTED = [[0.1, -0.2, 1.0], [0.2, 0.1, 1.0], [-0.1, 0.2, 0.9], [-0.1, -0.1, 1.0]]
 NO_WRENCH = torch.zeros(1, 4, dtype=F64)
 
 
@@ -142,14 +143,23 @@ def test_quaternions_stay_of_unit_norm(integrator):
         torch.testing.assert_close(state.quaternion.norm(dim=-1), torch.ones(1, dtype=F64))
 
 
-def test_allocation_is_r_cross_f_for_any_layout():
-    positions = [[0.2, 0.1], [-0.15, 0.12], [-0.1, -0.3], [0.05, -0.2]]
-    params = drone(rotor_positions=positions, rotor_spin=[1.0, 1.0, -1.0, -1.0])
-    thrust = torch.tensor([1.0, 2.0, 0.5, 1.5], dtype=F64)
-    arms = torch.nn.functional.pad(params.rotor_positions, (0, 1))
-    torque = torch.linalg.cross(arms, torch.nn.functional.pad(thrust.unsqueeze(-1), (2, 0))).sum(0)
-    torque[2] += (params.yaw_torque_coefficient * params.rotor_spin * thrust).sum()
-    torch.testing.assert_close(rigid_body.allocation_matrix(params) @ thrust, torch.cat((thrust.sum()[None], torque)))
+@pytest.mark.parametrize("tilted", [False, True])
+def test_allocation_is_r_cross_f_for_any_layout(tilted):
+    positions = [[0.2, 0.1, 0.03], [-0.15, 0.12, 0.0], [-0.1, -0.3, -0.04], [0.05, -0.2, 0.1], [0.3, 0.0, 0.02]]
+    params = drone(rotor_positions=positions, rotor_spin=[1.0, 1.0, -1.0, -1.0, 1.0])
+    thrust, up = torch.tensor([1.0, 2.0, 0.5, 1.5, 0.7], dtype=F64), vector(0.0, 0.0, 1.0).repeat(5, 1)
+    if tilted:
+        up = torch.nn.functional.normalize(torch.randn(5, 3, dtype=F64) + 2.0 * up, dim=-1)
+        params = params.replace(rotor_direction=3.0 * up)
+    force = up * thrust.unsqueeze(-1)
+    torque = torch.linalg.cross(params.rotor_positions, force)
+    torque += params.yaw_torque_coefficient * params.rotor_spin.unsqueeze(-1) * force
+    collective, whole = force.sum(0), torch.cat((force.sum(0)[2:], torque.sum(0)))
+    whole = torch.cat((whole, collective[:2])) if tilted else whole
+    torch.testing.assert_close(rigid_body.allocation_matrix(params) @ thrust, whole)
+    share = torch.tensor([1.0, 0.5, 0.0, 0.8, 1.2], dtype=F64)
+    worn = rigid_body.allocation_matrix(params.replace(rotor_effectiveness=share))
+    torch.testing.assert_close(worn @ thrust, rigid_body.allocation_matrix(params) @ (share * thrust))
 
 
 @pytest.mark.parametrize("name", available_drones())
@@ -226,6 +236,7 @@ def test_components_fly_as_tensors_do_with_two_time_constants_and_drag_above_the
     state["velocity"] = vector(1.0, -2.0, 0.5).repeat(3, 1)
     action = model.hover_action + torch.tensor([[0.3, 0.2, -0.1, 0.4], [-0.3, 0.0, 0.3, 0.0], [0.0] * 4], dtype=F64)
     flies = params.replace(mass=0.5, drag_height=0.04) if own else model.nominal
+    flies = flies.replace(rotor_effectiveness=[0.9, 1.0, 0.8, 1.0], rotor_direction=TILTED) if own else flies
     plant = tuple(getattr(flies, name).reshape(-1, 1).expand(-1, 3) for name in model.plant_fields) if own else ()
     rows = model.rows_step()(torch.cat([x.t() for x in state.values()]), model.setpoint_rows(action), plant, ())
     after = model.control_step(state, action, flies, None)
@@ -357,7 +368,10 @@ def test_with_respect_to_every_parameter_of_the_drone_also_through_resets(limit,
         state["step"] = torch.tensor([[3], [0], [7]])
     drag = {"drag_height": 0.02, "linear_drag": [0.3] * 3, "quadratic_drag": [0.05] * 3}  # it turns the drone
     own = env.params.replace(motor_time_constant=lag, rotor_speed_min=1300.0, rotor_speed_max=1850.0, **drag)
-    for name in sorted(set(env.dynamics.plant_fields) - {"rotor_spin"}):  # which is +1 or -1
+    if limit == 256:
+        places = torch.nn.functional.pad(own.rotor_positions, (0, 1), value=0.01)
+        own = own.replace(rotor_positions=places, rotor_direction=TILTED, rotor_effectiveness=[0.9, 1.0, 1.1, 0.8])
+    for name in sorted(own.fields().keys() & set(env.dynamics.plant_fields) - {"rotor_spin"}):  # which is +1 or -1
 
         def fly(x, name=name):
             env.params = own.replace(**{name: x})

@@ -10,6 +10,7 @@ from torchrl_quad.dynamics.control import (
     VelocityController,
     make_controller,
 )
+from torchrl_quad.dynamics.gains import suggest_gains
 from torchrl_quad.dynamics.model import Dynamics, PointMass, Quadrotor, QuadrotorState
 from torchrl_quad.dynamics.parameters import MotorCommand, QuadrotorParams, available_drones, load_drone
 from torchrl_quad.dynamics.rigid_body import INTEGRATORS, RigidBodyState, accelerations
@@ -38,4 +39,5 @@ __all__ = [
     "load_drone",
     "make_controller",
     "quaternion",
+    "suggest_gains",
 ]

@@ -10,15 +10,13 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Nominal, RotorThrustController, make_controller
+from torchrl_quad.dynamics.gains import PhysicsStep
 from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import INTEGRATORS, Integrator, RigidBodyState, Rotors, accelerations, drag
 from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, clamp, stack
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import between, checked
 
-# [s]. In a shorter step a drone at 1 m/s does not move in single precision; with a longer one the rate loop of no drone
-# that ships is stable.
-PhysicsStep = Annotated[float, between(1e-6, 0.1)]
 Substeps = Annotated[int, between(1, 200)]
 
 
@@ -39,8 +37,8 @@ class Dynamics(Protocol):
     #: Greatest absolute values of its own entries, beyond which the numbers mean nothing and the episode ends.
     limits: dict[str, Tensor]
     nominal: QuadrotorParams  #: the drone that the controller is built for
-    hover_action: Tensor  #: (4), holds the nominal drone where it is; (num_envs, 4) where drones differ in it
-    action_units: dict[str, str]  #: the four entries of an action by name, with their units; a model may leave this out
+    hover_action: Tensor  #: (k), holds the nominal drone where it is; (num_envs, k) where drones differ in it
+    action_units: dict[str, str]  #: the entries of an action by name, with their units; a model may leave this out
     substeps: int  #: physics steps in a control step
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
@@ -49,16 +47,16 @@ class Dynamics(Protocol):
     def control_step(
         self, state: dict[str, Tensor], action: Tensor, params: QuadrotorParams, wind: Tensor | None
     ) -> dict[str, Tensor]:
-        """Its entries (n, k) after a control step under an action (n, 4): the drone ``params`` in the wind (n, 3)."""
+        """Its entries (n, k) after a control step under an action (n, k): the drone ``params`` in the wind (n, 3)."""
 
     def setpoint_rows(self, action: Tensor) -> Tensor:
-        """What an action (n, 4) asks for, as rows (k, n) that ``rows_step`` reads."""
+        """What an action (n, k) asks for, as rows (k, n) that ``rows_step`` reads."""
 
     def rows_step(self) -> Callable[..., Tensor]:
         """One physics step for a compiler: ``step(x, setpoint, plant, wind)``, which returns the next ``x``.
 
-        ``x`` are the state's entries below each other (rows, n). ``plant`` are the ``plant_fields`` as rows (k, n), or
-        empty for the nominal drone. ``wind`` holds one tensor (3, n) or none.
+        ``x`` are the state's entries below each other (rows, n). ``plant`` are the ``plant_fields`` as rows (k, n),
+        what is None as no rows, (0, n); or empty for the nominal drone. ``wind`` holds one tensor (3, n) or none.
         """
 
 
@@ -111,7 +109,7 @@ class ControlledModel:
     def control_step(
         self, state: dict[str, Tensor], action: Tensor, params: QuadrotorParams, wind: Tensor | None
     ) -> dict[str, Tensor]:
-        """The entries of the drone after a control step, which holds the action (n, 4) in [-1, 1]."""
+        """The entries of the drone after a control step, which holds the action (n, k) in [-1, 1]."""
         setpoint, plant = self.controller.setpoint(action), self.plant(params, self.controller)
         entries: Sequence[Tensor] = [state[name] for name in self.sizes]
         for _ in range(self.substeps):
@@ -119,7 +117,7 @@ class ControlledModel:
         return dict(zip(self.sizes, entries, strict=True))
 
     def setpoint_rows(self, action: Tensor) -> Tensor:
-        """What an action (n, 4) asks of the controller, as rows (k, n)."""
+        """What an action (n, k) asks of the controller, as rows (k, n)."""
         return torch.cat([x.t() for x in self.controller.setpoint(action)])
 
     def rows_step(self) -> Callable[..., Tensor]:
@@ -131,7 +129,8 @@ class ControlledModel:
             wanted = controller.setpoint_type(*Components(setpoint.unbind()).split(controller.setpoint_sizes, -1))
             params = controller.nominal
             if plant:
-                params = RawParams(**{k: Components(v.unbind()) for k, v in zip(self.plant_fields, plant, strict=True)})
+                named = zip(self.plant_fields, plant, strict=True)
+                params = RawParams(**{k: Components(v.unbind()) for k, v in named if len(v)})
             air = Components(wind[0].unbind()) if wind else None
             return stack(cat(*self.physics_step(state, wanted, self.plant(params, controller), controller, air)))
 
@@ -139,13 +138,13 @@ class ControlledModel:
 
 
 class QuadrotorState(NamedTuple):
-    """A rigid body with four turning rotors."""
+    """A rigid body with n turning rotors."""
 
     position: Vector  #: (*, 3) [m], world frame
     quaternion: Vector  #: (*, 4), body to world, unit norm
     velocity: Vector  #: (*, 3) [m/s], world frame
     angular_velocity: Vector  #: (*, 3) [rad/s], body frame
-    rotor_speed: Vector  #: (*, 4) [rad/s]
+    rotor_speed: Vector  #: (*, n) [rad/s]
 
 
 class Quadrotor(ControlledModel):
@@ -159,12 +158,13 @@ class Quadrotor(ControlledModel):
     plant_fields = PLANT_FIELDS
 
     def finish(self) -> None:
-        """Limit the rotor speeds."""
+        """Count the rotors, and limit their speeds."""
+        self.sizes = {**self.sizes, "rotor_speed": self.nominal.rotor_spin.shape[-1]}
         self.limits = {"rotor_speed": 2.0 * self.nominal.rotor_speed_max}
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
         """Level, still, rotors at hover speed, at the positions (n, 3) [m]."""
-        return {**super().rest(position), "rotor_speed": self.controller.hover_speed.expand(len(position), 4).clone()}
+        return {**super().rest(position), "rotor_speed": self.controller.hover_speed.expand(len(position), -1).clone()}
 
     def plant(self, params: QuadrotorParams, controller: FlightController) -> tuple[QuadrotorParams, Rotors]:
         """The parameters and the rotors."""

@@ -11,6 +11,9 @@ from torch import Tensor
 
 from torchrl_quad.errors import UserTypeError, UserValueError
 
+#: What a policy may write, (n, 1), above zero where an episode ends with the step, such as at a limit of steps.
+ENDS = "ends_episode"
+
 
 class PlainPolicy(Protocol):
     """A policy as pure functions of tensors; a TensorDictModule gives it by a method ``plain()``, or gives None.

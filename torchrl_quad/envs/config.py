@@ -159,8 +159,8 @@ def known_weights(usual: Mapping[str, Any], weights: Mapping[str, Any]) -> Mappi
     return {**usual, **{name: float(x) for name, x in weights.items()}}
 
 
-def check_params(params: object, num_envs: int) -> None:
-    """Check that these are the parameters of one drone, or of one for each environment."""
+def check_params(params: object, num_envs: int, nominal: QuadrotorParams | None = None) -> None:
+    """Check that these are parameters of one drone, or one for each environment, with the nominal one's rotors."""
     if not isinstance(params, QuadrotorParams):
         raise UserTypeError(
             f"params must be QuadrotorParams, such as env.params.replace(mass=0.5) or load_drone('visfly'); got "
@@ -170,3 +170,9 @@ def check_params(params: object, num_envs: int) -> None:
         batch = value.shape[0] if value.dim() > params.dim(name) else 1
         if batch not in (1, num_envs):
             raise UserValueError(f"drone: field {name!r} is for {batch} environments, and num_envs={num_envs}.")
+    has, needs = (None if x is None else x.rotor_spin.shape[-1] for x in (params, nominal))
+    if needs not in (None, has):
+        raise UserValueError(
+            f"params: this drone has {has} rotors, and the one that the controller believes in has {needs}. Build the "
+            "environment with it: HoveringEnv(drone=params)."
+        )

@@ -84,7 +84,6 @@ class DroneRandomization(Disturbance):
         self, spec: str | Path | Mapping, nominal: QuadrotorParams, plant_fields: Sequence[str] = PLANT_FIELDS
     ) -> None:
         source, self.spec = presets.read("randomize", spec)
-        fields = nominal.fields()
         for name, distribution in self.spec.items():
             if name in CONTROLLER_FIELDS:
                 raise UserValueError(
@@ -105,7 +104,7 @@ class DroneRandomization(Disturbance):
             least, most = check_value(f"{source}: {kind}", numbers, _PAIR, f"{has}.")
             if most < (0.0 if kind == "normal" else least):
                 raise UserValueError(f"{source}: {has}; got {shown(numbers)}.")
-        self.nominal = {name: fields[name] for name in self.spec}
+        self.nominal = {name: nominal.value(name) for name in self.spec}
         # The least and the greatest of each; and for what has to lie below something else, the other way round.
         for sign in (-1.0, 1.0):
             extreme = {

@@ -36,8 +36,8 @@ class Task(abc.ABC):
     ``quaternion``                 (4)           (w, x, y, z), body to world, unit norm
     ``velocity``                   (3)           [m/s], world frame
     ``angular_velocity``           (3)           [rad/s], body frame
-    ``rotor_speed``                (4)           [rad/s]; absent with ``dynamics="point_mass"``
-    ``action_queue``               (delay, 4)    commands on their way, oldest first; absent when the delay is 0
+    ``rotor_speed``                (n)           [rad/s], of n rotors; absent with ``dynamics="point_mass"``
+    ``action_queue``               (delay, k)    commands on their way, oldest first; absent when the delay is 0
     ``step``                       (1)           control steps since the start of the episode
     ``("drone", field)``           as the field  the randomised parameters, with ``randomize``
     ``mean_wind``, ``wind``        (3)           [m/s], world frame, with ``wind``
@@ -123,6 +123,10 @@ class Task(abc.ABC):
         """What pictures show in addition to the drones."""
         return Markers()
 
+    def markers_of(self, drawn: State) -> Markers:
+        """The same for one environment, from what its episode has drawn, (1, ...): gates, for example."""
+        return self.markers()
+
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Judge the first episode of each environment, in a rollout (num_envs, time) from fresh starts.
 
@@ -165,12 +169,12 @@ class Task(abc.ABC):
 
     @property
     def hover_action(self) -> Tensor:
-        """The action (4) that holds the nominal drone where it is; (num_envs, 4) where drones differ in it."""
+        """The action (k) that holds the nominal drone where it is; (num_envs, k) where drones differ in it."""
         return self.dynamics.hover_action
 
     @property
     def action_units(self) -> dict[str, str]:
-        """What the four entries of an action command, by name, and the unit of each, such as "N" and "rad/s"."""
+        """What the entries of an action command, by name, and the unit of each, such as "N" and "rad/s"."""
         return getattr(self.dynamics, "action_units", dict.fromkeys("0123", ""))
 
     @property

@@ -194,6 +194,8 @@ class TanhGaussianActor(ProbabilisticActor):
 class PlainTanhGaussian:
     """A tanh-Gaussian policy on plain tensors; see the engine's ``PlainPolicy``."""
 
+    squashes = True  # the action is a tanh
+
     def __init__(self, actor: TanhGaussianActor) -> None:
         network, self.is_random = actor.last, actor.is_random
         self.scales, self.widths = network.scales, network.widths
@@ -252,6 +254,10 @@ class PlainTanhGaussian:
             action = (2.0 * action - (high + low)) / (high - low)
         limit = 1.0 - torch.finfo(action.dtype).resolution
         return ((torch.atanh(action.clamp(-limit, limit)) - loc) / scale).flatten(0, -2)
+
+    def recorded(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """loc and scale (*, k), before the tanh, with which a rollout was flown."""
+        return leaf(tensordict, "loc"), leaf(tensordict, "scale")
 
     def distribution(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """loc and scale (*, k) in the states of a rollout (*), with gradients in the weights alone."""

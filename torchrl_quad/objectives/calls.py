@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.unwrap import check_tensordict, leaf
 from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError
+from torchrl_quad.objectives.gaussian import GaussianPolicy
 
 
 def sample_action(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> TensorDictBase:
@@ -166,7 +167,7 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
     from that at the start. Actions within 1e-6 of a bound count as if they were that far from it.
     """
     with params.to_module(actor):
-        plain = plain_of(actor)
+        plain = plain_of(actor, tensordict)
         if hasattr(plain, "replay"):
             return plain.replay(tensordict)
         return act(plain, tensordict.select(*plain.in_keys).detach(), plain.drawn_again(tensordict))
@@ -177,20 +178,21 @@ def distribution_again(
 ) -> tuple[Tensor, Tensor]:
     """loc and scale, before the tanh, in a rollout's states, (*, k); otherwise as :func:`act_again`."""
     with params.to_module(actor):
-        return plain_of(actor).distribution(tensordict)
+        return plain_of(actor, tensordict).distribution(tensordict)
 
 
-def plain_of(actor: TensorDictModule) -> Any:
-    """A policy whose noise follows from its actions, as functions of tensors: a ``PlainTanhGaussian``."""
+def plain_of(actor: TensorDictModule, tensordict: TensorDictBase) -> Any:
+    """A policy whose noise follows from the actions of a rollout: a ``PlainTanhGaussian``, or a GaussianPolicy."""
     make = getattr(actor, "replayed", None) or getattr(actor, "plain", lambda: None)
     plain = make()
-    if not hasattr(plain, "drawn_again"):
+    if hasattr(plain, "drawn_again"):
+        return plain
+    if "noise_before" in actor.out_keys:
         raise Unsupported(
-            "Gradients of single actions need a policy of make_actor or make_visual_actor, whose noise follows from "
-            "its actions, and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed parts, or "
-            "leave clip_action_gradient=None with a loss other than AHACLoss and HybridLoss."
+            "Gradients of single actions need a policy with noise_correlation as make_actor builds it, without hooks "
+            "or changed parts, and RANDOM or DETERMINISTIC exploration. Build it so, or without noise_correlation."
         )
-    return plain
+    return GaussianPolicy(actor, tensordict)
 
 
 def median_length(length: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ from torchrl_quad.objectives.calls import (
     takes_rollout,
     total,
 )
+from torchrl_quad.objectives.gaussian import sampler_of
 from torchrl_quad.options import Coefficient, Entry, Fraction, Positive, Scale, between, check_value, checked
 
 
@@ -43,8 +44,8 @@ class PathwiseLoss(LossModule):
         target_entropy: where alpha=auto holds the entropy: a number, or auto for minus the number of action entries.
         alpha_init: what alpha=auto starts from.
         clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for no
-            bound. 1 to 5 keep tumbling drones from outweighing all others. Needs a policy of ``make_actor``. An entropy
-            bonus then counts at fixed states.
+            bound. 1 to 5 keep tumbling drones from outweighing all others. Needs a policy whose action is TorchRL's
+            TanhNormal or IndependentNormal, without dropout. An entropy bonus then counts at fixed states.
         reduction: mean or sum over environments (over samples for a critic), or none; null is mean, as in TorchRL.
 
     Steps that a collector's ``("collector", "mask")``, bool (*, horizon), marks as False do not count: such a step has
@@ -138,8 +139,16 @@ class PathwiseLoss(LossModule):
         if self.has_entropy_bonus:
             names.add(keys.sample_log_prob)
         if self.measured_of_actions:
-            names |= {"loc", "scale", *(set(self.actor_network.out_keys) & {"noise", "noise_before"})}
+            names |= self._drawn_keys
         return sorted((unravel_key(name) for name in names), key=str)
+
+    @property
+    def _drawn_keys(self) -> set[NestedKey]:
+        """The entries of a rollout that say what the policy drew."""
+        actor = self.actor_network
+        sampler = sampler_of(actor)
+        parameters = ["loc", "scale"] if sampler is None else sampler.dist_params_keys
+        return {*parameters, *(set(actor.out_keys) & {"noise", "noise_before"})}
 
     @property
     def alpha(self) -> Tensor:
@@ -321,10 +330,10 @@ class PathwiseLoss(LossModule):
                 'it what differentiable_rollout returns, unflattened; name a single flight: rollout.names = ["time"].'
             )
         missing = [key for key in self.in_keys if key not in tensordict and key != self.tensor_keys.sample_log_prob]
-        if missing and missing[0] in ("loc", "scale"):
+        if missing and missing[0] in self._drawn_keys:
             raise UserValueError(
-                f"{name} needs a policy as make_actor builds it, which writes loc and scale: the rollout has no "
-                f"{missing[0]!r}."
+                f"{name} needs a policy that writes what its distribution is made of, and the rollout has no "
+                f"{missing[0]!r}. Build it by make_actor, or keep that entry among the policy's out_keys."
             )
         if missing:
             raise UserValueError(

@@ -13,20 +13,23 @@ import numpy as np
 import pytest
 from log_writers import (
     END,
+    SERVOS,
     TABLE,
     ULOG,
+    dataflash_messages,
     flight,
     matrix,
-    ned,
     own_table,
+    px4_messages,
+    times,
     ulog_message,
+    usd_events,
     write_csv,
     write_dataflash,
     write_ulog,
     write_usd,
-)
+)  # fmt: skip
 from refusals import refuses
-from scipy.spatial.transform import Rotation
 
 from torchrl_quad.identification import GapsTooLarge, LogError, MissingColumns, read_log, sources
 from torchrl_quad.identification.autopilots import decompress_quaternions, read_ulog
@@ -35,10 +38,6 @@ from torchrl_quad.identification.errors import NoFlight, UnreadableLog, WrongMot
 BATTERY = {"battery_voltage": "/drone/battery.x"}
 TOLERANCES = dict.fromkeys(("position", "quaternion", "motor_command", "battery_voltage"), 2e-3)
 TOLERANCES |= {"velocity": 1e-2, "angular_velocity": 2e-2, "acceleration": 2e-2}
-
-
-def times(rate):
-    return np.arange(int(END * rate)) / rate
 
 
 def same(log, pieces=1, **tolerances):
@@ -51,30 +50,6 @@ def same(log, pieces=1, **tolerances):
     true["quaternion"] *= np.sign((true["quaternion"] * log.quaternion).sum(-1, keepdims=True))
     for name, tolerance in (TOLERANCES | tolerances).items():
         np.testing.assert_allclose(getattr(log, name)[rows], true[name][rows], atol=tolerance, rtol=0, err_msg=name)
-
-
-def px4_messages():
-    rates = {"position": 50, "quaternion": 100, "imu": 250, "motors": 200, "battery": 5, "setpoint": 10}
-    t = {name: times(rate) for name, rate in rates.items()}
-    true = {name: flight(x) for name, x in t.items()}
-    theirs = {name: ned(x) for name, x in true.items()}
-    signal = true["motors"]["motor_command"][:, [3, 1, 0, 2]]  # front right, back left, front left, back right
-    control = np.where(signal > 0.0, 0.3 * signal**2 + 0.7 * signal, np.nan)  # a motor that stands is NaN
-    late = {"timestamp_sample": ("uint64_t", np.round((t["imu"] + 5.0) * 1e6))}
-    place = np.concatenate((theirs["position"]["position"], theirs["position"]["velocity"]), 1)
-    return {
-        "vehicle_local_position": (
-            t["position"] + 5.0,
-            {name: ("float", x) for name, x in zip(("x", "y", "z", "vx", "vy", "vz"), place.T, strict=True)},
-        ),
-        "vehicle_attitude": (t["quaternion"] + 5.0, {"q": ("float", theirs["quaternion"]["quaternion"])}),
-        # Published 4 ms after they were sampled.
-        "vehicle_angular_velocity": (t["imu"] + 5.004, late | {"xyz": ("float", theirs["imu"]["angular_velocity"])}),
-        "vehicle_acceleration": (t["imu"] + 5.004, late | {"xyz": ("float", theirs["imu"]["acceleration"])}),
-        "actuator_motors": (t["motors"] + 5.0, {"control": ("float", np.pad(control, ((0, 0), (0, 8))))}),
-        "battery_status": (t["battery"] + 5.0, {"voltage_v": ("float", true["battery"]["battery_voltage"])}),
-        "trajectory_setpoint": (t["setpoint"] + 5.0, {"position": ("float", theirs["setpoint"]["position"])}),
-    }
 
 
 def test_a_ulog_is_read_in_our_frames_with_what_leaves_for_the_motors(tmp_path):
@@ -102,30 +77,6 @@ def test_a_ulog_is_read_in_our_frames_with_what_leaves_for_the_motors(tmp_path):
     del messages["actuator_outputs"]
     with pytest.raises(MissingColumns, match="has no motor_command or rotor_speed: looked for actuator_motors"):
         read_log(write_ulog(tmp_path / "none.ulg", messages, {}))
-
-
-def dataflash_messages():
-    t, slow = times(100), times(10)
-    true, battery = flight(t), flight(slow)
-    theirs = ned(true)
-    angles = Rotation.from_quat(theirs["quaternion"], scalar_first=True).as_euler("ZYX", degrees=True)[:, ::-1]
-    pulses = np.round(1000.0 + 900.0 * true["motor_command"]).astype(int)
-    kf = dict(
-        zip(("PN", "PE", "PD", "VN", "VE", "VD"), np.hstack((theirs["position"], theirs["velocity"])).T, strict=True)
-    )
-    imu = np.hstack((theirs["angular_velocity"], theirs["acceleration"])).T
-    which = {"C": np.zeros(len(t), int)}
-    return {
-        "XKF1": (t, "Bffffff", which | kf),
-        "ATT": (t, "ccc", dict(zip(("Roll", "Pitch", "Yaw"), np.round(100.0 * angles.T).astype(int), strict=True))),
-        "IMU": (t, "ffffff", dict(zip(("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"), imu, strict=True))),
-        # Outputs 5 to 8 drive motors 1 to 4: front right, back left, front left, back right.
-        "RCOU": (t, "HHHH", {f"C{5 + k}": pulses[:, place] for k, place in enumerate((3, 1, 0, 2))}),
-        "BAT": (slow, "Bf", {"Inst": np.zeros(len(slow), int), "Volt": battery["battery_voltage"]}),
-    }
-
-
-SERVOS = {f"SERVO{5 + k}_FUNCTION": 33.0 + k for k in range(4)} | {"MOT_PWM_MIN": 1000.0, "MOT_PWM_MAX": 1900.0}
 
 
 def test_a_dataflash_log_of_ardupilot_is_read_in_our_frames(tmp_path):
@@ -170,22 +121,6 @@ def test_the_parameters_of_a_ulog_say_which_outputs_are_motors_and_which_drones_
         (WrongMotors, "a drone with 12 motors", twelve, {}),
     ):
         refuses(message, read_log, write_ulog(path, logged, parameters), error=error)
-
-
-def usd_events(t, slow):
-    true, battery = flight(t), flight(slow)
-    columns = {}
-    for stem, axes, values in (
-        ("stateEstimate.", "xyz", true["position"]),
-        ("stateEstimate.v", "xyz", true["velocity"]),
-        ("stateEstimate.q", "wxyz", true["quaternion"]),
-        ("gyro.", "xyz", np.degrees(true["angular_velocity"])),
-        ("acc.", "xyz", true["acceleration"] / 9.80665),
-    ):
-        columns |= {stem + axis: ("f", values[:, k]) for k, axis in enumerate(axes)}
-    pulses = np.round(65535 * true["motor_command"]).astype(int)  # m1 is front right, and then clockwise
-    columns |= {f"motor.m{k + 1}": ("H", pulses[:, place]) for k, place in enumerate((3, 2, 1, 0))}
-    return {"fixedFrequency": (t, columns), "battery": (slow, {"pm.vbat": ("f", battery["battery_voltage"])})}
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -330,16 +265,8 @@ def test_bags_of_ros_1_and_2_find_topics_by_their_types(tmp_path):
     refuses("/drone/motors drives 6 motors", read_log, six, BATTERY, error=WrongMotors)
 
 
-KINDS = {
-    "a.ulg": None,
-    "a.bin": None,
-    "v1": None,
-    "v2": None,
-    "a.csv": TABLE,
-    "a.csv.gz": TABLE,
-    "a.bag": BATTERY,
-    "a.db3": BATTERY,
-}
+KINDS = dict.fromkeys(("a.ulg", "a.bin", "v1", "v2")) | {"a.csv": TABLE, "a.csv.gz": TABLE}
+KINDS |= {"a.bag": BATTERY, "a.db3": BATTERY}
 
 
 @pytest.fixture(scope="module")

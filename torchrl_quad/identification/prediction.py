@@ -148,6 +148,10 @@ def as_params(drone: Any) -> QuadrotorParams:
     drone = getattr(drone, "drone", drone)
     if not isinstance(drone, QuadrotorParams):
         drone = load_drone(drone, torch.float64)
+    if drone.rotor_spin.shape[-1] != 4:
+        raise UserValueError(
+            f"A FlightLog is of a drone with four rotors, and this one has {drone.rotor_spin.shape[-1]}."
+        )
     for name, value in drone.fields().items():
         if value.dim() != drone.dim(name):
             raise UserValueError(f"A flight is of one drone, and {name} has shape {tuple(value.shape)}, of several.")

@@ -126,7 +126,7 @@ class IdentificationResult:
         for name, value in self.drone.fields().items():
             plain = [_rounded(x) for x in value.reshape(-1).tolist()]
             if name == "rotor_positions":
-                content[name] = [plain[i : i + 2] for i in range(0, 8, 2)]
+                content[name] = [[_rounded(x) for x in place] for place in value.tolist()]
             else:
                 content[name] = plain[0] if len(plain) == 1 else plain
         motors = self.drone.motor_command

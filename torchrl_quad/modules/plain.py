@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -205,7 +206,11 @@ class PlainTanhGaussian:
         self.activations, layers = list(network.mlp)[1::2], cast(list[nn.Linear], list(network.mlp)[::2])
         self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
         self._take_head(actor)
-        self.signature = (*self._describe(), str(self.activations))
+
+    @functools.cached_property
+    def signature(self) -> Hashable:
+        """What it computes; a compiler of a loss need not describe it."""
+        return (*self._describe(), str(self.activations))
 
     def _describe(self) -> tuple[Any, ...]:
         """What it computes, apart from its activations."""

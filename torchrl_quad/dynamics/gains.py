@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_quad.airframe import Array, RateLoop, listed
 from torchrl_quad.dynamics.control import FlightController
-from torchrl_quad.dynamics.parameters import QuadrotorParams, load_drone
+from torchrl_quad.dynamics.parameters import QuadrotorParams, read_drone, read_fields
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import between, checked
 
@@ -40,7 +40,7 @@ def suggest_gains(drone: str | Path | Mapping | QuadrotorParams, dt: PhysicsStep
     command of the full body rate asks for no more torque than the rotors have. D is at most J.
 
     Args:
-        drone: :class:`QuadrotorParams`, or what :func:`load_drone` takes; a mapping may leave out the gains.
+        drone: :class:`QuadrotorParams`, a preset, a YAML file or a mapping, which may leave out the gains.
         dt: the physics step of the environment, 1e-6 to 0.1 s.
 
     Returns:
@@ -49,9 +49,11 @@ def suggest_gains(drone: str | Path | Mapping | QuadrotorParams, dt: PhysicsStep
     Raises:
         ValueError: the drone cannot be, or cannot hover.
     """
-    if isinstance(drone, Mapping):
-        drone = {"rate_gain": [1.0] * 3, "rate_damping": [0.0] * 3, **drone}
-    params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone, torch.float64)
+    if isinstance(drone, QuadrotorParams):
+        params = drone
+    else:
+        source, fields = read_fields(drone)
+        params = read_drone({"rate_gain": [1.0] * 3, "rate_damping": [0.0] * 3, **fields}, torch.float64, source)
     inertia = _numbers(params.inertia)
     most = _numbers(FlightController(params).spare_torque()) / _full_torque(params)
     gain, ratio, best = np.zeros_like(most), np.zeros_like(most), np.zeros_like(most)

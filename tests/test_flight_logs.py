@@ -106,13 +106,13 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "accelerometer in mg": (lambda t: scaled(t, FORCE, 1e3 / G), "WrongUnit", "in thousandths of g, write"),
     "motors in percent": (lambda t: scaled(t, MOTORS, 100.0), "WrongUnit", "percents, write"),
     "motors in counts": (lambda t: scaled(t, MOTORS, 65535.0), "WrongUnit", "counts of 16 bits, write"),
-    "motors beyond full": (lambda t: scaled(t, MOTORS, 2.0), "WrongUnit", "from 0 to 1, the full command.$"),
-    "motors are thrusts": (lambda t: scaled(t, MOTORS, 2.75), "WrongUnit", "from 0 to 1, the full command.$"),
+    "motors beyond full": (lambda t: scaled(t, MOTORS, 2.0), "WrongUnit", "full command. It is like neither"),
+    "motors are thrusts": (lambda t: scaled(t, MOTORS, 2.75), "WrongUnit", "full command. It is like neither"),
     "motors hardly run": (lambda t: scaled(t, MOTORS, 0.03), "WrongUnit", "no drone flies with so little"),
     "motors turn to and fro": (
         lambda t: {n: 65535 * 700 * np.sin(9 * t["t"] + t[n]) for n in MOTORS},
         "WrongUnit",
-        "full command.$",
+        "like neither",
     ),
     "motors are speeds": (
         lambda t: {n: 65535 * 3e-2 * (-1) ** k * t[n] for k, n in enumerate(MOTORS)},
@@ -225,9 +225,10 @@ def test_repeated_times_a_missing_battery_and_an_impact_are_told(table, read):
 
 
 def test_a_mapping_replaces_entries_of_a_preset_and_nothing_else(table, read):
-    renamed = {"volts": table["pwr_pm_vbat"]}
+    renamed = {"volts": table["pwr_pm_vbat"], "motor_motor_m5": table["t"]}
     log = read(renamed, drop=("pwr_pm_vbat", "sp_ctrltarget_yaw"), columns={"battery_voltage": "volts"})
     np.testing.assert_array_equal(log.battery_voltage, read().battery_voltage)
+    assert "motor_motor_m5 looks like a fifth motor" in str(log)
     assert set(log.setpoint) == {"position"}  # what the preset knows and the file lacks is left out, as ever
 
 
@@ -245,7 +246,7 @@ def test_what_holds_no_flight_or_not_what_was_asked_for_is_refused_by_name(read)
         (NoFlight, "never for 60 s", {"min_duration": 60.0}),
         (MissingColumns, "Unknown layout 'betaflight'. Choose from: nanobench", {"columns": "betaflight"}),
         (MissingColumns, "no column volts, named for battery_voltage", {"columns": {"battery_voltage": "volts"}}),
-        (MissingColumns, "no column s of the time. There are: t, ", {"columns": {"time": "s"}}),
+        (MissingColumns, "no column s of the time. There are: imu_acc_x, ", {"columns": {"time": "s"}}),
     ):
         refuses(message, read, error=error, **options)
 

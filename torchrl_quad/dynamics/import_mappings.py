@@ -110,13 +110,14 @@ def same(values: Any, what: str) -> tuple[Any, str]:
 def speed_at(force: Any, curve: Sequence[float]) -> float:
     """Of a rotor that thrusts with a force [N], by a thrust map."""
     k2, k1, k0 = curve
-    return float((-k1 + math.sqrt(max(k1 * k1 - 4.0 * k2 * (k0 - force), 0.0))) / (2.0 * k2))
+    root = math.sqrt(max(k1 * k1 + 4.0 * k2 * (force - k0), 0.0))
+    return float(2.0 * (force - k0) / max(k1 + root, 1e-12))
 
 
 def add_drag(found: Found, sides: float | None, up: float | None) -> None:
     """The linear drag of rotors whose drag grows with their speed [N s2/(m rad)], at hover."""
     mass, curve, places = (found.get(x, (None,))[0] for x in ("mass", "thrust_map", "rotor_positions"))
-    if sides is not None and mass and curve is not None and places is not None and curve[0] > 0.0:
+    if sides is not None and mass and curve is not None and places is not None:
         total = len(places) * speed_at(9.81 * mass / len(places), curve)
         found["linear_drag"] = total * np.array([sides, sides, up or 0.0]), "the rotors', at hover"
 

@@ -202,7 +202,18 @@ def match(header: Sequence[str], name: str) -> Layout:
     for layout in LAYOUTS.values():
         if {*layout.time.names, *layout.columns["position"][0].names} <= set(header):
             return layout
+    if {"gyroADC[0]", "motor[0]"} <= set(header):
+        raise blackbox(name)
     raise MissingColumns(f"No preset knows the columns of {name}. {_columns_there(header)}")
+
+
+def blackbox(name: str) -> MissingColumns:
+    """The error of a log of Betaflight, or of its decoder."""
+    return MissingColumns(
+        f"{name} is a Betaflight blackbox log: it has gyro, accelerometer and motors, and neither position nor "
+        "attitude, which every log needs. Fly in motion capture, decode the log with blackbox_decode, add the poses at "
+        "its times, and name all columns."
+    )
 
 
 def _columns_there(names: Iterable[str], asked: Sequence[str] = ()) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.identification import checks
 from torchrl_quad.identification.errors import GapsTooLarge, LogError, NoFlight, UnreadableLog, WrongUnit
 from torchrl_quad.identification.layouts import QUANTITIES, Columns, Layout, gather
+from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
 from torchrl_quad.identification.remedies import Mended, remedy_for
 from torchrl_quad.identification.signals import LARGEST, Array, Signal, Stream, clean, cover, on_grid
 from torchrl_quad.identification.sources import read_streams
@@ -167,13 +169,13 @@ def _read(
     grid, step = _grid(signals, main, dt, path.name)
     valid = cover(main, grid, step, max_gap, notes)
     at = on_grid(signals, grid, step)
-    on, _ = checks.motors_on(at["motor_command"], step, path.name)
-    sound = on & valid & ~checks.broken(at, on, step)[0]
+    on, _ = motors_on(at["motor_command"], step, path.name)
+    sound = on & valid & ~broken(at, on, step)[0]
     moving = sound if sound.sum() > 10 else on
     checks.check_velocity(at, signals, step, moving)
     notes.append(checks.check_rates(at, signals, step, moving))
     checks.check_specific_force(at, signals, step, moving)
-    segments, found = checks.find_pieces(at, valid, step, path.name, clearance, max_gap, min_duration)
+    segments, found = find_pieces(at, valid, step, path.name, clearance, max_gap, min_duration)
     notes.append(checks.check_order(at, signals, step, segments))
     setpoint = {q.removeprefix("setpoint."): x for q, x in at.items() if q.startswith("setpoint.")}
     present = {q.partition(".")[0] for q in at}
@@ -232,6 +234,10 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
             f"motor commands are rotor speeds as shares of {FULL_SPEED:g} rad/s, whatever the battery: a drone's "
             f"motor_command with speed_per_volt {FULL_SPEED:g}, nominal_voltage 1 and delay 0 keeps the speeds"
         )
+    motors = gathered["motor_command"].columns
+    last = re.sub(r"\d+(?=\D*$)", lambda found: str(int(found[0]) + 1), max(motors))  # m5 after m4
+    if last not in motors and any(last in stream.columns for stream in streams):
+        notes.append(f"{last} looks like a fifth motor: only {', '.join(motors)} are read, of a drone with four rotors")
     for quantity, signal in gathered.items():
         if quantity == "battery_voltage" and not (signal.values > 0.0).any():
             continue  # autopilots say 0 where no battery is measured

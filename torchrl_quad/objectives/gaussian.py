@@ -95,37 +95,22 @@ class GaussianPolicy:
         return dist
 
     def _call(self, states: TensorDictBase) -> TensorDictBase:
-        """What the policy writes in states, once it is sure to write the same again."""
-        parts = list(self.actor.named_modules())
-        for name, part in parts:
+        """What the policy writes in states; an error for a layer that would not write the same again."""
+        names, before = {part: name for name, part in self.actor.named_modules()}, {}
+        for part in names:
             if isinstance(part, _BatchNorm) and (part.training or part.running_mean is None):
-                raise _changing(name, part, "uses the statistics of its batch")
+                raise _changing(part, names[part], "uses the statistics of its batch")
         if torch.compiler.is_compiling():
             return self.actor(states)
-        random, versions = _random_state(), [_versions(part) for _, part in parts]
-        written = self.actor(states.copy())
-        for (name, part), version in zip(parts, versions, strict=True):
-            if _versions(part) != version:
-                raise _changing(name, part, "changes its statistics")
-        if _random_state() != random:
-            name, part = self._random_part(states)
-            raise _changing(name, part, "draws random numbers")
-        return written
 
-    def _random_part(self, states: TensorDictBase) -> tuple[str, nn.Module]:
-        """The innermost part of the policy that draws random numbers, and its name."""
-        before: dict[nn.Module, Any] = {}
-        found: list[nn.Module] = [self.actor]
+        def leave(part: nn.Module, *_: Any) -> None:  # the innermost part returns first
+            for does, now, then in zip(_CHANGES, _changeable(part), before[part], strict=True):
+                if now != then:
+                    raise _changing(part, names.get(part, ""), does)
 
-        def leave(part: nn.Module, *_: Any) -> None:
-            if _random_state() != before[part]:
-                found.append(part)  # the innermost returns first
-
-        enter = register_module_forward_pre_hook(lambda part, _: before.update({part: _random_state()}))
+        enter = register_module_forward_pre_hook(lambda part, _: before.update({part: _changeable(part)}))
         with enter, register_module_forward_hook(leave):
-            self.actor(states)
-        part = found[min(1, len(found) - 1)]
-        return {part: name for name, part in self.actor.named_modules()}.get(part, ""), part
+            return self.actor(states)
 
 
 def sampler_of(actor: TensorDictModuleBase) -> ProbabilisticTensorDictModule | None:
@@ -147,19 +132,18 @@ def _normal(dist: Any) -> tuple[Tensor, Tensor]:
     return base.loc, base.scale
 
 
-def _random_state() -> list[bytes]:
-    """Where the generators of torch stand."""
+_CHANGES = ("draws random numbers", "changes its statistics")
+
+
+def _changeable(part: nn.Module) -> tuple[Any, Any]:
+    """Where torch's generators stand, and how often the statistics of a part were changed in place."""
     devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
-    states = torch.get_rng_state(), *(torch.cuda.get_rng_state(i) for i in devices)
-    return [x.numpy().tobytes() for x in states]
+    random = torch.get_rng_state(), *(torch.cuda.get_rng_state(i) for i in devices)
+    statistics = (x for x in part._buffers.values() if x is not None and x.is_floating_point())
+    return [x.numpy().tobytes() for x in random], [x._version for x in statistics]
 
 
-def _versions(part: nn.Module) -> list[int]:
-    """How often each of the statistics of a part was changed in place."""
-    return [x._version for x in part._buffers.values() if x is not None and x.is_floating_point()]
-
-
-def _changing(name: str, part: nn.Module, does: str) -> Unsupported:
+def _changing(part: nn.Module, name: str, does: str) -> Unsupported:
     return Unsupported(
         "Gradients of single actions let the policy act again in the same states, and its layer "
         f"{type(part).__name__}{f' ({name})' * bool(name)} {does}, so that it writes something else. Call actor.eval() "

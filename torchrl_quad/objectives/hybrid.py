@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.distributions import Normal, kl_divergence
+from torch.distributions import Normal
 from torch.distributions.transforms import TanhTransform
 from torchrl.objectives.utils import ValueEstimators
 
@@ -85,7 +85,7 @@ class HybridLoss(SHACLoss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        value_network: TensorDictModule,
+        value_network: TensorDictModule | list[TensorDictModule],
         *,
         gradient_lmbda: Share = 0.9,
         clip_epsilon: Annotated[float, Field(gt=0, lt=1)] = 0.2,
@@ -94,8 +94,9 @@ class HybridLoss(SHACLoss):
         decay: Below1 = 0.9,
         average: Callable[[Tensor], Tensor] | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
+        loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
     ) -> None:
-        own = {"clip_action_gradient": clip_action_gradient, "reduction": reduction}
+        own = {"clip_action_gradient": clip_action_gradient, "reduction": reduction, "loss_function": loss_function}
         super().__init__(actor_network, value_network, delay_value=False, **own)
         self.gradient_lmbda, self.clip_epsilon, self.entropy_coeff = gradient_lmbda, clip_epsilon, entropy_coeff
         self.decay, self.average = decay, average
@@ -112,6 +113,7 @@ class HybridLoss(SHACLoss):
         """The losses and their metadata, the ``out_keys``, of samples (*) with targets or of a rollout (*, horizon)."""
         return super().forward(self._with_targets(tensordict))
 
+    @torch.compiler.disable(reason="gradients of single actions are read off the graph of the flight")
     def write_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Differentiate a rollout (*, horizon), update the weight, and return what the minibatches read.
 
@@ -148,7 +150,9 @@ class HybridLoss(SHACLoss):
         clipped = ratio.clamp(1.0 - self.clip_epsilon, 1.0 + self.clip_epsilon)
         score = torch.minimum(ratio * advantage, clipped * advantage).squeeze(-1)
         pathwise = (leaf(tensordict, keys.location_gradient) * (new.loc - old.loc)).sum(-1)
-        kl = kl_divergence(old, new).sum(-1).mean().detach()
+        # Written out, since a compiler cannot trace torch's dispatch.
+        ratio, shift = (old.scale / new.scale).square(), ((old.loc - new.loc) / new.scale).square()
+        kl = (0.5 * (ratio + shift - 1 - ratio.log())).sum(-1).mean().detach()
         objective, metadata = score + pathwise, {"pathwise_weight": self.pathwise_weight.clamp(0.0, 1.0), "kl": kl}
         if self.entropy_coeff:
             entropy = new.entropy()

@@ -153,13 +153,13 @@ def _read(drone: Any, entry: str | None) -> tuple[str, str, Found, list[str]]:
         for kind, (reader, *keys) in MAPPINGS.items()
         if isinstance(part, Mapping) and any(key in part for key in keys)
     }
+    if entry is not None and not drones:
+        raise UserValueError(f"{source}: has no drones by name. Leave out entry={shown(entry)}.")
     if (entry is None and len(drones) > 1) or (entry is not None and entry not in drones):
-        raise UserValueError(
-            f"{source}: choose one drone of the file, by entry={next(iter(drones), '')!r} or another of "
-            f"{shown(list(drones))}; got {shown(entry)}."
-        )
-    if not drones and suffix == ".json":
-        raise UserValueError(f"{source}: this JSON is of no kind that is known. {READABLE}")
+        names = f"entry={next(iter(drones))!r} or another of {shown(list(drones))}"
+        raise UserValueError(f"{source}: choose one drone of the file, by {names}; got {shown(entry)}.")
+    if not drones and not (isinstance(data, Mapping) and set(FIELDS) & set(data)) and not isinstance(drone, Mapping):
+        raise UserValueError(f"{source}: this file is of no kind that is known. {READABLE}")
     if not drones:
         return source, "", {k: (v, "") for k, v in data.items()}, []
     kind, reader, part = drones[entry] if entry is not None else next(iter(drones.values()))

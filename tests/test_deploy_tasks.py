@@ -224,8 +224,9 @@ CHANGES = [  # of a contract whose checksums fit
     ("drone.thrust_map", [1e-9, 0, 0], "drone: to hover each rotor must give"),
     ("drone.rotor_positions", [[0.1, 0.1]] * 4, "drone.rotor_positions and rotor_spin cannot make thrust"),
     ("plant", {"mass": 0}, "plant.mass: 0 is less than the minimum of 0.001"),
+    ("plant", {"inertia": [1e-3, 1e-3, 3e-3]}, "plant.inertia .* kg m2: in a body none of the three exceeds"),
     ("plant", {"wings": 2}, "plant: .*'wings' was unexpected"),
-    ("plant", {"rotor_speed_min": 9000}, "plant.rotor_speed_min is 9000, and must be below"),
+    ("plant", {"rotor_speed_min": 9000}, "plant.rotor_speed_min must be below rotor_speed_max"),
 ]
 
 

@@ -144,7 +144,7 @@ def files(contract: Contract) -> tuple[str, ...]:
 def _contradictions(drone: Contract, name: str, hovers: bool = False) -> Iterator[str]:
     """Why these parts do not make a drone, or one that hovers."""
     (k2, k1, k0), low, high = drone["thrust_map"], drone["rotor_speed_min"], drone["rotor_speed_max"]
-    yield from (f"{name}.{why}" for why in contradictions({k: drone[k] for k in drone if k != "motor_command"}))
+    yield from (f"{name}.{why}" for why in contradictions(drone))
     x, y = np.array(drone["rotor_positions"], float).T
     allocation = np.array([np.ones(4), y, -x, drone["yaw_torque_coefficient"] * np.array(drone["rotor_spin"], float)])
     rows = allocation / np.maximum(np.linalg.norm(allocation, axis=1, keepdims=True), 1e-30)

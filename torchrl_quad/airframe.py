@@ -15,10 +15,12 @@ from torchrl_quad.errors import shown
 Array = NDArray[np.float64]
 NEARLY_LINEAR = 1e-3  # of a thrust map, k2 / k1 times the highest speed, below which single precision loses the speed
 
+JUDGED = ("mass", "inertia", "rotor_positions", "thrust_map", "rotor_speed_min", "rotor_speed_max")
+
 
 def contradictions(fields: Mapping[str, ArrayLike]) -> Iterator[str]:
     """Why there is no drone with these fields, of one drone or (n, ...) of several, in words."""
-    drone = {name: np.asarray(x, float) for name, x in fields.items() if x is not None}
+    drone = {name: np.asarray(fields[name], float) for name in JUDGED}
     inertia, k2, k1 = drone["inertia"], drone["thrust_map"][..., 0], drone["thrust_map"][..., 1]
     mass, low, high = (drone[x].reshape(-1) for x in ("mass", "rotor_speed_min", "rotor_speed_max"))
     units = "Check the order of the axes and the unit: 1 g cm2 is 1e-7 kg m2"

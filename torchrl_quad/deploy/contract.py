@@ -149,7 +149,7 @@ def _contradictions(drone: Contract, name: str, hovers: bool = False) -> Iterato
     if len({len(x) for x in each}) > 1 or len({len(x) for x in each[0]}) > 1:
         yield f"{name}: rotor_positions and the other fields of rotors must be equally long"
         return
-    yield from (f"{name}.{why}" for why in contradictions({k: drone[k] for k in drone if k != "motor_command"}))
+    yield from (f"{name}.{why}" for why in contradictions(drone))
     allocation = matrix(drone)[:4]
     if not np.isfinite(allocation).all():
         yield f"{name}.rotor_direction has a rotor without a direction"

@@ -289,7 +289,6 @@ class PlainParts(PlainTanhGaussian):
         self.sees, gru = bool(parts.convolutions), cast(Any, parts.memory)
         self.memory = {MEMORY: (1, gru.hidden_size)} if gru else {}
         self.in_keys, self.out_keys = [*map(unravel_key, first.in_keys), *self.memory], list(actor.out_keys)
-        self.without_gradient: frozenset[NestedKey] = frozenset()
         self._take_head(actor)
         before = [(x.weight, x.bias) for x in cast(Any, [*parts.convolutions[::2], *parts.trunk[::2]])]
         gates = [(gru.weight_ih_l0, gru.bias_ih_l0), (gru.weight_hh_l0, gru.bias_hh_l0)] if gru else []

@@ -42,8 +42,8 @@ class GaussianPolicy:
         for name, part in parts[[part for _, part in parts].index(sampler) + 1 :]:
             if isinstance(part, TensorDictModuleBase) and self.action_key in part.out_keys:
                 raise Unsupported(
-                    f"{_NEEDED}, and here {type(part).__name__} ({name}) changes the action afterwards. Let the distribution "
-                    "write the action that is flown."
+                    f"{_NEEDED}, and here {type(part).__name__} ({name}) changes the action afterwards. "
+                    "Let the distribution write the action that is flown."
                 )
         self.flown = self._distribution(tensordict.select(*sampler.in_keys).detach())
         self.squashes = isinstance(self.flown, TanhNormal)

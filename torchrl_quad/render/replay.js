@@ -5,7 +5,7 @@ const decoded = (text) => text && new Float32Array(Uint8Array.from(atob(text), (
 
 const flight = JSON.parse(element("flight").textContent);
 const { environments, frames, ended, endings } = flight;
-const [position, attitude, lift, target, gate, rings, places, path, rotors] = ["position", "quaternion", "lift", "target",
+const [position, attitude, lift, target, gate, allRings, places, path, rotors] = ["position", "quaternion", "lift", "target",
   "gate", "gates", "places", "curve", "rotors"].map((name) => decoded(flight[name]));
 const shapes = flight.shapes.map((shape) => ({ ...shape, points: decoded(shape.points), faces: decoded(shape.faces) }));
 const obstacles = flight.obstacles.map(({ points, faces }) => ({ points: decoded(points), faces: decoded(faces) }));
@@ -14,7 +14,8 @@ const times = Float64Array.from({ length: frames }, (_, k) => flight.start + k *
 
 const RED = "#c8452f", ORANGE = "#e8912d", INK = "#222222", PALE = "#dcdfe3";
 const CURVES = [INK, "#2f6db5", "#e8912d", "#3a9a5b", "#c8452f", "#8a5fb0", "#8c6d4f", "#d17ba6", "#5bb0c0"];
-const RING = 33; // points of a circle around a gate
+const RING = 33; // points around a gate
+let rings = ringsOf(null);
 const TRAIL = Math.min(Math.round(2 / flight.control_dt), frames - 1); // steps behind a drone
 
 const everyone = Array.from({ length: environments }, (_, i) => i);
@@ -56,15 +57,15 @@ class Pen {
 }
 
 const plus = (a, b, scale = 1) => a.map((value, j) => value + scale * b[j]);
-const arm = Math.hypot(...rotors.slice(0, 2));
+const arm = Math.hypot(...rotors.slice(0, 2)), hubs = rotors.length / (2 * environments);
 
 function drawBody(pen, i, centre, world) {
-  for (let j = 0; j < 4; j++) {
+  for (let j = 0; j < hubs; j++) {
     pen.to(centre);
     pen.to(plus(centre, world(hub(i, j)), size));
   }
   pen.lift();
-  for (let j = 0; j < 4; j++) {
+  for (let j = 0; j < hubs; j++) {
     for (let k = 0; k <= 8; k++) {
       const angle = (k * Math.PI) / 4, radius = 0.45 * arm;
       const rim = plus(hub(i, j), [radius * Math.cos(angle), radius * Math.sin(angle), 0]);
@@ -75,7 +76,8 @@ function drawBody(pen, i, centre, world) {
 }
 
 function hub(i, j) {
-  return [rotors[8 * i + 2 * j], rotors[8 * i + 2 * j + 1], 0];
+  const k = 2 * (hubs * i + j);
+  return [rotors[k], rotors[k + 1], 0];
 }
 
 function drawTrail(pen, i, centre) {
@@ -88,8 +90,14 @@ function drawTrail(pen, i, centre) {
   pen.lift();
 }
 
+// The gates of the environment that is followed, or else of the first; all may share those of the first.
+function ringsOf(i) {
+  const size = allRings ? allRings.length / flight.tracks : 0;
+  return allRings ? allRings.subarray(size * (flight.tracks > 1 ? i ?? 0 : 0)).subarray(0, size) : null;
+}
+
 function drawNextGates(pen) {
-  const next = new Set(shown().map((i) => gate[i * frames + Math.floor(frame)]));
+  const next = new Set((flight.tracks > 1 ? [chosen ?? 0] : shown()).map((i) => gate[i * frames + Math.floor(frame)]));
   for (let g = 0; g < rings.length / (3 * RING); g++) drawRing(pen, next.has(g) ? g : null);
 }
 
@@ -115,8 +123,8 @@ function moving() {
     pens.crash.to(endings[i] === "crashed" && frame >= ended[i] ? centre : NOWHERE);
     if (pens.target) pens.target.to(centre === NOWHERE ? NOWHERE : between(target, 3, i));
     if (lift) {
-      const thrust = between(lift, 4, i);
-      for (let j = 0; j < 4; j++) {
+      const thrust = between(lift, hubs, i);
+      for (let j = 0; j < hubs; j++) {
         pens.thrust.to(plus(centre, world(hub(i, j)), size));
         pens.thrust.to(plus(centre, world(plus(hub(i, j), [0, 0, arm * thrust[j]])), size));
         pens.thrust.lift();
@@ -137,7 +145,7 @@ const trailColors = () => each(TRAIL + 3, (i) => (shown().includes(i) ? colors[i
 
 const MOVING = ["shadow", "trail", "body", "nose", ...(lift ? ["thrust"] : []), ...(target && !gate ? ["target"] : []),
   ...(gate ? ["next"] : []), "crash"];
-const [low, high] = bounds(...[position, target, rings, places, path].filter(Boolean),
+const [low, high] = bounds(...[position, target, allRings, places, path].filter(Boolean),
   ...shapes.map((shape) => shape.points));
 const extent = Math.max(...high.map((value, j) => value - low[j]), 1);
 const grounded = low[2] < 2 * extent; // otherwise the ground is too far below to be shown
@@ -244,7 +252,7 @@ function drawSpace() {
   const traces = {
     shadow: () => markers("shadow", pens.shadow, "#b9bec4", "circle", grounded ? 2.5 : 0),
     trail: () => line("trail", pens.trail, trailColors(), 2),
-    body: () => line("body", pens.body, each(49, (i) => colors[i]), 4),
+    body: () => line("body", pens.body, each(12 * hubs + 1, (i) => colors[i]), 4),
     nose: () => line("nose", pens.nose, RED, 6),
     thrust: () => line("thrust", pens.thrust, ORANGE, 3),
     target: () => markers("target", pens.target, RED, "diamond", 7),
@@ -416,6 +424,10 @@ function choose(i) {
   if (indexOf("course") >= 0) {
     const { x, y, z } = course();
     Plotly.restyle("space", { x: [x], y: [y], z: [z] }, [indexOf("course")]);
+  }
+  if (rings && flight.tracks > 1) {
+    rings = ringsOf(i);
+    for (const { name, x, y, z } of gates()) Plotly.restyle("space", { x: [x], y: [y], z: [z] }, [indexOf(name)]);
   }
   if (obstacles.length > 1) {
     const { x, y, z, i: a, j: b, k: c } = obstacle();

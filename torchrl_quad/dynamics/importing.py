@@ -47,7 +47,11 @@ ASKED = {  # what no drone flies without and nobody can guess, as a user could g
 
 
 def load_drone(
-    drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torch.float32, *, entry: str | None = None, **fields: Any
+    drone: str | Path | Mapping = "visfly",
+    dtype: torch.dtype = torch.float32,
+    *,
+    entry: str | None = None,
+    **fields: Any,
 ) -> QuadrotorParams:
     """A preset by its name (:func:`available_drones`), a file by its path, or a mapping of fields to numbers.
 
@@ -93,9 +97,14 @@ def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -
     name = f"{Path(path).name}, {entry}" if entry else Path(path).name
     lines = [f"# Source: {one_line(name)} ({kind})."]
     if unread:
-        lines += textwrap.wrap(f"Not read: {', '.join(map(one_line, unread))}.", 118, initial_indent="# ", subsequent_indent="#   ")
+        lines += textwrap.wrap(
+            f"Not read: {', '.join(map(one_line, unread))}.", 118, initial_indent="# ", subsequent_indent="#   "
+        )
     for field in (x for x in FIELDS if x in found):
-        value, note = np.asarray(found[field][0], float), "; ".join(x for x in (FIELDS[field]["unit"], found[field][1]) if x)
+        value, note = (
+            np.asarray(found[field][0], float),
+            "; ".join(x for x in (FIELDS[field]["unit"], found[field][1]) if x),
+        )
         text = "\n".join(["", *(f"  - {_flow(row)}" for row in value)]) if value.ndim > 1 else f" {_flow(value)}"
         head, *rest = text.split("\n")
         lines.append("\n".join([f"{field}:{head}{'  # ' * bool(note)}{note}", *rest]))
@@ -137,8 +146,14 @@ def _completed(source: str, kind: str, found: Found, fields: Mapping[str, Any]) 
     reached = rotors.spare_torque() / drone.inertia * torch.tensor([0.1, 0.1, 0.5])  # within as many seconds
     rates = reached.minimum(torch.tensor([6.0, 6.0, 2.0])).clamp_min(0.1)
     limits = {
-        "max_body_rate": ((rates * 10.0).floor() / 10.0, "chosen here: 6, 6, 2, or what takes 0.1 s, 0.1 s, 0.5 s from hover"),
-        "max_thrust_to_weight": (most.clamp(1.1, 5.0).mul(10.0).floor().item() / 10.0, "chosen here: 5, or what the rotors reach"),
+        "max_body_rate": (
+            (rates * 10.0).floor() / 10.0,
+            "chosen here: 6, 6, 2, or what takes 0.1 s, 0.1 s, 0.5 s from hover",
+        ),
+        "max_thrust_to_weight": (
+            most.clamp(1.1, 5.0).mul(10.0).floor().item() / 10.0,
+            "chosen here: 5, or what the rotors reach",
+        ),
     }
     found = {**limits, **found}
     gains = suggest_gains({k: v for k, (v, _) in found.items()})
@@ -157,7 +172,13 @@ def _read(drone: Any, entry: str | None) -> tuple[str, str, Found, list[str]]:
     if suffix in (".urdf", ".sdf", ".xml"):
         path = Path(drone)
         root = _xml(path)
-        said = _urdf(root, str(path)) if root.tag == "robot" else _sdf(root, path) if root.tag in ("sdf", "model") else None
+        said = (
+            _urdf(root, str(path))
+            if root.tag == "robot"
+            else _sdf(root, path)
+            if root.tag in ("sdf", "model")
+            else None
+        )
         if said is None:
             raise UserValueError(f"{path}: XML with the root <{one_line(root.tag)}> is no URDF or SDF. {_readable()}")
         return str(path), "URDF" if root.tag == "robot" else "SDF", said, []
@@ -244,7 +265,12 @@ def _inertia(matrix: Any, note: str = "") -> Found:
     products = abs(matrix - np.diag(diagonal)).max()
     products = products if products > 1e-6 * diagonal.min() else 0.0  # rounding
     if products > 0.05 * diagonal.min():
-        return {"inertia": (None, f"its products of inertia, of {products:.3g} kg m2, are no small ones: give principal axes")}
+        return {
+            "inertia": (
+                None,
+                f"its products of inertia, of {products:.3g} kg m2, are no small ones: give principal axes",
+            )
+        }
     left = f"products of inertia up to {products:.2g} kg m2 left out" if products > 0.0 else ""
     return {"inertia": (diagonal, "; ".join(x for x in (note, left) if x))}
 
@@ -308,7 +334,11 @@ def _flightmare(said: Said) -> Found:
 
 
 def _l2f(said: Said) -> Found:
-    gravity, limit, thrust = said("gravity", 3), said.data.get("action_limit"), said("rotor_thrust_coefficients", None, 3)
+    gravity, limit, thrust = (
+        said("gravity", 3),
+        said.data.get("action_limit"),
+        said("rotor_thrust_coefficients", None, 3),
+    )
     ours = np.array([1.0, -1.0, -1.0]) if gravity is not None and gravity[2] > 0.0 else np.ones(3)  # z may point down
     places, up, torque = (
         None if (x := said(f"rotor_{name}", None, 3)) is None else x * ours
@@ -361,7 +391,11 @@ def _rotorpy(said: Said) -> Found:
     moments = [said(f"I{axes}") for axes in ("xx", "yy", "zz", "xy", "xz", "yz")]
     drag, n = [said(f"c_D{axis}") for axis in "xyz"], 0 if places is None else len(places)
     said.asked |= {"num_rotors"}
-    found = {"mass": (mass, ""), "motor_time_constant": (said("tau_m"), ""), "rotor_spin": (said("rotor_directions", None), "")}
+    found = {
+        "mass": (mass, ""),
+        "motor_time_constant": (said("tau_m"), ""),
+        "rotor_spin": (said("rotor_directions", None), ""),
+    }
     found |= {f"rotor_speed_{end}": (said(f"rotor_speed_{end}"), "") for end in ("min", "max")} | _placed(places, None)
     if all(x is not None for x in moments[:3]):
         found |= _inertia(_symmetric(*(0.0 if x is None else x for x in moments)))
@@ -519,7 +553,11 @@ def _numbered(links: Links) -> list[str]:
 def _gym_pybullet(root: ET.Element, links: Links, said: Mapping[str, str], source: str) -> Found:
     rotors = _numbered(links)
     found, _, _ = _body(links, rotors)
-    numbers = {k: _floats(said.get(k), 1, source)[0] for k in ("kf", "km", "thrust2weight", "drag_coeff_xy", "drag_coeff_z") if k in said}
+    numbers = {
+        k: _floats(said.get(k), 1, source)[0]
+        for k in ("kf", "km", "thrust2weight", "drag_coeff_xy", "drag_coeff_z")
+        if k in said
+    }
     n, mass = len(rotors), found.get("mass", (None,))[0]
     if n == 4:
         spin = np.array([-1, 1, -1, 1]) * (-1 if root.get("name") == "racer" else 1)
@@ -552,7 +590,10 @@ def _vehicle(root: ET.Element, links: Links, source: str) -> Found:
         value, why = _same(some, names[0])
         return (None if value is None else value[0] if len(set(value)) == 1 else value), why
 
-    found["rotor_spin"] = [-1 if (x.findtext("turningDirection") or "").strip() == "ccw" else 1 for x in motors], "turningDirection"
+    found["rotor_spin"] = (
+        [-1 if (x.findtext("turningDirection") or "").strip() == "ccw" else 1 for x in motors],
+        "turningDirection",
+    )
     found["yaw_torque_coefficient"], found["rotor_speed_max"] = all_of("momentConstant"), all_of("maxRotVelocity")
     found["motor_time_constant"] = all_of("timeConstantUp", "timeConstantDown")
     k2, why = all_of("motorConstant")

@@ -18,6 +18,13 @@ from torchrl_quad.envs.markers import Markers, Shape  # noqa: E402
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the programs that tests start, which go side by side
 RECIPES = Path(__file__).parent.parent / "recipes"
 
+LONG = {"test_docs.py", "test_transforms.py", "test_horizon.py", "test_processes.py", "test_replay.py"}
+
+
+def pytest_collection_modifyitems(items):
+    """The longest tests start first, so that no worker is left alone with one at the end."""
+    items.sort(key=lambda item: item.path.name not in LONG)
+
 
 @pytest.fixture(autouse=True)
 def one_thread_and_a_fixed_seed():

@@ -45,15 +45,18 @@ HARDER = {  # so that some episodes succeed, some do not, and some crash
     "hovering": {"box_height": 1.7},
     "tracking": {"success_radius": 1.24, "ceiling": 1.15},
     "landing": {"success_speed": 0.28, "box_half_width": 0.9},
-    "racing": {"success_gates": 1, "ceiling": 1.5},
+    "racing": {"success_gates": 2},
     **{"relay": {}, "ring": {}},
 }
-PILOTS = {"relay": {"after": 6}, "ring": {"beyond": 0.5}}
+RANDOM_TRACK = {"file": "random", "random": {"gates": 3, "spacing": [2, 4]}, "frame": 0.3}
+OPTIONS = {"racing": {"track": RANDOM_TRACK, "observe_directions": True}}
+PILOTS = {"relay": {"after": 6}, "ring": {"beyond": 0.5}, "racing": {"directed": True}}
 
 
 def harder(name):
     task = name.removesuffix(", harder")
     options = {"num_envs": 16, "max_episode_steps": 130, "seed": 1, "random_start": {"velocity": 2.0, "tilt": 0.3}}
+    options |= OPTIONS.get(task, {})
     env = OWN[task](**options) if task in OWN else make_env(task, **options)
     vars(env).update(HARDER[task])
     return env, pilot(env, **PILOTS.get(task, {}))

@@ -55,9 +55,11 @@ __all__ = [
     "make_qvalue",
     "make_value",
     "make_visual_actor",
+    "random_track",
     "register_envs",
     "register_task",
     "restart",
+    "suggest_gains",
 ]
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.airframe import contradictions
 from torchrl_quad.allocation import matrix, uncontrolled
 from torchrl_quad.errors import MissingPackage, UserError, UserValueError, one_line, shown
 
@@ -144,14 +145,11 @@ def files(contract: Contract) -> tuple[str, ...]:
 def _contradictions(drone: Contract, name: str, hovers: bool = False) -> Iterator[str]:
     """Why these parts do not make a drone, or one that hovers."""
     (k2, k1, k0), low, high = drone["thrust_map"], drone["rotor_speed_min"], drone["rotor_speed_max"]
-    if not (k2 > 0 and k1 + 2 * k2 * low >= 0):
-        yield f"{name}.thrust_map is {drone['thrust_map']}, and must rise from rotor_speed_min on"
-    if not low < high:
-        yield f"{name}.rotor_speed_min is {low:g}, and must be below rotor_speed_max, {high:g}"
     each = [drone[k] for k in ("rotor_positions", "rotor_spin", "rotor_direction", "rotor_effectiveness") if k in drone]
     if len({len(x) for x in each}) > 1 or len({len(x) for x in each[0]}) > 1:
         yield f"{name}: rotor_positions and the other fields of rotors must be equally long"
         return
+    yield from (f"{name}.{why}" for why in contradictions({k: drone[k] for k in drone if k != "motor_command"}))
     allocation = matrix(drone)[:4]
     if not np.isfinite(allocation).all():
         yield f"{name}.rotor_direction has a rotor without a direction"

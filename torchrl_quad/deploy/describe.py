@@ -14,10 +14,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.linalg import vector_norm
 
+from torchrl_quad.airframe import RateLoop
 from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.deploy.contract import GRAPHS, MEASURED, Contract, Fields, schema_table
 from torchrl_quad.deploy.network import fill_in
-from torchrl_quad.deploy.simulators.vehicle import bandwidth, damping_ratio
 from torchrl_quad.deploy.tracing import Rules
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
 from torchrl_quad.dynamics.parameters import LIMITS
@@ -197,18 +197,17 @@ def _is_plain(x: Any) -> bool:
 
 
 def _rate_loop(env: QuadrotorEnv, drone: Contract) -> Fields | None:
-    """The rate loop about hover, a second-order system per axis; None where rates follow the command at once."""
+    """The rate loop about hover, in the steps that were flown; None where rates follow the command at once."""
     if "rotor_speed" not in env.dynamics.sizes:
         return None
-    gain, inertia, loss = (np.array(drone[k]) for k in ("rate_gain", "inertia", "rate_damping"))
-    tau = np.mean(drone["motor_time_constant"])  # where it differs up and down, their mean
-    values = {
-        "natural_frequency": np.sqrt(gain / tau),
-        "damping_ratio": damping_ratio(gain, inertia, loss, tau),
-        "bandwidth": bandwidth(gain, inertia, loss, tau),
-    }
-    law = "tau w'' + 2 damping_ratio sqrt(gain tau) w' + gain w = gain desired, tau = motor_time_constant"
-    return {"law": law, "gain": drone["rate_gain"], **{k: numbers(np.float32(v)) for k, v in values.items()}}
+    tau, dt = drone["motor_time_constant"], getattr(env.dynamics, "dt")  # noqa: B009
+    loop = RateLoop(drone["rate_gain"], drone["inertia"], drone["rate_damping"], tau, dt)
+    values = {k: numbers(np.float32(getattr(loop, k))) for k in ("natural_frequency", "damping_ratio", "bandwidth")}
+    law = (
+        "every simulator.dt: w += dt a and, at once, a += (1 - exp(-dt / motor_time_constant)) "
+        "(gain (desired - w) - (1 + rate_damping / inertia) a)"
+    )
+    return {"law": law, "gain": drone["rate_gain"], **values}
 
 
 # -- what has flown ----------------------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, Protocol
 
@@ -10,15 +12,13 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Nominal, RotorThrustController, make_controller
+from torchrl_quad.dynamics.gains import PhysicsStep, check_flown, check_gains
 from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import INTEGRATORS, Integrator, RigidBodyState, Rotors, accelerations, drag
 from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, clamp, stack
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import DroneWarning, UserValueError
 from torchrl_quad.options import between, checked
 
-# [s]. In a shorter step a drone at 1 m/s does not move in single precision; with a longer one the rate loop of no drone
-# that ships is stable.
-PhysicsStep = Annotated[float, between(1e-6, 0.1)]
 Substeps = Annotated[int, between(1, 200)]
 
 
@@ -94,7 +94,10 @@ class ControlledModel:
         self.finish()
 
     def finish(self) -> None:
-        """What a model adds to its construction: its limits, or a refusal of what it cannot fly."""
+        """What a model adds to its construction: its limits, or a refusal of what it cannot fly.
+
+        A method ``check_flown(params)`` can refuse another drone that is to fly.
+        """
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
         """Level and still, at the positions (n, 3) [m]."""
@@ -163,9 +166,25 @@ class Quadrotor(ControlledModel):
     plant_fields, commanded = PLANT_FIELDS, ("rotor_speed",)
 
     def finish(self) -> None:
-        """Count the rotors, and limit their speeds."""
+        """Count the rotors, limit their speeds, and refuse or question what such steps, or the rotors, do not fly."""
         self.sizes = {**self.sizes, "rotor_speed": self.nominal.rotor_spin.shape[-1]}
         self.limits = {"rotor_speed": 2.0 * self.nominal.rotor_speed_max}
+        if not isinstance(self.controller, RotorThrustController):
+            check_gains(self.controller, self.dt, self.substeps)
+        asked, reach = self.nominal.max_thrust_to_weight, self.controller.reach()
+        if (asked > reach * (1.0 + 1e-5)).any():
+            warnings.warn(
+                f"drone: full throttle commands max_thrust_to_weight={asked.max():.4g}, and the rotors reach "
+                f"{reach.min():.4g} times the weight. Actions above that do nothing and have no gradient. Write "
+                f"max_thrust_to_weight: {math.floor(1e3 * reach.min()) / 1e3:g}.",
+                DroneWarning,
+                stacklevel=2,
+            )
+
+    def check_flown(self, params: QuadrotorParams) -> None:
+        """Refuse a drone with which the rate loop is unstable."""
+        if not isinstance(self.controller, RotorThrustController):
+            check_flown(self.nominal, params, self.dt)
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
         """Level, still, rotors at hover speed, at the positions (n, 3) [m]."""

@@ -2,6 +2,7 @@
 
 import numbers
 import re
+import tomllib
 from collections.abc import Hashable, Mapping, Sequence
 from importlib.abc import Traversable
 from pathlib import Path
@@ -36,14 +37,14 @@ def read(kind: str, preset: str | Path | Mapping, folder: Traversable | None = N
     choices = f"Choose from: {', '.join(known)}; or give" if known else "Give"
     if isinstance(preset, str) and preset in known:
         source, path = f"{preset}.yaml", known[preset]
-    elif isinstance(preset, Path) or (isinstance(preset, str) and preset.endswith((".yaml", ".yml"))):
+    elif isinstance(preset, Path) or (isinstance(preset, str) and preset.endswith((".yaml", ".yml", ".toml"))):
         source, path = str(preset), Path(preset)
     else:
         raise UserValueError(f"Unknown {kind} {shown(preset)}. {choices} the path of a .yaml file, or a mapping.")
     if not path.is_file():  # which a pipe or a device is not, whose reading may never end
         raise FileNotFoundError(f"No {kind} file at {path}. {choices} the path of a .yaml file that exists.")
     with path.open("rb") as file:
-        values = parse(file.read(MAX_BYTES + 1), source)
+        values = (parse_toml if path.suffix == ".toml" else parse)(file.read(MAX_BYTES + 1), source)
     if not isinstance(values, Mapping):
         raise UserValueError(f"{source}: expected a mapping of names to values, got {type(values).__name__}.")
     return source, values
@@ -69,6 +70,16 @@ def parse(content: bytes, source: str) -> Any:
         raise UserValueError(f"{source}: not a YAML file: {' '.join(str(error).split())}") from error
     except UserValueError as error:
         raise UserValueError(f"{source}: {error}") from None
+
+
+def parse_toml(content: bytes, source: str) -> Any:
+    """The content of a TOML file; a ValueError if it is too large or none."""
+    try:
+        if len(content) > MAX_BYTES:
+            raise ValueError(f"it has more than {MAX_BYTES:,} bytes")
+        return tomllib.loads(content.decode())
+    except (ValueError, RecursionError) as error:
+        raise UserValueError(f"{source}: not a TOML file: {' '.join(str(error).split())}") from None
 
 
 class _Loader(yaml.SafeLoader):

@@ -5,11 +5,12 @@ from torchrl_quad.envs.disturbances import Disturbance
 from torchrl_quad.envs.forest import Forest, ForestEnv
 from torchrl_quad.envs.hovering import HoveringEnv
 from torchrl_quad.envs.landing import LandingEnv
-from torchrl_quad.envs.racing import RacingEnv, load_track
+from torchrl_quad.envs.racing import RacingEnv
 from torchrl_quad.envs.registry import TASKS, available_tasks, make_env, register_task, task_class
 from torchrl_quad.envs.scenes import Scene
 from torchrl_quad.envs.task import Task
 from torchrl_quad.envs.terms import Event, ball_entry, level_crossing
+from torchrl_quad.envs.track import load_track, random_track
 from torchrl_quad.envs.tracking import TrackingEnv
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "level_crossing",
     "load_track",
     "make_env",
+    "random_track",
     "register_task",
     "task_class",
 ]

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import QuadrotorParams, load_drone
-from torchrl_quad.dynamics.model import PhysicsStep
+from torchrl_quad.dynamics.gains import PhysicsStep
 from torchrl_quad.dynamics.rigid_body import Integrator
 from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compiler, nested
 from torchrl_quad.engine.simulation import State
@@ -26,8 +26,18 @@ from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, check_value, checked
 
 
+class _Build(type(EnvBase)):
+    def __call__(cls, *args: Any, auto_reset: bool = False, **kwargs: Any) -> Any:
+        if auto_reset:  # TorchRL would wrap it, and no episode would ever begin again
+            raise UserValueError(
+                "auto_reset=True is for environments that reset themselves in the step that ends an episode, and this "
+                "one waits for a reset. Leave it out: rollouts and collectors reset where an episode ends."
+            )
+        return super().__call__(*args, **kwargs)
+
+
 @checked
-class QuadrotorEnv(Task, EnvBase):
+class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
     """Base of all tasks: a batch of quadrotors, stateless and differentiable.
 
     A step is a pure function of its tensordict. The complete Markov state is in ``"state"``, and gradients flow from
@@ -163,6 +173,7 @@ class QuadrotorEnv(Task, EnvBase):
     def set_params(self, params: QuadrotorParams) -> None:
         """Set :attr:`params`, also through a TransformedEnv, where an assignment would not reach this environment."""
         config.check_params(params, self.num_envs, self.nominal)
+        config.check_flown(self.dynamics, params)
         fits = all(x.dtype == self.dtype and x.device == self.device for x in params.fields().values())
         self._params = params if fits else params.to(device=self.device, dtype=self.dtype)
 

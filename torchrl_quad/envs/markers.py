@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from torchrl_quad.dynamics import quaternion
 from torchrl_quad.engine.packing import like
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.errors import UserValueError, shown
@@ -132,6 +133,17 @@ def rings(centres: Tensor, axes: Tensor, radius: float | Tensor) -> Tensor:
     return centres[:, None] + torch.as_tensor(radius).reshape(-1, 1, 1) * turns
 
 
+def rims(centres: Tensor, rotations: Tensor, sizes: Tensor) -> Tensor:
+    """Rims (k, 33, 3) around the x axes of rotations (k, 4): rectangles of half a width and a height (k, 2), or circles
+    of radii (k, 1)."""
+    angle = torch.linspace(0, 2 * math.pi, _RING).to(centres)
+    rim = torch.stack((torch.zeros_like(angle), angle.cos(), angle.sin()), -1)
+    if sizes.shape[-1] == 2:  # from a circle to a square
+        rim = rim / rim.abs().amax(-1, keepdim=True)
+    rim = rim * torch.nn.functional.pad(sizes.expand(-1, 2), (1, 0)).unsqueeze(1)
+    return centres.unsqueeze(1) + quaternion.rotate(rotations.unsqueeze(1), rim)
+
+
 @checked
 @dataclass(frozen=True)
 class Markers:
@@ -148,6 +160,7 @@ class Markers:
     gates: Tensor | None = None  #: centres of gates (k, 3), in the order of flight
     gate_radius: float | Tensor = 0.3  #: of all gates, or of each (k) [m]
     gate_axes: Tensor | None = None  #: the direction (k, 3) in which each gate is flown; by default along the course
+    gate_rims: Tensor | None = None  #: points around the openings (k, 33, 3), instead of circles
     shapes: Sequence[Shape] = ()  #: other objects
     progress: str | None = None  #: the metric that best shows how a flight goes; None for the distance to the target
     success: Real | None = None  # the value of the progress, in SI units, from which a state fulfils the task
@@ -163,6 +176,10 @@ class Markers:
             raise UserValueError(f"Markers: gate_radius must be positive [m], one for all {count} gates or one each.")
         if self.gate_axes is not None and len(self.gate_axes) != count:
             raise UserValueError(f"Markers: gate_axes has {len(self.gate_axes)} directions for {count} gates.")
+        if self.gate_rims is not None:
+            object.__setattr__(self, "gate_rims", as_numbers(self.gate_rims))
+            if self.gate_rims is None or self.gate_rims.shape != (count, _RING, 3):
+                raise UserValueError(f"Markers: gate_rims must be {_RING} points around each of {count} gates.")
         is_list = isinstance(self.shapes, Sequence) and not isinstance(self.shapes, str | bytes)
         if not is_list or not all(isinstance(shape, Shape) for shape in self.shapes):
             raise UserValueError("Markers: shapes must be a list of Shape, such as [Shape.sphere((0, 0, 2), 0.5)].")
@@ -171,6 +188,8 @@ class Markers:
         """The rims of the gates (k, 33, 3), if there are any."""
         if self.gates is None:
             return None
+        if self.gate_rims is not None:
+            return self.gate_rims
         axes = along_the_course(self.gates) if self.gate_axes is None else self.gate_axes
         return rings(self.gates, axes, self.gate_radius)
 
@@ -182,15 +201,14 @@ class Markers:
 
 def visible_state(state: Any) -> State:
     """The entries of a state, nested or not, that pictures show: ``position``, ``quaternion``, ``target`` if it is a
-    position, and the random obstacles of a scene."""
+    position, the random obstacles of a scene, and a track of each environment's own."""
     shown: State = {key: state[key] for key in ("position", "quaternion")}
     if "target" in state and state["target"].shape == state["position"].shape:
         shown["target"] = state["target"]
-    nested = state.get("scene", {})
-    for kind in SIZES:
-        obstacles = state["scene", kind] if ("scene", kind) in state else nested.get(kind, None)
-        if obstacles is not None:
-            shown["scene", kind] = obstacles
+    for key in (*(("scene", kind) for kind in SIZES), ("track", "gates"), ("track", "rotations")):
+        own = state[key] if key in state else state.get(key[0], {}).get(key[1], None)
+        if own is not None:
+            shown[key] = own
     return {key: x.detach() for key, x in shown.items()}
 
 

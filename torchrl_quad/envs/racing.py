@@ -1,37 +1,33 @@
 """The racing task."""
 
 import math
-from collections.abc import Mapping
-from importlib import resources
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_quad.dynamics import presets
+from torchrl_quad.dynamics import quaternion
 from torchrl_quad.engine.packing import Key
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.envs import terms
 from torchrl_quad.envs.base import QuadrotorEnv
 from torchrl_quad.envs.guard import MAX_STEPS
-from torchrl_quad.envs.markers import Markers
+from torchrl_quad.envs.markers import Markers, Shape, rims
 from torchrl_quad.envs.metrics import EPISODE_METRICS, Metric, first_episode, read
-from torchrl_quad.errors import UserValueError, shown
-from torchrl_quad.options import Size, accepted, between, check_value
+from torchrl_quad.envs.scenes import reach_of
+from torchrl_quad.envs.track import MARGIN, Course, TrackOption, forward, load_track, starts_before
+from torchrl_quad.errors import UserValueError
+from torchrl_quad.options import Size, between
 
 WEIGHTS = {  # of the reward's terms, by reward
     "position": {**terms.TARGET_WEIGHTS, "gate": 20.0},
     "velocity": {"towards": 0.02, "across": 0.02, "angular_velocity": 0.001, "gate": 5.0},
 }
 RELAXATION_WEIGHTS = {"log": {"gate": 5.0}, "reciprocal": {"gate": 1.0}}
-MAX_GATES = 1_000
-GateRadius = Annotated[float, between(0.01, 100.0)]
-_TRACK = "the name of a track, the path of a YAML file, or a mapping"
-TrackOption = Annotated[Any, accepted(lambda x: isinstance(x, str | Path | Mapping), _TRACK)]
-_TRACKS = resources.files("torchrl_quad.envs") / "tracks"
+GATES, ROTATIONS = ("track", "gates"), ("track", "rotations")  # in the state, where each episode has another track
+FirstGate = Annotated[int, between(0, 999)]
+SAMPLES = 8  # of the way of a step, on which it may touch the frame of a gate
 
 
 class RacingEnv(QuadrotorEnv):
@@ -42,6 +38,8 @@ class RacingEnv(QuadrotorEnv):
     ==========================================  ====  =============================================
     next gate - position                        3     m, world frame
     gate after that - position                  3     m, world frame
+    10 direction of the next gate               3     world frame; with ``observe_directions``
+    10 direction of the gate after that         3     world frame; with ``observe_directions``
     10 quaternion                               4     (w, x, y, z), body to world
     velocity                                    3     m/s, world frame
     angular velocity                            3     rad/s, body frame
@@ -51,34 +49,62 @@ class RacingEnv(QuadrotorEnv):
     velocity towards the next gate, v_a the part of the velocity across that direction, and d the distance to the gate
     [m]. Reward "position": that of hovering, with the next gate as its target, and a gate bonus of 20. The binary bonus
     is paid in the step that passes a gate and carries no gradient; with ``event_discount`` the time at which the drone
-    enters the gate's sphere does. Two relaxations replace the bonus by one in each step: "log", -5 log(d + 0.01), and
-    "reciprocal", 1 / (d + 0.05).
+    enters the gate's sphere, or crosses its plane, does. Two relaxations replace the bonus by one in each step: "log",
+    -5 log(d + 0.01), and "reciprocal", 1 / (d + 0.05).
 
-    A gate is passed when the straight line that the drone flew in a control step comes within 0.3 m of its centre. The
-    reward of that step is already about the gate after it.
+    A gate that is a point is passed when the straight line that the drone flew in a control step comes within 0.3 m of
+    it. A gate with a direction is passed when that line crosses its plane, from behind, within its opening. The reward
+    of that step is already about the gate after it.
 
     Start: level and at rest, uniformly within 0.2 m of one of four points along each axis, each before another gate.
     State added: ``gate`` (1), the index of the next; ``target`` (3) [m], its centre; ``gate_passed`` (1), whether this
     step passed one; ``gates_passed`` (1) in this episode; ``pass_step`` (gates), when each was passed last, -1 for
-    never; ``lap_time`` (1) [s], of the last full lap, 0 before.
+    never; ``lap_time`` (1) [s], of the last full lap, 0 before; ``frame_touched`` (1), where gates have frames; and
+    where each episode draws its gates, ``("track", "gates")`` (gates, 3) [m] and ``("track", "rotations")`` (gates, 4).
 
-    End: crash when x or y leaves the gates behind by 4 m, or outside 0 < z < 6 m; truncated after
-    ``max_episode_steps``, 512. Success of a state: 8 gates passed. Success of an episode: 8 gates, without a crash.
+    End: crash when x or y leaves the gates behind by 4 m, outside 0 < z < 6 m, or when the drone touches a frame;
+    truncated after ``max_episode_steps``, 512. Success of a state: 8 gates passed. Success of an episode: 8 gates,
+    without a crash. A track that is not ``closed`` ends in success at its last gate.
 
     Metrics: ``gates_passed``; ``lap_time`` [s], from a gate to the same gate again, NaN for an episode without a full
-    lap; ``time_near_gate`` [s], within 1 m of the next gate.
+    lap (not ``closed``: from a start before the first gate to the last gate); ``time_near_gate`` [s], within 1 m of the
+    next gate.
+
+    A track is a mapping, or a YAML file of one:
+
+    .. code-block:: yaml
+
+        gates:                                          # in the order of flight
+          - {position: [4, 0, 2], yaw: 1.57}            # the direction of flight [rad]; with a pitch, if wanted
+          - {position: [0, 4, 2], rotation: [0, 0, 0, 1]}  # or (w, x, y, z), whose x axis it is
+        width: 1.5                                      # m, of openings; or a radius; or one for each gate
+        height: 1.5
+        frame: 0.1                                      # m, bars around them; the drone counts as a ball
+
+    Gates of points are ``gates: [[4, 0, 2], [0, 4, 2]]``, with a ``gate_radius`` [m]. A track may also say:
+
+    - ``starts``, a point before each gate [m], by default half way from the gate before, or up to 3 m before a gate
+      with a direction; ``start``, only the first; ``start_range``, 0.2 m;
+    - ``closed``, whether the first gate follows the last, true;
+    - ``floor`` [m], 0; ``box``, the lowest and the highest corner [m] of where drones may be, instead of 4 m of room;
+    - ``position_jitter`` [m] and ``rotation_jitter`` [rad], three numbers each: how far each episode moves and turns
+      gates to both sides;
+    - ``random``, instead of gates: the rules (:class:`~torchrl_quad.envs.track.Course`) by which each episode draws
+      other gates;
+    - ``scene``, obstacles, as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
 
     Args:
-        track: "visfly", "six_gates", the path of a YAML file, or a mapping, with ``gates``, a list of 2 to 1000 centres
-            [m]; and, if wanted, ``starts``, as many points [m] (by default half way between gates), and
-            ``gate_radius``, 0.01 to 100 m. Coordinates are within 10 km.
+        track: "visfly", "six_gates", "random", the path of a file that :func:`~torchrl_quad.load_track` reads, or a
+            mapping, with 2 to 1000 gates. ``{"file": PATH, "width": 1.5, "height": 1.5}`` adds to a file.
         reward: which of the two rewards above.
         gate_bonus: how gates are paid, as above.
+        observe_directions: whether the policy observes the directions of gates.
+        first_gate: the index of the gate before which all episodes start; by default any.
         **kwargs: as for :class:`~torchrl_quad.envs.QuadrotorEnv`.
     """
 
     start_range = 0.2  # [m], to both sides of the start
-    box_margin = 4.0  # [m], beyond the outermost gates
+    box_margin = MARGIN  # [m], beyond the outermost gates
     box_height = 6.0  # [m]; a track that is higher has 4 m above it
     max_rewarded_speed = 15.0  # [m/s]
     success_gates = 8
@@ -96,79 +122,195 @@ class RacingEnv(QuadrotorEnv):
         track: TrackOption = "visfly",
         reward: Literal["position", "velocity"] = "velocity",
         gate_bonus: Literal["binary", "log", "reciprocal"] = "binary",
+        observe_directions: bool = False,
+        first_gate: FirstGate | None = None,
         max_episode_steps: Size = 512,
         **kwargs: Any,
     ) -> None:
         self.track, self.reward, self.gate_bonus = load_track(track), reward, gate_bonus
+        self.observe_directions, self.first_gate = observe_directions, first_gate
+        if first_gate is not None and first_gate >= len(self.track["gates"]):
+            raise UserValueError(
+                f"first_gate={first_gate}, and the track has {len(self.track['gates'])} gates, from 0."
+            )
+        if observe_directions and "gate_radius" in self.track:
+            raise UserValueError(
+                "observe_directions=True needs gates with a direction; those of this track are spheres."
+            )
+        self.is_closed, self.frame = self.track.get("closed", True), self.track.get("frame", 0.0)
+        self.ends_on_success = not self.is_closed
+        self.start_range = self.track.get("start_range", self.start_range)
         self.weights = {**WEIGHTS[reward], **RELAXATION_WEIGHTS.get(gate_bonus, {})}
+        if "scene" in self.track and kwargs.get("scene") is None:
+            kwargs["scene"] = self.track["scene"]
         super().__init__(num_envs, max_episode_steps=max_episode_steps, **kwargs)
 
     def set_up(self) -> None:
-        self.gates, self.starts = self.tensor(self.track["gates"]), self.tensor(self.track["starts"])
+        track, gates = self.track, self.track["gates"]
+        self.is_directed = "gate_radius" not in track
+        self.rotations = self.openings = self.tensor([])  # half of widths and heights (k, 2), or radii (k, 1)
+        if self.is_directed:
+            sizes = [[g["radius"]] if "radius" in g else [0.5 * g["width"], 0.5 * g["height"]] for g in gates]
+            self.rotations, self.openings = self.tensor([gate["rotation"] for gate in gates]), self.tensor(sizes)
+            gates = [gate["position"] for gate in gates]
+        self.gate_radius = self.openings.min().item() if self.is_directed else track["gate_radius"]
+        self.gates, self.starts = self.tensor(gates), self.tensor(track["starts"])
         self.gate_indices = torch.arange(len(self.gates), device=self.device)
+        self.course = Course(**track["random"]) if "random" in track else None
+        self.moved, self.turned = (track.get(f"{name}_jitter", (0.0,) * 3) for name in ("position", "rotation"))
+        self.is_drawn = self.course is not None or any((*self.moved, *self.turned))
+        self.drone_radius, self.floor = reach_of(self.nominal), track.get("floor", 0.0)
         low, high = self.gates.amin(0), self.gates.amax(0)
-        self.centre = 0.5 * (low + high)
         self.half_width = 0.5 * (high - low)[:2] + self.box_margin
         self.ceiling = max(self.box_height, high[2].item() + self.box_margin)
-        for start, point in zip(self.starts, self.track["starts"], strict=True):
-            corners = torch.stack((start - self.start_range, start + self.start_range))
+        if "box" in track:
+            low, high = self.tensor(track["box"])
+            self.half_width, self.floor, self.ceiling = 0.5 * (high - low)[:2], low[2].item(), high[2].item()
+        self.centre = 0.5 * (low + high)
+        for start, point in zip(self.starts, track["starts"], strict=True):
+            room = self.tensor(self.moved) + self.start_range  # starts move with their gates
+            corners = torch.stack((start - room, start + room))
             if self.is_crash({"position": corners}).any():
                 raise UserValueError(
                     f"track: drones start within {self.start_range} m of {point}, which is not all inside the box: x "
-                    f"and y at most {self.box_margin} m beyond the gates, 0 < z < {self.ceiling} m. Move that start."
+                    f"and y at most {self.box_margin} m beyond the gates, {self.floor:g} < z < {self.ceiling} m. Move "
+                    "that start."
                 )
 
     def initial_state(self, n: int) -> State:
         gate = self.integers(len(self.gates), n, 1)
-        start = self.hover_state(self.starts[gate[:, 0]] + self.start_range * self.uniform(n, 3))
+        if self.first_gate is not None:
+            gate = torch.full_like(gate, self.first_gate)
+        state = self.draw_track(n)
+        starts = self.starts[gate[:, 0]]
+        if any(self.moved):
+            starts = starts + self.pose(state, gate)[0] - self.gates[gate[:, 0]]
+        if self.course is not None:
+            every = starts_before(state[GATES], state.get(ROTATIONS), self.floor)
+            starts = every[torch.arange(n, device=self.device), gate[:, 0]]
+        start = self.hover_state(starts + self.start_range * self.uniform(n, 3))
         return {
             **start,
+            **state,
+            **({"frame_touched": torch.zeros_like(gate, dtype=torch.bool)} if self.frame else {}),
             "gate": gate,
-            "target": self.gates[gate[:, 0]],
+            "target": self.pose(state, gate)[0],
             "gate_passed": torch.zeros_like(gate, dtype=torch.bool),
             "gates_passed": torch.zeros_like(gate),
             "pass_step": torch.full_like(gate, -1).repeat(1, len(self.gates)),
             "lap_time": torch.zeros_like(start["position"][:, :1]),
         }
 
+    def draw_track(self, n: int) -> State:
+        """What stands in the state of n episodes, each with a track of its own; nothing where all share one."""
+        if not self.is_drawn:
+            return {}
+        gates, rotations = self.gates.expand(n, -1, -1), self.rotations.unsqueeze(0)
+        if self.course is not None:
+            gates, rotations = self.course.draw(n, self.uniform)
+        gates = gates + self.tensor(self.moved) * self.uniform(*gates.shape)
+        if not self.is_directed:
+            return {GATES: gates}
+        turn = quaternion.from_axis_angle(self.tensor(self.turned) * self.uniform(*gates.shape))
+        return {GATES: gates, ROTATIONS: quaternion.multiply(rotations.expand(n, -1, -1), turn)}
+
+    def pose(self, state: State, gate: Tensor) -> tuple[Tensor, Tensor]:
+        """Centres (n, 3) [m] and, where gates have a direction, rotations (n, 4) of gates by their index (n, 1)."""
+        if not self.is_drawn:
+            return self.gates[gate[:, 0]], self.rotations[gate[:, 0]] if self.is_directed else self.rotations
+        chosen = (gate == self.gate_indices).unsqueeze(-1)  # by weights: bundles know no gather along shapes
+        found = [(x * chosen).sum(1) for x in (state[GATES], state[ROTATIONS] if self.is_directed else state[GATES])]
+        return found[0], found[1]
+
+    def local(self, previous: State, state: State) -> tuple[Tensor, Tensor]:
+        """Both ends of a step, each (n, 3) [m], in the frame of the gate that was next: x in its direction."""
+        centre, rotation = self.pose(previous, previous["gate"])
+        start, end = (quaternion.rotate_inverse(rotation, x["position"] - centre) for x in (previous, state))
+        return start, end
+
+    def crosses(self, previous: State, state: State) -> Tensor:
+        """Whether a step crosses the plane of the next gate, in its direction and within its opening, (n, 1)."""
+        start, end = self.local(previous, state)
+        behind, beyond = start[:, :1], end[:, :1]
+        off = torch.lerp(start, end, -behind / (beyond - behind).clamp_min(1e-12))[:, 1:]
+        opening = self.openings[previous["gate"][:, 0]]
+        off = terms.norm(off) if opening.shape[-1] == 1 else off.abs()
+        return (behind < 0.0) & (beyond >= 0.0) & (off < opening).all(-1, keepdim=True)
+
+    def touches(self, previous: State, state: State) -> Tensor:
+        """Whether a step touches the frame of any gate, (n, 1): bars around the opening, as deep as they are wide.
+
+        The distance of the drone to them is taken at nine instants, and where it crosses the gate's plane.
+        """
+        gates, rotations = (
+            (state[GATES], state[ROTATIONS]) if self.is_drawn else (self.gates[None], self.rotations[None])
+        )
+        start, end = (quaternion.rotate_inverse(rotations, x["position"][:, None] - gates) for x in (previous, state))
+        way = end - start
+        share = torch.arange(SAMPLES + 1, device=self.device, dtype=self.dtype) / SAMPLES
+        crossing = (-start[..., :1] / torch.where(way[..., :1] == 0.0, 1.0, way[..., :1])).clamp(0.0, 1.0)
+        share = torch.cat((share + 0.0 * crossing, crossing), -1).unsqueeze(-1)  # (n, k, instants, 1)
+        along, aside = (start.unsqueeze(2) + share * way.unsqueeze(2)).split((1, 2), -1)
+        aside = terms.norm(aside) if self.openings.shape[-1] == 1 else aside.abs()
+        beyond = aside - self.openings.unsqueeze(1)  # the edges of the opening
+        bars = torch.maximum(_box(beyond - self.frame), -beyond.amax(-1, keepdim=True))
+        distance = _box(torch.cat((bars, along.abs() - 0.5 * self.frame), -1))
+        return (distance < self.drone_radius).flatten(1).any(1, keepdim=True)
+
     def advance(self, previous: State, state: State) -> State:
         gate, step = previous["gate"], state["step"]
         with torch.no_grad():  # how close to the gate the straight line between the two positions comes
-            start, centre = previous["position"], self.gates[gate[:, 0]]
-            line = state["position"] - start
-            along = ((centre - start) * line).sum(-1, keepdim=True)
-            fraction = (along / line.square().sum(-1, keepdim=True).clamp_min(1e-12)).clamp(0.0, 1.0)
-            passed = terms.norm(start + fraction * line - centre) < self.track["gate_radius"]
+            if self.is_directed:
+                passed = self.crosses(previous, state)
+            else:
+                start, (centre, _) = previous["position"], self.pose(previous, gate)
+                line = state["position"] - start
+                along = ((centre - start) * line).sum(-1, keepdim=True)
+                fraction = (along / line.square().sum(-1, keepdim=True).clamp_min(1e-12)).clamp(0.0, 1.0)
+                passed = terms.norm(start + fraction * line - centre) < self.gate_radius
+            more = {"frame_touched": self.touches(previous, state)} if self.frame else {}
         this_gate = passed & (gate == self.gate_indices)
         last_pass = previous["pass_step"].gather(1, gate)
-        lap = (step - last_pass).to(self.dtype) * self.control_dt
+        lap, is_lap = (step - last_pass).to(self.dtype) * self.control_dt, last_pass >= 0
+        if not self.is_closed:  # from the start of the episode, if that was before the first gate
+            lap = step.to(self.dtype) * self.control_dt
+            is_lap = (gate == len(self.gates) - 1) & (previous["gates_passed"] == gate)
         next_gate = torch.where(passed, (gate + 1) % len(self.gates), gate)
         return {
             **state,
+            **more,
             "gate": next_gate,
-            "target": self.gates[next_gate[:, 0]],
+            "target": self.pose(state, next_gate)[0],
             "gate_passed": passed,
             "gates_passed": previous["gates_passed"] + passed,
             "pass_step": torch.where(this_gate, step, previous["pass_step"]),
-            "lap_time": torch.where(passed & (last_pass >= 0), lap, previous["lap_time"]),
+            "lap_time": torch.where(passed & is_lap, lap, previous["lap_time"]),
         }
 
     def events(self, previous: State, state: State) -> dict[str, terms.Event]:
-        """``gate``: the drone enters the sphere of the gate that it passes in this step."""
+        """``gate``: the drone crosses the plane, or enters the sphere, of the gate that it passes in this step."""
         if self.gate_bonus != "binary":
             return {}
-        ends = previous["position"], state["position"]
-        time = terms.ball_entry(*ends, previous["target"], self.track["gate_radius"])
+        if self.is_directed:
+            start, end = self.local(previous, state)
+            time = terms.level_crossing(-start[:, :1], -end[:, :1], 0.0)
+        else:
+            ends = previous["position"], state["position"]
+            time = terms.ball_entry(*ends, previous["target"], self.gate_radius)
         return {"gate": terms.Event(state["gate_passed"], time, self.weights["gate"])}
 
     def observe(self, state: State) -> Tensor:
-        gate = state["gate"][:, 0]  # any number, in environments that are not reset
-        relative = [self.gates[k % len(self.gates)] - state["position"] for k in (gate, gate + 1)]
-        return torch.cat((*relative, *terms.body_observation(state)), -1)
+        gate = state["gate"]  # any number, in environments that are not reset
+        poses = [self.pose(state, k % len(self.gates)) for k in (gate, gate + 1)]
+        parts = [centre - state["position"] for centre, _ in poses]
+        if self.observe_directions:
+            parts += [10.0 * forward(rotation) for _, rotation in poses]
+        return torch.cat((*parts, *terms.body_observation(state)), -1)
 
     def observation_bounds(self) -> Tensor:
         width, depth = (2.0 * self.half_width).tolist()  # from one side of the box to the other
-        return self.tensor((*2 * (width, depth, self.ceiling), *terms.BODY_BOUNDS))
+        directions = 6 * (10.0,) if self.observe_directions else ()
+        return self.tensor((*2 * (width, depth, self.ceiling - self.floor), *directions, *terms.BODY_BOUNDS))
 
     def reward_terms(self, state: State) -> State:
         gap = terms.distance(state)
@@ -189,10 +331,11 @@ class RacingEnv(QuadrotorEnv):
         return {**rewards, "gate": self.weights["gate"] * bonus}
 
     def is_crash(self, state: State) -> Tensor:
-        return terms.outside(state["position"], self.centre, self.half_width, self.ceiling)
+        left = terms.outside(state["position"], self.centre, self.half_width, self.ceiling, self.floor)
+        return left | state["frame_touched"] if "frame_touched" in state else left
 
     def is_success(self, state: State) -> Tensor:
-        return state["gates_passed"] >= self.success_gates
+        return state["gates_passed"] >= self.success_gates if self.is_closed else state["pass_step"][:, -1:] >= 0
 
     def metrics(self, state: State) -> State:
         return {"gates_passed": state["gates_passed"].to(self.dtype), "lap_time": state["lap_time"]}
@@ -210,44 +353,25 @@ class RacingEnv(QuadrotorEnv):
         return {**metrics, "lap_time": lap_time, "time_near_gate": self.control_dt * near.sum((1, 2)).to(self.dtype)}
 
     def markers(self) -> Markers:
-        gates = {"gates": self.gates, "gate_radius": self.track["gate_radius"]}
-        return Markers("next gate", **gates, progress="gates_passed", success=self.success_gates)
+        return self.markers_of({})
+
+    def markers_of(self, drawn: State) -> Markers:
+        """The gates of the episode in one environment, or of the track that all share."""
+        success = self.success_gates if self.is_closed else len(self.gates)
+        gates, rotations = self.gates, self.rotations
+        if GATES in drawn:
+            gates, rotations = drawn[GATES][0], drawn[ROTATIONS][0] if self.is_directed else rotations
+        marked: dict[str, Any] = {"gates": gates, "gate_radius": self.gate_radius}
+        if self.is_directed:
+            marked["gate_rims"] = rims(gates, rotations, self.openings)
+        if self.frame:
+            outer = torch.nn.functional.pad(
+                rims(gates, rotations, self.openings + self.frame), (0, 0, 0, 1), value=math.nan
+            )
+            marked["shapes"] = [Shape.line(outer.flatten(0, 1))]
+        return Markers("next gate", **marked, progress="gates_passed", success=success)
 
 
-def load_track(track: str | Path | Mapping = "visfly") -> dict[str, Any]:
-    """Read a track: the name of one in the package, the path of a YAML file, or a mapping.
-
-    Returns:
-        ``gates`` and ``starts``, equally long lists of points [m], and ``gate_radius`` [m].
-
-    Raises:
-        ValueError: a key is unknown or missing, or a value is not what :class:`RacingEnv` takes.
-        FileNotFoundError: there is no such file.
-    """
-    source, values = presets.read("track", track, _TRACKS)
-    for key in values.keys() - {"gates", "starts", "gate_radius"}:
-        raise UserValueError(f"{source}: unknown key {shown(key)}. Allowed: gates, starts, gate_radius.")
-    gates = _points(source, "gates", values.get("gates"))
-    if not 2 <= len(gates) <= MAX_GATES:
-        raise UserValueError(f"{source}: a track has 2 to {MAX_GATES} gates, got {len(gates)}.")
-    before = [gates[-1], *gates[:-1]]
-    halfway = [[0.5 * (p + q) for p, q in zip(a, b, strict=True)] for a, b in zip(before, gates, strict=True)]
-    starts = _points(source, "starts", values.get("starts", halfway))
-    if len(starts) != len(gates):
-        raise UserValueError(f"{source}: there must be one start before each gate, got {len(starts)} for {len(gates)}.")
-    radius = check_value(f"{source}: gate_radius", values.get("gate_radius", 0.3), GateRadius, "Of all gates [m].")
-    return {"gates": gates, "starts": starts, "gate_radius": float(radius)}
-
-
-def _points(source: str, name: str, value: Any) -> Any:
-    try:
-        points = presets.as_array(value.tolist() if isinstance(value, Tensor) else value)
-    except (ValueError, RecursionError):
-        points = np.zeros(0)
-    is_list = points.ndim == 2 and points.shape[-1] == 3
-    if not (is_list and (abs(points) < 1e4).all() and (points[..., -1] > 0).all()):
-        raise UserValueError(
-            f"{source}: {name} must be a list of points [x, y, z] in metres above ground, within 10 km; got "
-            f"{shown(value)}."
-        )
-    return points.tolist()
+def _box(beyond: Tensor) -> Tensor:
+    """The signed distance (*, 1) from a box, from how far a point lies beyond each of its faces (*, k)."""
+    return terms.norm(beyond.clamp_min(0.0)) + beyond.amax(-1, keepdim=True).clamp_max(0.0)

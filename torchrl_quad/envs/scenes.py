@@ -122,11 +122,7 @@ class Scene(Disturbance):
         fixed = {kind: like.new_tensor(self.fixed[kind]).reshape(1, -1, size) for kind, size in SIZES.items()}
         own.constants = Primitives(**fixed)
         own.touchable = own.constants._replace(planes=own.constants.planes[:, int(self.ground) :])
-        # As large as propellers can be without touching each other; coaxial ones are above each other.
-        rotors = nominal.rotor_positions.detach()[..., :2].reshape(-1, nominal.rotor_spin.shape[-1], 2)[0]
-        arm, gaps = rotors.norm(dim=-1).max(), torch.pdist(rotors)
-        reach = (arm + 0.5 * gaps[gaps > 1e-2 * arm].min()).item()
-        own.radius = reach if self.drone_radius is None else self.drone_radius
+        own.radius = reach_of(nominal) if self.drone_radius is None else self.drone_radius
         return own
 
     def draw(self, random: Randomness, state: State) -> dict[str, Tensor]:
@@ -216,6 +212,13 @@ class Scene(Disturbance):
             if looks_are_free(points.device) and not blocked.any():
                 return drawn
         return left_out(drawn, blocked)
+
+
+def reach_of(drone: QuadrotorParams) -> float:
+    """The radius [m] of a drone whose propellers are as large as they can be without touching each other."""
+    rotors = drone.rotor_positions.detach()[..., :2].reshape(-1, drone.rotor_spin.shape[-1], 2)[0]
+    arm, gaps = rotors.norm(dim=-1).max(), torch.pdist(rotors)
+    return (arm + 0.5 * gaps[gaps > 1e-2 * arm].min()).item()  # coaxial rotors are above each other
 
 
 def left_out(solids: Tensor, who: Tensor) -> Tensor:

@@ -123,6 +123,10 @@ class Task(abc.ABC):
         """What pictures show in addition to the drones."""
         return Markers()
 
+    def markers_of(self, drawn: State) -> Markers:
+        """The same for one environment, from what its episode has drawn, (1, ...): gates, for example."""
+        return self.markers()
+
     def episode_metrics(self, rollout: TensorDictBase) -> dict[str, Tensor]:
         """Judge the first episode of each environment, in a rollout (num_envs, time) from fresh starts.
 

@@ -53,15 +53,15 @@ def target_reward(state: Mapping[str, Tensor], weights: Mapping[str, float]) -> 
     }
 
 
-def outside(position: Tensor, centre: Tensor, half_width: Tensor | float, height: float) -> Tensor:
+def outside(position: Tensor, centre: Tensor, half_width: Tensor | float, height: float, floor: float = 0.0) -> Tensor:
     """Whether a position (*, 3) [m] has left the box, (*, 1).
 
     The box reaches half_width (a number, or one for x and one for y) [m] to all sides of the centre (*, 3), and from
-    the ground at 0 up to the height [m].
+    the floor, the ground at 0, up to the height [m].
     """
     sideways = ((position - centre)[..., :2].abs() > half_width).any(-1, keepdim=True)
     z = position[..., 2:]
-    return sideways | (z <= 0.0) | (z >= height)
+    return sideways | (z <= floor) | (z >= height)
 
 
 class Event(NamedTuple):

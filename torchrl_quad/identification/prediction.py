@@ -92,6 +92,21 @@ def predict(
     return windows, windows.fly(plant, states_at(seen, 0), speed, windows.push(plant, speed)), seen
 
 
+@torch.no_grad()
+def trim(logs: Sequence[FlightLog], drone: QuadrotorParams, past: float = PAST) -> Push | None:
+    """What moves the flights beyond a drone with a ``motor_command``, on average over windows of ``past`` [s], (3)
+    each: as a share of its weight, and [rad/s2]; None where the flights are too short for a window."""
+    motors = drone.motor_command or MotorCommand(1.0, 1.0)
+    try:
+        windows = cut(logs, 0.1, past or PAST, 0.1, nominal_voltage=motors.nominal_voltage)
+    except TooShort:
+        return None
+    late = torch.tensor([stream_delay(log) for log in logs], dtype=torch.float64)[windows.log]
+    plant = plant_of(drone, motors, late)
+    force, torque = windows.push(plant, windows.rotor_speed(plant))
+    return Push(force.mean(0) / drone.gravity, torque.mean(0))
+
+
 def as_logs(log: FlightLog | Sequence[FlightLog], whose: str) -> list[FlightLog]:
     """One flight or several, as a list."""
     logs = [log] if isinstance(log, FlightLog) else list(log) if isinstance(log, Sequence) else [log]
@@ -134,6 +149,10 @@ def as_params(drone: Any) -> QuadrotorParams:
     drone = getattr(drone, "drone", drone)
     if not isinstance(drone, QuadrotorParams):
         drone = load_drone(drone, torch.float64)
+    if drone.rotor_spin.shape[-1] != 4:
+        raise UserValueError(
+            f"A FlightLog is of a drone with four rotors, and this one has {drone.rotor_spin.shape[-1]}."
+        )
     for name, value in drone.fields().items():
         if value.dim() != drone.dim(name):
             raise UserValueError(f"A flight is of one drone, and {name} has shape {tuple(value.shape)}, of several.")

@@ -83,7 +83,7 @@ def plot_flight(
         space.scatter(*position[i, 0], color=color, s=14)
         over_time.plot(flight.times[flown], values[i, flown], color=color, linewidth=1.2)
     alike = len(flight) == 1 or not flight.has_own_obstacles
-    markers = with_obstacles(flight.markers, flight.solids(0) if alike else None)
+    markers = with_obstacles(flight.markers, flight.solids(0)) if alike else flight.shared_markers
     canvas.draw_markers(space, markers)
     canvas.set_box(space, *canvas.box(*canvas.bounds(position, *markers.points())), zoom=0.9)
     named = dict(zip(*reversed(space.get_legend_handles_labels()), strict=True))  # a name once

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -75,7 +75,8 @@ class Flight:
         if ("next", "done") in keys:
             self.steps = first_episode(self.rollout).sum((1, 2))
         self.target = self.state("target")
-        self.named = Markers() if self.env is None else self.env.markers()  # by the task
+        self.tracks = self.entries("next", "state", "track")  # gates of each environment's own, where it has some
+        self.named = self.markers_of(0)  # by the task
         self.markers = self._with_targets()
         # The distance to the target [m] from which a state fulfils the task, if it says so; and whether its axis is
         # logarithmic: not on a course, where it jumps from gate to gate.
@@ -131,10 +132,15 @@ class Flight:
         """The speed (num_envs, time + 1) [m/s], as :meth:`state`, where the rollout holds the velocity."""
         return cast("Tensor", self.state("velocity")).norm(dim=-1)
 
+    def markers_of(self, i: int) -> Markers:
+        """What the task shows for an environment."""
+        drawn: Any = {("track", name): x[i : i + 1, 0] for name, x in self.tracks.items()}
+        return Markers() if self.env is None else self.env.markers_of(drawn)
+
     @property
     def has_own_obstacles(self) -> bool:
-        """Whether each environment has other obstacles."""
-        return self.env is not None and bool(self.entries("next", "state", "scene"))
+        """Whether each environment has other obstacles, or gates."""
+        return self.env is not None and bool({**self.tracks, **self.entries("next", "state", "scene")})
 
     def solids(self, i: int) -> Primitives | None:
         """The obstacles in the first episode of an environment, if there are any."""
@@ -203,8 +209,14 @@ class Flight:
         """The index of the gate that each drone flies to (num_envs, time + 1), if the targets are gates."""
         if self.named.gates is None or self.target is None:
             return None
-        gap, index = (self.target.unsqueeze(-2) - self.named.gates).norm(dim=-1).min(-1)
+        gates = self.tracks["gates"][:, :1].float() if "gates" in self.tracks else self.named.gates
+        gap, index = (self.target.unsqueeze(-2) - gates).norm(dim=-1).min(-1)
         return index if gap.nan_to_num(0.0).max() < 1e-3 else None
+
+    @property
+    def shared_markers(self) -> Markers:
+        """The markers without the gates of one environment, where each has its own."""
+        return dataclasses.replace(self.markers, gates=None, gate_rims=None, shapes=()) if self.tracks else self.markers
 
     def _with_targets(self) -> Markers:
         """The markers of the task; if it shows no targets, with where those of these episodes have been."""

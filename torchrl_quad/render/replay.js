@@ -5,7 +5,7 @@ const decoded = (text) => text && new Float32Array(Uint8Array.from(atob(text), (
 
 const flight = JSON.parse(element("flight").textContent);
 const { environments, frames, ended, endings } = flight;
-const [position, attitude, lift, target, gate, rings, places, path, rotors] = ["position", "quaternion", "lift", "target",
+const [position, attitude, lift, target, gate, allRings, places, path, rotors] = ["position", "quaternion", "lift", "target",
   "gate", "gates", "places", "curve", "rotors"].map((name) => decoded(flight[name]));
 const shapes = flight.shapes.map((shape) => ({ ...shape, points: decoded(shape.points), faces: decoded(shape.faces) }));
 const obstacles = flight.obstacles.map(({ points, faces }) => ({ points: decoded(points), faces: decoded(faces) }));
@@ -14,7 +14,8 @@ const times = Float64Array.from({ length: frames }, (_, k) => flight.start + k *
 
 const RED = "#c8452f", ORANGE = "#e8912d", INK = "#222222", PALE = "#dcdfe3";
 const CURVES = [INK, "#2f6db5", "#e8912d", "#3a9a5b", "#c8452f", "#8a5fb0", "#8c6d4f", "#d17ba6", "#5bb0c0"];
-const RING = 33; // points of a circle around a gate
+const RING = 33; // points around a gate
+let rings = ringsOf(null);
 const TRAIL = Math.min(Math.round(2 / flight.control_dt), frames - 1); // steps behind a drone
 
 const everyone = Array.from({ length: environments }, (_, i) => i);
@@ -89,8 +90,14 @@ function drawTrail(pen, i, centre) {
   pen.lift();
 }
 
+// The gates of the environment that is followed, or else of the first; all may share those of the first.
+function ringsOf(i) {
+  const size = allRings ? allRings.length / flight.tracks : 0;
+  return allRings ? allRings.subarray(size * (flight.tracks > 1 ? i ?? 0 : 0)).subarray(0, size) : null;
+}
+
 function drawNextGates(pen) {
-  const next = new Set(shown().map((i) => gate[i * frames + Math.floor(frame)]));
+  const next = new Set((flight.tracks > 1 ? [chosen ?? 0] : shown()).map((i) => gate[i * frames + Math.floor(frame)]));
   for (let g = 0; g < rings.length / (3 * RING); g++) drawRing(pen, next.has(g) ? g : null);
 }
 
@@ -138,7 +145,7 @@ const trailColors = () => each(TRAIL + 3, (i) => (shown().includes(i) ? colors[i
 
 const MOVING = ["shadow", "trail", "body", "nose", ...(lift ? ["thrust"] : []), ...(target && !gate ? ["target"] : []),
   ...(gate ? ["next"] : []), "crash"];
-const [low, high] = bounds(...[position, target, rings, places, path].filter(Boolean),
+const [low, high] = bounds(...[position, target, allRings, places, path].filter(Boolean),
   ...shapes.map((shape) => shape.points));
 const extent = Math.max(...high.map((value, j) => value - low[j]), 1);
 const grounded = low[2] < 2 * extent; // otherwise the ground is too far below to be shown
@@ -417,6 +424,10 @@ function choose(i) {
   if (indexOf("course") >= 0) {
     const { x, y, z } = course();
     Plotly.restyle("space", { x: [x], y: [y], z: [z] }, [indexOf("course")]);
+  }
+  if (rings && flight.tracks > 1) {
+    rings = ringsOf(i);
+    for (const { name, x, y, z } of gates()) Plotly.restyle("space", { x: [x], y: [y], z: [z] }, [indexOf(name)]);
   }
   if (obstacles.length > 1) {
     const { x, y, z, i: a, j: b, k: c } = obstacle();

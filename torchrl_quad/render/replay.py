@@ -108,10 +108,10 @@ def _content(flight: Flight) -> dict[str, Any]:
         values = torch.stack([x.masked_fill(over, math.nan) for x in lines.values()], -1)
         return {"label": label, "names": list(lines), "values": values[:, first:]}
 
-    rotors, lift = _rotors(
-        flight, *(frames(flight.state(*name)) for name in (["rotor_speed"], ["drone", "rotor_effectiveness"]))
-    )
-    markers = flight.named
+    of_rotors = (["rotor_speed"], ["drone", "rotor_effectiveness"])
+    rotors, lift = _rotors(flight, *(frames(flight.state(*name)) for name in of_rotors))
+    markers, of_each = flight.named, range(len(flight) if flight.tracks else 1)
+    rings = [x for i in of_each if (x := flight.markers_of(i).rings()) is not None]
     return {
         "environments": len(flight),
         "frames": rollout.shape[1] + 1 - first,
@@ -125,7 +125,8 @@ def _content(flight: Flight) -> dict[str, Any]:
         "quaternion": frames(flight.state("quaternion")),
         "lift": lift,
         "target": frames(flight.target),
-        "gates": markers.rings(),
+        "gates": torch.cat(rings) if rings else None,
+        "tracks": max(len(rings), 1),
         "gate": frames(flight.gate_index()),
         "places": markers.places,
         "curve": markers.curve,

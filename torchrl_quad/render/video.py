@@ -252,6 +252,7 @@ def draw_frame(env: QuadrotorEnv, drones: Sequence[int] | None, size: int) -> np
     shown = {key: x[chosen].cpu() for key, x in state.items()}
     obstacles = {key: x[chosen[:1]] for key, x in obstacles.items()}
     solids = None if env.scene is None else env.scene.solids(obstacles)
+    named = env.markers_of(obstacles)
     image = None
     if env.camera is not None and solids is not None:
         depth = env.camera.depth(solids, state["position"][chosen[:1]], state["quaternion"][chosen[:1]])
@@ -261,7 +262,7 @@ def draw_frame(env: QuadrotorEnv, drones: Sequence[int] | None, size: int) -> np
     kind = len(chosen), size, b"".join(_numpy(x).tobytes() for x in obstacles.values())
     view = views.get(kind)
     if view is None:  # half a metre of room around all drones, their targets and the markers
-        low, high = canvas.bounds(*(x for key, x in state.items() if key != "quaternion"), *env.markers().points())
+        low, high = canvas.bounds(*(x for key, x in state.items() if key != "quaternion"), *named.points())
         low, high = low - torch.tensor([0.5, 0.5, 0.0]), high + 0.5
     else:  # a side that has become too near moves out by half of the view, so that it need not at every step
         low, high = canvas.bounds(*(x for key, x in shown.items() if key != "quaternion"), view.low, view.high)
@@ -270,7 +271,7 @@ def draw_frame(env: QuadrotorEnv, drones: Sequence[int] | None, size: int) -> np
     if view is None or (low < view.low).any() or (high > view.high).any():
         if obstacles:
             views.clear()  # of episodes that are over
-        markers, pixels = with_obstacles(env.markers(), solids), None if image is None else image.shape
+        markers, pixels = with_obstacles(named, solids), None if image is None else image.shape
         views[kind] = view = View(torch.stack((low, high)), len(chosen), size, markers, pixels)
     return view.draw(shown["position"], shown["quaternion"], shown.get("target"), image=image)
 

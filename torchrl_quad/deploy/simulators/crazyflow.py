@@ -82,7 +82,7 @@ def _parameters(drone: Drone, frame: frames.Convention) -> Fields:
     k2, k1, k0 = drone.thrust_map
     curve = np.array([[k0, k1 / RPM, k2 / RPM**2]])
     x, y = drone.rotor_positions[order, :2].T
-    lag = 1.0 / drone.motor_time_constant
+    up, down = 1.0 / drone.motor_time_constant
     return {
         "mass": drone.mass,
         "L": [1.0],
@@ -94,5 +94,5 @@ def _parameters(drone: Drone, frame: frames.Convention) -> Fields:
         "rpm2torque": curve * drone.yaw_torque_coefficient,
         "mixing_matrix": [y, -x, drone.rotor_spin[order]],
         "drag_matrix": -np.diag(drone.linear_drag),
-        "rotor_dyn_coef": [[lag, 0.0, lag, 0.0]],
+        "rotor_dyn_coef": [[up, 0.0, down, 0.0]],
     }

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.deploy.simulators import Simulator
 from torchrl_quad.deploy.simulators.vehicle import Array, Drone
-from torchrl_quad.errors import UserValueError
 
 # qpos of a free joint: position and quaternion (w, x, y, z), body to world. qvel: velocity in the world frame, angular
 # velocity in the body frame. act: the rotor speeds.
@@ -25,18 +24,21 @@ def model(drone: Drone, timestep: float) -> str:
 
     It states everything that the motion depends on: mass and inertia, gravity, the integrator (semi-implicit Euler), no
     contact, no fluid. The first half of the actuators makes no force: they are the lag of the rotors, of first order in
-    the speed and exact for any step. The others push and turn the body by what the thrust [N] written into them does at
-    the place and along the direction of a rotor, with what it has left of its effectiveness.
+    the speed and exact for any step; of two time constants it is the shorter. The others push and turn the body by what
+    the thrust [N] written into them does at the place and along the direction of a rotor, with what it has left of its
+    effectiveness.
     """
     n = len(drone.rotor_spin)
     places = np.pad(drone.rotor_positions, ((0, 0), (0, 3 - drone.rotor_positions.shape[1])))
     force = drone.allocation[[4, 5, 0]].T * drone.rotor_effectiveness[:, None]
     gears = np.concatenate((force, force * (drone.rotor_spin * drone.yaw_torque_coefficient)[:, None]), 1)
     sites = "".join(f'<site name="rotor{i}" pos="{_words(place)}"/>' for i, place in enumerate(places))
-    lag = f'dyntype="filterexact" dynprm="{drone.motor_time_constant!r}" gaintype="fixed" gainprm="0" biastype="none"'
+    shortest = float(drone.motor_time_constant.min())
+    lag = f'dyntype="filterexact" dynprm="{shortest!r}" gaintype="fixed" gainprm="0" biastype="none"'
     lags = "".join(f'<general site="rotor{i}" {lag} gear="0 0 1 0 0 0" ctrllimited="false"/>' for i in range(n))
     motors = (f'<motor site="rotor{i}" gear="{_words(gear)}" ctrllimited="false"/>' for i, gear in enumerate(gears))
-    thrusts, inertia = "".join(motors), _words(drone.inertia)
+    most = (1.0 - 1e-12) * (drone.inertia.sum() - drone.inertia)  # rounding may put a flat body a little beyond
+    thrusts, inertia = "".join(motors), _words(np.minimum(drone.inertia, most))
     return f"""<mujoco>
   <compiler inertiafromgeom="false" balanceinertia="false" boundmass="0" boundinertia="0"/>
   <option timestep="{timestep!r}" integrator="Euler" gravity="0 0 {-drone.gravity!r}" wind="0 0 0" density="0"
@@ -69,12 +71,9 @@ class MuJoCo(Simulator):
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         super().__init__(contract, loop, motors)
-        inertia = self.drone.inertia
-        if 2.0 * inertia.max() > inertia.sum():
-            raise UserValueError(
-                f"MuJoCo flies no body with the inertia {inertia.tolist()}, since there is none: each of the three is "
-                "at most the sum of the other two. Fly it in another simulator."
-            )
+        # In MuJoCo a rotor lags alike in both directions: where it is the slower one it is asked for less.
+        pulls = -np.expm1(-self.dt / self.drone.motor_time_constant)
+        self.pulls = pulls / pulls.max()
         self.model = mujoco.MjModel.from_xml_string(model(self.drone, self.dt))
         self.data = mujoco.MjData(self.model)
         self.rollout = rollout.Rollout(nthread=0)
@@ -99,6 +98,8 @@ class MuJoCo(Simulator):
             speed = x[:, STATE["rotor_speed"]]
             asked = self.loop(thrust, rates, x[:, STATE["angular_velocity"]], speed)
             np.clip(asked[:, self.motors], *limits, out=command)
+            if self.pulls.min() < 1.0:
+                command[:] = speed + np.where(command > speed, *self.pulls) * (command - speed)
             lift[:] = drone.thrust(speed)
             force[:] = drone.drag(x[:, STATE["quaternion"]], x[:, STATE["velocity"]])
             self.rollout.rollout(self.model, [self.data], x, self.control, control_spec=self.inputs, state=self.after)

@@ -1,0 +1,290 @@
+"""Tracks of the racing task: spheres, or gates with a shape and a direction; and random courses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from torchrl_quad.dynamics import presets, quaternion
+from torchrl_quad.envs.track_files import own_format
+from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.options import Seed, accepted, between, build, check_value, checked, entries
+from torchrl_quad.rotations import from_euler
+
+MAX_GATES = 1_000
+MARGIN = 4.0  # [m], from gates to the sides of the box in which drones fly
+TRIES = 16  # courses that are drawn for a random track before it becomes a regular polygon
+RUN_UP = 3.0  # [m], at most, from a start to its gate, where gates have a direction
+LOWEST_START = 0.25  # [m], above the floor
+Length = Annotated[float, between(0.01, 100.0)]
+Angle = Annotated[float, between(-10.0, 10.0)]
+Triple = Annotated[Sequence[Annotated[float, between(0.0, 10.0)]], entries(3, 3)]
+Pair = Annotated[Sequence[Annotated[float, between(0.01, 1_000.0)]], entries(2, 2)]
+_TRACK = "the name of a track, the path of a YAML or TOML file, or a mapping"
+TrackOption = Annotated[Any, accepted(lambda x: isinstance(x, str | Path | Mapping), _TRACK)]
+_TRACKS = resources.files("torchrl_quad.envs") / "tracks"
+_OPENING = ("width", "height", "radius")  # of gates with a direction
+_SIZES = {"gate_radius", *_OPENING}
+_KEYS = {  # what else a track may say, beside its points
+    **{key: (Length, "Of all gates [m].") for key in ("gate_radius", *_OPENING)},
+    "frame": (Length, "How thick the bars around gates are [m]."),
+    "closed": (bool, "Whether the first gate follows the last."),
+    "floor": (Annotated[float, between(-1e4, 1e4)], "Its height [m]."),
+    "start_range": (Annotated[float, between(0.0, 10.0)], "How far from a start drones start [m]."),
+    "position_jitter": (Triple, "How far each episode moves gates to both sides [m]."),
+    "rotation_jitter": (Triple, "How far each episode turns gates to both sides [rad]."),
+}
+_PARTS = ("gates", "starts", *_KEYS, "start", "box", "scene", "random", "notes")
+
+
+@checked
+@dataclass(frozen=True)
+class Gate:
+    """A gate with a direction. Its x axis is the direction of flight, z is up where it is neither pitched nor rolled.
+
+    Args:
+        position: of the centre [m].
+        yaw: of the direction, from the world's x axis to its y axis [rad].
+        pitch: of the direction, upwards [rad].
+        rotation: (w, x, y, z), to the world, instead of yaw and pitch.
+        width, height: of an opening with four sides [m].
+        radius: of a round one [m].
+    """
+
+    position: Any
+    yaw: Angle | None = None
+    pitch: Angle | None = None
+    rotation: Annotated[Sequence[Annotated[float, between(-1.01, 1.01)]], entries(4, 4)] | None = None
+    width: Length | None = None
+    height: Length | None = None
+    radius: Length | None = None
+
+    def __post_init__(self) -> None:
+        if (self.yaw is None) == (self.rotation is None) or (self.pitch is not None and self.rotation is not None):
+            raise UserValueError("give a yaw, and a pitch if wanted, or a rotation (w, x, y, z), not both.")
+        if self.rotation is not None and abs(math.hypot(*self.rotation) - 1.0) > 0.01:
+            raise UserValueError(f"its rotation must be a unit quaternion (w, x, y, z); got {shown(self.rotation)}.")
+        if [x is None for x in (self.width, self.height, self.radius)] not in (
+            [False, False, True],
+            [True, True, False],
+        ):
+            raise UserValueError(
+                "how far it is open is not said. Give width and height, or radius [m], once for the track or for each "
+                "gate: load_track(..., width=1.5, height=1.5)."
+            )
+
+    def entries(self) -> dict[str, Any]:
+        """The gate as :func:`load_track` returns it."""
+        if self.rotation is None:  # the y axis points left: pitched upwards is negative
+            q = from_euler(np.array([0.0, -(self.pitch or 0.0), self.yaw]))
+        else:
+            q = np.array(self.rotation) / math.hypot(*self.rotation)
+        size = {name: float(x) for name in _OPENING if (x := getattr(self, name)) is not None}
+        return {"position": list(self.position), "rotation": q.tolist(), **size}
+
+
+@checked
+@dataclass(frozen=True)
+class Course:
+    """The rules of random tracks: closed courses that turn once around the origin.
+
+    Args:
+        gates: how many, 3 to 50.
+        spacing: the least and the greatest horizontal way from gate to gate [m]; the least is between any two.
+        turn: the greatest change of course at a gate [rad], at least 2 pi over the number of gates.
+        heights: the least and the greatest [m], or one for each gate.
+        yaw: how far a gate may be turned from the mean of the ways to it and from it [rad], 0 to 1.5.
+    """
+
+    gates: Annotated[int, between(3, 50)] = 6
+    spacing: Pair = (4.0, 8.0)
+    turn: Annotated[float, between(0.1, 3.1)] = 2.2
+    heights: Annotated[Sequence[Annotated[float, between(-1e3, 1e3)]], entries(2, 50)] = (1.0, 3.0)
+    yaw: Annotated[float, between(0.0, 1.5)] = 0.3
+
+    def __post_init__(self) -> None:
+        if self.turn < (least := 2.0 * math.pi / self.gates):
+            raise UserValueError(f"{self.gates} gates need a turn of at least {least:.3g} rad, got {self.turn:g}.")
+        if self.spacing[0] > self.spacing[1] or (len(self.heights) == 2 and self.heights[0] > self.heights[1]):
+            raise UserValueError("spacing and heights are the least and then the greatest.")
+        if len(self.heights) not in (2, self.gates):
+            raise UserValueError(f"heights are the least and the greatest, or one for each of the {self.gates} gates.")
+
+    @property
+    def reach(self) -> float:
+        """How far from the origin gates may be [m]."""
+        return 0.25 * self.gates * self.spacing[1]
+
+    def draw(self, n: int, uniform: Callable[..., Tensor]) -> tuple[Tensor, Tensor]:
+        """Draw n courses: centres (n, k, 3) [m], and rotations (n, k, 4).
+
+        Turns and ways are drawn; taking the mean way off closes the course. Of 16 such courses the first that keeps to
+        the rules counts, and if none does, a regular polygon.
+        """
+        k, (low, high), even = self.gates, self.spacing, 2.0 * math.pi / self.gates
+        turn = (self.turn - even) * uniform(n, TRIES, k)
+        length = low + (high - low) * 0.5 * (uniform(n, TRIES, k) + 1.0)
+        turn[:, -1], length[:, -1] = 0.0, 0.5 * (low + high)
+        side = torch.where(uniform(n, 1, 1) < 0.0, -1.0, 1.0).to(turn)
+        course = math.pi * uniform(n, 1, 1) + side * (even + turn - turn.mean(-1, keepdim=True)).cumsum(-1)
+        way = length.unsqueeze(-1) * torch.stack((course.cos(), course.sin()), -1)  # to each gate
+        way = way - way.mean(2, keepdim=True)
+        place = way.cumsum(2)
+        place, length, after = place - place.mean(2, keepdim=True), way.norm(dim=-1), way.roll(-1, 2)
+        follows = (way * after).sum(-1) >= math.cos(self.turn) * length * after.norm(dim=-1)
+        apart = torch.cdist(place, place) + 2.0 * low * torch.eye(k).to(place) >= low
+        fits = (follows & (length <= high) & apart.all(-1) & (place.norm(dim=-1) <= self.reach)).all(-1)
+        fits[:, -1] = True
+        chosen = torch.arange(n, device=place.device), fits.to(torch.uint8).argmax(1)
+        along = normalize(way[chosen], dim=-1) + normalize(after[chosen], dim=-1)
+        height = 0.5 * (uniform(n, k, 1) + 1.0) * (self.heights[1] - self.heights[0]) + self.heights[0]
+        if len(self.heights) > 2:
+            height = torch.tensor(self.heights).to(place).reshape(1, k, 1).expand(n, k, 1)
+        half = 0.5 * (torch.atan2(along[..., 1], along[..., 0]) + self.yaw * uniform(n, k))
+        none = torch.zeros_like(half)
+        return torch.cat((place[chosen], height), -1), torch.stack((half.cos(), none, none, half.sin()), -1)
+
+
+def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[str, Any]:
+    """Read a track: by name, from a file, or from a mapping.
+
+    Files of these projects are known by what they hold: uzh-rpg's agile_flight (``position``, ``rotation`` and
+    ``scale`` of gates by name) and rpg_time_optimal (points, ``initial`` and ``end``), utiasDSL's lsy_drone_racing
+    (TOML), and the ``track_config`` of isaac_drone_racer (``pos`` and ``yaw`` of gates by name).
+
+    Args:
+        track: the name of one in the package, the path of a YAML or TOML file, or a mapping; one with ``file`` changes
+            what that file says.
+        **settings: what the file does not say, or says otherwise, named as on the page of :class:`RacingEnv`. Also
+            ``axis``, "x", "-x", "y" or "-y", along which agile_flight's gates are flown, where their order does not
+            show it; and ``lift`` [m], from ``pos`` of isaac_drone_racer up to the centre of the opening.
+
+    Returns:
+        ``gates``, points [m], or mappings with ``position`` [m], ``rotation`` (w, x, y, z), and ``width`` and
+        ``height`` or ``radius`` [m]; ``starts``, a point before each [m]; ``gate_radius`` [m] of points; what else the
+        track says; and ``notes`` on what was assumed of a file of another project.
+
+    Raises:
+        ValueError: a key is unknown or missing, or a value is not what :class:`RacingEnv` takes.
+        FileNotFoundError: there is no such file.
+    """
+    source, values = presets.read("track", track, _TRACKS)
+    if _SIZES & settings.keys():
+        values = {key: x for key, x in values.items() if key not in _SIZES}
+    values = own_format(source, {**values, **settings})
+    if "file" in values:
+        return load_track(values.pop("file"), **values)
+    for key in values.keys() - set(_PARTS):
+        raise UserValueError(f"{source}: unknown key {shown(key)}. Allowed: {', '.join(_PARTS)}.")
+    found = {key: check_value(f"{source}: {key}", values[key], *_KEYS[key]) for key in _KEYS if key in values}
+    found |= {key: values[key] for key in ("scene", "notes") if key in values}
+    shape = {key: found.pop(key) for key in _OPENING if key in found}
+    raw, floor = values.get("gates"), found.get("floor", 0.0)
+    if "random" in values:
+        course = build(Course, f"{source}: random", values["random"] or {})
+        found["random"], reach, top = asdict(course), course.reach + MARGIN, max(course.heights) + MARGIN
+        values = {"box": [[-reach, -reach, floor], [reach, reach, top]], **values}
+        centres, rotations = (
+            x[0].tolist() for x in course.draw(1, lambda *size: torch.zeros(size, dtype=torch.float64))
+        )
+        raw = centres if "gate_radius" in found else _gates(centres, rotations)
+    is_directed = isinstance(raw, Sequence) and any(isinstance(gate, Mapping) for gate in raw)
+    if is_directed:
+        if not all(isinstance(gate, Mapping) for gate in raw):
+            raise UserValueError(f"{source}: gates must be all points, or all mappings with a position and a yaw.")
+        own = [gate if set(gate) & set(_OPENING) else {**gate, **shape} for gate in raw]
+        found["gates"] = [build(Gate, f"{source}: gate {i}", gate).entries() for i, gate in enumerate(own, 1)]
+        if len({"radius" in gate for gate in found["gates"]}) > 1:
+            raise UserValueError(f"{source}: all gates have a width and a height, or all have a radius.")
+        raw = [gate["position"] for gate in found["gates"]]
+    elif extra := [key for key in (*shape, "frame", "rotation_jitter") if key in {**shape, **found}]:
+        raise UserValueError(
+            f"{source}: {extra[0]} is of gates with a direction; these are points, with a gate_radius."
+        )
+    gates = _points(source, "gates", raw, floor)
+    if not 2 <= len(gates) <= MAX_GATES:
+        raise UserValueError(f"{source}: a track has 2 to {MAX_GATES} gates, got {len(gates)}.")
+    if not is_directed:
+        found |= {"gates": gates, "gate_radius": float(found.get("gate_radius", 0.3))}
+    turned = torch.tensor([gate["rotation"] for gate in found["gates"]], dtype=torch.float64) if is_directed else None
+    usual = starts_before(torch.tensor(gates, dtype=torch.float64), turned, floor).tolist()
+    if "start" in values:
+        usual[0] = values["start"]
+    found["starts"] = _points(source, "starts", values.get("starts", usual), floor)
+    if (given := len(found["starts"])) != len(gates):
+        raise UserValueError(f"{source}: there must be one start before each gate, got {given} for {len(gates)}.")
+    if "box" in values:
+        found["box"] = _points(source, "box", values["box"], -1e4)
+        if len(found["box"]) != 2 or not all(a < b for a, b in zip(*found["box"], strict=True)):
+            raise UserValueError(f"{source}: box must be its lowest and its highest corner, [x, y, z] each.")
+    return found
+
+
+def random_track(seed: int, **settings: Any) -> dict[str, Any]:
+    """Draw a track for :class:`RacingEnv`. ``track="random"`` draws another in each episode, by the same rules.
+
+    Args:
+        seed: the same seed gives the same track.
+        **settings: rules, as of :class:`~torchrl_quad.envs.track.Course`, and what else a track says, such as
+            ``width`` and ``height``, 1.5 m each, ``radius``, or the ``gate_radius`` of spheres.
+
+    Returns:
+        as :func:`load_track`.
+
+    Raises:
+        ValueError: a setting is unknown or out of its range.
+    """
+    rules = {field.name: settings.pop(field.name) for field in fields(Course) if field.name in settings}
+    track = load_track("random", random=rules, **settings)
+    generator = torch.Generator().manual_seed(check_value("seed", seed, Seed))
+
+    def uniform(*shape: int) -> Tensor:
+        return 2.0 * torch.rand(shape, generator=generator, dtype=torch.float64) - 1.0
+
+    centres, rotations = (x[0].tolist() for x in Course(**track.pop("random")).draw(1, uniform))
+    shape = {key: x for key, x in track["gates"][0].items() if key in _OPENING} if "gate_radius" not in track else {}
+    gates = _gates(centres, rotations) if shape else centres
+    return load_track({key: x for key, x in track.items() if key != "starts"} | {"gates": gates, **shape})
+
+
+def starts_before(gates: Tensor, rotations: Tensor | None, floor: float) -> Tensor:
+    """A start before each gate (*, k, 3) [m]: half way from the gate before; before a gate with a direction, against
+    that, half as far away as the gate before, and at most 3 m."""
+    before = gates.roll(1, -2)
+    if rotations is None:
+        return 0.5 * (before + gates)
+    start = gates - (0.5 * (gates - before).norm(dim=-1, keepdim=True)).clamp_max(RUN_UP) * forward(rotations)
+    return torch.cat((start[..., :2], start[..., 2:].clamp_min(floor + LOWEST_START)), -1)
+
+
+def forward(rotations: Tensor) -> Tensor:
+    """The direction (*, 3) in which gates with these rotations (*, 4) are flown."""
+    return quaternion.rotate(rotations, 0.0 * rotations[..., 1:] + rotations.new_tensor([1.0, 0.0, 0.0]))
+
+
+def _gates(centres: list, rotations: list) -> list[dict[str, Any]]:
+    return [{"position": p, "rotation": q} for p, q in zip(centres, rotations, strict=True)]
+
+
+def _points(source: str, name: str, value: Any, floor: float) -> Any:
+    try:
+        points = presets.as_array(value.tolist() if isinstance(value, Tensor) else value)
+    except (ValueError, RecursionError):
+        points = np.zeros(0)
+    is_list = points.ndim == 2 and points.shape[-1] == 3
+    if not (is_list and (abs(points) < 1e4).all() and (points[..., -1] > floor).all()):
+        where = "ground" if floor == 0.0 else f"the floor at {floor:g} m"
+        raise UserValueError(
+            f"{source}: {name} must be a list of points [x, y, z] in metres above {where}, within 10 km; got "
+            f"{shown(value)}."
+        )
+    return points.tolist()

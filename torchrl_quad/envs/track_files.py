@@ -1,0 +1,179 @@
+"""Tracks in the formats of other projects, as mappings in our own."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from torchrl_quad.dynamics.presets import as_array
+from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.rotations import from_euler, multiply, rotate
+
+BELOW = 4.0  # [m], from the lowest gate down to the end of the box, where gates are below z = 0
+_YAWS = {"x": 0.0, "y": 0.5 * math.pi, "-x": math.pi, "-y": -0.5 * math.pi}
+AXES = {name: from_euler(np.array([0.0, 0.0, yaw])) for name, yaw in _YAWS.items()}  # what turns the x axis there
+# Of lsy_drone_racing, in the comments of its files: "0.72m wide (outer dimensions of the frame) with a 0.4m wide
+# opening", and obstacles are "cylinders with a diameter of 0.03m", whose position is that of their top.
+LSY_OPENING, LSY_FRAME, LSY_POLE = 0.4, 0.16, 0.015
+LSY_RUN_UP = 0.25  # [m], from a start to its gate, before which poles stand
+
+
+def own_format(source: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """A track in our own format, from that of any project that is known.
+
+    Raises:
+        UserValueError: what a file must say is missing, or not of the right form.
+    """
+    values = dict(values)
+    gates = values.get("gates")
+    by_name = gates if isinstance(gates, Mapping) else values
+    named = {name: gate for name, gate in by_name.items() if isinstance(gate, Mapping)}
+    try:
+        if isinstance(values.get("env"), Mapping):
+            return lsy_drone_racing(source, values)
+        if (
+            isinstance(gates, Mapping)
+            and named
+            and all({"position", "rotation"} <= set(gate) for gate in named.values())
+        ):
+            return agile_flight(source, values, _in_order(named))
+        if named and all({"pos", "yaw"} <= set(gate) for gate in named.values()):
+            return isaac_drone_racer(source, values, _in_order(named))
+        if {"initial", "end", "ring"} & set(values):
+            return time_optimal(source, values)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        if isinstance(error, UserValueError):
+            raise
+        raise UserValueError(f"{source}: cannot be read, {type(error).__name__}: {error}.") from error
+    if isinstance(gates, Mapping):
+        raise UserValueError(
+            f"{source}: its gates have names, and {shown(gates)} is of no format that is known. Write gates as a list "
+            "of points, or of mappings with position, yaw, width and height; load_track names the formats it reads."
+        )
+    return values
+
+
+def agile_flight(source: str, values: dict[str, Any], gates: list[Mapping[str, Any]]) -> dict[str, Any]:
+    """Of uzh-rpg/agile_flight: gates by name, the drone's start, and the goal. ``scale`` has no unit, and is not read.
+
+    The axis of gates along which they are flown differs from file to file. It is the one along which each gate is
+    flown in the order of the gates, on the ways to it and from it together.
+    """
+    centres, rotations = (as_array([gate[key] for gate in gates]) for key in ("position", "rotation"))
+    start, goal = as_array(values["start_pos"]), as_array(values["goal_pos"])
+    is_lap = np.linalg.norm(goal - centres[0]) < np.linalg.norm(goal - centres[-1])
+    path = np.vstack((start, centres, centres[:1] if is_lap else centres[-1:]))
+    ways = np.diff(path, axis=0)
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True).clip(1e-9)
+    axis = values.get("axis")
+    if axis is None:
+        flown = {name: rotate(multiply(rotations, turn), [1.0, 0.0, 0.0]) for name, turn in AXES.items()}
+        fit = [name for name, along in flown.items() if ((ways[:-1] + ways[1:]) * along).sum(1).min() > 1e-3]
+        if len(fit) != 1:
+            raise UserValueError(
+                f"{source}: its gates are flown along one of their axes, and their order does not show which. Give "
+                f'axis="x", "-x", "y" or "-y".'
+            )
+        (axis,) = fit
+    elif axis not in AXES:
+        raise UserValueError(f"{source}: axis must be one of {', '.join(AXES)}; got {shown(axis)}.")
+    notes = [
+        f"gates are flown along their {axis} axis",
+        "a lap: the goal is nearer to the first gate" if is_lap else "no lap: the goal is nearer to the last gate",
+        "scale and uncertainty are not read",
+    ]
+    turned, floor = multiply(rotations, AXES[axis]), {}
+    if centres[:, 2].min() <= 0.0:
+        floor["floor"] = float(centres[:, 2].min()) - BELOW
+        notes.append(f"gates are below z = 0: the floor is {BELOW:g} m below the lowest")
+    own = {key: x for key, x in values.items() if key not in ("start_pos", "goal_pos", "render_offset", "axis")}
+    listed = [{"position": p, "rotation": q} for p, q in zip(centres.tolist(), turned.tolist(), strict=True)]
+    return {**floor, "closed": bool(is_lap), "start": start.tolist(), **own, "gates": listed, "notes": notes}
+
+
+def time_optimal(source: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Of uzh-rpg/rpg_time_optimal: points, from ``initial`` to ``end``; several rounds stand there one by one."""
+    if "gate_radius" not in values:
+        raise UserValueError(f"{source}: how near to a gate counts is not said. Give gate_radius [m].")
+    own = {key: x for key, x in values.items() if key not in ("initial", "end", "ring")}
+    points = as_array(values["gates"]).tolist()
+    if end := values.get("end", {}).get("position"):
+        points.append(as_array(end).tolist())
+    rounds = (k for k in range(2, len(points) // 2 + 1) if points[k:] == points[:-k])
+    lap = next(rounds, None)
+    closed = bool(values.get("ring", False)) or lap is not None
+    notes = [f"the gates repeat: a lap of {lap}"] if lap else ["a ring" if closed else "no lap: end is the last gate"]
+    if start := values.get("initial", {}).get("position"):
+        own["start"] = as_array(start).tolist()
+    return {"closed": closed, **own, "gates": points[:lap], "notes": [*notes, "only positions of the ends are read"]}
+
+
+def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Of utiasDSL/lsy_drone_racing: square gates, flown along their x axis, poles, and how both are drawn."""
+    track = values["env"]["track"]
+    centres = as_array([gate["pos"] for gate in track["gates"]])
+    start, limits = as_array(track["drones"][0]["pos"]).tolist(), track["safety_limits"]
+    box = as_array([limits["pos_limit_low"], limits["pos_limit_high"]]).tolist()
+    own = {key: x for key, x in values.items() if key not in ("controller", "deploy", "sim", "env")}
+    own = {"width": LSY_OPENING, "height": LSY_OPENING, "frame": LSY_FRAME, "closed": False, "box": box, **own}
+    notes = [
+        "gates are open 0.4 m, with frames of 0.16 m; poles are 0.03 m thick, and end at their position",
+        "the drone hovers above its start; drone, sensors and disturbances are not read",
+    ]
+    own |= {"start_range": 0.05, "floor": box[0][2], "notes": notes}
+    if track.get("randomize", False):  # of positions it says nothing but the limits
+        low, high = box
+        reach = min(high[i] - low[i] for i in (0, 1)) / 2.0
+        heights = centres[:, 2].tolist()
+        own["random"] = {
+            "gates": len(centres),
+            "spacing": [1.0, 1.1 * reach],
+            "heights": heights,
+            "turn": 2.2,
+            "yaw": 0.75,
+        }
+        notes.append("gates stand anew in each episode, by the rules of random tracks; no poles")
+        return own
+    drawn = {name: _spread(source, x) for name, x in values["env"].get("randomizations", {}).items()}
+    middle, spread = drawn.get("gate_pos", (np.zeros(3), None))
+    centres, rotations = centres + middle, from_euler(as_array([gate["rpy"] for gate in track["gates"]]))
+    listed = zip(centres.tolist(), rotations.tolist(), strict=True)
+    own["gates"] = [{"position": position, "rotation": rotation} for position, rotation in listed]
+    before = (centres - LSY_RUN_UP * rotate(rotations, [1.0, 0.0, 0.0])).tolist()
+    own |= {"position_jitter": spread.tolist()} if spread is not None else {}
+    own |= {"rotation_jitter": drawn["gate_rpy"][1].tolist()} if "gate_rpy" in drawn else {}
+    own["starts"] = [[*start[:2], max(start[2], box[0][2] + 0.25)], *before[1:]]
+    tops = as_array([pole["pos"] for pole in track["obstacles"]])
+    middle, spread = drawn.get("obstacle_pos", (np.zeros(3), np.zeros(3)))
+    low, high = (np.c_[tops[:, :2] + middle[:2] + sign * spread[:2], 0.0 * tops[:, 2]].tolist() for sign in (-1, 1))
+    poles = [{"radius": LSY_POLE, "height": z} for z in tops[:, 2].tolist()]
+    for pole, z, least, most in zip(poles, tops[:, 2] + middle[2], low, high, strict=True):
+        ends = {"count": 1, "low": least, "high": most, "height": [z - spread[2], z + spread[2]]}
+        pole |= ends if spread.any() else {"base": least}
+    return {**own, "scene": {"cylinders": poles}} if poles else own
+
+
+def isaac_drone_racer(source: str, values: dict[str, Any], gates: list[Mapping[str, Any]]) -> dict[str, Any]:
+    """The ``track_config`` of kousheekc/isaac_drone_racer: positions of its gates' models, flown along their x axis."""
+    if "lift" not in values:
+        raise UserValueError(f"{source}: how high above pos its gates are open is not said. Give lift [m].")
+    own = {key: x for key, x in values.items() if key not in ("lift", "gates") and not isinstance(x, Mapping)}
+    listed = [{"position": [*gate["pos"][:2], gate["pos"][2] + values["lift"]], "yaw": gate["yaw"]} for gate in gates]
+    return {**own, "gates": listed, "notes": ["gates are flown along their x axis, and round after round"]}
+
+
+def _in_order(gates: Mapping[str, Mapping]) -> list[Mapping[str, Any]]:
+    """Gates by the number in their name: Gate10 comes after Gate2."""
+    return [gates[name] for name in sorted(gates, key=lambda name: int(re.findall(r"\d+", name)[-1]))]
+
+
+def _spread(source: str, spec: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """The middle of what is drawn uniformly, and how far it goes to both sides."""
+    low, high = (as_array(spec["kwargs"][key]) for key in ("minval", "maxval"))
+    if spec["fn"] != "uniform":
+        raise UserValueError(f"{source}: what is drawn must be uniform; got {shown(spec['fn'])}.")
+    return 0.5 * (low + high), 0.5 * (high - low)

@@ -6,18 +6,23 @@ python recipes/identify.py 'logs=[flight1.csv, flight2.csv]' drone=crazyflie mas
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_quad.deploy import frames
 from torchrl_quad.files import make_folder
-from torchrl_quad.identification import identify, read_log
+from torchrl_quad.identification import Columns, identify, read_log
 from torchrl_quad.training.launch import recipe
 
 
 @recipe("identify")
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
-    logs = [read_log(path) for path in cfg.logs]
+    settings = OmegaConf.to_container(cfg)
+    convention = None if cfg.convention is None else getattr(frames, cfg.convention)()
+    columns = settings["columns"]
+    if isinstance(columns, dict):  # a mapping for Columns: {names: [ax, ay, az], scale: 9.80665}
+        columns = {name: Columns(**x) if isinstance(x, dict) else x for name, x in columns.items()}
+    logs = [read_log(path, columns, convention=convention) for path in cfg.logs]
     for log in logs:
         print(log)
-    settings = OmegaConf.to_container(cfg)
     known = dict(settings["known"] or {}) | ({} if cfg.mass is None else {"mass": cfg.mass})
     options = {name: cfg[name] for name in ("past", "horizon", "iterations", "draws", "seed")}
     folder = make_folder(cfg.folder)

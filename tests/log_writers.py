@@ -8,6 +8,8 @@ from scipy.spatial.transform import Rotation
 
 END = 10.0  # [s]
 G = 9.80665
+# By rotors front left, back left, back right, front right: how each turns the drone about x, y and z.
+TURNING = np.array([[1, 1, -1, -1], [-1, 1, 1, -1], [1, -1, 1, -1]])
 OURS = {"position": ("x", "y", "z"), "quaternion": ("qw", "qx", "qy", "qz"), "velocity": ("vx", "vy", "vz")}
 OURS |= {"angular_velocity": ("wx", "wy", "wz"), "acceleration": ("fx", "fy", "fz")}
 OURS |= {"motor_command": ("u0", "u1", "u2", "u3")}
@@ -43,14 +45,15 @@ def flight(t):
     attitude, size = _attitude(t)
     turned = _attitude(t - h)[0].inv() * _attitude(t + h)[0]
     on = ((t > 0.7) & (t < 9.3))[:, None]
-    k = np.arange(4)
+    rates = [(_attitude(x - h)[0].inv() * _attitude(x + h)[0]).as_rotvec() / (2.0 * h) for x in (t - h, t + h)]
+    thrust = 0.35 * size[:, None] / G + 0.004 * np.clip((rates[1] - rates[0]) / (2.0 * h), -20.0, 20.0) @ TURNING
     return {
         "position": _position(t),
         "quaternion": attitude.as_quat(scalar_first=True),
         "velocity": (_position(t + h) - _position(t - h)) / (2.0 * h),
         "angular_velocity": turned.as_rotvec() / (2.0 * h),
         "acceleration": size[:, None] * (0.0, 0.0, 1.0),
-        "motor_command": on * (0.5 + 0.05 * k + 0.03 * np.sin(t[:, None] * (k + 1))),
+        "motor_command": on * np.sqrt(np.clip(thrust, 0.01, 1.0)),
         "battery_voltage": 4.1 - 0.04 * t,
     }
 
@@ -93,17 +96,19 @@ def write_ulog(path, messages, parameters):
     ``messages`` maps a name to (times [s], {field: (type, array)}); arrays of shape (T, n) are fields of n.
     """
     out = [ULOG, ulog_message("B", bytes(40))]
-    letters = {"float": "f4", "uint64_t": "u8"}
+    letters = {"float": "f4", "uint64_t": "u8", "uint8_t": "u1"}
     for name, (_, fields) in messages.items():
         parts = ["uint64_t timestamp"]
         for field, (kind, values) in fields.items():
             parts.append(f"{kind}[{values.shape[1]}] {field}" if values.ndim == 2 else f"{kind} {field}")
-        out.append(ulog_message("F", f"{name}:{';'.join(parts)};".encode()))
+        out.append(ulog_message("F", f"{name.partition('#')[0]}:{';'.join(parts)};".encode()))
     for name, value in parameters.items():
-        key = f"float {name}".encode()
-        out.append(ulog_message("P", bytes([len(key)]) + key + struct.pack("<f", value)))
+        kind, letter = ("int32_t", "i") if isinstance(value, int) else ("float", "f")
+        key = f"{kind} {name}".encode()
+        out.append(ulog_message("P", bytes([len(key)]) + key + struct.pack(f"<{letter}", value)))
     for k, name in enumerate(messages):
-        out.append(ulog_message("A", bytes([0]) + struct.pack("<H", k) + name.encode()))
+        stem, _, instance = name.partition("#")
+        out.append(ulog_message("A", bytes([int(instance or 0)]) + struct.pack("<H", k) + stem.encode()))
     rows = []
     for k, (times, fields) in enumerate(messages.values()):
         stamps = np.round(times * 1e6).astype("<u8")
@@ -129,3 +134,95 @@ def write_usd(path, events, version):
     data = b"".join(out + [row for _, row in sorted(rows, key=lambda row: row[0])])
     path.write_bytes(data + struct.pack("<I", zlib.crc32(data)))
     return path
+
+
+def write_dataflash(path, messages, parameters):
+    """A dataflash log: a message FMT of 89 bytes for each kind, then the messages, each behind a3 95 and its number.
+
+    ``messages`` maps a name to (times [s], format of its columns, {column: array})."""
+    sizes, out, rows = {"Q": 8, "f": 4, "B": 1, "H": 2, "N": 16, "c": 2}, [], []
+
+    def describe(number, name, letters, columns):
+        size = 3 + sum(sizes[letter] for letter in letters)
+        packed = struct.pack("<BB4s16s64s", number, size, name.encode(), letters.encode(), ",".join(columns).encode())
+        out.append(b"\xa3\x95\x80" + packed)
+
+    describe(1, "PARM", "QNf", ["TimeUS", "Name", "Value"])
+    out += [b"\xa3\x95\x01" + struct.pack("<Q16sf", 0, name.encode(), value) for name, value in parameters.items()]
+    for k, (name, (times, letters, columns)) in enumerate(messages.items(), 2):
+        describe(k, name, f"Q{letters}", ["TimeUS", *columns])
+        layout = "<Q" + letters.replace("c", "h")
+        for at, *row in zip(
+            np.round(1e6 * times).astype(int).tolist(), *(x.tolist() for x in columns.values()), strict=True
+        ):
+            rows.append((at, b"\xa3\x95" + bytes([k]) + struct.pack(layout, at, *row)))
+    path.write_bytes(b"".join(out + [row for _, row in sorted(rows, key=lambda row: row[0])]))
+    return path
+
+
+def times(rate):
+    return np.arange(int(END * rate)) / rate
+
+
+def px4_messages():
+    rates = {"position": 50, "quaternion": 100, "imu": 250, "motors": 200, "battery": 5, "setpoint": 10}
+    t = {name: times(rate) for name, rate in rates.items()}
+    true = {name: flight(x) for name, x in t.items()}
+    theirs = {name: ned(x) for name, x in true.items()}
+    signal = true["motors"]["motor_command"][:, [3, 1, 0, 2]]  # front right, back left, front left, back right
+    control = np.where(signal > 0.0, 0.3 * signal**2 + 0.7 * signal, np.nan)  # a motor that stands is NaN
+    late = {"timestamp_sample": ("uint64_t", np.round((t["imu"] + 5.0) * 1e6))}
+    place = np.concatenate((theirs["position"]["position"], theirs["position"]["velocity"]), 1)
+    return {
+        "vehicle_local_position": (
+            t["position"] + 5.0,
+            {name: ("float", x) for name, x in zip(("x", "y", "z", "vx", "vy", "vz"), place.T, strict=True)},
+        ),
+        "vehicle_attitude": (t["quaternion"] + 5.0, {"q": ("float", theirs["quaternion"]["quaternion"])}),
+        # Published 4 ms after they were sampled.
+        "vehicle_angular_velocity": (t["imu"] + 5.004, late | {"xyz": ("float", theirs["imu"]["angular_velocity"])}),
+        "vehicle_acceleration": (t["imu"] + 5.004, late | {"xyz": ("float", theirs["imu"]["acceleration"])}),
+        "actuator_motors": (t["motors"] + 5.0, {"control": ("float", np.pad(control, ((0, 0), (0, 8))))}),
+        "battery_status": (t["battery"] + 5.0, {"voltage_v": ("float", true["battery"]["battery_voltage"])}),
+        "trajectory_setpoint": (t["setpoint"] + 5.0, {"position": ("float", theirs["setpoint"]["position"])}),
+    }
+
+
+def dataflash_messages():
+    t, slow = times(100), times(10)
+    true, battery = flight(t), flight(slow)
+    theirs = ned(true)
+    angles = Rotation.from_quat(theirs["quaternion"], scalar_first=True).as_euler("ZYX", degrees=True)[:, ::-1]
+    pulses = np.round(1000.0 + 900.0 * true["motor_command"]).astype(int)
+    kf = dict(
+        zip(("PN", "PE", "PD", "VN", "VE", "VD"), np.hstack((theirs["position"], theirs["velocity"])).T, strict=True)
+    )
+    imu = np.hstack((theirs["angular_velocity"], theirs["acceleration"])).T
+    which = {"C": np.zeros(len(t), int)}
+    return {
+        "XKF1": (t, "Bffffff", which | kf),
+        "ATT": (t, "ccc", dict(zip(("Roll", "Pitch", "Yaw"), np.round(100.0 * angles.T).astype(int), strict=True))),
+        "IMU": (t, "ffffff", dict(zip(("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"), imu, strict=True))),
+        # Outputs 5 to 8 drive motors 1 to 4: front right, back left, front left, back right.
+        "RCOU": (t, "HHHH", {f"C{5 + k}": pulses[:, place] for k, place in enumerate((3, 1, 0, 2))}),
+        "BAT": (slow, "Bf", {"Inst": np.zeros(len(slow), int), "Volt": battery["battery_voltage"]}),
+    }
+
+
+SERVOS = {f"SERVO{5 + k}_FUNCTION": 33.0 + k for k in range(4)} | {"MOT_PWM_MIN": 1000.0, "MOT_PWM_MAX": 1900.0}
+
+
+def usd_events(t, slow):
+    true, battery = flight(t), flight(slow)
+    columns = {}
+    for stem, axes, values in (
+        ("stateEstimate.", "xyz", true["position"]),
+        ("stateEstimate.v", "xyz", true["velocity"]),
+        ("stateEstimate.q", "wxyz", true["quaternion"]),
+        ("gyro.", "xyz", np.degrees(true["angular_velocity"])),
+        ("acc.", "xyz", true["acceleration"] / 9.80665),
+    ):
+        columns |= {stem + axis: ("f", values[:, k]) for k, axis in enumerate(axes)}
+    pulses = np.round(65535 * true["motor_command"]).astype(int)  # m1 is front right, and then clockwise
+    columns |= {f"motor.m{k + 1}": ("H", pulses[:, place]) for k, place in enumerate((3, 2, 1, 0))}
+    return {"fixedFrequency": (t, columns), "battery": (slow, {"pm.vbat": ("f", battery["battery_voltage"])})}

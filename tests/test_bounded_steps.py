@@ -1,14 +1,25 @@
 """Bounds on what a policy learns from: the gradient of each action, and the length of an update."""
 
+import copy
+
 import pytest
 import torch
-from refusals import refuses
-from tensordict.nn import TensorDictSequential
+from refusals import cases, refuses
+from tensordict.nn import (
+    NormalParamExtractor,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
+from torch import nn
+from torch.distributions import Normal
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal
 
 from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_qvalue, make_value
-from torchrl_quad.objectives import ABPTLoss, BPTTLoss, SHACLoss, TrustRegion
+from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SHACLoss, TrustRegion
 from torchrl_quad.objectives.calls import MedianClip, action_gradient, sources_of_steps
 
 LOSSES = {
@@ -154,12 +165,89 @@ def test_what_cannot_be_clipped_is_refused(env):
     loss = BPTTLoss(actor, clip_action_gradient=5.0)
     for changed in (rollout[:2], torch.stack([flight(env, actor, steps=4) for _ in range(4)])):
         refuses("needs one rollout as differentiable_rollout returned it, whole", loss.loss_actor, changed)
-    refuses("BPTTLoss needs a policy as make_actor builds it, .*no 'loc'", loss.loss_actor, rollout.exclude("loc"))
+    refuses("BPTTLoss needs .* the rollout has no 'loc'. Build it by", loss.loss_actor, rollout.exclude("loc"))
     with torch.no_grad():
         loss.loss_actor(rollout)
-    other = TensorDictSequential(actor)
-    with pytest.raises(NotImplementedError, match="need a policy of make_actor or make_visual_actor"):
-        BPTTLoss(other, clip_action_gradient=5.0).loss_actor(flight(env, other))
+
+
+SCALE = NormalParamExtractor(scale_mapping="biased_softplus_0.1_0.01")  # that of make_actor
+WRAPPINGS = {
+    "actor": lambda body, head, **how: ProbabilisticActor(TensorDictSequential(body, head), ["loc", "scale"], **how),
+    "sequence": lambda body, head, **how: TensorDictSequential(body, ProbabilisticActor(head, ["loc", "scale"], **how)),
+    "modules": lambda body, head, **how: ProbabilisticTensorDictSequential(
+        body, head, ProbabilisticTensorDictModule(["loc", "scale"], ["action"], **how)
+    ),
+}
+
+
+def by_hand(actor, wrapping="actor", *more, distribution=TanhNormal, **options):
+    """The network of a policy of make_actor, as a user of TorchRL writes a policy; ``more`` stands before the head."""
+    *layers, last = copy.deepcopy(actor.last.mlp)
+    body = TensorDictModule(nn.Sequential(*layers, *more), ["observation"], ["hidden"])
+    head = TensorDictModule(nn.Sequential(last, SCALE), ["hidden"], ["loc", "scale"])
+    return WRAPPINGS[wrapping](body, head, distribution_class=distribution, return_log_prob=True, **options)
+
+
+LEARN = {
+    "clip": lambda actor, value: BPTTLoss(actor, alpha=0.1, clip_action_gradient=1.5),
+    "ahac": lambda actor, value: AHACLoss(actor, value, alpha=0.1, num_value_nets=1),
+    "hybrid": lambda actor, value: HybridLoss(actor, value, entropy_coeff=0.1),
+}
+
+
+@pytest.mark.parametrize("wrapping", WRAPPINGS)
+@pytest.mark.parametrize("name", LEARN)
+def test_a_policy_of_torchrl_learns_what_the_same_network_of_make_actor_learns(env, name, wrapping):
+    actor, value = make_actor(env, return_log_prob=True), make_value(env)
+    other = by_hand(actor, wrapping)
+    (found_value, found), (expected_value, expected) = (
+        gradient(LEARN[name](policy, value), flight(env, policy)) for policy in (other, actor)
+    )
+    torch.testing.assert_close(found_value, expected_value, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("distribution", [TanhNormal, IndependentNormal])
+def test_a_clip_that_never_clips_has_the_gradient_of_finite_differences_for_any_policy(env, distribution):
+    bounds = {"low": torch.full((4,), -0.9), "high": torch.full((4,), 0.8)} if distribution is TanhNormal else {}
+    policy = by_hand(make_actor(env), distribution=distribution, distribution_kwargs=bounds).to(env.dtype)
+    loss = BPTTLoss(policy, clip_action_gradient=FAR)
+    _, grads = gradient(loss, flight(env, policy))
+    direction = [torch.randn_like(x) for x in loss.actor_network_params.parameters()]
+
+    def moved(size):
+        params = list(loss.actor_network_params.parameters())
+        with torch.no_grad():
+            torch._foreach_add_(params, direction, alpha=size)
+            value = loss.loss_actor(flight(env, policy))[0]
+            torch._foreach_add_(params, direction, alpha=-size)
+        return value
+
+    numeric = (moved(1e-6) - moved(-1e-6)) / 2e-6
+    torch.testing.assert_close(
+        sum((a * b).sum() for a, b in zip(grads, direction, strict=True)), numeric, rtol=1e-6, atol=1e-8
+    )
+
+
+class Blurred(nn.Module):
+    """Draws in its forward pass, by a function."""
+
+    def forward(self, x):
+        return nn.functional.dropout(x, 0.5)
+
+
+@cases(
+    ([nn.Dropout(0.5)], {}, "its layer Dropout .*module.4. draws random numbers.*Call actor.eval"),
+    ([Blurred()], {}, "its layer Blurred .*draws random numbers"),
+    ([nn.BatchNorm1d(64, dtype=torch.float64)], {}, "its layer BatchNorm1d .*uses the statistics of its batch"),
+    ([], {"distribution": Normal}, "TanhNormal or an IndependentNormal; this one has Normal. Build it by make_actor"),
+)
+def test_a_policy_that_would_not_act_the_same_again_is_refused_by_the_name_of_the_layer(more, options, message, env):
+    policy = by_hand(make_actor(env), "actor", *more, **options)
+    loss = BPTTLoss(policy, clip_action_gradient=5.0)
+    refuses(message, loss.loss_actor, flight(env, policy, steps=3), error=NotImplementedError)
+    if more and not isinstance(more[0], Blurred):
+        loss.loss_actor(flight(env, policy.eval(), steps=3))
 
 
 def test_an_update_is_shortened_to_the_bound():

@@ -225,7 +225,11 @@ CHANGES = [  # of a contract whose checksums fit
     ("output.order", ["thrust"] * 4, "output.order: .* was expected"),
     ("simulator.integrator", "rk9", "simulator.integrator: 'rk9' is not one of"),
     ("drone.thrust_map", [1e-9, 0, 0], "drone: to hover each rotor must give"),
-    ("drone.rotor_positions", [[0.1, 0.1]] * 4, "drone.rotor_positions and rotor_spin cannot make thrust"),
+    (
+        "drone.rotor_positions",
+        [[0.1, 0.1]] * 4,
+        "drone.rotor_positions and rotor_spin cannot control roll and pitch",
+    ),
     ("plant", {"mass": 0}, "plant.mass: 0 is less than the minimum of 0.001"),
     ("plant", {"wings": 2}, "plant: .*'wings' was unexpected"),
     ("plant", {"rotor_speed_min": 9000}, "plant.rotor_speed_min is 9000, and must be below"),

@@ -2,14 +2,17 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
 from torchrl_quad import HoveringEnv
+from torchrl_quad.deploy.simulators import vehicle
 from torchrl_quad.dynamics import FlightController, Quadrotor, available_drones, load_drone, quaternion, rigid_body
 from torchrl_quad.dynamics.control import Setpoint
+from torchrl_quad.dynamics.gains import rate_loop
 from torchrl_quad.dynamics.model import QuadrotorState
 from torchrl_quad.dynamics.rigid_body import INTEGRATORS, RigidBodyState, Rotors, accelerations
 from torchrl_quad.dynamics.vector import matvec
@@ -17,6 +20,7 @@ from torchrl_quad.dynamics.vector import matvec
 F64 = torch.float64
 LEVEL = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=F64)
 ZERO = torch.zeros(1, 3, dtype=F64)
+TILTED = [[0.1, -0.2, 1.0], [0.2, 0.1, 1.0], [-0.1, 0.2, 0.9], [-0.1, -0.1, 1.0]]
 NO_WRENCH = torch.zeros(1, 4, dtype=F64)
 
 
@@ -142,14 +146,23 @@ def test_quaternions_stay_of_unit_norm(integrator):
         torch.testing.assert_close(state.quaternion.norm(dim=-1), torch.ones(1, dtype=F64))
 
 
-def test_allocation_is_r_cross_f_for_any_layout():
-    positions = [[0.2, 0.1], [-0.15, 0.12], [-0.1, -0.3], [0.05, -0.2]]
-    params = drone(rotor_positions=positions, rotor_spin=[1.0, 1.0, -1.0, -1.0])
-    thrust = torch.tensor([1.0, 2.0, 0.5, 1.5], dtype=F64)
-    arms = torch.nn.functional.pad(params.rotor_positions, (0, 1))
-    torque = torch.linalg.cross(arms, torch.nn.functional.pad(thrust.unsqueeze(-1), (2, 0))).sum(0)
-    torque[2] += (params.yaw_torque_coefficient * params.rotor_spin * thrust).sum()
-    torch.testing.assert_close(rigid_body.allocation_matrix(params) @ thrust, torch.cat((thrust.sum()[None], torque)))
+@pytest.mark.parametrize("tilted", [False, True])
+def test_allocation_is_r_cross_f_for_any_layout(tilted):
+    positions = [[0.2, 0.1, 0.03], [-0.15, 0.12, 0.0], [-0.1, -0.3, -0.04], [0.05, -0.2, 0.1], [0.3, 0.0, 0.02]]
+    params = drone(rotor_positions=positions, rotor_spin=[1.0, 1.0, -1.0, -1.0, 1.0])
+    thrust, up = torch.tensor([1.0, 2.0, 0.5, 1.5, 0.7], dtype=F64), vector(0.0, 0.0, 1.0).repeat(5, 1)
+    if tilted:
+        up = torch.nn.functional.normalize(torch.randn(5, 3, dtype=F64) + 2.0 * up, dim=-1)
+        params = params.replace(rotor_direction=3.0 * up)
+    force = up * thrust.unsqueeze(-1)
+    torque = torch.linalg.cross(params.rotor_positions, force)
+    torque += params.yaw_torque_coefficient * params.rotor_spin.unsqueeze(-1) * force
+    collective, whole = force.sum(0), torch.cat((force.sum(0)[2:], torque.sum(0)))
+    whole = torch.cat((whole, collective[:2])) if tilted else whole
+    torch.testing.assert_close(rigid_body.allocation_matrix(params) @ thrust, whole)
+    share = torch.tensor([1.0, 0.5, 0.0, 0.8, 1.2], dtype=F64)
+    worn = rigid_body.allocation_matrix(params.replace(rotor_effectiveness=share))
+    torch.testing.assert_close(worn @ thrust, rigid_body.allocation_matrix(params) @ (share * thrust))
 
 
 @pytest.mark.parametrize("name", available_drones())
@@ -164,28 +177,48 @@ def test_a_body_rate_command_turns_the_drone_that_way(name):
         torch.testing.assert_close(end.angular_velocity, wanted, atol=0.02 * params.max_body_rate[0].item(), rtol=0.02)
 
 
+@pytest.mark.parametrize("dt", [5e-4, 5e-3, 1e-2])
 @pytest.mark.parametrize("name", available_drones())
-def test_the_rate_loop_is_damped_as_its_gains_say(name):
+def test_the_rate_loop_is_damped_as_its_poles_say_in_the_steps_that_are_flown(name, dt):
     params = drone(name, drag_height=0.0)
     controller = FlightController(params)
-    step = torch.nn.functional.pad(0.2 * torch.eye(3, dtype=F64), (1, 0))  # about one axis each, no rotor saturates
-    history = fly(hovering(controller, 3), controller.hover_action + step, params, controller, 1.0, 5e-4)
-    peak = torch.stack([state.angular_velocity.diagonal() for state in history]).amax(0)
-    # Of the second-order loop that rotor lag, rate gain and damping form.
-    lag = 2 * (params.rate_gain * params.motor_time_constant).sqrt()
-    ratios = (1 + params.rate_damping / params.inertia) / lag
-    for overshoot, ratio in zip((peak / (0.2 * params.max_body_rate) - 1).tolist(), ratios.tolist(), strict=True):
-        assert ratio >= 0.7 or name == "visfly"  # its published gains: 0.71, 0.64 and 0.74
-        expected = math.exp(-math.pi * ratio / math.sqrt(1 - ratio**2)) if ratio < 1 else 0.0
-        assert overshoot == pytest.approx(expected, abs=0.01)
+    step = torch.nn.functional.pad(0.02 * torch.eye(3, dtype=F64), (1, 0))  # about one axis each
+    history = fly(hovering(controller, 3), controller.hover_action + step, params, controller, 1.0, dt)
+    rates = torch.stack([state.angular_velocity.diagonal() for state in history]) / (0.02 * params.max_body_rate)
+    loop, fields = rate_loop(params, dt), (params.rate_gain, params.rate_damping / params.inertia)
+    torch.testing.assert_close((rates.amax(0) - 1).clamp_min(0), torch.tensor(loop.overshoot), atol=2e-3, rtol=0)
+    for axis, (gain, ratio) in enumerate(zip(*(x.tolist() for x in fields), strict=True)):
+        share = -math.expm1(-dt / params.motor_time_constant.item())
+        a = np.array([[1.0, dt], [-share * gain, 1.0 - share - share * ratio]])
+        np.testing.assert_allclose(np.sort(np.linalg.eigvals(a)), np.sort(loop.poles[axis]), rtol=1e-9)
+        state, flown = np.zeros(2), []
+        for _ in history:
+            state = a @ state + [0.0, share * gain]
+            flown.append(state[0])
+        np.testing.assert_allclose(rates[:, axis], flown, atol=5e-3)
+        answer = np.linalg.solve(np.exp(1j * loop.bandwidth[axis] * dt) * np.eye(2) - a, [0.0, share * gain])[0]
+        assert abs(answer) == pytest.approx(0.5**0.5, rel=1e-9)
+        of_continuous_time = (1 + ratio) / (2 * math.sqrt(gain * params.motor_time_constant))
+        assert rate_loop(params, 0.0).damping_ratio[axis] == pytest.approx(of_continuous_time, rel=1e-5)
 
 
+FALLING_SLOPE = {"thrust_map": [-2.0, 8.0, 0.1], "rotor_speed_min": 0.0, "rotor_speed_max": 1.0}  # of a motor command
+
+
+@pytest.mark.parametrize("changes", [{}, FALLING_SLOPE, {**FALLING_SLOPE, "thrust_map": [0.01, 6.0, -0.1]}])
 @pytest.mark.parametrize("name", available_drones())
-def test_the_thrust_map_and_its_inverse_agree_over_the_speed_range(name):
-    rotors = Rotors(drone(name))
-    low, high = rigid_body.thrust_limits(drone(name))
+def test_the_thrust_map_and_its_inverse_agree_over_the_speed_range(name, changes):
+    params = drone(name, **changes)
+    rotors, apart = (
+        Rotors(params),
+        vehicle.Drone({k: x.squeeze().numpy() for k, x in params.fields().items() if k != "drag_height"}),
+    )
+    low, high = rigid_body.thrust_limits(params)
     thrust = low + torch.linspace(0.01, 1, 50, dtype=F64) * (high - low)
-    torch.testing.assert_close(rotors.thrust(rotors.speed(thrust)), thrust)
+    speed = rotors.speed(thrust)
+    torch.testing.assert_close(rotors.thrust(speed), thrust)
+    assert ((params.rotor_speed_min <= speed) & (speed <= params.rotor_speed_max * (1 + 1e-9))).all()
+    np.testing.assert_allclose(apart.speed(thrust.numpy()), speed.numpy(), rtol=1e-12)
 
 
 @pytest.mark.parametrize("dt", [1e-3, 5e-3, 0.05])
@@ -226,6 +259,7 @@ def test_components_fly_as_tensors_do_with_two_time_constants_and_drag_above_the
     state["velocity"] = vector(1.0, -2.0, 0.5).repeat(3, 1)
     action = model.hover_action + torch.tensor([[0.3, 0.2, -0.1, 0.4], [-0.3, 0.0, 0.3, 0.0], [0.0] * 4], dtype=F64)
     flies = params.replace(mass=0.5, drag_height=0.04) if own else model.nominal
+    flies = flies.replace(rotor_effectiveness=[0.9, 1.0, 0.8, 1.0], rotor_direction=TILTED) if own else flies
     plant = tuple(getattr(flies, name).reshape(-1, 1).expand(-1, 3) for name in model.plant_fields) if own else ()
     rows = model.rows_step()(torch.cat([x.t() for x in state.values()]), model.setpoint_rows(action), plant, ())
     after = model.control_step(state, action, flies, None)
@@ -357,7 +391,10 @@ def test_with_respect_to_every_parameter_of_the_drone_also_through_resets(limit,
         state["step"] = torch.tensor([[3], [0], [7]])
     drag = {"drag_height": 0.02, "linear_drag": [0.3] * 3, "quadratic_drag": [0.05] * 3}  # it turns the drone
     own = env.params.replace(motor_time_constant=lag, rotor_speed_min=1300.0, rotor_speed_max=1850.0, **drag)
-    for name in sorted(set(env.dynamics.plant_fields) - {"rotor_spin"}):  # which is +1 or -1
+    if limit == 256:
+        places = torch.nn.functional.pad(own.rotor_positions, (0, 1), value=0.01)
+        own = own.replace(rotor_positions=places, rotor_direction=TILTED, rotor_effectiveness=[0.9, 1.0, 1.1, 0.8])
+    for name in sorted(own.fields().keys() & set(env.dynamics.plant_fields) - {"rotor_spin"}):  # which is +1 or -1
 
         def fly(x, name=name):
             env.params = own.replace(**{name: x})

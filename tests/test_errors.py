@@ -53,7 +53,7 @@ def test_an_unknown_option_is_refused_with_the_closest_one_and_all_of_them():
     ({"drone": visfly.replace(max_thrust_to_weight=0.8)}, "max_thrust_to_weight .* must be above 1 to hover; got"),
     (
         {"drone": visfly.replace(rotor_positions=[[0.1 * i, 0.03 * i] for i in (-3, -1, 1, 3)])},
-        "the four rotors cannot make thrust and torque about each axis on their own",
+        "its 4 rotors cannot control roll and pitch independently. It takes four or more with a torque about each axis",
     ),
     ({"drone": None}, "drone must be the name of a preset, .* or QuadrotorParams, got None"),
     ({"dtype": torch.int32}, "dtype must be torch.float32 or torch.float64"),

@@ -1,6 +1,7 @@
 """From flights to parameters: simulated flights whose truth is known, and a real one."""
 
 import dataclasses
+import gzip
 import json
 import re
 
@@ -247,7 +248,9 @@ def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
 
 
 def test_the_recipe_fits_a_real_flight_and_draws_it(launch, refused, tmp_path):
-    arguments = [f"logs=[{REAL}]", "mass=0.027", "fields=[linear_drag]", "iterations=1", "draws=5"]
+    (tmp_path / "own.csv").write_text(gzip.decompress(REAL.read_bytes()).decode().replace("pwr_pm_vbat", "volts"))
+    own = ["columns={battery_voltage: {names: [volts], scale: 1.0}}", "convention=crazyflie"]
+    arguments = [f"logs=[{tmp_path}/own.csv]", *own, "mass=0.027", "fields=[linear_drag]", "iterations=1", "draws=5"]
     assert "linear_drag.xy" in launch("identify", *arguments, f"folder={tmp_path}/fit")
     names = "checkpoint.json drone.yaml prediction.png randomization.yaml report.json residuals.png"
     assert sorted(path.name for path in (tmp_path / "fit").iterdir()) == names.split()

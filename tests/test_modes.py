@@ -119,7 +119,7 @@ def test_flights_have_exact_derivatives_with_delay_and_random_drones(control, dy
 
 @each_model
 def test_the_step_that_is_compiled_is_the_eager_step(control, dynamics):
-    env = HoveringEnv(num_envs=50, control=control, dynamics=dynamics, dtype=F64, dt=0.02)
+    env = HoveringEnv(num_envs=50, control=control, dynamics=dynamics, dtype=F64, dt=0.01, control_dt=0.01)
     model, action = env.dynamics, 1.2 * (2 * torch.rand(50, 4, dtype=F64) - 1)
     state = {name: x + 0.5 * torch.randn_like(x) for name, x in model.rest(torch.zeros(50, 3, dtype=F64)).items()}
     state["quaternion"] = quaternion.normalize(state["quaternion"])

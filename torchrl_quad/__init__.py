@@ -59,6 +59,7 @@ __all__ = [
     "register_envs",
     "register_task",
     "restart",
+    "suggest_gains",
 ]
 
 

@@ -43,7 +43,7 @@ class GymVectorEnv(VectorEnv):
 
     Observations are float32 (num_envs, k), clipped to the bounds of their space: the task's ``observation_bounds`` or
     1e6. With a ``camera`` they are a dictionary of ``observation`` and ``depth`` (num_envs, 1, height, width) [m].
-    Actions are floats (num_envs, 4), clipped to [-1, 1], rewards float64 (num_envs). ``info`` holds ``success``,
+    Actions are floats (num_envs, k), clipped to [-1, 1], rewards float64 (num_envs). ``info`` holds ``success``,
     ``crash``, ``reward_terms`` and ``metrics`` by name, each (num_envs), with a mask ``_name`` for every name.
 
     The time limit is the task's ``max_episode_steps``. ``reset(seed=...)`` seeds the one generator of all drones;
@@ -92,7 +92,7 @@ class GymVectorEnv(VectorEnv):
         if (camera := self.torchrl_env.camera) is not None:
             depth = Box(0.0, camera.range, (1, camera.height, camera.width), np.float32)
             self.single_observation_space = Dict({"observation": self.single_observation_space, "depth": depth})
-        self.single_action_space = Box(-1.0, 1.0, (4,), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, self.torchrl_env.hover_action.shape[-1:], np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.now: TensorDictBase | None = None  # the tensordict to step from
@@ -111,7 +111,7 @@ class GymVectorEnv(VectorEnv):
 
     @torch.no_grad()
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Fly one control step with actions (num_envs, 4)."""
+        """Fly one control step with actions (num_envs, k)."""
         env, over, info = self.torchrl_env, self._over, {}
         actions = check_action(actions, self.action_space)
         now = check_open(self, needed_by="A step")
@@ -216,7 +216,7 @@ class GymEnv(gymnasium.Env):
         return _row(observation, 0), _first(info)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Fly one control step with an action (4)."""
+        """Fly one control step with an action (k)."""
         observation, *ends, info = self._drones.step(check_action(action, self.action_space)[None])
         reward, terminated, truncated = (x.item() for x in ends)
         return _row(observation, 0), reward, terminated, truncated, _first(info)

@@ -94,7 +94,7 @@ class MPC(Controller):
         return tensordict.set("action", actions[0].clone())
 
     def goal(self, state: State) -> tuple[Tensor, Tensor]:
-        """The wanted states at the end of each step, (H, n, 17), and the actions (H, n, 4) that suit them."""
+        """The wanted states at the end of each step, (H, n, 17) with four rotors, and actions that suit them."""
         attitude = state["quaternion"]
         motion = follow(self.reference, state, self.times)
         force = (motion.acceleration + pad(self.nominal.gravity, (2, 0)).view(-1, 1, 3)).transpose(0, 1)
@@ -103,7 +103,8 @@ class MPC(Controller):
         turn = torch.cat((1.0 + (now * up).sum(-1, keepdim=True), torch.linalg.cross(now, up)), -1)
         wanted = quaternion.multiply(quaternion.normalize(turn), attitude.expand(*up.shape[:-1], 4))
         position, velocity = motion.position.transpose(0, 1), motion.velocity.transpose(0, 1)
-        goal = torch.cat((position, wanted, velocity, torch.zeros_like(up), torch.ones_like(wanted)), -1)
+        hovering = up.new_ones(*up.shape[:-1], self.sizes["rotor_speed"])
+        goal = torch.cat((position, wanted, velocity, torch.zeros_like(up), hovering), -1)
         thrust = self.nominal.mass * torch.linalg.vector_norm(force, dim=-1, keepdim=True)
         neutral = self.dynamics.controller.encode(pad(thrust, (0, 3))).clamp(-1.0, 1.0)
         return goal[1:], neutral[:-1]

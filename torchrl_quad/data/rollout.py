@@ -127,7 +127,8 @@ def _check_start(env: EnvBase, actor: TensorDictModuleBase, carry: TensorDictBas
             f"carry has batch size {tuple(carry.batch_size)}, and the environment {tuple(size)}. Start from "
             "the tensordict of its own reset(), or of its last rollout."
         )
-    for key in (key for key in actor.in_keys if key in carry and key in observed(env).keys(True, True)):
+    # Transforms have a precision of their own: TargetReturn resets in float32.
+    for key in (key for key in actor.in_keys if key in carry and key in observed(base_env(env)).keys(True, True)):
         x, spec = leaf(carry, key), observed(env)[key]
         if x.dtype != spec.dtype or (env.device is not None and x.device != env.device):
             raise UserValueError(

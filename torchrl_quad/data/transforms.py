@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import types
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, cast
 
@@ -13,6 +14,7 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 from torch.func import vjp
 from torchrl.envs import (
+    CatFrames,
     Compose,
     EnvBase,
     InitTracker,
@@ -34,6 +36,7 @@ from torchrl_quad.data.values import (
     ELEMENTWISE,
     OF_KEYS,
     OF_REWARDS,
+    Followed,
     Known,
     Value,
     elementwise,
@@ -41,6 +44,7 @@ from torchrl_quad.data.values import (
     inverse,
     written_by,
 )
+from torchrl_quad.engine.policy import ENDS
 from torchrl_quad.errors import UserValueError
 
 OUTER = "action_of_policy"  # before the transforms, where these change it on its way to the environment
@@ -52,6 +56,7 @@ class Flown(NamedTuple):
     transforms: list[Transform]
     known: Known
     policy: TensorDictModuleBase
+    memory: dict[Any, Value] = {}  # what transforms remember, as far as it is used; see :class:`Followed`
 
     def fly(self, env: EnvBase, actor: TensorDictModuleBase, start: TensorDictBase, horizon: int) -> Any:
         """The rollout as TorchRL's own loop writes it; None if ``start`` lacks what is counted or read."""
@@ -60,15 +65,31 @@ class Flown(NamedTuple):
         if any(key not in start for key in (*counted, *read)):
             return None
         options: dict[str, Any] = {"auto_reset": False, "break_when_any_done": False}
-        root = base_env(env).rollout(horizon, self.policy, tensordict=self.start(env, start), **options)
+        begin = self.start(env, start)
+        if any(key not in begin for key in self.memory):
+            return None
+        root = base_env(env).rollout(horizon, self.policy, tensordict=begin, **options)
         after = cast(TensorDictBase, root.pop("next"))
-        done = leaf(after, "done")
+        remembered = {key: (root.pop(key), after.pop(key))[1] for key in self.memory}
+        done, ends = leaf(after, "done"), root.pop(ENDS, None)
+        done = done if ends is None else done | (ends > 0)
         own = {*map(unravel_key, self.policy.out_keys), "is_init"}
         written = {key: root.pop(key) for key in own if key in root}
         memory = {key: after.pop(key) for key in ("is_init", *memory_keys(actor)) if key in after}
+        if remembered and not memory_keys(actor):
+            del written["is_init"], memory["is_init"]
+        frames = iter(x for key, x in remembered.items() if self.memory[key].kind == "frames")
         for transform in self.transforms:
             if isinstance(transform, COUNTERS):
                 _count(transform, root, after, start, done)
+            elif isinstance(transform, CatFrames):
+                for a, b in zip(transform.in_keys, transform.out_keys, strict=True):
+                    new, before = leaf(after, a), next(frames)
+                    size = new.shape[transform.dim]
+                    old = before.narrow(transform.dim, size, before.shape[transform.dim] - size)
+                    root.set(b, before)
+                    after.set(b, torch.cat((old, new), transform.dim))
+                    setattr(transform, f"_cat_buffers_{a}", leaf(after, b)[:, -1].detach().clone())
             elif not isinstance(transform, TensorDictPrimer):
                 root, after = transform._reset(start, root), transform._call(after)
         for key, value in self.known.items():  # the first step is that of the start
@@ -88,15 +109,19 @@ class Flown(NamedTuple):
         spec = {unravel_key(key): x for key, x in observed(base).items(True, True)}
         spec |= {key: base.full_done_spec[key] for key in base.done_keys}
         found = {key: leaf(entries, key) for key in map(unravel_key, base.state_keys)}
+        wanted = {*spec, *self.memory}
         for is_entry in (True, False):
             for key, value in self.known.items():
-                if value is not None and (value.kind == "entry") == is_entry and key in start:
+                if value is None or (value.kind == "entry") != is_entry or wanted.isdisjoint(value.sources()):
+                    continue
+                if key in start:
                     value.undo(leaf(start, key), found, spec)
         if not spec.keys() <= found.keys():  # a transform leaves some out
             again = base.reset(entries.select("state"), set_state=True)
             found |= {key: leaf(again, key) for key in spec.keys() - found.keys()}
         own = {unravel_key(key) for key in (*self.policy.in_keys, *self.policy.out_keys)}
         kept = start.select(*(key for key in own if key not in found and key != "action"), strict=False)
+        found = {key: x for key, x in found.items() if key in {*spec, *own}}
         return TensorDict(cast(Any, found), start.batch_size, start.device).update(kept)
 
 
@@ -107,17 +132,28 @@ class PolicyUnder(TensorDictModuleBase):
         policy: reads and writes what is outside.
         reads: how each entry that it reads follows from those inside.
         action: how the action inside follows from what it writes.
+        writes: what is written besides, of the entries inside.
+        memory: the shape, apart from n, of what it reads as it was written in the step before.
     """
 
-    def __init__(self, policy: TensorDictModuleBase, reads: dict[Any, Value], action: Value) -> None:
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        reads: dict[Any, Value],
+        action: Value,
+        writes: Mapping[Any, Value] = types.MappingProxyType({}),
+        memory: Mapping[Any, tuple[int, ...]] = types.MappingProxyType({}),
+    ) -> None:
         passed = [key for key in policy.in_keys if unravel_key(key) not in reads]
-        self.in_keys = [*dict.fromkeys([*(key for x in reads.values() for key in x.sources()), *passed])]
+        of_values = [key for x in (*reads.values(), *writes.values()) for key in x.sources()]
+        self.in_keys = [*dict.fromkeys([*of_values, *passed])]
         changes = action != Value("entry", "action")
         self.own = action.sources()[0]  # the key under which the policy writes its action
         self.out_keys = [OUTER if changes and unravel_key(key) == self.own else key for key in policy.out_keys]
-        self.out_keys += ["action"] if changes else []
+        self.out_keys += [*(["action"] if changes else []), *writes]
         super().__init__()
         self.policy, self.reads, self.action, self.changes = policy, reads, action, changes
+        self.writes, self.transform_memory = writes, memory
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the policy writes, and the action inside; all else stays as it is."""
@@ -129,6 +165,8 @@ class PolicyUnder(TensorDictModuleBase):
         if self.changes:
             outer = leaf(written, self.own)
             written = written.exclude(self.own).set(OUTER, outer).set("action", self.action.compute({self.own: outer}))
+        for key, value in self.writes.items():
+            written.set(key, value.compute({name: leaf(tensordict, name) for name in value.sources()}))
         return tensordict.update(written)
 
     def plain(self) -> Any:
@@ -136,7 +174,7 @@ class PolicyUnder(TensorDictModuleBase):
         make = getattr(self.policy, "plain", None)
         inner = make() if callable(make) else None
         if not hasattr(inner, "weight_gradient"):  # nothing, or actions that are given
-            return None if self.changes else inner
+            return None if self.changes or self.writes else inner
         return _PlainUnder(inner, self)
 
 
@@ -152,15 +190,16 @@ class _PlainUnder:
 
     def __init__(self, inner: Any, under: PolicyUnder) -> None:
         self.reads = [under.reads.get(unravel_key(key), Value("entry", unravel_key(key))) for key in inner.in_keys]
-        self.in_keys = [*dict.fromkeys(key for x in self.reads for key in x.sources())]
+        self.writes = dict(under.writes)
+        self.in_keys = [*dict.fromkeys(key for x in (*self.reads, *self.writes.values()) for key in x.sources())]
         self.action, self.own, self.size = under.action if under.changes else None, under.own, inner.size
         self.written = list(map(unravel_key, inner.out_keys))
         self.out_keys = [OUTER if self.action and key == self.own else key for key in self.written]
-        self.out_keys += ["action"] if self.action else []
+        self.out_keys += [*(["action"] if self.action else []), *self.writes]
         self.command = OUTER if self.action else "action"
-        values = [*self.reads, *([self.action] if self.action else [])]
+        values = [*self.reads, *self.writes.values(), *([self.action] if self.action else [])]
         self.signature = (inner.signature, *map(str, (self.out_keys, *(value.describe() for value in values))))
-        self.inner, self.count, self.memory = inner, len(inner.weights), inner.memory
+        self.inner, self.count, self.memory = inner, len(inner.weights), {**inner.memory, **under.transform_memory}
         self.constants = tuple(x for value in values for x in value.tensors())
 
     @property
@@ -173,9 +212,21 @@ class _PlainUnder:
         self.inner = copy.copy(self.inner)
         self.inner.weights, self.constants = weights[: self.count], weights[self.count :]
 
+    @property
+    def without_gradient(self) -> frozenset[Any]:
+        """What the policy reads that is made of nothing but such entries, and of what was remembered of them."""
+        return self.inner.without_gradient
+
+    @without_gradient.setter
+    def without_gradient(self, names: frozenset[Any]) -> None:
+        free = {key for key in self.in_keys if (key if isinstance(key, str) else key[0]) in names}
+        free |= self.memory.keys() - self.inner.memory.keys()
+        pairs = zip(self.inner.in_keys, self.reads, strict=True)
+        self.inner.without_gradient = frozenset(unravel_key(key) for key, x in pairs if free.issuperset(x.sources()))
+
     def fits(self, inputs: Sequence[Tensor]) -> bool:
         """Whether the policy can read what the transforms make of these."""
-        return self.inner.fits(self._read(self.weights, [x[:1] for x in inputs])[0])
+        return self.inner.fits(self._read(self.weights, [x[:1] for x in inputs])[: len(self.reads)])
 
     def drawn(self, steps: int, n: int, before: Mapping[Any, Tensor]) -> Tensor:
         """What the policy draws."""
@@ -193,12 +244,15 @@ class _PlainUnder:
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
     ) -> tuple[list[Tensor], dict[Any, Tensor]]:
         """What the policy keeps and writes."""
-        read, constants = self._read(weights, inputs)
-        kept, written = self.inner.forward(weights[: self.count], read, drawn)
+        constants = iter(weights[self.count :])
+        read = self._read(weights, inputs, constants)
+        kept, written = self.inner.forward(weights[: self.count], read[: len(self.reads)], drawn)
+        more = dict(zip(self.writes, read[len(self.reads) :], strict=True))
         if self.action is None:
-            return kept, written
+            return kept, {**written, **more}
         outer = written.pop(self.own)
-        return [*kept, outer], {**written, OUTER: outer, "action": self.action.compute({self.own: outer}, constants)}
+        action = self.action.compute({self.own: outer}, constants)
+        return [*kept, outer], {**written, OUTER: outer, "action": action, **more}
 
     def adjoint(
         self,
@@ -209,23 +263,32 @@ class _PlainUnder:
         grads: dict[Any, Tensor],
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """The gradients through policy and transforms."""
-        read, pull = vjp(lambda *x: tuple(self._read(weights, x)[0]), *inputs)[:2]
+        constants = iter(weights[self.count :])
+        read, pull = vjp(lambda *x: tuple(self._read(weights, x, constants)), *inputs)[:2]
+        own = {key: grads.get(key) for key in self.written}  # in the order in which the policy writes
         if self.action is not None:
-            action, (*kept, outer), constants = self.action, kept, self._read(weights, inputs)[1]
+            action, (*kept, outer) = self.action, kept
             (grad,) = vjp(lambda x: action.compute({self.own: x}, constants), outer)[1](grads["action"])
-            own = {key: grads[OUTER] + grad if key == self.own else grads.get(key) for key in self.written}
-            grads = cast(Any, own)  # in the order in which the policy writes
-        traces, of_read, of_drawn = self.inner.adjoint(weights[: self.count], read, kept, drawn, grads)
-        return traces, list(pull(tuple(of_read))), of_drawn
+            own[self.own] = grads[OUTER] + grad
+        traces, of_read, of_drawn = self.inner.adjoint(
+            weights[: self.count], read[: len(self.reads)], kept, drawn, cast(Any, own)
+        )
+        of_written = [grads[key] for key in self.writes]
+        return traces, list(pull((*of_read, *of_written))), of_drawn
 
     def weight_gradient(self, weights: Sequence[Tensor], traces: Sequence[Tensor]) -> list[Tensor]:
         """Those of the policy; constants have none."""
         return self.inner.weight_gradient(weights[: self.count], traces)
 
-    def _read(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> tuple[list[Tensor], Iterator[Tensor]]:
-        """What the policy reads, and the constants of its action."""
-        entries, constants = dict(zip(self.in_keys, inputs, strict=True)), iter(weights[self.count :])
-        return [value.compute(entries, constants) for value in self.reads], constants
+    def _read(
+        self, weights: Sequence[Tensor], inputs: Sequence[Tensor], constants: Iterator[Tensor] | None = None
+    ) -> list[Tensor]:
+        """What the policy reads, and what is written besides; it takes their constants."""
+        entries = dict(zip(self.in_keys, inputs, strict=True))
+        constants = iter(weights[self.count :]) if constants is None else constants
+        read = [value.compute(entries, constants) for value in (*self.reads, *self.writes.values())]
+        numbers = next(x.dtype for x in inputs if x.is_floating_point())  # networks join counters with these
+        return [x if x.is_floating_point() else x.to(numbers) for x in read]
 
 
 def transforms_of(env: EnvBase) -> list[Transform]:
@@ -282,20 +345,19 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
         return f"{type(base).__name__} has only TorchRL's own loop"
     memory = {unravel_key(key) for key in memory_keys(actor)}
     inside = (*observed(base).keys(True, True), *cast(Any, base).done_keys)
-    known: Known = {unravel_key(key): Value("entry", unravel_key(key)) for key in inside}
+    followed = Followed.begin(map(unravel_key, inside))
+    known, remembered = followed.known, followed.memory
     for transform in transforms:
         name, kind = type(transform).__name__, type(transform)
-        if kind is StepCounter and transform.max_steps is not None:
-            return "StepCounter(max_steps=...) ends episodes; give the environment max_episode_steps instead"
         if (
             kind is TensorDictPrimer
             and {unravel_key(key) for key in cast(Any, transform.primers).keys(True, True)} <= memory
         ):
             continue
-        if kind not in (*ELEMENTWISE, *OF_REWARDS, *COUNTERS, *OF_KEYS):
+        if kind not in (*ELEMENTWISE, *OF_REWARDS, *COUNTERS, *OF_KEYS, CatFrames):
             return f"{name} is none of the transforms that are pure functions of entries"
         try:
-            follow(transform, known)
+            follow(transform, followed)
         except (NotImplementedError, KeyError, RuntimeError) as error:
             return f"{name}: {error}"
     reads = {}
@@ -315,9 +377,19 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
                 actions[inner] = inverse(transform, x)
     if (action := actions.get("action")) is None or action.sources()[0] not in map(unravel_key, actor.out_keys):
         return "the policy writes no action that the transforms pass on"
-    if action == Value("entry", "action") and all(x == Value("entry", key) for key, x in reads.items()):
+    writes, used = {}, {key for x in reads.values() for key in x.sources()}
+    if limits := followed.limits:
+        writes[ENDS] = Value("limit", tuple(limits.values()), tuple(Value("entry", key) for key in limits))
+    used |= {*limits, *(key for key, x in remembered.items() if x.kind == "frames")}
+    for key in reversed(remembered):  # each is made of earlier ones
+        used |= {*remembered[key].sources()} if key in used else set()
+    remembered = {key: x for key, x in remembered.items() if key in used}
+    writes |= {("next", key): x for key, x in remembered.items()}
+    if not writes and action == Value("entry", "action") and all(x == Value("entry", key) for key, x in reads.items()):
         return Flown(transforms, known, actor)
-    return Flown(transforms, known, PolicyUnder(actor, reads, action))
+    spec = dict(observed(base).items(True, True)) if remembered else {}
+    sizes = {key: tuple(x.shape(spec)) for key, x in remembered.items()}
+    return Flown(transforms, known, PolicyUnder(actor, reads, action, writes, sizes), remembered)
 
 
 def _parts(transform: Transform) -> list[Transform]:
@@ -343,6 +415,9 @@ def _count(transform: Any, root: TensorDictBase, after: TensorDictBase, start: T
         elif isinstance(transform, StepCounter):
             root.set(key, torch.where(first < 0, leaf(start, key).unsqueeze(1) + steps, steps - first))
             after.set(key, leaf(root, key) + 1)
+            if transform.max_steps is not None:
+                ends = leaf(after, key) >= transform.max_steps
+                after.update({name: leaf(after, name) | ends for name in ("truncated", "done")})
         elif isinstance(transform, InitTracker):
             root.set(key, torch.cat((leaf(start, key).unsqueeze(1), begun[:, 1:]), 1))
             after.set(key, torch.zeros_like(done))

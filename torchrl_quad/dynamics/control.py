@@ -1,4 +1,4 @@
-"""The flight controllers, from an action to four rotor speeds: actions command rates, an attitude, rotors, or velocity.
+"""The flight controllers, from an action to rotor speeds: actions command rates, an attitude, rotors, or velocity.
 
 The outer loops need no tuning: a loop is half as quick as what it acts through, down to the rate loop of the drone.
 Loops in such a row are well damped, whatever their number (the damping optimum, Naslin 1968).
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchrl_quad.allocation import uncontrolled
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.parameters import QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import Rotors, drag, drag_moment, gyroscopic_torque, thrust_limits
@@ -53,19 +54,23 @@ class Setpoint(NamedTuple):
 class FlightController:
     """Rate controller and mixer, with a copy of the parameters of the nominal drone: ``control="rates"``.
 
+    The mixer is the inverse of the allocation of four rotors, and the pseudo-inverse of that of more: of all thrusts
+    that make a wrench those with the least sum of squares. It uses the force along body z and the torques: the lateral
+    force of tilted rotors pushes the drone, but is not commanded. All rotors count as whole.
+
     Raises:
         ValueError: the rotor layout cannot make thrust and torque about each axis, or the drone cannot hover.
     """
 
-    #: What the four entries of an action command, and in which unit.
+    #: What the entries of an action command, and in which unit.
     action_units = {"thrust": "N", "roll rate": "rad/s", "pitch rate": "rad/s", "yaw rate": "rad/s"}
     setpoint_type: type[Any] = Setpoint
     setpoint_sizes: tuple[int, ...] = (1, 3)
 
     def __init__(self, nominal: Nominal) -> None:
-        self.nominal = nominal = nominal.detach()
+        self.nominal = nominal = nominal.detach().replace(rotor_effectiveness=None)
         self.rotors = Rotors(nominal)
-        self.mixer = _inverse(self.rotors.allocation)
+        self.mixer = _inverse(self.rotors.allocation[..., :4, :])
         self.thrust_min, self.thrust_max = thrust_limits(nominal)
         self.gain = nominal.inertia * nominal.rate_gain
         self.knows_moment = bool((nominal.drag_height != 0).any())
@@ -84,29 +89,40 @@ class FlightController:
         self.offset = pad(weight.new_ones(1), (0, 3))
         self.scale = join(self.half_range, nominal.max_body_rate)
         self.hover_action = pad(2.0 / nominal.max_thrust_to_weight - 1.0, (0, 3))
-        _check_hover(nominal, self.hover_speed)
+        _check_hover(nominal, self.hover_speed, self.share)
+
+    def reach(self) -> Tensor:
+        """The greatest collective thrust without torque, (*, 1), in weights."""
+        return (self.middle + self.half_span) / (self.nominal.mass * self.nominal.gravity)
+
+    def spare_torque(self) -> Tensor:
+        """Torque (*, 3) [N m] about each axis that the rotors have at hover, to either side, at the same thrust."""
+        hover = self.rotors.thrust(self.hover_speed)
+        room = torch.minimum(self.thrust_max - hover, hover - self.thrust_min)
+        return (room.unsqueeze(-1) / self.mixer[..., 1:].abs().clamp_min(1e-30)).amin(-2)
 
     def unbind(self) -> FlightController:
         """The same on components: its numbers become constants of the code that is compiled with it."""
         apart = unbind_all(self, matrices=["mixer"])
-        fields = {k: unbind(x, constant=True) for k, x in self.nominal.fields().items() if k != "rotor_positions"}
+        used = "rotor_positions", "rotor_direction"  # in the allocation of the rotors
+        fields = {k: unbind(x, constant=True) for k, x in self.nominal.fields().items() if k not in used}
         apart.nominal, apart.rotors = RawParams(**fields), unbind_all(self.rotors, matrices=["allocation"])
         return apart
 
     def decode(self, action: Tensor) -> Tensor:
-        """What an action (*, 4) in [-1, 1] commands, in ``action_units``; values outside are clamped."""
+        """What an action (*, k) in [-1, 1] commands, in ``action_units``; values outside are clamped."""
         return (action.clamp(-1.0, 1.0) + self.offset) * self.scale
 
     def encode(self, command: Tensor) -> Tensor:
-        """The action (*, 4) for a command in ``action_units``; beyond the limits it lies outside [-1, 1]."""
+        """The action (*, k) for a command in ``action_units``; beyond the limits it lies outside [-1, 1]."""
         return command / self.scale - self.offset
 
     def setpoint(self, action: Tensor) -> Any:
-        """Decode an action (*, 4), for :meth:`command`."""
+        """Decode an action (*, k), for :meth:`command`."""
         return self.setpoint_type(*self.decode(action).split(self.setpoint_sizes, -1))
 
     def command(self, setpoint: Any, state: Any, wrench: Vector) -> Vector:
-        """Commanded rotor speed (*, 4) [rad/s] for a setpoint, the drone's state, and the present wrench (*, 4)."""
+        """Commanded rotor speed (*, n) [rad/s] for a setpoint, the drone's state, and the present wrench."""
         rates, moment = self.rate_setpoint(setpoint, state.quaternion, state.velocity), None
         if self.knows_moment:
             velocity_body = quaternion.rotate_inverse(state.quaternion, state.velocity)
@@ -120,7 +136,7 @@ class FlightController:
     def rotor_speed(
         self, setpoint: Setpoint, angular_velocity: Vector, wrench: Vector, moment: Vector | None = None
     ) -> Vector:
-        """Commanded rotor speed (*, 4) [rad/s] for a setpoint, the body rates (*, 3), and the present wrench (*, 4).
+        """Commanded rotor speed (*, n) [rad/s] for a setpoint, the body rates (*, 3), and the present wrench.
 
         Torque = J K (desired rate - rate) - D (angular acceleration) + w x J w, where the angular acceleration follows
         from the wrench that nominal rotors exert; the setpoint is held, so that the paper's derivative of the desired
@@ -128,14 +144,14 @@ class FlightController:
         """
         held = gyroscopic_torque(angular_velocity, self.nominal.inertia)
         held = held if moment is None else held - moment
-        acceleration = (wrench[..., 1:] - held) / self.nominal.inertia
+        acceleration = (wrench[..., 1:4] - held) / self.nominal.inertia
         torque = held.addcmul(self.gain, setpoint.body_rate - angular_velocity)
         torque = torque - self.nominal.rate_damping * acceleration
         thrust = matvec(self.mixer, cat(setpoint.thrust, torque))
         return self.rotors.speed(self._within_limits(thrust, setpoint.thrust, torque[..., 2:]))
 
     def _within_limits(self, thrust: Vector, collective: Vector, yaw_torque: Vector) -> Vector:
-        """The rotor thrusts (*, 4) [N] that can be flown, for what the mixer asks of them."""
+        """The rotor thrusts (*, n) [N] that can be flown, for what the mixer asks of them."""
         # Thrusts within the limits pass unchanged. Where a rotor saturates, the yaw torque shrinks; if that is not
         # enough the collective thrust moves to make room for roll and pitch, up as well as down (airmode); roll and
         # pitch shrink only where they need more than the whole range.
@@ -164,7 +180,13 @@ def join(*parts: Tensor) -> Tensor:
     return torch.cat([x.expand(*batch, x.shape[-1]) for x in parts], -1)
 
 
-def _check_hover(nominal: QuadrotorParams, speed: Tensor) -> None:
+def _check_hover(nominal: QuadrotorParams, speed: Tensor, share: Tensor) -> None:
+    if not (share > 0).all():
+        raise UserValueError(
+            f"drone: to hover, its rotors would have to carry {shown(share.tolist())} of the weight each, and each "
+            "must carry a part. Put the centre of mass, x = y = 0, between the rotors of rotor_positions, and let "
+            "rotor_direction point up."
+        )
     low, high, most = nominal.rotor_speed_min, nominal.rotor_speed_max, nominal.max_thrust_to_weight
     if not ((low < speed) & (speed < high)).all():
         raise UserValueError(
@@ -178,15 +200,14 @@ def _check_hover(nominal: QuadrotorParams, speed: Tensor) -> None:
 
 
 def _inverse(allocation: Tensor) -> Tensor:
-    # Rounding makes rotors on one line look invertible: with rows of one length drones have conditions below 100.
-    rows = allocation.double()
-    rows = rows / rows.norm(dim=-1, keepdim=True).clamp_min(1e-30)
-    if not (torch.linalg.cond(rows) < 1e4).all():
+    if axes := uncontrolled(allocation.double().cpu().numpy()):
         raise UserValueError(
-            "drone: with these rotor_positions and rotor_spin the four rotors cannot make thrust and torque about each "
-            "axis on their own. Put them off one line, and let two of them spin each way."
+            f"drone: its {allocation.shape[-1]} rotors cannot control {axes} independently. It takes four "
+            "or more with a torque about each axis on its own: put them off one line, let some spin each way "
+            "(rotor_spin), or tilt them (rotor_direction)."
         )
-    return torch.linalg.inv_ex(allocation)[0]
+    four = allocation.shape[-1] == 4
+    return torch.linalg.inv_ex(allocation)[0] if four else torch.linalg.pinv(allocation.double()).to(allocation)
 
 
 class AttitudeSetpoint(NamedTuple):
@@ -200,7 +221,7 @@ class AttitudeSetpoint(NamedTuple):
 class RotorSetpoint(NamedTuple):
     """What an action of ``control="rotor_thrusts"`` asks for."""
 
-    thrust: Vector  #: (*, 4) [N], of each rotor
+    thrust: Vector  #: (*, n) [N], of each of n rotors
 
 
 class VelocitySetpoint(NamedTuple):
@@ -267,16 +288,17 @@ class RotorThrustController(FlightController):
     rotor cannot give is cut off.
     """
 
-    action_units = {f"rotor {i}": "N" for i in (1, 2, 3, 4)}
-    setpoint_type, setpoint_sizes = RotorSetpoint, (4,)
+    setpoint_type = RotorSetpoint
 
     def __init__(self, nominal: Nominal) -> None:
         super().__init__(nominal)
-        self.offset, self.scale = self.offset.new_ones(4), self.half_range * self.share
-        self.hover_action = self.hover_action[..., :1].expand(*self.hover_action.shape).contiguous()
+        n = self.share.shape[-1]
+        self.action_units, self.setpoint_sizes = {f"rotor {i + 1}": "N" for i in range(n)}, (n,)
+        self.offset, self.scale = self.offset.new_ones(n), self.half_range * self.share
+        self.hover_action = self.hover_action[..., :1].repeat_interleave(n, -1)
 
     def command(self, setpoint: RotorSetpoint, state: Any, wrench: Vector) -> Vector:
-        """Commanded rotor speed (*, 4) [rad/s]."""
+        """Commanded rotor speed (*, n) [rad/s]."""
         return self.rotors.speed(clamp(setpoint.thrust, self.thrust_min, self.thrust_max))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, Protocol
 
@@ -10,15 +12,13 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Nominal, RotorThrustController, make_controller
+from torchrl_quad.dynamics.gains import PhysicsStep, check_flown, check_gains
 from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import INTEGRATORS, Integrator, RigidBodyState, Rotors, accelerations, drag
 from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, clamp, stack
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import DroneWarning, UserValueError
 from torchrl_quad.options import between, checked
 
-# [s]. In a shorter step a drone at 1 m/s does not move in single precision; with a longer one the rate loop of no drone
-# that ships is stable.
-PhysicsStep = Annotated[float, between(1e-6, 0.1)]
 Substeps = Annotated[int, between(1, 200)]
 
 
@@ -38,9 +38,11 @@ class Dynamics(Protocol):
     plant_fields: tuple[str, ...]
     #: Greatest absolute values of its own entries, beyond which the numbers mean nothing and the episode ends.
     limits: dict[str, Tensor]
+    #: Entries that follow the command within a control step, so that nothing else can hold them; it may leave this out.
+    commanded: tuple[str, ...]
     nominal: QuadrotorParams  #: the drone that the controller is built for
-    hover_action: Tensor  #: (4), holds the nominal drone where it is; (num_envs, 4) where drones differ in it
-    action_units: dict[str, str]  #: the four entries of an action by name, with their units; a model may leave this out
+    hover_action: Tensor  #: (k), holds the nominal drone where it is; (num_envs, k) where drones differ in it
+    action_units: dict[str, str]  #: the entries of an action by name, with their units; a model may leave this out
     substeps: int  #: physics steps in a control step
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
@@ -49,16 +51,16 @@ class Dynamics(Protocol):
     def control_step(
         self, state: dict[str, Tensor], action: Tensor, params: QuadrotorParams, wind: Tensor | None
     ) -> dict[str, Tensor]:
-        """Its entries (n, k) after a control step under an action (n, 4): the drone ``params`` in the wind (n, 3)."""
+        """Its entries (n, k) after a control step under an action (n, k): the drone ``params`` in the wind (n, 3)."""
 
     def setpoint_rows(self, action: Tensor) -> Tensor:
-        """What an action (n, 4) asks for, as rows (k, n) that ``rows_step`` reads."""
+        """What an action (n, k) asks for, as rows (k, n) that ``rows_step`` reads."""
 
     def rows_step(self) -> Callable[..., Tensor]:
         """One physics step for a compiler: ``step(x, setpoint, plant, wind)``, which returns the next ``x``.
 
-        ``x`` are the state's entries below each other (rows, n). ``plant`` are the ``plant_fields`` as rows (k, n), or
-        empty for the nominal drone. ``wind`` holds one tensor (3, n) or none.
+        ``x`` are the state's entries below each other (rows, n). ``plant`` are the ``plant_fields`` as rows (k, n),
+        what is None as no rows, (0, n); or empty for the nominal drone. ``wind`` holds one tensor (3, n) or none.
         """
 
 
@@ -74,6 +76,7 @@ class ControlledModel:
 
     sizes: dict[str, int]
     plant_fields: tuple[str, ...]
+    commanded: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -91,7 +94,10 @@ class ControlledModel:
         self.finish()
 
     def finish(self) -> None:
-        """What a model adds to its construction: its limits, or a refusal of what it cannot fly."""
+        """What a model adds to its construction: its limits, or a refusal of what it cannot fly.
+
+        A method ``check_flown(params)`` can refuse another drone that is to fly.
+        """
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
         """Level and still, at the positions (n, 3) [m]."""
@@ -111,7 +117,7 @@ class ControlledModel:
     def control_step(
         self, state: dict[str, Tensor], action: Tensor, params: QuadrotorParams, wind: Tensor | None
     ) -> dict[str, Tensor]:
-        """The entries of the drone after a control step, which holds the action (n, 4) in [-1, 1]."""
+        """The entries of the drone after a control step, which holds the action (n, k) in [-1, 1]."""
         setpoint, plant = self.controller.setpoint(action), self.plant(params, self.controller)
         entries: Sequence[Tensor] = [state[name] for name in self.sizes]
         for _ in range(self.substeps):
@@ -119,7 +125,7 @@ class ControlledModel:
         return dict(zip(self.sizes, entries, strict=True))
 
     def setpoint_rows(self, action: Tensor) -> Tensor:
-        """What an action (n, 4) asks of the controller, as rows (k, n)."""
+        """What an action (n, k) asks of the controller, as rows (k, n)."""
         return torch.cat([x.t() for x in self.controller.setpoint(action)])
 
     def rows_step(self) -> Callable[..., Tensor]:
@@ -131,7 +137,8 @@ class ControlledModel:
             wanted = controller.setpoint_type(*Components(setpoint.unbind()).split(controller.setpoint_sizes, -1))
             params = controller.nominal
             if plant:
-                params = RawParams(**{k: Components(v.unbind()) for k, v in zip(self.plant_fields, plant, strict=True)})
+                named = zip(self.plant_fields, plant, strict=True)
+                params = RawParams(**{k: Components(v.unbind()) for k, v in named if len(v)})
             air = Components(wind[0].unbind()) if wind else None
             return stack(cat(*self.physics_step(state, wanted, self.plant(params, controller), controller, air)))
 
@@ -139,13 +146,13 @@ class ControlledModel:
 
 
 class QuadrotorState(NamedTuple):
-    """A rigid body with four turning rotors."""
+    """A rigid body with n turning rotors."""
 
     position: Vector  #: (*, 3) [m], world frame
     quaternion: Vector  #: (*, 4), body to world, unit norm
     velocity: Vector  #: (*, 3) [m/s], world frame
     angular_velocity: Vector  #: (*, 3) [rad/s], body frame
-    rotor_speed: Vector  #: (*, 4) [rad/s]
+    rotor_speed: Vector  #: (*, n) [rad/s]
 
 
 class Quadrotor(ControlledModel):
@@ -156,15 +163,32 @@ class Quadrotor(ControlledModel):
     """
 
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3, "rotor_speed": 4}
-    plant_fields = PLANT_FIELDS
+    plant_fields, commanded = PLANT_FIELDS, ("rotor_speed",)
 
     def finish(self) -> None:
-        """Limit the rotor speeds."""
+        """Count the rotors, limit their speeds, and refuse or question what such steps, or the rotors, do not fly."""
+        self.sizes = {**self.sizes, "rotor_speed": self.nominal.rotor_spin.shape[-1]}
         self.limits = {"rotor_speed": 2.0 * self.nominal.rotor_speed_max}
+        if not isinstance(self.controller, RotorThrustController):
+            check_gains(self.controller, self.dt, self.substeps)
+        asked, reach = self.nominal.max_thrust_to_weight, self.controller.reach()
+        if (asked > reach * (1.0 + 1e-5)).any():
+            warnings.warn(
+                f"drone: full throttle commands max_thrust_to_weight={asked.max():.4g}, and the rotors reach "
+                f"{reach.min():.4g} times the weight. Actions above that do nothing and have no gradient. Write "
+                f"max_thrust_to_weight: {math.floor(1e3 * reach.min()) / 1e3:g}.",
+                DroneWarning,
+                stacklevel=2,
+            )
+
+    def check_flown(self, params: QuadrotorParams) -> None:
+        """Refuse a drone with which the rate loop is unstable."""
+        if not isinstance(self.controller, RotorThrustController):
+            check_flown(self.nominal, params, self.dt)
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
         """Level, still, rotors at hover speed, at the positions (n, 3) [m]."""
-        return {**super().rest(position), "rotor_speed": self.controller.hover_speed.expand(len(position), 4).clone()}
+        return {**super().rest(position), "rotor_speed": self.controller.hover_speed.expand(len(position), -1).clone()}
 
     def plant(self, params: QuadrotorParams, controller: FlightController) -> tuple[QuadrotorParams, Rotors]:
         """The parameters and the rotors."""
@@ -199,7 +223,7 @@ class PointMass(ControlledModel):
     """
 
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}
-    plant_fields = ("mass", "linear_drag", "quadratic_drag", "gravity")
+    plant_fields, commanded = ("mass", "linear_drag", "quadratic_drag", "gravity"), ("angular_velocity",)
 
     def finish(self) -> None:
         """Refuse what it cannot fly."""

@@ -1,25 +1,25 @@
 """The body: rotors that make a wrench, Newton and Euler with drag (the paper's section III-B), and integrators.
 
-A wrench is (*, 4): collective thrust [N] along body z, then torque [N m] about body x, y, z. The integrators are of
-order 1, 1 and 4 under a prescribed wrench, and of order 1 with controller and rotors in the loop, since the wrench is
-held over each physics step.
+A wrench is (*, 4): collective thrust [N] along body z, then torque [N m] about body x, y, z. That of tilted rotors is
+(*, 6), with the force [N] along body x and y behind. The integrators are of order 1, 1 and 4 under a prescribed wrench,
+and of order 1 with controller and rotors in the loop, since the wrench is held over each physics step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.parameters import QuadrotorParams
-from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, cross, matvec, where_positive
+from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, cross, larger, matvec, where_positive
 
 
 class Rotors:
-    """The four rotors of a drone, with what follows from its parameters worked out once.
+    """The n rotors of a drone, with what follows from its parameters worked out once.
 
     The thrust map k2 w^2 + k1 w + k0 (paper, section III-B) is kept as k2 (w - w0)^2 + f0, which is quick both ways.
     """
@@ -29,29 +29,31 @@ class Rotors:
         self.curvature = k2
         self.vertex_speed = -k1 / (k2 * 2.0)
         self.vertex_thrust = k0 - k1 * k1 / (k2 * 4.0)
-        self.least_root = (params.rotor_speed_max - self.vertex_speed).square() * 1e-6
+        self.side = k2.sign()  # of the vertex on which speeds lie: above the lowest point, or below the highest
+        far = (params.rotor_speed_max - self.vertex_speed).square()
+        self.least_root = larger(far, (params.rotor_speed_min - self.vertex_speed).square()) * 1e-6
         self.time_constant = params.motor_time_constant
         self.allocation = allocation_matrix(params)
 
     def thrust(self, speed: Vector) -> Vector:
-        """Rotor thrust (*, 4) [N] at the rotor speed (*, 4) [rad/s]."""
+        """Thrust (*, n) [N] of whole rotors at the rotor speed (*, n) [rad/s]."""
         return self.vertex_thrust.addcmul(self.curvature, (speed - self.vertex_speed).square())
 
     def speed(self, thrust: Vector) -> Vector:
-        """Rotor speed (*, 4) [rad/s] that gives the thrust (*, 4) [N]: the inverse of :meth:`thrust`.
+        """Rotor speed (*, n) [rad/s] that gives the thrust (*, n) [N]: the inverse of :meth:`thrust`.
 
-        Next to the lowest point of the thrust map, where the slope of the inverse is infinite, the speed is held one
-        thousandth of its range above that point, so that derivatives stay finite.
+        Next to the vertex of the thrust map, where the slope of the inverse is infinite, the speed is held one
+        thousandth of its range away from that point, so that derivatives stay finite.
         """
         squared = (thrust - self.vertex_thrust) / self.curvature
-        return squared.maximum(self.least_root).sqrt() + self.vertex_speed
+        return self.vertex_speed.addcmul(self.side, squared.maximum(self.least_root).sqrt())
 
     def wrench(self, speed: Vector) -> Vector:
-        """The wrench (*, 4) on the body at the rotor speeds (*, 4) [rad/s]."""
+        """The wrench (*, 4 or 6) on the body at the rotor speeds (*, n) [rad/s]."""
         return matvec(self.allocation, self.thrust(speed))
 
     def follow(self, speed: Vector, commanded: Vector, dt: float) -> Vector:
-        """Rotor speed (*, 4) after dt [s] of first-order lag towards a constant command: exact for any dt."""
+        """Rotor speed (*, n) after dt [s] of first-order lag towards a constant command: exact for any dt."""
         remains = (-dt / self.time_constant).exp()
         if remains.shape[-1] > 1:  # one rotor speeds up at the pace of the first, and slows down at that of the second
             remains = where_positive(commanded - speed, remains[..., :1], remains[..., 1:])
@@ -65,13 +67,32 @@ def thrust_limits(params: QuadrotorParams) -> tuple[Tensor, Tensor]:
 
 
 def allocation_matrix(params: QuadrotorParams) -> Vector:
-    """The matrix (*, 4, 4) from four rotor thrusts f to a wrench: of torque, r x F = (y f, -x f), and kappa s f."""
+    """The matrix (*, 4, n), or (*, 6, n) for tilted rotors, from the thrusts f of n whole rotors to a wrench.
+
+    The force of a rotor is F = f d, with d its direction, and its torque r x F + kappa s F: upright (y f, -x f,
+    kappa s f). ``rotor_effectiveness`` multiplies both.
+    """
     yaw = params.yaw_torque_coefficient * params.rotor_spin
-    if isinstance(yaw, Components):  # then the positions are (x, y, x, y, ...)
-        x, y = params.rotor_positions[..., 0::2], params.rotor_positions[..., 1::2]
-        return Components([Components([1.0]), y, -x, yaw])
-    x, y = params.rotor_positions.unbind(-1)
-    return torch.stack(torch.broadcast_tensors(torch.ones_like(x), y, -x, yaw), -2)
+    x, y, *height = _columns(params.rotor_positions, params.rotor_spin)
+    one: Any = Components([1.0]) if isinstance(yaw, Components) else torch.ones_like(x)
+    rows = [one, y, -x, yaw]
+    if params.rotor_direction is not None:
+        u, v, w = _columns(params.rotor_direction, params.rotor_spin)
+        shorten = (u * u + v * v + w * w).clamp_min(1e-12).rsqrt()
+        u, v, w = u * shorten, v * shorten, w * shorten
+        z = height[0] if height else x * 0.0
+        rows = [w, y * w - z * v + yaw * u, z * u - x * w + yaw * v, x * v - y * u + yaw * w, u, v]
+    if params.rotor_effectiveness is not None:
+        rows = [row * params.rotor_effectiveness for row in rows]
+    return Components(rows) if isinstance(yaw, Components) else torch.stack(torch.broadcast_tensors(*rows), -2)
+
+
+def _columns(matrix: Vector, spin: Vector) -> Sequence[Vector]:
+    """The columns, each (*, n), of a matrix (*, n, k); its components are the entries of one row after another."""
+    if isinstance(matrix, Components):
+        k = matrix.shape[-1] // spin.shape[-1]
+        return [matrix[..., i::k] for i in range(k)]
+    return matrix.unbind(-1)
 
 
 class RigidBodyState(NamedTuple):
@@ -105,17 +126,18 @@ def gyroscopic_torque(angular_velocity: Vector, inertia: Vector) -> Vector:
 def accelerations(
     state: RigidBodyState, wrench: Vector, params: QuadrotorParams, wind: Vector | None = None
 ) -> tuple[Vector, Vector]:
-    """Linear acceleration (world frame) and angular acceleration (body frame), each (*, 3), under a wrench (*, 4).
+    """Linear acceleration (world frame) and angular acceleration (body frame), each (*, 3), under a wrench.
 
     Drag acts on the velocity relative to the wind (*, 3) [m/s], world frame; None is still air. It acts ``drag_height``
     above the centre of mass, so that a drone that flies forward is pitched up.
     """
     airspeed = state.velocity if wind is None else state.velocity - wind
-    air, torque = drag(quaternion.rotate_inverse(state.quaternion, airspeed), params), wrench[..., 1:]
+    air, torque = drag(quaternion.rotate_inverse(state.quaternion, airspeed), params), wrench[..., 1:4]
+    push = along_z(wrench[..., :1]) if wrench.shape[-1] == 4 else cat(wrench[..., 4:], wrench[..., :1])
     height = params.drag_height.components[0] if isinstance(params.drag_height, Components) else None
     if not (isinstance(height, float) and height == 0.0):  # compiled code of such a drone has no moment
         torque = torque + drag_moment(air, params)
-    linear = quaternion.rotate(state.quaternion, (air + along_z(wrench[..., :1])) / params.mass)
+    linear = quaternion.rotate(state.quaternion, (air + push) / params.mass)
     angular = (torque - gyroscopic_torque(state.angular_velocity, params.inertia)) / params.inertia
     return linear - along_z(params.gravity), angular
 

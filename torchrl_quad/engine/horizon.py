@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_quad.engine.packing import Record, flat, like, looks_are_free, nested
-from torchrl_quad.engine.policy import GivenActions, PlainPolicy
+from torchrl_quad.engine.policy import ENDS, GivenActions, PlainPolicy
 from torchrl_quad.engine.program import policy_inputs
 from torchrl_quad.engine.simulation import State
 from torchrl_quad.engine.stepper import Stepper
@@ -43,8 +43,9 @@ def can_fly(stepper: Stepper, policy: Any, tensordict: TensorDictBase) -> bool:
     memory = _memory(policy)
     writes |= {*memory, "is_init"} if memory else set()
     given = set(tensordict.keys(True, True))
-    knows = reads <= state | needed | writes and "action" in writes
-    return knows and needed <= given <= state | needed | writes
+    # The reward of the step before is nothing that a policy finds in TorchRL's loop; transforms hand it on.
+    known = state | needed | writes | ({"reward"} & given & reads)
+    return reads <= known and "action" in writes and needed <= given <= known
 
 
 def flies_inside(stepper: Stepper, policy: Any) -> bool:
@@ -84,14 +85,16 @@ class _Loop:
         own = (*policy.out_keys, *self.memory, "is_init")
         # What the policy has written in the step before.
         self.before = _entries(tensordict, [key for key in own if key in tensordict and key != "action"])
-        for key in self.memory if {"is_init", *self.memory} <= self.before.keys() else ():
+        # What transforms remember is as it was given; the memory of a network is empty where an episode begins.
+        cleared = [key for key in self.memory if key not in getattr(policy, "transform_memory", ())]
+        for key in cleared if {"is_init", *cleared} <= self.before.keys() else ():
             self.before[key] = torch.where(like(self.before["is_init"], self.before[key]), 0.0, self.before[key])
 
     def inside(self, acts: PlainPolicy | GivenActions, start: Record, valid: Tensor, steps: int) -> tuple[Entries, ...]:
         """With a policy that acts inside the compiled step."""
 
-        def restarted(end: Record) -> tuple[Record, Tensor] | None:
-            done = self.done(end)
+        def restarted(end: Record, ends: Tensor | None) -> tuple[Record, Tensor] | None:
+            done = self.done(end, ends)
             return (self.restarted(end, done), done[0]) if _may_restart(done) else None
 
         flight = self.stepper.fly(acts, start, valid, steps, self.source.noise, restarted, self.before)
@@ -125,7 +128,7 @@ class _Loop:
             written.append(now)
             ends.append(end)
             valid = torch.ones_like(valid) if t == 0 else valid  # a step leads to meaningful states
-            done = self.done(end)
+            done = self.done(end, now.get(ENDS))
             self.hand_on(now, done.t())
             roots.append(self.restarted(end, done) if t < steps - 1 and _may_restart(done) else end)
         return self.entries(_stacked(roots[:-1])), self.entries(_stacked(ends), "next"), _over_time(written)
@@ -133,12 +136,14 @@ class _Loop:
     def eager(self, state: State, outputs: Entries, valid: Tensor, steps: int) -> tuple[Entries, ...]:
         """Without a compiler, on entries: each is a tensor of its own anyway."""
         roots, ends, written = [_of_state(state) | outputs], [], []
+        reward = torch.zeros_like(outputs["observation"][:, :1])
         for t in range(steps):
-            action, now = self.act(roots[-1], state)
+            action, now = self.act({**roots[-1], "reward": reward}, state)
             state, outputs = self.stepper.step(state, valid, action, self.source.noise())
             written.append(now)
             ends.append(_of_state(state) | flat(outputs))
-            done = outputs["done"]
+            done, reward = outputs["done"], outputs["reward"]
+            done = done | (now[ENDS] > 0) if ENDS in now else done
             self.hand_on(now, done)
             valid = torch.ones_like(valid) if t == 0 else valid  # a step leads to meaningful states
             root = {key: x for key, x in ends[-1].items() if key != "reward"}
@@ -181,9 +186,10 @@ class _Loop:
             self.before[key] = torch.where(like(done, x), 0.0, x) if _may_restart(done) else x
         self.before["is_init"] = done
 
-    def done(self, end: Record) -> Tensor:
-        """Where an episode ends, bool (1, n)."""
-        return end.outputs[self.kind][self.done_row]
+    def done(self, end: Record, ends: Tensor | None) -> Tensor:
+        """Where an episode ends, bool (1, n), also where the policy ends it, (n, 1)."""
+        done = end.outputs[self.kind][self.done_row]
+        return done if ends is None else done | (ends > 0).t()
 
     def record(self, state: State, outputs: Entries) -> Record:
         """What is known of a state, on rows; there is no reward before the first step."""
@@ -211,10 +217,9 @@ def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | GivenActions | None:
     acts = make() if stepper.is_compiled and callable(make) else None
     if acts is None:
         return None
-    if hasattr(acts, "without_gradient"):
-        acts.without_gradient = stepper.simulation.constants
+    acts.without_gradient = stepper.simulation.constants
     known = {"observation", *acts.memory, *stepper.output_layout.place, *map(_in_state, stepper.layout.place)}
-    if not set(map(unravel_key, acts.in_keys)) <= known - {"reward"}:
+    if not set(map(unravel_key, acts.in_keys)) <= known:
         return None
     at, n = stepper.example, len(stepper.example.observation)
     memory = {key: at.observation.new_zeros((n, *size)) for key, size in acts.memory.items()}

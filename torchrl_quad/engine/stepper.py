@@ -11,7 +11,7 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 
 from torchrl_quad.engine.packing import Layout, Record, Rows, flat, like, nested, record
-from torchrl_quad.engine.policy import GivenActions, PlainPolicy
+from torchrl_quad.engine.policy import ENDS, GivenActions, PlainPolicy
 from torchrl_quad.engine.program import PolicyProgram, StepProgram, name_in_state, policy_inputs
 from torchrl_quad.engine.simulation import Simulation, State, Transition
 from torchrl_quad.errors import Unsupported
@@ -78,7 +78,7 @@ class Stepper:
         valid: Tensor,
         steps: int,
         noise: Callable[[], dict[str, Tensor]],
-        restarted: Callable[[Record], tuple[Record, Tensor] | None] = lambda end: None,
+        restarted: Callable[[Record, Tensor | None], tuple[Record, Tensor] | None] = lambda end, ends: None,
         before: Mapping[Any, Tensor] | None = None,
     ) -> Flight:
         """A compiled horizon with its graph, as one node.
@@ -90,7 +90,8 @@ class Stepper:
         Args:
             valid: where the start is meaningful, bool (n); elsewhere the episode ends with the first step.
             noise: gives what each disturbance has drawn for the next step, by name.
-            restarted: from the end of a step where to continue, and who restarts, bool (n); None if nobody does.
+            restarted: from the end of a step, and where the policy ends an episode with it, (n, 1) or None:
+                where to continue, and who restarts, bool (n); None if nobody does.
             before: what the policy has written in the step before.
         """
         assert self.options is not None  # only a compiled stepper flies horizons
@@ -128,7 +129,7 @@ class Horizon(NamedTuple):
     valid: Tensor
     steps: int
     noise: Callable[[], dict[str, Tensor]]
-    restarted: Callable[[Record], tuple[Record, Tensor] | None]
+    restarted: Callable[[Record, Tensor | None], tuple[Record, Tensor] | None]
     restarts: list[tuple[int, Record, Tensor]]  # to be filled
 
 
@@ -142,7 +143,7 @@ class _Horizon(torch.autograd.Function):
         policy.weights, parameters = others[first : first + count], others[first + count :]
         states_start, outputs_start = horizon.start.state, horizon.start.outputs
         at = Record(Rows(floats, *states_start[1:]), Rows(outputs, *outputs_start[1:]), observation)
-        valid, saved, ends, entries = horizon.valid, [], [], []
+        valid, saved, all_ends, entries = horizon.valid, [], [], []
         leaves = written = ()
         for t in range(horizon.steps):
             inputs = policy.inputs(at, remembered)
@@ -158,11 +159,12 @@ class _Horizon(torch.autograd.Function):
             remembered = {key: written[place].contiguous() for key, place in memory.items()}
             if keeps:
                 saved.append((start, states, inputs, kept, drawn[t]))
-            ends.append(leaves)
+            all_ends.append(leaves)
             entries.append(written)
             if t == 0:
                 valid = torch.ones_like(valid)  # a step leads to meaningful states
-            if t < horizon.steps - 1 and (again := horizon.restarted(at)) is not None:
+            ends = None if policy.ends is None else written[policy.ends]
+            if t < horizon.steps - 1 and (again := horizon.restarted(at, ends)) is not None:
                 horizon.restarts.append((t, *again))
                 at = again[0]
                 remembered = {key: torch.where(like(again[1], x), 0.0, x) for key, x in remembered.items()}
@@ -173,9 +175,9 @@ class _Horizon(torch.autograd.Function):
             *policy.weights, *(x for parts in saved for part in (*parts[:4], parts[4:]) for x in part)
         )
         ctx.set_materialize_grads(False)
-        stacked = [_stack(x, 0) for x in zip(*(leaves[:6] for leaves in ends), strict=True)]
+        stacked = [_stack(x, 0) for x in zip(*(leaves[:6] for leaves in all_ends), strict=True)]
         ctx.mark_non_differentiable(*stacked[1:3], *stacked[4:6])
-        observations = _stack([leaves[6] for leaves in ends], 1)
+        observations = _stack([leaves[6] for leaves in all_ends], 1)
         return *stacked, observations, *(_stack(x, 1) for x in zip(*entries, strict=True))
 
     @staticmethod
@@ -235,6 +237,7 @@ class _Policy:
         place = {unravel_key(key): i for i, key in enumerate(self.policy.out_keys)}
         self.action, self.command = place["action"], place[getattr(self.policy, "command", "action")]
         self.memory = {key: place[unravel_key(("next", key))] for key in self.policy.memory}
+        self.ends = place.get(ENDS)
         self.steps: list[Sequence[Tensor]] = []  # whose gradient in the weights is still to be taken
         self.total: list[Tensor] | None = None
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_quad.dynamics import QuadrotorParams, load_drone
-from torchrl_quad.dynamics.model import PhysicsStep
+from torchrl_quad.dynamics.gains import PhysicsStep
 from torchrl_quad.dynamics.rigid_body import Integrator
 from torchrl_quad.engine import Stepper, can_fly, flies_inside, fly, has_compiler, nested
 from torchrl_quad.engine.simulation import State
@@ -26,8 +26,18 @@ from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, check_value, checked
 
 
+class _Build(type(EnvBase)):
+    def __call__(cls, *args: Any, auto_reset: bool = False, **kwargs: Any) -> Any:
+        if auto_reset:  # TorchRL would wrap it, and no episode would ever begin again
+            raise UserValueError(
+                "auto_reset=True is for environments that reset themselves in the step that ends an episode, and this "
+                "one waits for a reset. Leave it out: rollouts and collectors reset where an episode ends."
+            )
+        return super().__call__(*args, **kwargs)
+
+
 @checked
-class QuadrotorEnv(Task, EnvBase):
+class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
     """Base of all tasks: a batch of quadrotors, stateless and differentiable.
 
     A step is a pure function of its tensordict. The complete Markov state is in ``"state"``, and gradients flow from
@@ -49,8 +59,8 @@ class QuadrotorEnv(Task, EnvBase):
         drone: name of a preset, path of a YAML file, mapping, or :class:`~torchrl_quad.QuadrotorParams`.
         dynamics: "quadrotor", or "point_mass", whose thrust and body rates follow the action at once.
         control: what an action (4) in [-1, 1] commands: "rates" (thrust, body rates), "attitude" (thrust, roll, pitch,
-            yaw rate), "rotor_thrusts", "velocity" (and yaw rate), or a mapping with limits, such as {mode: velocity,
-            max_speed: 5.0}. See ``docs/actions.md``.
+            yaw rate), "rotor_thrusts" (n, of n rotors), "velocity" (and yaw rate), or a mapping with limits, such as
+            {mode: velocity, max_speed: 5.0}. See ``docs/actions.md``.
         dt: the physics step, 1e-6 to 0.1 s.
         control_dt: the control step, 1e-6 to 1 s, 1 to 200 times dt. Hovering is judged by its last second.
         action_delay: control steps from a command to its effect, 0 to 1000; 1 is usual.
@@ -125,7 +135,7 @@ class QuadrotorEnv(Task, EnvBase):
         config.check_params(params, num_envs)
         self.weights = config.known_weights(self.weights, weights or {})
         self._place(params)
-        self._params = params if params.requires_grad else self.nominal
+        self._params = params if params.requires_grad or params.rotor_effectiveness is not None else self.nominal
         self.randomness.seed(seed)
         self.set_up()
         self.task_entries = [key for key in self.initial_state(num_envs) if key not in self.dynamics.sizes]
@@ -162,7 +172,8 @@ class QuadrotorEnv(Task, EnvBase):
 
     def set_params(self, params: QuadrotorParams) -> None:
         """Set :attr:`params`, also through a TransformedEnv, where an assignment would not reach this environment."""
-        config.check_params(params, self.num_envs)
+        config.check_params(params, self.num_envs, self.nominal)
+        config.check_flown(self.dynamics, params)
         fits = all(x.dtype == self.dtype and x.device == self.device for x in params.fields().values())
         self._params = params if fits else params.to(device=self.device, dtype=self.dtype)
 

@@ -146,14 +146,14 @@ def read_state(state: Any, safe_state: State, source: str, convert: bool = False
     return entries
 
 
-def check_action(action: Tensor | None, example: Tensor) -> None:
-    """Check that an action is (n, 4), of the precision and on the device of an example (n, ...)."""
+def check_action(action: Tensor | None, example: Tensor, size: int) -> None:
+    """Check that an action is (n, size), of the precision and on the device of an example (n, ...)."""
     n, dtype = len(example), example.dtype
-    if action is None or action.shape != (n, 4):
+    if action is None or action.shape != (n, size):
         got = "there is none" if action is None else f"got {tuple(action.shape)}"
         raise UserValueError(
-            f"The action must have shape ({n}, 4), named in env.action_units, for each environment; {got}. A policy "
-            'writes it under "action", as make_actor(env) does.'
+            f"The action must have shape ({n}, {size}), named in env.action_units, for each environment; {got}. A "
+            'policy writes it under "action", as make_actor(env) does.'
         )
     if action.device != example.device:
         raise UserValueError(f"The action is on {action.device}, and the environment on {example.device}.")
@@ -165,7 +165,7 @@ def check_action(action: Tensor | None, example: Tensor) -> None:
 
 
 def check_finite(action: Tensor) -> None:
-    """Check that actions (n, 4), or (n, time, 4) of a horizon, are finite."""
+    """Check that actions (n, k), or (n, time, k) of a horizon, are finite."""
     if is_traced() or (finite := action.isfinite().all(-1)).all():
         return
     broken = ~finite if action.dim() == 3 else ~finite.unsqueeze(1)

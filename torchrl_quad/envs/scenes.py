@@ -216,8 +216,9 @@ class Scene(Disturbance):
 
 def reach_of(drone: QuadrotorParams) -> float:
     """The radius [m] of a drone whose propellers are as large as they can be without touching each other."""
-    rotors = drone.rotor_positions.detach().reshape(-1, 4, 2)[0]
-    return (rotors.norm(dim=-1).max() + 0.5 * torch.pdist(rotors).min()).item()
+    rotors = drone.rotor_positions.detach()[..., :2].reshape(-1, drone.rotor_spin.shape[-1], 2)[0]
+    arm, gaps = rotors.norm(dim=-1).max(), torch.pdist(rotors)
+    return (arm + 0.5 * gaps[gaps > 1e-2 * arm].min()).item()  # coaxial rotors are above each other
 
 
 def left_out(solids: Tensor, who: Tensor) -> Tensor:

@@ -57,7 +57,7 @@ class ControlStep:
         return end
 
     def queue(self, state: State, valid: Tensor, action: Tensor) -> tuple[State, Tensor, Tensor]:
-        """The state with the action queued, the action (n, 4) that takes effect now, and where both make sense (n)."""
+        """The state with the action queued, the action (n, k) that takes effect now, and where both make sense (n)."""
         valid = valid & (action.detach().abs().amax(1) < guard.MAX_VALUE)
         action = torch.where(valid.unsqueeze(1), action, self.dynamics.hover_action)
         if "action_queue" not in state:
@@ -173,8 +173,11 @@ class ControlStep:
     def parameters(self) -> tuple[Tensor, ...]:
         """The parameters of the drone that flies; none where it is the nominal one."""
         params = self.env.params
-        own = params is not self.env.nominal
-        return tuple(getattr(params, name) for name in self.dynamics.plant_fields) if own else ()
+        return tuple(self._plant(params).values()) if params is not self.env.nominal else ()
+
+    def _plant(self, params: QuadrotorParams) -> State:
+        fields = params.fields()
+        return {name: fields[name] for name in self.dynamics.plant_fields if name in fields}
 
     def example(self) -> tuple[State, Outputs]:
         """The safe state and outputs of it."""
@@ -183,20 +186,22 @@ class ControlStep:
         return self.safe_state, {**outputs, "reward": outputs["observation"][:, :1]}
 
     def check_action(self, action: Tensor | None) -> None:
-        guard.check_action(action, self.safe_state["position"])
+        guard.check_action(action, self.safe_state["position"], self.env.hover_action.shape[-1])
 
     def begin(
         self, state: State, valid: Tensor, action: Tensor, parameters: tuple[Tensor, ...]
     ) -> tuple[State, Tensor, Tensor, tuple[Any, ...]]:
         """Queue the action, and lay out as rows what the physics reads; see the engine's ``Simulation``."""
         state, applied, valid = self.queue(state, valid, action)
-        names, fields, n = self.dynamics.plant_fields, self.env.nominal.fields(), len(action)
-        fields |= dict(zip(names, parameters, strict=False))
+        n, fields = len(action), self._plant(self.env.params)
+        fields |= dict(zip(fields, parameters, strict=False))  # with their gradients
         fields |= {name: state["drone", name] for name in self.drawn}
         plant = ()
         if parameters or self.drawn:
             # A parameter of its own for each environment, where there is a gradient to be kept apart.
-            plant = tuple(_rows(fields[name], name, n if parameters else 1) for name in names)
+            many, none = n if parameters else 1, action.new_empty((0, 1))
+            names = self.dynamics.plant_fields
+            plant = tuple(_rows(fields[name], name, many) if name in fields else none.clone() for name in names)
         # Compiled regions must not share memory between their inputs, so views of the state are copied.
         wind = (state["wind"].t().clone(),) if "wind" in state else ()
         x = torch.cat([state[name].t() for name in self.dynamics.sizes])
@@ -230,7 +235,9 @@ class ControlStep:
             # TorchRL carries no key to the next step that is only in the state spec: it has to be in both.
             "observation_spec": spec(outputs),
             "state_spec": spec({"state": outputs["state"]}),
-            "action_spec": Bounded(-1.0, 1.0, torch.Size((*n, 4)), device=device, dtype=example.dtype),
+            "action_spec": Bounded(
+                -1.0, 1.0, torch.Size((*n, self.env.hover_action.shape[-1])), device=device, dtype=example.dtype
+            ),
             "reward_spec": Unbounded(torch.Size((*n, 1)), device=device, dtype=example.dtype),
             "done_spec": spec(done),
         }
@@ -242,8 +249,8 @@ def sample_state(env: Task, n: int) -> State:
     for disturbance in env.disturbances.values():
         state |= disturbance.start(env.randomness, state)
     if env.action_delay:
-        hover = env.hover_action.expand(n, 4).unsqueeze(1)
-        state["action_queue"] = hover.expand(n, env.action_delay, 4).clone()
+        hover = env.hover_action.expand(n, -1).unsqueeze(1)
+        state["action_queue"] = hover.expand(-1, env.action_delay, -1).clone()
     state["step"] = torch.zeros(n, 1, dtype=torch.int64, device=state["position"].device)
     return state
 

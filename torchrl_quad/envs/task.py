@@ -36,8 +36,8 @@ class Task(abc.ABC):
     ``quaternion``                 (4)           (w, x, y, z), body to world, unit norm
     ``velocity``                   (3)           [m/s], world frame
     ``angular_velocity``           (3)           [rad/s], body frame
-    ``rotor_speed``                (4)           [rad/s]; absent with ``dynamics="point_mass"``
-    ``action_queue``               (delay, 4)    commands on their way, oldest first; absent when the delay is 0
+    ``rotor_speed``                (n)           [rad/s], of n rotors; absent with ``dynamics="point_mass"``
+    ``action_queue``               (delay, k)    commands on their way, oldest first; absent when the delay is 0
     ``step``                       (1)           control steps since the start of the episode
     ``("drone", field)``           as the field  the randomised parameters, with ``randomize``
     ``mean_wind``, ``wind``        (3)           [m/s], world frame, with ``wind``
@@ -169,12 +169,12 @@ class Task(abc.ABC):
 
     @property
     def hover_action(self) -> Tensor:
-        """The action (4) that holds the nominal drone where it is; (num_envs, 4) where drones differ in it."""
+        """The action (k) that holds the nominal drone where it is; (num_envs, k) where drones differ in it."""
         return self.dynamics.hover_action
 
     @property
     def action_units(self) -> dict[str, str]:
-        """What the four entries of an action command, by name, and the unit of each, such as "N" and "rad/s"."""
+        """What the entries of an action command, by name, and the unit of each, such as "N" and "rad/s"."""
         return getattr(self.dynamics, "action_units", dict.fromkeys("0123", ""))
 
     @property
@@ -230,6 +230,7 @@ def check_task(env: Task, state: State) -> None:
     for key in taken & set(env.task_entries):
         check(False, f"initial_state: entry {key!r} is the environment's own; give yours another name.")
     fields, kinds = env.dynamics.plant_fields, (env.dtype, torch.int64, torch.bool)
+    check_changes(env, state)
     for key, x in state.items():
         check(
             isinstance(x, Tensor) and x.dim() > 1 and len(x) == n and x.dtype in kinds,
@@ -238,6 +239,11 @@ def check_task(env: Task, state: State) -> None:
         )
         if isinstance(key, tuple) and key[0] == "drone" and key[1] not in fields:
             raise UserValueError(f"Entry {key!r} changes no parameter of the drone. Choose from: {', '.join(fields)}.")
+        if isinstance(key, tuple) and key[0] == "drone":
+            one = env.nominal.value(key[1])
+            shape = (n, *one.shape[-env.nominal.dim(key[1]) :])
+            fits = x.shape == shape or key[1] == "motor_time_constant"  # which may be two
+            check(fits, f"initial_state: entry {key!r} must have shape {shape}, got {tuple(x.shape)}.")
     check_tensor("observe(state)", env.observe(state), env.dtype, None)
     terms, metrics, events = env.reward_terms(state), env.metrics(state), env.events(state, state)
     for method, term in named("reward_terms(state)", terms):
@@ -268,3 +274,25 @@ def check_task(env: Task, state: State) -> None:
             f"advance must return the whole state, and {key!r} as initial_state gives it, ({wanted}); got ({got}). "
             "Start from {**state, ...}.",
         )
+
+
+def check_changes(env: Task, state: State) -> None:
+    """Check that disturbances change what their ``start`` gives or the drone has, and nothing that the physics sets."""
+    commanded = getattr(env.dynamics, "commanded", ())
+    for disturbance in env.disturbances.values():
+        noise = state["position"].new_zeros(env.num_envs, disturbance.noise_size) if disturbance.noise_size else None
+        who = f"{type(disturbance).__name__}.advance"
+        for key, x in disturbance.advance(dict(state), noise, env.control_dt).items():
+            if key in commanded:
+                raise UserValueError(
+                    f"{who} writes {key!r}, which follows the command within the next control step: the change would "
+                    'be undone. A motor that fails has a ("drone", "rotor_effectiveness") of 0: give that in start and '
+                    "in advance, (num_envs, n) for n rotors."
+                )
+            if key not in state:
+                raise UserValueError(
+                    f"{who} writes {key!r}, which the state lacks, so that it would be lost. Give it in start, too."
+                )
+            if x.shape != state[key].shape or x.dtype != state[key].dtype:
+                got, wanted = (f"{tuple(y.shape)}, {y.dtype}" for y in (x, state[key]))
+                raise UserValueError(f"{who} must give {key!r} as the state has it, ({wanted}); got ({got}).")

@@ -10,6 +10,7 @@ from torchrl_quad.identification.errors import (
     TooShort,
     UnreadableLog,
     WrongFrame,
+    WrongMotors,
     WrongQuaternion,
     WrongUnit,
 )
@@ -36,6 +37,7 @@ __all__ = [
     "TooShort",
     "UnreadableLog",
     "WrongFrame",
+    "WrongMotors",
     "WrongQuaternion",
     "WrongUnit",
     "identify",

@@ -8,7 +8,7 @@ import re
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from torchrl_quad.deploy.frames import motor_signal
 from torchrl_quad.errors import shown
-from torchrl_quad.identification.errors import UnreadableLog
+from torchrl_quad.identification.errors import NoFlight, UnreadableLog, WrongMotors
 from torchrl_quad.identification.signals import MAX_COLUMNS, Array, Stream
 
 _SYNC = bytes.fromhex("2f731320250cbb12")
@@ -44,9 +44,13 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     """A stream for each message: columns ``message.field``, or ``message#1.field`` of its second instance.
 
     Where a message says when its data were sampled, that is its time. A motor that is stopped has the command 0.
-    ``actuator_motors.signal`` is what leaves for the motors: PX4 undoes the thrust curve of THR_MDL_FAC after it has
-    logged ``actuator_motors.control`` (``FunctionMotors.hpp``). The file is read once, in time and memory proportional
-    to its size; the notes say what could not be read.
+    ``actuator_motors.signal`` is what leaves for the motors, in the order of the quad X: PX4 undoes the thrust curve of
+    THR_MDL_FAC after it has logged ``actuator_motors.control`` (``FunctionMotors.hpp``). In older logs
+    ``actuator_outputs.signal`` is: pulses of the instance that moves, from PWM_MIN to PWM_MAX. The file is read once,
+    in time and memory proportional to its size; the notes say what could not be read.
+
+    Raises:
+        LogError: it was never armed, or is not of a drone with four rotors.
     """
     log = _Log(data)
     log.scan()
@@ -59,7 +63,7 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     if log.dropouts:
         lost = sum(log.dropouts) / 1000.0
         notes.append(f"the logger lost {lost:.2f} s in {len(log.dropouts)} dropouts: gaps where samples are missing")
-    streams = []
+    streams = {}
     for message in used:
         parts = message.record.names or ()
         if "timestamp" not in parts or message.record["timestamp"].kind not in "iu":
@@ -70,18 +74,83 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
         columns = {f"{stem}.{part}": rows[part] for part in parts}
         sampled = columns.get(f"{stem}.timestamp_sample")
         time = columns[f"{stem}.timestamp"] if sampled is None or not sampled.all() else sampled
-        for k in range(4 if message.name == "actuator_motors" else 0):
-            control = columns.get(f"{stem}.control[{k}]")
+        streams[stem] = Stream(stem, time * 1e-6, columns)
+    _check_vehicle(streams, log.parameters, name)
+    notes.append(_add_signals(streams, log.parameters))
+    return list(streams.values()), notes
+
+
+# By MAV_TYPE of MAVLink, the vehicles that do not fly by four rotors alone.
+_VEHICLES = dict.fromkeys(range(19, 26), "a VTOL") | {1: "an aeroplane", 4: "a helicopter", 13: "a hexacopter"}
+_VEHICLES |= {14: "an octocopter", 15: "a tricopter", 29: "a dodecacopter", 35: "a decacopter"}
+_CORNERS = ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0))  # of the quad X, FRD
+_OUTPUTS = re.compile(r"actuator_outputs(#\d+)?")
+
+
+def _check_vehicle(streams: Mapping[str, Stream], parameters: Mapping[str, float], name: str) -> None:
+    """Refuse what was never armed, and what has other than four rotors."""
+    column = {column: x for stream in streams.values() for column, x in stream.columns.items()}
+    pulses = {c: x for c, x in column.items() if _OUTPUTS.match(c) and re.search(r"output\[\d+\]$", c) and x.any()}
+    rest = parameters.get("PWM_DISARMED", 900)
+    motors = sorted({int(c.split("[")[1][:-1]) for c, x in pulses.items() if x.min() <= rest < x.max()})
+    for state, least in (("actuator_armed.armed", 1), ("vehicle_status.arming_state", 2)):
+        if state in column and column[state].max() < least:
+            stay = f": its motors stay at PWM_DISARMED = {rest:g} us" if pulses and not motors else ""
+            raise NoFlight(f"{name} was never armed{stay}. Give the log of a flight.")
+    kind = int(parameters.get("MAV_TYPE", 2))
+    count = int(parameters.get("CA_ROTOR_COUNT", 0))
+    control = (column.get(f"actuator_motors.control[{k}]", np.zeros(1)) for k in range(12))
+    driven = sum(bool((np.nan_to_num(x.astype(float)) > 0.02).any()) for x in control)
+    if kind in _VEHICLES:
+        which = f"; its lift motors are outputs {motors[0]} to {motors[-1]}" if kind in range(19, 26) and motors else ""
+        said = f"{_VEHICLES[kind]} (MAV_TYPE {kind}{which})"
+    elif count not in (0, 4):
+        said = f"a drone with {count} rotors (CA_ROTOR_COUNT)"
+    elif driven > 4:
+        said = f"a drone with {driven} motors (actuator_motors)"
+    else:
+        return
+    raise WrongMotors(f"{name} is the log of {said}. Only drones that fly by four rotors are fitted.")
+
+
+def _add_signals(streams: dict[str, Stream], parameters: Mapping[str, float]) -> str:
+    """The signals of the motors as columns of a stream; and a note on them."""
+    place = [[parameters.get(f"CA_ROTOR{k}_P{x}", np.nan) for x in "XY"] for k in range(4)]
+    found = [[k for k in range(4) if (np.sign(place[k]) == corner).all()] for corner in _CORNERS]
+    placed = all(len(x) == 1 for x in found)
+    order = [x[0] for x in found] if placed else [0, 1, 2, 3]
+    stem, signals, said = "", {}, "nowhere: neither actuator_motors nor actuator_outputs were logged"
+    motors = streams.get("actuator_motors")
+    if motors is not None:
+        curve = min(max(parameters.get("THR_MDL_FAC", 0.0), 0.0), 1.0)
+        for k, place in enumerate(order):
+            control = motors.columns.get(f"actuator_motors.control[{place}]")
             if control is not None:
                 with np.errstate(invalid="ignore", over="ignore"):  # NaN of some patterns warn
                     thrust = np.nan_to_num(control.astype(float))
-                    columns[f"{stem}.signal[{k}]"] = motor_signal(thrust, log.curve)
-        streams.append(Stream(stem, time * 1e-6, columns))
-    if "actuator_motors" not in {stream.name for stream in streams}:
-        notes.append("no actuator_motors: motor commands are actuator_outputs, taken as 1000 to 2000 us")
-    elif log.curve:
-        notes.append(f"motor commands are what is left after the thrust curve of THR_MDL_FAC = {log.curve:g}")
-    return streams, notes
+                    signals[f"actuator_motors.signal[{k}]"] = motor_signal(thrust, curve)
+        stem, said = "actuator_motors", f"actuator_motors, after the thrust curve of THR_MDL_FAC = {curve:g}"
+    elif any(_OUTPUTS.fullmatch(x) for x in streams):
+        moves = {
+            stem: sum(float(np.std(np.nan_to_num(stream.columns.get(f"{stem}.output[{k}]", 0.0)))) for k in range(16))
+            for stem, stream in streams.items()
+            if _OUTPUTS.fullmatch(stem)
+        }
+        stem = max(moves, key=lambda stem: moves[stem])
+        ports = {101 + k: (p, n - 1) for p in ("AUX", "MAIN") for n in range(16, 0, -1) for k in range(4)
+                 if parameters.get(f"PWM_{p}_FUNC{n}") == 101 + k}  # fmt: skip
+        for k, motor in enumerate(order):
+            port, place = ports.get(101 + motor, ("MAIN", motor))
+            pulses = streams[stem].columns.get(f"{stem}.output[{place}]")
+            own = [parameters.get(f"PWM_{port}_{x}{place + 1}", -1.0) for x in ("MIN", "MAX")]
+            usual = parameters.get("PWM_MIN", 1000.0), parameters.get("PWM_MAX", 2000.0)
+            low, high = (x if x > 0.0 else y for x, y in zip(own, usual, strict=True))
+            if pulses is not None and high > low:
+                signals[f"actuator_outputs.signal[{k}]"] = np.where(pulses < low, 0.0, (pulses - low) / (high - low))
+                said = f"{stem}, pulses from {low:g} to {high:g} us"
+    if signals:
+        streams[stem] = Stream(stem, streams[stem].time, {**streams[stem].columns, **signals})
+    return f"motor commands are in {said}{', placed by CA_ROTOR' if placed else ''}"
 
 
 class _Log:
@@ -93,7 +162,7 @@ class _Log:
         self.room = MAX_COLUMNS  # for those of subscribed messages
         self.subscriptions: list[_Subscription] = []
         self.current: dict[int, _Subscription] = {}
-        self.curve = 0.0
+        self.parameters: dict[str, float] = {}
         self.dropouts: list[int] = []  # [ms]
         self.ends: list[int] = []  # where the autopilot appended after a crash
         self.damage = self.unread = 0
@@ -152,11 +221,9 @@ class _Log:
             self.formats[message] = [(kind, int(length or 0), name) for kind, length, name in _FIELD.findall(fields)]
         elif kind == ord("P") and not self.flying:
             value = start + 1 + data[start]
-            if data[start + 1 : value] == b"float THR_MDL_FAC":
-                (self.curve,) = struct.unpack("<f", data[value:stop])
-                if not 0.0 <= self.curve <= 1.0:
-                    self.curve = 0.0
-                    raise ValueError
+            kind_of, _, key = data[start + 1 : value].decode(errors="ignore").partition(" ")
+            if key not in self.parameters and kind_of in ("int32_t", "float"):
+                (self.parameters[key],) = struct.unpack("<i" if kind_of == "int32_t" else "<f", data[value:stop])
         elif kind == ord("B"):
             flags, *offsets = struct.unpack_from("<8xB7x3Q", data, start)
             self.ends = sorted(offset for offset in offsets if flags & 1 and start < offset < len(data))

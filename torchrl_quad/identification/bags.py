@@ -5,25 +5,38 @@ from __future__ import annotations
 import dataclasses
 import re
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchrl_quad.errors import UserError, one_line
-from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
-from torchrl_quad.identification.layouts import BY_IMU, ROS, Asked, Columns, Layout, choose, named_alike, shipped
-from torchrl_quad.identification.signals import Stream, open_plain
+from torchrl_quad.identification.errors import MissingColumns, UnreadableLog, WrongMotors
+from torchrl_quad.identification.layouts import (
+    BY_IMU,
+    RIVALS,
+    ROS,
+    Asked,
+    Columns,
+    Layout,
+    choose,
+    listed,
+    named_alike,
+    shipped,
+)  # fmt: skip
+from torchrl_quad.identification.signals import Array, Stream, open_plain
 
+LIKELY = ("pose", "odometry", "imu", "motors", "actuators", "battery")
 MAGIC = (b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0")
 
 
 def read_bag(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list[str]]:
     """A stream for each topic that the layout names: columns ``/topic.field.part[0]``.
 
-    The time of a message is its header's stamp; without one, when the bag received it. By default topics are found by
-    their types, in the convention of ROS (z up, body FLU, x y z w) with motors in our order.
+    The times of a topic are its headers' stamps; where they stand still or fall to zero, when the bag received it, on
+    the clock of other stamps. By default topics are found by their types, in the convention of ROS (z up, body FLU,
+    x y z w) with motors in our order.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -46,17 +59,17 @@ def read_bag(path: Path, columns: Asked) -> tuple[list[Stream], Layout, list[str
 
 def _read(bag: Any, name: str, columns: Asked) -> tuple[list[Stream], Layout, list[str]]:
     topics = {connection.topic: connection.msgtype for connection in bag.connections if connection.msgcount}
-    layout = _layout(topics, columns, name)
+    layout = _layout(bag, topics, columns, name)
     asked: dict[str, list[str]] = {}
     for column in sorted(layout.names):
         asked.setdefault(column.split(".")[0], []).append(column)
     missing = sorted(asked.keys() - topics.keys())
     if missing:
-        raise MissingColumns(f"{name} has no topic {', '.join(missing)}. {_there(topics)}")
-    notes, begin = [], bag.start_time
+        raise MissingColumns(f"{name} has no topic {', '.join(missing)}. {_there(topics, missing)}")
     # Times since the bag began: a float of seconds since 1970 keeps only a fraction of the nanoseconds.
-    times, rows = ({topic: array("d") for topic in asked} for _ in range(2))
-    for connection, received, raw in bag.messages([x for x in bag.connections if x.topic in asked]):
+    begin = bag.start_time
+    received, stamped, rows = ({topic: array("d") for topic in asked} for _ in range(3))
+    for connection, at, raw in bag.messages([x for x in bag.connections if x.topic in asked]):
         topic = connection.topic
         message = bag.deserialize(raw, connection.msgtype)
         try:
@@ -67,16 +80,25 @@ def _read(bag: Any, name: str, columns: Asked) -> tuple[list[Stream], Layout, li
                 f"{topic} lacks a field of {', '.join(asked[topic])}, or it is not a number: {error}. Its messages "
                 f"have: {fields}."
             ) from error
+        received[topic].append((at - begin) * 1e-9)
         stamp = getattr(getattr(message, "header", None), "stamp", None)
-        stamped = stamp.sec * 10**9 + stamp.nanosec if stamp and stamp.sec > 0 else None
-        if not times[topic] and stamped is None:
-            notes.append(f"messages of {topic} carry no stamp: their times are when the bag received them")
-        times[topic].append(((received if stamped is None else stamped) - begin) * 1e-9)
-    streams = []
+        stamped[topic].append((stamp.sec * 10**9 + stamp.nanosec - begin) * 1e-9 if stamp else -begin * 1e-9)
+    streams, notes = [], []
+    times = {topic: np.frombuffer(x) for topic, x in stamped.items() if _is_clock(np.frombuffer(x), -begin * 1e-9)}
+    # Simulated stamps and the wall clock may be far apart: what has no stamps comes to the clock of those that have.
+    apart = float(np.median([np.median(np.frombuffer(received[topic]) - x) for topic, x in times.items()] or [0.0]))
     for topic, names in asked.items():
+        if topic not in times:
+            notes.append(f"messages of {topic} carry no stamp: their times are when the bag received them")
+            times[topic] = np.frombuffer(received[topic]) - (apart if abs(apart) > 1.0 else 0.0)
         table = np.frombuffer(rows[topic]).reshape(-1, len(names))
-        streams.append(Stream(topic, np.frombuffer(times[topic]), dict(zip(names, table.T, strict=True))))
+        streams.append(Stream(topic, times[topic], dict(zip(names, table.T, strict=True))))
     return streams, layout, notes
+
+
+def _is_clock(stamps: Array, zero: float) -> bool:
+    """Whether stamps, which say ``zero`` where none was set, are those of a clock: it may begin at zero."""
+    return len(stamps) > 1 and bool((stamps[1:] > zero).all()) and stamps.max() > stamps.min()
 
 
 def _number(message: Any, place: str) -> float:
@@ -86,27 +108,29 @@ def _number(message: Any, place: str) -> float:
     return float(message)
 
 
-def _layout(topics: Mapping[str, str], columns: Asked, name: str) -> Layout:
+def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> Layout:
     if columns is not None and not isinstance(columns, Mapping):
         return choose(columns, None)
     given = columns or {}
     named = set(given)
     if named & {"position", "quaternion"}:  # the caller means the pose of that topic only
         named |= {"position", "quaternion", "velocity_body"}
-    if "velocity" in named:
-        named.add("velocity_body")
+    named |= {second for first, second in RIVALS if first in named}
     found: dict[str, tuple[Columns, ...]] = {}
     onboard = BY_IMU
     for kind, quantities in shipped("ros_messages.yaml").items():
-        own = sorted(topic for topic in topics if topics[topic] == kind)
+        topics_of_kind = sorted(topic for topic in topics if topics[topic] == kind)
         for quantity, fields in quantities.items():
-            if not own or quantity in named or quantity in found:
+            own, rival = topics_of_kind, {second: first for first, second in RIVALS}.get(quantity)
+            if kind.endswith("/Actuators"):  # whose messages hold commands, or speeds
+                own = [topic for topic in own if _length(bag, topic, fields["of"], name)]
+            if not own or {quantity, rival} & named or quantity in found or (rival in found and rival != "velocity"):
                 continue
             choice = named_alike(**fields | {"of": f"{own[0]}.{fields.get('of', '')}"})
             if len(own) > 1:
                 raise MissingColumns(
                     f"{name} has several topics for {quantity}: {', '.join(own)}. Say which: "
-                    f'columns={{"{quantity}": [{", ".join(choice.names[:2])}, ...]}}.'
+                    f'columns={{"{quantity}": {list(choice.names)}}}, or those of another.'
                 )
             if quantity == "angular_velocity" and kind == "nav_msgs/msg/Odometry":  # whose clock is that of its pose
                 onboard = tuple(field for field in BY_IMU if field != quantity)
@@ -116,6 +140,16 @@ def _layout(topics: Mapping[str, str], columns: Asked, name: str) -> Layout:
     return choose(given, Layout(found, ROS, onboard))
 
 
-def _there(topics: Mapping[str, str]) -> str:
-    listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())) or "none"
-    return f'Name columns as columns={{"position": ["/topic.field.x", ...]}}. There are: {listed}.'
+def _length(bag: Any, topic: str, field: str, name: str) -> int:
+    """How many motors the array of the first message has; more than four are refused."""
+    connections = [x for x in bag.connections if x.topic == topic]
+    first = next((bag.deserialize(raw, x.msgtype) for x, _, raw in bag.messages(connections)), None)
+    count = len(getattr(first, field, ()))
+    if count > 4:
+        raise WrongMotors(f"{name}: {topic} drives {count} motors. Only drones with four rotors are fitted.")
+    return count
+
+
+def _there(topics: Mapping[str, str], asked: Sequence[str] = ()) -> str:
+    there = listed([f"{topic} ({kind})" for topic, kind in topics.items()], [*asked, *LIKELY])
+    return f'Name columns as columns={{"position": ["/topic.field.x", ...]}}. There are{there}.'

@@ -1,42 +1,101 @@
-"""Does a log mean what its columns claim, as each follows from others, and which pieces of it are in flight?"""
+"""Does a log mean what its columns claim, as each follows from others?"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike, NDArray
 
-from torchrl_quad.identification.errors import GapsTooLarge, NoFlight, WrongFrame, WrongQuaternion, WrongUnit
+from torchrl_quad.deploy.frames import px4
+from torchrl_quad.identification.errors import (
+    Remedy,
+    WrongFrame,
+    WrongMotors,
+    WrongQuaternion,
+    WrongUnit,
+)
 from torchrl_quad.identification.layouts import G
-from torchrl_quad.identification.signals import Array, Mask, Signal, body_rates, runs, slope, smooth
+from torchrl_quad.identification.pieces import OFF
+from torchrl_quad.identification.signals import Array, Mask, Signal, body_rates, convolved, slope, smooth
 from torchrl_quad.rotations import conjugate, rotate, rotate_inverse
 
 MAX_LAG = 0.3  # [s] between streams
 CALM = 0.1  # [rad/s]: slower rotations are lost in the noise of motion capture
 SURE = 0.05  # how much better a hypothesis must correlate than the log as it is given
-OFF = 0.02  # mean command of motors that stand
-_CHUNK = 20_000  # samples whose medians are taken together
-REST = 0.2  # [s] and [m/s]: how long and how slowly a drone stands
 FRD = np.array([1.0, -1.0, -1.0])
-_FIXES = {  # by what may be wrong
-    "from world to body": "conjugate it: Columns(names, scale=(1, -1, -1, -1)), whose second to fourth are x y z",
-    "scalar last": "name its columns in the order w x y z",
-    "scalar first": "name its columns in the order x y z w, as the convention in use expects them",
+_CONJUGATE = (1.0, -1.0, -1.0, -1.0)
+_LAST, _FIRST = (3, 0, 1, 2), (1, 2, 3, 0)  # where w x y z stand in a quaternion that is read a place off
+_QUATERNIONS: dict[str, Remedy] = {  # what may be wrong, and what mends it
+    "from world to body": {"factor": _CONJUGATE},
+    "scalar last": {"order": _LAST},
+    "scalar last, from world to body": {"order": _LAST, "factor": _CONJUGATE},
+    "scalar first": {"order": _FIRST},
+    "scalar first, from world to body": {"order": _FIRST, "factor": _CONJUGATE},
 }
-_FULL = {101.0: "scale=1 / 100", 2600.0: "scale=1e-3, offset=1000", 65535.5: "scale=1 / 65535"}  # by the largest
+LEAST_HOVER = 0.05  # of the full command: a drone of which this is more than hovering lifts itself a hundred times
+_COMMANDS = (  # factor, offset, least, largest, and what they are
+    (0.01, 0.0, 0.0, 101.0, "percents"),
+    (1e-3, 1000.0, 700.0, 2600.0, "pulses from 1000 to 2000 us"),
+    (1.0 / 65535.0, 0.0, 0.0, 65535.5, "counts of 16 bits"),
+)
+_X = np.array([[1, 1, -1, -1], [-1, 1, 1, -1], [1, -1, 1, -1]])  # roll, pitch, yaw by our motors, yaw either way
+_ORDERS = list(itertools.permutations(range(4)))
 
 
 def check_motors(signal: Signal) -> list[str]:
-    """Refuse motor commands that are counts, pulses or percents; commands just outside of 0 to 1 get a note."""
-    low, high = signal.values.min(), signal.values.max()
+    """Refuse motor commands that are counts, pulses, percents or speeds; a note on some just outside of 0 to 1."""
+    low, high = float(signal.values.min()), float(signal.values.max())
+    full = float(np.percentile(signal.values.mean(-1), 95))
+    below = signal.values < -0.01
+    if -0.5 < low < -0.01 and high <= 1.01 and np.ptp(signal.values[below]) < 1e-3 and full > LEAST_HOVER:
+        return [f"{signal} is {low:.3g} in {below.mean():.0%} of its samples, as where motors are disarmed: taken as 0"]
     if low >= -0.01 and high <= 1.01:
+        if OFF < full < LEAST_HOVER:
+            raise WrongUnit(
+                f"{signal} reaches {high:.3g} at most, and must run from 0 to 1, the full command: no drone flies with "
+                "so little of it. Name the commands, or say by Columns(names, scale=...) what is full."
+            )
         return [f"{signal} reaches {low:.3f} to {high:.3f}: clipped to 0 to 1"] if low < 0.0 or high > 1.0 else []
-    guess = next((text for full, text in _FULL.items() if high <= full), "scale=1 / FULL")
+    remedies = [
+        {"quantity": signal.field, "factor": factor, "offset": offset, "when": f"they are {what}"}
+        for factor, offset, least, most, what in _COMMANDS
+        if least <= low and high <= most and (full - offset) * factor > 4.0 * LEAST_HOVER
+    ]
+    if _turn_one_way(signal.values) and np.abs(signal.values).max() > 50.0:
+        remedies.append({"quantity": signal.field, "name": "rotor_speed", "when": "they are rotor speeds in rad/s"})
+    none = "" if remedies else " It is like neither percents, pulses, counts of 16 bits nor speeds of rotors."
     raise WrongUnit(
-        f"{signal} runs from {low:.4g} to {high:.4g}, and must run from 0 to 1, the full command. "
-        f'Write columns={{"motor_command": Columns({signal.columns!r}, {guess})}}.'
+        f"{signal} runs from {low:.4g} to {high:.4g}, and must run from 0 to 1, the full command.{none}", *remedies
     )
+
+
+def check_speeds(signal: Signal, most: float) -> list[str]:
+    """Refuse rotor speeds that are none."""
+    values = signal.values[np.isfinite(signal.values).all(-1)]
+    if not len(values) or (_turn_one_way(values) and 20.0 < np.abs(values).max() <= most):
+        return []
+    raise WrongUnit(
+        f"{signal} runs from {values.min():.4g} to {values.max():.4g}: speeds of rotors [rad/s] keep their sign, and "
+        f"reach 20 to {most:g}.",
+        {"quantity": "rotor_speed", "factor": np.pi / 30.0, "when": "they are revolutions per minute"},
+    )
+
+
+def _turn_one_way(values: Array) -> bool:
+    least, most = values.min(0), values.max(0)
+    return bool((np.minimum(np.abs(least), np.abs(most)) * (least * most < 0.0) <= 0.02 * np.abs(values).max()).all())
+
+
+def check_angles(signal: Signal) -> None:
+    """Refuse Euler angles in degrees."""
+    values = signal.values
+    if np.abs(values).max() > 2.0 * np.pi + 0.1:
+        raise WrongUnit(
+            f"{signal} reach {np.abs(values).max():.3g}, and are angles in rad.",
+            {"quantity": "euler", "factor": np.pi / 180.0, "when": "they are in degrees"},
+        )
 
 
 def check_quaternion(signal: Signal) -> list[str]:
@@ -46,7 +105,8 @@ def check_quaternion(signal: Signal) -> list[str]:
     if off.mean() > 0.01:
         raise WrongQuaternion(
             f"{off.mean():.0%} of {signal} are not of length 1; the median is {np.median(norm):.3g}. Name the four "
-            "columns of one quaternion, scalar first, or scale them."
+            "columns of one quaternion.",
+            {"quantity": "quaternion", "factor": float(f"{1.0 / max(np.median(norm), 1e-9):.3g}")},
         )
     return [f"{off.sum()} samples of {signal} are not of length 1; they count as missing"] if off.any() else []
 
@@ -58,8 +118,9 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
     place = signals["position"]
     if np.percentile(speed, 99) > 100.0:
         raise WrongUnit(
-            f"By {place} the drone flies at {np.percentile(speed, 99):.3g} m/s. Is it in millimetres? Then write "
-            f'columns={{"position": Columns({place.columns!r}, scale=1e-3)}}, and the same for the velocity.'
+            f"By {place} the drone flies at {np.percentile(speed, 99):.3g} m/s.",
+            {"quantity": "position", "factor": 1e-3, "when": "the position is in millimetres"},
+            {"quantity": "position", "factor": 1e-2, "when": "the position is in centimetres"},
         )
     signal = signals.get("velocity")
     if signal is None or speed.std() + speed.mean() < 0.05:
@@ -67,41 +128,67 @@ def check_velocity(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: f
     given = smooth(at["velocity"], dt)
     fit, factor, _ = _compare(given, derived, dt, moving)
     if not 0.5 < factor < 2.0:
-        what = "millimetres" if factor < 0.01 else "other units"
+        size = "position" if factor < 1.0 else "velocity"
+        ratio = min(factor, 1.0 / factor)
         raise WrongUnit(
-            f"{signal} is {factor:.3g} times the derivative of {place}: one of them, or the clock, is in {what}. Write "
-            f'columns={{"position": Columns({place.columns!r}, scale=1e-3)}} for millimetres.'
+            f"{signal} is {factor:.3g} times the derivative of {place}: they, or the clock, are in different units.",
+            *(
+                {"quantity": size, "factor": x, "when": f"the {size} is in {unit}"}
+                for unit, x in (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048))
+                if 0.8 < ratio / x < 1.25
+            ),
+            {"quantity": "velocity", "drop": True},
         )
     body, _, _ = _compare(smooth(rotate(at["quaternion"], at["velocity"]), dt), derived, dt, moving)
     if body > fit + 0.02 and body > 0.9:
         raise WrongFrame(
             f"{signal} fits the derivative of {place} in the body frame (correlation {body:.2f}) and not in the world "
-            f'frame ({fit:.2f}). Name it "velocity_body" in columns: it is then turned into the world frame.'
+            f"frame ({fit:.2f}).",
+            {"quantity": "velocity", "name": "velocity_body"},
         )
-    if fit < 0.7:
+    still = np.minimum(given[moving].std(0), derived[moving].std(0)) < 0.05
+    sides = [1.0 if still[k] else _compare(given[:, [k]], derived[:, [k]], dt, moving)[0] for k in range(3)]
+    if fit < 0.7 or min(sides) < 0.2:
+        flip = tuple(-1.0 if side < 0.2 else 1.0 for side in sides)
         raise WrongFrame(
-            f"{signal} does not follow {place}: its correlation with the derivative is {fit:.2f}. Name columns of one "
-            "world frame, or leave the velocity out: it is then derived from the position."
+            f"{signal} does not follow {place}: correlations with the derivative are "
+            f"{', '.join(f'{side:.2f}' for side in sides)} along x, y, z.",
+            {"quantity": "velocity", "factor": flip, "when": "an axis of the velocity points the other way"},
+            {"quantity": "position", "factor": flip, "when": "an axis of the position points the other way"},
+            {"quantity": "velocity", "drop": True, "when": "it shall be derived from the position"},
         )
 
 
-def check_specific_force(at: Mapping[str, Array], signals: Mapping[str, Signal], moving: Mask) -> None:
-    """Refuse an accelerometer in g, or of a body with z down."""
+def check_specific_force(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> None:
+    """Refuse an accelerometer that does not measure the acceleration of the motion and gravity, in m/s^2."""
     if "acceleration" not in at:
         return
-    signal, force = signals["acceleration"], at["acceleration"][moving]
-    length = float(np.median(np.linalg.norm(force, axis=-1)))
-    if not 4.0 < length < 40.0:
-        scale = "9.80665" if 0.4 < length < 4.0 else "9.80665e-3" if 400.0 < length < 4000.0 else "..."
-        raise WrongUnit(
-            f"In flight {signal} has a median length of {length:.3g} m/s^2, and a drone that hovers measures 9.8. "
-            f'Is it in g? Then write columns={{"acceleration": Columns({signal.columns!r}, scale={scale})}}.'
-        )
-    if np.median(force[:, 2]) < -0.5 * G:
-        raise WrongFrame(
-            f"In flight {signal} measures {np.median(force[:, 2]):.2f} m/s^2 along z, and in our body frame, z up, a "
-            "drone that hovers measures +9.8. If the log is in NED and FRD, write convention=frames.px4()."
-        )
+    signal, q = signals["acceleration"], at["quaternion"]
+    force = smooth(at["acceleration"], dt)[moving]
+    speeding = smooth(slope(at["velocity"], dt), dt)
+    free = rotate_inverse(q, speeding)[moving]
+    due = rotate_inverse(q, speeding + (0.0, 0.0, G))[moving]
+    size, usual = (float(np.sqrt((x * x).sum(-1).mean())) for x in (force, due))
+    fit = float((force * due).sum(-1).mean()) / max(size * usual, 1e-12)
+    if fit > 0.5 and 0.5 < size / usual < 2.0:
+        return
+    said = f"In flight {signal} has a mean length of {size:.3g}, and the motion asks for {usual:.3g} m/s^2"
+    remedies: list[Remedy] = [{"quantity": "acceleration", "drop": True}]
+    if fit > 0.5:
+        units = (("g", G), ("thousandths of g", 1e-3 * G), ("m/s^2", 1.0 / G))  # which a preset may take for g
+        found = [(unit, x) for unit, x in units if 0.5 < x * size / usual < 2.0]
+        remedies[:0] = [
+            {"quantity": "acceleration", "factor": x, "when": f"the accelerometer is in {unit}"} for unit, x in found
+        ]
+        raise WrongUnit(f"{said} along it. It is in another unit.", *remedies)
+    if size < 0.7 * usual and size > 0.0 and (force * free).sum() > 0.5 * np.linalg.norm(force) * np.linalg.norm(free):
+        raise WrongUnit(f"{said}: it lacks gravity, which accelerometers measure.", *remedies)
+    if fit < -0.5:
+        flips = sorted(([1, -1, -1], [1, 1, -1], [-1, -1, -1]), key=lambda flip: -(force * flip * due).sum())
+        remedies[:0] = [{"quantity": "acceleration", "factor": flip, "when": "it counts so"} for flip in flips]
+        remedies.insert(0, {"convention": px4(), "when": "all of the log is in NED and FRD"})
+        said = f"{said} along the other direction"
+    raise WrongFrame(f"{said} (correlation {fit:.2f}).", *remedies)
 
 
 def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, moving: Mask) -> str:
@@ -135,30 +222,42 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
         told = f"{signal} correlates with the derivative of {given} by {fit:.2f} as given, and by {fits[best][0]:.2f}"
         if best in hypotheses:
             raise WrongQuaternion(
-                f"{told} if the quaternion is {best}. We need w x y z, from body to world: {_fix(best)}."
+                f"{told} if the quaternion is {best}. We need w x y z, from body to world.",
+                {"quantity": "quaternion", **_QUATERNIONS[best]},
             )
         if best == "in the world frame":
-            raise WrongFrame(f"{told} if the gyro is in the world frame. Name the body rates, or leave them out.")
+            raise WrongFrame(f"{told} if the gyro is in the world frame.", {"quantity": signal.field, "drop": True})
         raise WrongFrame(
-            f"{told} if the gyro is of a body with y right and z down. Write scale=(1, -1, -1) in its Columns, or "
-            "convention=frames.px4() if all of the log is in NED and FRD."
+            f"{told} if the gyro is of a body with y right and z down.",
+            {"convention": px4(), "when": "all of the log is in NED and FRD"},
+            {"quantity": signal.field, "factor": tuple(FRD)},
         )
-    for unit, size, scale in (("degrees", 57.3, "np.pi / 180"), ("milliradians", 1000.0, "1e-3")):
-        if size / 3.0 < factor < 3.0 * size and fit > 0.2:
+    for unit, scale in (("degrees", np.pi / 180.0), ("milliradians", 1e-3)):
+        if 1.0 / 3.0 < factor * scale < 3.0 and fit > 0.2:
             raise WrongUnit(
-                f"{signal} is {factor:.3g} times the derivative of {given}: it is in {unit}/s. Write "
-                f'columns={{"angular_velocity": Columns({signal.columns!r}, scale={scale})}}.'
+                f"{signal} is {factor:.3g} times the derivative of {given}: it is in {unit}/s.",
+                {"quantity": signal.field, "factor": scale},
             )
     if turning < CALM:
         return calm
     if fit < 0.5:
         raise WrongFrame(
             f"{signal} does not follow {given}: their correlation is {fit:.2f} at best, also if the quaternion is "
-            "scalar last or inverse, or the gyro in another frame. Name columns that belong together."
+            "scalar last or inverse, or the gyro in another frame. Name columns that belong together.",
+            {
+                "quantity": signal.field,
+                "drop": True,
+                "when": "the rates shall follow from the attitude",
+            },
         )
     if not 1.0 / 3.0 < factor < 3.0:
         raise WrongUnit(
-            f"{signal} is {factor:.3g} times the derivative of {given}. Give its unit by Columns(names, scale=...)."
+            f"{signal} is {factor:.3g} times the derivative of {given}: it is in an unknown unit.",
+            {
+                "quantity": signal.field,
+                "drop": True,
+                "when": "the rates shall follow from the attitude",
+            },
         )
     return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late"
 
@@ -176,12 +275,51 @@ def _check_by_thrust(
     if lean[best] + fits[best] > lean["as given"] + fits["as given"] + 6.0 * SURE and lean[best] > 0.5:
         raise WrongQuaternion(
             f"{given} leans where the drone accelerates if it is {best} (correlation {lean[best]:.2f}), and not as "
-            f"given ({lean['as given']:.2f}). We need w x y z, from body to world: {_fix(best)}."
+            f"given ({lean['as given']:.2f}). We need w x y z, from body to world.",
+            {"quantity": "quaternion", **_QUATERNIONS[best]},
         )
 
 
-def _fix(hypothesis: str) -> str:
-    return ", and ".join(_FIXES[part] for part in hypothesis.split(", "))
+def check_order(
+    at: Mapping[str, Array], signals: Mapping[str, Signal], dt: float, pieces: Sequence[tuple[int, int]]
+) -> str:
+    """Refuse motors in another order than the one in which they turn the drone, as far as the flight tells it."""
+    signal, rows = signals["motor_command"], np.concatenate([np.arange(start, stop) for start, stop in pieces])
+    parts = (rows, rows[: len(rows) // 2], rows[len(rows) // 2 :])  # what is chance in one half is not in the other
+    fits = [turning_fits(at["angular_velocity"], at["motor_command"], dt, part) for part in parts]
+    worth = np.array([x[:, 0] + x[:, 1] + np.abs(x[:, 2]) for x in fits])  # yaw: which turn alike, not which way
+    best = int(worth[0].argmax())
+    if worth[:, best].min() < 0.4:
+        return f"the order of {signal} was not checked: the flight hardly tells it ({worth[0, best]:.2f} of 3)"
+    if (worth[:, best] > worth[:, 0] + 0.15).all() and worth[0, best] > worth[0, 0] + 0.2:
+        raise WrongMotors(
+            f"{signal} explain how the drone turns less in the order front left, back left, back right, front right "
+            f"(correlations about roll, pitch and yaw add up to {worth[0, 0]:.2f}) than in another "
+            f"({worth[0, best]:.2f}).",
+            {"quantity": signal.field, "order": _ORDERS[best]},
+        )
+    others = float(np.delete(worth[0], 0).max())
+    return f"the order of {signal} fits how the drone turns: {worth[0, 0]:.2f} of 3, and {others:.2f} in another order"
+
+
+def turning_fits(rates: Array, command: Array, dt: float, rows: NDArray[np.int_], signs: ArrayLike = _X) -> Array:
+    """How well the motors explain the angular acceleration about each axis in each order (24, 3), as correlations;
+    ``signs`` (3, 4) are those of roll, pitch and yaw by each motor."""
+    turning = slope(rates, dt)[rows]
+    turning = turning - turning.mean(0)
+    mixing = np.zeros((len(_ORDERS), 4, 3))  # the signs of a command in each order, about each axis
+    for mix, order in zip(mixing, _ORDERS, strict=True):
+        mix[list(order)] = np.transpose(signs)
+    best = np.zeros((len(_ORDERS), 3))
+    for lag in (0.03, 0.06):  # of the rotors [s]
+        weights = np.exp(-dt / lag * np.arange(max(2, round(6.0 * lag / dt))))
+        late = convolved(np.pad(command**2, ((len(weights) - 1, 0), (0, 0)), "edge"), weights / weights.sum())
+        late = smooth(late, dt, 0.08)[rows]
+        late = late - late.mean(0)
+        size = np.einsum("pka,kl,pla->pa", mixing, late.T @ late, mixing) * (turning**2).sum(0)
+        fits = np.einsum("pka,ka->pa", mixing, late.T @ turning) / np.sqrt(np.maximum(size, 1e-24))
+        best = max(best, fits, key=lambda x: x.sum(1).max())
+    return best
 
 
 def _compare(late: Array, early: Array, dt: float, moving: Mask) -> tuple[float, float, float]:
@@ -200,131 +338,3 @@ def _compare(late: Array, early: Array, dt: float, moving: Mask) -> tuple[float,
         a, b, c = products[best - 1 : best + 2]
         shift = 0.5 * (a - c) / (a - 2.0 * b + c) if a - 2.0 * b + c < 0.0 else 0.0
     return float(products[best] / (sizes[0] * sizes[1])), float(sizes[0] / sizes[1]), float((best - reach + shift) * dt)
-
-
-def motors_on(motors: Array, dt: float, name: str) -> tuple[Mask, Mask]:
-    """When the motors carry the drone, and when they stand or idle for longer than a moment."""
-    level = motors.mean(-1)
-    full = float(np.percentile(level, 95))
-    if full < OFF:
-        raise NoFlight(
-            f"{name} is not a flight: the mean motor command is below {OFF:g} for 95 % of the time. Give the log of a "
-            "flight, or name the right motor columns."
-        )
-    idle = _long(level < max(OFF, 0.3 * full), REST, dt)
-    return ~idle, idle
-
-
-def find_pieces(
-    at: Mapping[str, Array], valid: Mask, dt: float, name: str, clearance: float, min_duration: float
-) -> tuple[tuple[tuple[int, int], ...], list[str]]:
-    """Pieces (start, stop) in flight without gaps, and notes.
-
-    The drone flies where its motors run and it is more than ``clearance`` above where it stood, or will stand next.
-    """
-    carried, idle = motors_on(at["motor_command"], dt, name)
-    z = at["position"][:, 2]
-    resting = _long(idle & (np.linalg.norm(at["velocity"], axis=-1) < REST), REST, dt)
-    flying = carried & ~_near_ground(z, resting, clearance, name)
-    if not flying.any():
-        rise = (z - np.median(z[resting])).max()
-        raise NoFlight(
-            f"{name} is not a flight: it rises {rise:.3f} m at most above where it stood, and never {clearance:g} m. "
-            "Give the log of a flight, or a smaller clearance."
-        )
-    cut, notes = broken(at, flying, dt)
-    airborne = flying & ~cut
-    pieces = tuple((int(start), int(stop)) for start, stop in runs(airborne & valid, min_duration, dt))
-    if not pieces:
-        if len(runs(airborne, min_duration, dt)):
-            raise GapsTooLarge(
-                f"{name}: gaps leave no piece of {min_duration:g} s of its {airborne.sum() * dt:.1f} s in flight. Give "
-                "a log with fewer gaps, a larger max_gap, or a smaller min_duration."
-            )
-        raise NoFlight(
-            f"{name} is not a flight: in the air for {airborne.sum() * dt:.2f} s in all, and never for "
-            f"{min_duration:g} s at a time. Give the log of a longer flight, or a smaller min_duration."
-        )
-    first, last = pieces[0][0], pieces[-1][1]
-    if resting[:first].any():
-        notes.append(f"take-off: cut out up to {first * dt:.2f} s, {clearance:g} m above the ground")
-    if resting[last:].any():
-        notes.append(f"landing: cut out from {last * dt:.2f} s, {clearance:g} m above the ground")
-    if not resting.any():
-        notes.append("the log holds no stand on the ground, so contact with it could not be looked for by height")
-    low = (~flying)[first:last].sum() * dt
-    if low:
-        notes.append(f"{low:.2f} s between take-off and landing are within {clearance:g} m of the ground: cut out")
-    total = sum(stop - start for start, stop in pieces) * dt
-    short = (airborne & valid).sum() * dt - total
-    if short > dt / 2.0:
-        notes.append(f"{short:.2f} s in flight were left out: they come in pieces shorter than {min_duration:g} s")
-    notes.append(f"{total:.2f} s of {len(z) * dt:.2f} s are in flight, in {len(pieces)} piece(s)")
-    return pieces, notes
-
-
-def _near_ground(z: Array, resting: Mask, clearance: float, name: str) -> Mask:
-    """From each stand until the drone has risen by ``clearance``, back from the next one likewise, and in between
-    whenever it is that near to the lower of the two."""
-    low = resting.copy()
-    stands = runs(resting)
-    heights = [float(np.median(z[start:stop])) for start, stop in stands]
-    begins, ends = [0, *(stop for _, stop in stands)], [*(start for start, _ in stands), len(z)]
-    away = []
-    for k, (begin, end) in enumerate(zip(begins, ends, strict=True)):
-        around = heights[max(k - 1, 0) : k + 1]
-        part = z[begin:end]
-        if not around or not len(part):
-            continue
-        low[begin:end] = part < min(around) + clearance
-        stood = [(heights[k - 1], 1)] if k else []
-        stood += [(heights[k], -1)] if k < len(stands) else []
-        for height, order in stood:
-            rise = part[::order] - height
-            left = np.flatnonzero(np.abs(rise) > clearance)
-            away += [rise[left[0]] > 0.0] if len(left) else []
-            up = np.flatnonzero(rise > clearance)
-            low[begin:end][::order][: up[0] if len(up) else len(part)] = True
-    if away and not any(away):
-        raise WrongFrame(
-            f"{name}: z falls when the drone takes off, from {heights[0]:.2f} to {z.min():.2f} m, so z points down. If "
-            "the log is in NED and FRD, write convention=frames.px4()."
-        )
-    return low
-
-
-def broken(at: Mapping[str, Array], flying: Mask, dt: float) -> tuple[Mask, list[str]]:
-    """Around spikes of the specific force, which no rotor makes, and where the tracker or the estimator jumps; and
-    what was found."""
-    cut = np.zeros(len(flying), bool)
-    notes: list[str] = []
-    if not flying.any():
-        return cut, notes
-    half = max(1, round(0.05 / dt))
-    for name, least, unit, what, after in (
-        ("acceleration", 15.0, " m/s^2", "an impact", 0.3),
-        # From sample to sample, beyond what a drone that accelerates by 50 m/s^2 or 200 rad/s^2 adds.
-        ("position", 0.05 + 50.0 * dt**2, " m", "a jump of the position", 0.1),
-        ("quaternion", 0.1 + 100.0 * dt**2, "", "a jump of the quaternion", 0.1),
-    ):
-        if name not in at:
-            continue
-        x = at[name] if name == "acceleration" else np.diff(at[name], axis=0, prepend=at[name][:1])
-        windows = sliding_window_view(np.pad(x, ((half, half), (0, 0)), mode="edge"), 2 * half + 1, 0)
-        middle = [np.median(windows[k : k + _CHUNK], -1) for k in range(0, len(x), _CHUNK)]  # which copies its windows
-        spike = np.linalg.norm(x - np.concatenate(middle), axis=-1)
-        limit = max(least, 10.0 * 1.4826 * float(np.median(spike[flying])))
-        end = 0
-        for start, stop in runs(flying & (spike > limit)):
-            if start >= end:
-                notes.append(f"{what}, of {spike[start:stop].max():.2g}{unit}, at {start * dt:.2f} s: cut out")
-            end = stop + round(after / dt)
-            cut[max(0, start - round(0.1 / dt)) : end] = True
-    return cut, notes
-
-
-def _long(mask: Mask, shortest: float, dt: float) -> Mask:
-    kept = np.zeros_like(mask)
-    for start, stop in runs(mask, shortest, dt):
-        kept[start:stop] = True
-    return kept

@@ -1,10 +1,20 @@
 """What a log may be refused for, by name."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from torchrl_quad.errors import UserValueError
+
+Remedy = Mapping[str, Any]  # see torchrl_quad.identification.remedies
 
 
 class LogError(UserValueError):
-    """A log cannot be used. Each of its classes names one reason, and each message what to do."""
+    """A log cannot be used. Each of its classes names one reason, and each message what is odd; what it tells to write
+    was tried on the log, and works."""
+
+    def __init__(self, message: str, *remedies: Remedy) -> None:
+        super().__init__(message)
+        self.remedies = remedies  #: what may mend it, in this order
 
 
 class UnreadableLog(LogError):
@@ -37,6 +47,10 @@ class WrongQuaternion(LogError):
 
 class WrongFrame(LogError):
     """A quantity is in another frame: z down, body y right, a velocity of the body, rates of the world or of none."""
+
+
+class WrongMotors(LogError):
+    """The drone has other than four rotors, or its motors are named in another order."""
 
 
 class NoFlight(LogError):

@@ -16,8 +16,10 @@ from pydantic import Field
 from torch import Tensor
 
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams
+from torchrl_quad.dynamics.rigid_body import RigidBodyState
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.files import replacing
+from torchrl_quad.identification.checks import turning_fits
 from torchrl_quad.identification.errors import TooShort
 from torchrl_quad.identification.fitting import MAX_ITERATIONS, Linear, Problem, State, bootstrap, covariance, minimise
 from torchrl_quad.identification.log import FlightLog
@@ -33,6 +35,7 @@ from torchrl_quad.identification.prediction import (
     predict,
     rms_errors,
     stream_delay,
+    trim,
 )
 from torchrl_quad.identification.result import IdentificationResult
 from torchrl_quad.options import Seed, checked
@@ -42,6 +45,8 @@ _MOST_WINDOWS = 360  # more would cost more and tell little more, since neighbou
 _HORIZONS = (0.1, 0.25, 0.5)  # [s], of the errors that are reported
 _BLOCK = 2.0  # [s] of flight that are held out together
 _EVERY_BLOCK = 5  # of which the last is held out
+_CONTRARY = 0.15  # correlation
+_MOST_TRIM = 0.2  # of the weight
 _MASS = "without a known mass, motion only tells its ratio to the mass, which `ratios` gives"
 
 
@@ -83,7 +88,8 @@ def identify(
 
     Raises:
         TooShort: no piece of a flight is long enough for a window, or there are too few windows for the unknowns.
-        ValueError: a field cannot be fitted, or the drone is wrong, or a known value.
+        ValueError: a field cannot be fitted, or the drone is wrong, or a known value: its rotors turn it another way
+            than the flights, or a fifth of its weight or more is left over.
     """
     logs = as_logs(log, "identify")
     if draws == 1:
@@ -92,6 +98,7 @@ def identify(
     delay = given.pop("command_delay", None)
     prior = as_params(drone)
     prior = as_params(prior.replace(**given)) if given else prior
+    _check_turning(prior, logs)
     prior, motors = _with_motors(prior, logs, delay)
     unknowns = unknowns_of(fields)
     not_fitted = {x for name in known or () for x in FIELDS.get(name, ())} | {"stream"}  # which each log has
@@ -128,6 +135,8 @@ def identify(
     found = parameters["command_delay"]["value"] if "command_delay" in parameters else motors.delay
     motors = dataclasses.replace(motors, delay=float(np.clip(found, -0.1, 0.5)))  # what a drone's file may say
     fitted = QuadrotorParams(**model.params(state.x)._asdict(), motor_command=motors)
+    left = _checked_trim(logs, fitted, past, "thrust" in state.free)
+    errors, by_flight = _errors(logs, {"fitted": fitted, "prior": prior}, past, horizon)
     half = quantile * cover.diag()[n:].clamp_min(0.0).sqrt() * UNKNOWNS["stream"].scale
     return IdentificationResult(
         drone=fitted,
@@ -144,7 +153,9 @@ def identify(
         correlation=_correlation(cover[:n, :n]).tolist(),
         not_identifiable=_not_identifiable(dropped, has_mass, fields),
         time_constants=two,
-        errors=_errors(logs, {"fitted": fitted, "prior": prior}, past, horizon),
+        errors=errors,
+        errors_by_flight=by_flight,
+        trim=left,
         settings={
             "past": past,
             "horizon": horizon,
@@ -171,6 +182,44 @@ def _with_motors(
     if delay is not None:
         motors = dataclasses.replace(motors, delay=delay)
     return dataclasses.replace(prior, motor_command=motors), motors
+
+
+def _check_turning(prior: QuadrotorParams, logs: Sequence[FlightLog]) -> None:
+    """Refuse rotors whose places or spins turn the drone against what its flights show."""
+    places, spin = prior.rotor_positions.numpy(), prior.rotor_spin.numpy()
+    signs = np.stack((places[:, 1], -places[:, 0], spin))  # of roll, pitch and yaw
+    rows = [np.concatenate([np.arange(a, b) for a, b in x.segments]) for x in logs]
+    fits = np.mean([turning_fits(x.angular_velocity, x.motor_command, x.dt, r, signs)[0]
+                    for x, r in zip(logs, rows, strict=True)], 0)  # fmt: skip
+    if fits[2] < -_CONTRARY:
+        raise UserValueError(
+            f"identify: the rotors of these flights turn the other way than the drone's (correlation {fits[2]:.2f} "
+            f"of torque and acceleration about z). Write rotor_spin: {(-spin).astype(int).tolist()} in the drone."
+        )
+    if fits[:2].min() < -_CONTRARY:
+        raise UserValueError(
+            f"identify: motors turn these flights against where the drone's rotor_positions are (correlations "
+            f"{fits[0]:.2f} in roll, {fits[1]:.2f} in pitch). Name its rotors front left, back left, back right, front "
+            "right, as motors of a FlightLog are."
+        )
+
+
+def _checked_trim(
+    logs: Sequence[FlightLog], fitted: QuadrotorParams, past: float, fits_thrust: bool
+) -> dict[str, list[float]]:
+    """The mean force and torque that the fitted drone leaves over, refused beyond a fifth of the weight."""
+    left = trim(logs, fitted, past)
+    if left is None:
+        return {}
+    force, torque = left.force.tolist(), left.torque.tolist()
+    if math.hypot(*force) > _MOST_TRIM:
+        more = "" if fits_thrust else ' Or fit its thrust, too: name "thrust_map" in fields.'
+        raise UserValueError(
+            f"identify: {math.hypot(*force):.0%} of the drone's weight is left over ({force[0]:+.2f}, {force[1]:+.2f}, "
+            f"{force[2]:+.2f} along x, y, z): its mass of {float(fitted.mass):.3g} kg or its thrust is not that of "
+            f"these flights. Weigh it with its battery.{more}"
+        )
+    return {"force_per_weight": force, "torque": torque}
 
 
 @dataclasses.dataclass
@@ -261,7 +310,7 @@ class Fit:
         name, half = state.free[i], float(halves[i])
         unknown = UNKNOWNS[name]
         if excess[i] <= 1.0 and abs(float(state.x[i])) < unknown.limit:
-            return {}
+            return self._impossible(state)
         if unknown.is_log:
             spread = f"its 95 % interval spans a factor of {math.exp(2 * min(half, 20.0)):.3g}"
         else:
@@ -272,6 +321,17 @@ class Fit:
         if abs(float(correlation[j])) > 0.9:
             spread += f", and it is hardly told from {state.free[j]} (correlation {float(correlation[j]):.2f})"
         return {name: f"{spread}; it needs {unknown.why}"}
+
+    def _impossible(self, state: State) -> dict[str, str]:
+        """The inertia about z, where the flights want one that no body has."""
+        if "z_ratio" not in state.free:
+            return {}
+        step = torch.tensor([1e-3 * (name == "z_ratio") for name in state.free], dtype=torch.float64)
+        up, down = (self.model.only(state.free).bounded(state.x + x).dist(state.x) for x in (step, -step))
+        if min(up, down) > 5e-4:
+            return {}
+        limit = "Jx + Jy, the most" if up < down else "|Jx - Jy|, the least"
+        return {"z_ratio": f"its best value is {limit} that a body can have; it needs {UNKNOWNS['z_ratio'].why}"}
 
 
 @dataclasses.dataclass
@@ -330,15 +390,25 @@ def held_out(windows: Windows) -> Tensor:
 
 def _errors(
     logs: Sequence[FlightLog], drones: Mapping[str, QuadrotorParams], past: float, horizon: float
-) -> dict[str, dict[str, dict[float, float]]]:
-    """RMS errors of the predictions in the held-out windows, of drones by name, and of constant velocity."""
+) -> tuple[dict[str, dict[str, dict[float, float]]], dict[str, dict[str, dict[str, float]]]]:
+    """RMS errors of the predictions in the held-out windows, of drones by name, and of constant velocity; and those
+    after the horizon in each flight."""
     horizons = sorted({h for h in _HORIZONS if h <= horizon} | {horizon})
-    table = {}
+    table: dict[str, dict[str, dict[float, float]]] = {}
+    flights: dict[str, dict[str, dict[str, float]]] = {log.name: {} for log in logs}
     for name, drone in {**drones, CONSTANT_VELOCITY: CONSTANT_VELOCITY}.items():
-        windows, *flights = predict(logs, drone, horizon, past, 0.1)
-        flown, seen = (type(flight)(*(x[held_out(windows)] for x in flight)) for flight in flights)
-        table[name] = rms_errors(windows, flown, seen, horizons)
-    return table
+        windows, flown, seen = predict(logs, drone, horizon, past, 0.1)
+        held = held_out(windows)
+        for k, log in [(None, None), *enumerate(logs)]:
+            own = held if k is None else held & (windows.log == k)
+            if own.any():
+                pair = (RigidBodyState(*(x[own] for x in states)) for states in (flown, seen))
+                errors = rms_errors(windows, *pair, horizons=horizons)
+                if log is None:
+                    table[name] = errors
+                else:
+                    flights[log.name][name] = {quantity: x[horizon] for quantity, x in errors.items()}
+    return table, flights
 
 
 def _not_identifiable(dropped: Mapping[str, str], has_mass: bool, fields: str | Sequence[str] | None) -> dict[str, str]:

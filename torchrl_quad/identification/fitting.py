@@ -118,6 +118,7 @@ class Problem:
 
 def minimise(problem: Problem, state: State, report: Callable[[State], None], max_iterations: int) -> State:
     """Levenberg-Marquardt steps from a state until the coordinates stand still, each of which is reported."""
+    state = dataclasses.replace(state, x=problem.model.bounded(state.x))
     if state.scale is not None:
         problem.scale = state.x.new_tensor(state.scale)
     while not state.converged and state.iteration < max_iterations:
@@ -127,7 +128,7 @@ def minimise(problem: Problem, state: State, report: Callable[[State], None], ma
         hessian, gradient = normal_equations(linear, problem.windows.log, len(state.streams))
         before = state
         for _ in range(8):
-            state = _moved(before, _solve(hessian, gradient, before.damping))
+            state = _moved(before, _solve(hessian, gradient, before.damping), problem.model)
             cost = problem.cost(state)
             if math.isfinite(cost) and cost <= before.cost * (1.0 + 1e-9):
                 change = float((state.x - before.x).abs().max()) if len(before.x) else 0.0
@@ -225,12 +226,12 @@ def _inverse(hessian: Tensor) -> Tensor:
     return torch.linalg.pinv(scaled, hermitian=True, rtol=1e-13) * unit[:, None] * unit
 
 
-def _moved(state: State, step: Tensor) -> State:
-    """The state after a step (n + L) that goes no further than its derivatives are good for."""
+def _moved(state: State, step: Tensor, model: Model) -> State:
+    """The state after a step (n + L) that goes no further than its derivatives are good for, nor than a body can."""
     n, stream = len(state.x), UNKNOWNS["stream"]
     limit = state.x.new_tensor([UNKNOWNS[name].limit for name in state.free])
     most = torch.tensor([0.7 if UNKNOWNS[name].is_log else 2.0 for name in state.free]).to(state.x)
     x = (state.x + step[:n].clamp(-most, most)).clamp(-limit, limit)
     end = stream.limit * stream.scale
     streams = (state.streams + step[n:].clamp(-2.0, 2.0) * stream.scale).clamp(-end, end)
-    return dataclasses.replace(state, x=x, streams=streams)
+    return dataclasses.replace(state, x=model.bounded(x), streams=streams)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,10 +28,13 @@ QUANTITIES: dict[str, tuple[int, str | None]] = {
     "angular_velocity": (3, "angular_velocity"),
     "acceleration": (3, "angular_velocity"),
     "motor_command": (4, "motors"),
+    "rotor_speed": (4, "motors"),
     "battery_voltage": (1, None),
 }
+# Two names of one thing: who names one leaves out the other, and of what a file has the first is read.
+RIVALS = (("quaternion", "euler"), ("velocity", "velocity_body"), ("motor_command", "rotor_speed"))
 _TRANSLATED = ("position", "velocity", "quaternion", "angular_velocity")  # setpoints
-_NEEDED = (("position",), ("quaternion", "euler"), ("motor_command",))
+NEEDED = (("position",), ("quaternion", "euler"), ("motor_command", "rotor_speed"))
 G = 9.80665
 OURS = frames.Convention("torchrl_quad", motors=(0, 1, 2, 3))
 ROS = frames.Convention("ROS", xyzw=True, motors=(0, 1, 2, 3))
@@ -144,12 +148,11 @@ def choose(columns: Asked, default: Layout | None) -> Layout:
             f"columns must be the name of a layout ({', '.join(LAYOUTS)}), a Layout, or a mapping of quantities to "
             f"names of columns; got {shown(columns)}."
         )
-    chosen = {quantity: (_as_columns(quantity, names),) for quantity, names in columns.items()}
+    chosen = {quantity: (_as_columns(quantity, names),) for quantity, names in columns.items() if names is not None}
     time = chosen.pop("time", None)
     default = default or Layout({}, onboard=BY_IMU)
-    kept = dict(default.columns)
-    if "quaternion" in chosen or "euler" in chosen:  # the caller names the attitude: not that of the preset, too
-        kept = {quantity: choices for quantity, choices in kept.items() if quantity not in ("quaternion", "euler")}
+    ousted = {*columns, *(rival for pair in RIVALS for rival in pair if set(pair) & set(chosen))}
+    kept = {quantity: choices for quantity, choices in default.columns.items() if quantity not in ousted}
     return replace(default, columns=kept | chosen, time=time[0] if time else default.time, required=frozenset(chosen))
 
 
@@ -163,7 +166,7 @@ def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Si
             if quantity in layout.required:
                 missing = sorted({column for c in choices for column in c.names} - owner.keys())
                 raise MissingColumns(
-                    f"{name} has no column {', '.join(missing)}, named for {quantity}. {_columns_there(owner)}"
+                    f"{name} has no column {', '.join(missing)}, named for {quantity}. {_columns_there(owner, missing)}"
                 )
             continue
         stream = owner[choice.names[0]]
@@ -181,16 +184,15 @@ def gather(layout: Layout, streams: Sequence[Stream], name: str) -> dict[str, Si
         if alike and not (alike == "motors" and layout.convention.motors is None):
             values = layout.convention.back({alike: values})[alike]
         found[quantity] = Signal(quantity, choice.names, stream.time, values)
-    if "quaternion" in found:
-        found.pop("euler", None)
-    if "velocity" in found:
-        found.pop("velocity_body", None)
-    for quantities in _NEEDED:
+    for first, second in RIVALS:
+        if first in found:
+            found.pop(second, None)
+    for quantities in NEEDED:
         if not found.keys() & set(quantities):
             asked = [column for q in quantities for choice in layout.columns.get(q, ()) for column in choice.names]
             raise MissingColumns(
                 f"{name} has no {' or '.join(quantities)}: looked for {', '.join(asked) or 'nothing'}. Every log needs "
-                f"position, attitude and motor commands. {_columns_there(owner)}"
+                f"position, attitude and motor commands. {_columns_there(owner, asked)}"
             )
     return found
 
@@ -200,13 +202,42 @@ def match(header: Sequence[str], name: str) -> Layout:
     for layout in LAYOUTS.values():
         if {*layout.time.names, *layout.columns["position"][0].names} <= set(header):
             return layout
+    if {"gyroADC[0]", "motor[0]"} <= set(header):
+        raise blackbox(name)
     raise MissingColumns(f"No preset knows the columns of {name}. {_columns_there(header)}")
 
 
-def _columns_there(names: Iterable[str]) -> str:
-    there = sorted(names)
-    more = f" and {len(there) - 40} more" if len(there) > 40 else ""
+def blackbox(name: str) -> MissingColumns:
+    """The error of a log of Betaflight, or of its decoder."""
+    return MissingColumns(
+        f"{name} is a Betaflight blackbox log: it has gyro, accelerometer and motors, and neither position nor "
+        "attitude, which every log needs. Fly in motion capture, decode the log with blackbox_decode, add the poses at "
+        "its times, and name all columns."
+    )
+
+
+def _columns_there(names: Iterable[str], asked: Sequence[str] = ()) -> str:
     return (
         'Name them: columns={"time": "t", "position": ["x", "y", "z"], ...}. '
-        f"There are: {', '.join(there[:40]) or 'none'}{more}."
+        f"There are{listed(names, [*asked, *QUANTITIES])}."
     )
+
+
+def listed(names: Iterable[str], asked: Sequence[str], most: int = 2200) -> str:
+    """What there is, whole where ``most`` letters hold it, else what is most like something asked for."""
+    there = sorted(names)
+    if sum(map(len, there)) + 2 * len(there) <= most:
+        return f": {', '.join(there) or 'none'}"
+    words = [set(_words(x)) for x in asked]
+    rank = {x: max(len(w & set(_words(x))) / max(len(w), 1) for w in words) for x in there[: 10**4]}
+    kept, room = [], most
+    for x in sorted(rank, key=lambda x: -rank[x]):
+        room -= len(x) + 2
+        if room < 0:
+            break
+        kept.append(x)
+    return f" {len(there)}, of which these are most alike: {', '.join(kept)}"
+
+
+def _words(name: str) -> list[str]:
+    return re.findall(r"[a-z]{2,}|\d+", name.lower())

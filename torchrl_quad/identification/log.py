@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -16,6 +17,8 @@ from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.identification import checks
 from torchrl_quad.identification.errors import GapsTooLarge, LogError, NoFlight, UnreadableLog, WrongUnit
 from torchrl_quad.identification.layouts import QUANTITIES, Columns, Layout, gather
+from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
+from torchrl_quad.identification.remedies import Mended, remedy_for
 from torchrl_quad.identification.signals import LARGEST, Array, Signal, Stream, clean, cover, on_grid
 from torchrl_quad.identification.sources import read_streams
 from torchrl_quad.options import NonNegative, checked
@@ -23,7 +26,8 @@ from torchrl_quad.rotations import from_euler
 
 _LONGEST = 3000  # letters of an error: it lists up to 60 columns
 LEAST_STEP, MAX_STEPS = 1e-3, 1_000_000  # [s] of a log, and how many: 17 minutes at 1 kHz, half a gigabyte
-_FIELDS = [name for name in QUANTITIES if name not in ("euler", "velocity_body")]
+FULL_SPEED = 4000.0  # [rad/s], of which rotor speeds are given as shares where a file has them instead of commands
+_FIELDS = [name for name in QUANTITIES if name not in ("euler", "velocity_body", "rotor_speed")]
 
 
 @checked
@@ -87,7 +91,7 @@ class FlightLog:
 @checked
 def read_log(
     path: str | Path,
-    columns: str | Layout | Mapping[str, str | Sequence[str] | Columns] | None = None,
+    columns: str | Layout | Mapping[str, str | Sequence[str] | Columns | None] | None = None,
     *,
     convention: Convention | None = None,
     onboard: Sequence[str] | None = None,
@@ -104,8 +108,8 @@ def read_log(
         path: a file, or the folder of a ROS 2 bag. Its first bytes say of what kind it is.
         columns: which columns are which quantity: a preset's name ("nanobench", "px4", "crazyflie"), a
             :class:`Layout`, or a mapping from quantities to names or :class:`Columns`, in the order of the convention.
-            By default the kind of file and the header decide. A mapping replaces entries of the preset for the file;
-            of a CSV file it describes all, if it names the position.
+            By default the kind of file and the header decide. A mapping replaces entries of the preset for the file,
+            and None leaves one out; it describes all of a CSV file, if it names position, attitude and motors.
         convention: the frames and orders of the file, of :mod:`torchrl_quad.deploy.frames`; by default the preset's,
             and for a mapping of a CSV file ours. Its ``xyzw`` and ``motors`` say how quaternions and motors are named.
         onboard: fields that another clock than the position's has stamped; "setpoint" is one.
@@ -119,26 +123,60 @@ def read_log(
         LogError: the log cannot be used. Its subclasses name the reason.
     """
     path = Path(path)
+    options = {"onboard": onboard, "dt": dt, "clearance": clearance, "max_gap": max_gap, "min_duration": min_duration}
     with _naming(path):
         streams, layout, notes = read_streams(path, columns)
         layout = layout if convention is None else replace(layout, convention=convention)
-        fields = layout.onboard if onboard is None else tuple(onboard)
-        unknown = [field for field in fields if field not in (*_FIELDS, "setpoint")]
-        if unknown:
-            known = ", ".join([*_FIELDS, "setpoint"])
-            raise UserValueError(f"onboard: unknown field {shown(unknown[0])}. Choose from: {known}.")
-        signals = _signals(layout, streams, path.name, notes)
-        main = [s for q, s in signals.items() if not _is_optional(q)]
-        grid, step = _grid(signals, main, dt, path.name)
-        valid = cover(main, grid, step, max_gap, notes)
-        at = on_grid(signals, grid, step)
-        on, _ = checks.motors_on(at["motor_command"], step, path.name)
-        sound = on & valid & ~checks.broken(at, on, step)[0]
-        moving = sound if sound.sum() > 10 else on
-        checks.check_velocity(at, signals, step, moving)
-        checks.check_specific_force(at, signals, moving)
-        notes.append(checks.check_rates(at, signals, step, moving))
-        segments, found = checks.find_pieces(at, valid, step, path.name, clearance, min_duration)
+        start = Mended(layout, options, {column for stream in streams for column in stream.columns})
+
+        def read(mended: Mended) -> FlightLog:
+            factor = np.divide(mended.layout.time.scale, layout.time.scale)
+            late = np.subtract(mended.layout.time.offset, layout.time.offset) * np.asarray(mended.layout.time.scale)
+            moved = streams
+            if mended.layout.time != layout.time:
+                moved = [replace(stream, time=stream.time * factor - late) for stream in streams]
+            return _read(path, moved, mended.layout, list(notes), **mended.options)
+
+        try:
+            return read(start)
+        except LogError as error:
+            mended = remedy_for(error, start, read)
+            if mended is None:
+                raise
+            raise type(error)(f"{error} {mended.told(columns)}") from error
+
+
+def _read(
+    path: Path,
+    streams: Sequence[Stream],
+    layout: Layout,
+    notes: list[str],
+    onboard: Sequence[str] | None,
+    dt: float | None,
+    clearance: float,
+    max_gap: float,
+    min_duration: float,
+    span: tuple[float, float] = (-np.inf, np.inf),
+) -> FlightLog:
+    """The flight in the streams of a file, as a layout says what they are."""
+    fields = layout.onboard if onboard is None else tuple(onboard)
+    unknown = [field for field in fields if field not in (*_FIELDS, "setpoint")]
+    if unknown:
+        known = ", ".join([*_FIELDS, "setpoint"])
+        raise UserValueError(f"onboard: unknown field {shown(unknown[0])}. Choose from: {known}.")
+    signals = _signals(layout, [_within(stream, span) for stream in streams], path.name, notes)
+    main = [s for q, s in signals.items() if not _is_optional(q)]
+    grid, step = _grid(signals, main, dt, path.name)
+    valid = cover(main, grid, step, max_gap, notes)
+    at = on_grid(signals, grid, step)
+    on, _ = motors_on(at["motor_command"], step, path.name)
+    sound = on & valid & ~broken(at, on, step)[0]
+    moving = sound if sound.sum() > 10 else on
+    checks.check_velocity(at, signals, step, moving)
+    notes.append(checks.check_rates(at, signals, step, moving))
+    checks.check_specific_force(at, signals, step, moving)
+    segments, found = find_pieces(at, valid, step, path.name, clearance, max_gap, min_duration)
+    notes.append(checks.check_order(at, signals, step, segments))
     setpoint = {q.removeprefix("setpoint."): x for q, x in at.items() if q.startswith("setpoint.")}
     present = {q.partition(".")[0] for q in at}
     if "battery_voltage" not in at:
@@ -160,6 +198,14 @@ def read_log(
     )
 
 
+def _within(stream: Stream, span: tuple[float, float]) -> Stream:
+    low, high = span
+    inside = (stream.time >= low) & (stream.time <= high)
+    if inside.all() or not np.isfinite(span).any():
+        return stream
+    return Stream(stream.name, stream.time[inside], {name: x[inside] for name, x in stream.columns.items()})
+
+
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
     """Put errors of a log in one line that names its file."""
@@ -178,7 +224,21 @@ def _is_optional(quantity: str) -> bool:
 def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[str]) -> dict[str, Signal]:
     """Each quantity at its own rate, finite, in order of time, and in range."""
     signals = {}
-    for quantity, signal in gather(layout, streams, name).items():
+    gathered = gather(layout, streams, name)
+    if "rotor_speed" in gathered:
+        speeds = gathered.pop("rotor_speed")
+        notes += checks.check_speeds(speeds, FULL_SPEED)
+        gathered["motor_command"] = replace(speeds, values=np.abs(speeds.values) / FULL_SPEED)
+        gathered.pop("battery_voltage", None)
+        notes.append(
+            f"motor commands are rotor speeds as shares of {FULL_SPEED:g} rad/s, whatever the battery: a drone's "
+            f"motor_command with speed_per_volt {FULL_SPEED:g}, nominal_voltage 1 and delay 0 keeps the speeds"
+        )
+    motors = gathered["motor_command"].columns
+    last = re.sub(r"\d+(?=\D*$)", lambda found: str(int(found[0]) + 1), max(motors))  # m5 after m4
+    if last not in motors and any(last in stream.columns for stream in streams):
+        notes.append(f"{last} looks like a fifth motor: only {', '.join(motors)} are read, of a drone with four rotors")
+    for quantity, signal in gathered.items():
         if quantity == "battery_voltage" and not (signal.values > 0.0).any():
             continue  # autopilots say 0 where no battery is measured
         if quantity == "quaternion":
@@ -193,8 +253,10 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
         notes += dropped
     if "quaternion" not in signals:
         euler = signals.pop("euler")
+        checks.check_angles(euler)
         signals["quaternion"] = replace(euler, values=from_euler(euler.values))
-    notes += checks.check_motors(signals["motor_command"])
+    if signals["motor_command"].field == "motor_command":
+        notes += checks.check_motors(signals["motor_command"])
     return signals
 
 
@@ -203,9 +265,10 @@ def _grid(signals: Mapping[str, Signal], main: Sequence[Signal], dt: float | Non
     attitude = signals["quaternion"]
     step = dt or max(round(attitude.step, 5), LEAST_STEP)
     if not 0.0 < attitude.step < 0.5:
+        units = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
         raise WrongUnit(
-            f"{name}: the clock steps by {attitude.step:.4g} s, which is not a flight. Is it in milliseconds? Then "
-            'write columns={"time": Columns(("t",), scale=1e-3), ...}.'
+            f"{name}: the clock steps by {attitude.step:.4g} s, which is not a flight.",
+            *({"quantity": "time", "factor": x, "when": f"it is in {unit}"} for unit, x in units.items()),
         )
     start, stop = max(s.time[0] for s in main), min(s.time[-1] for s in main)
     span = stop - start
@@ -220,9 +283,10 @@ def _grid(signals: Mapping[str, Signal], main: Sequence[Signal], dt: float | Non
         k = int(np.diff(signal.time).argmax())
         begin, end = signal.time[k : k + 2]
         if end - begin < 0.1 * span:
-            raise UnreadableLog(f"{said}. Cut it into shorter logs, or give a larger dt.")
+            raise UnreadableLog(f"{said}. Cut it into shorter logs.", {"dt": float(f"{2.0 * span / MAX_STEPS:.2g}")})
         raise GapsTooLarge(
-            f"{said}. The clock of {signal} jumps from {begin:.6g} to {end:.6g} s at sample {k + 1}. Cut the file "
-            "there and read the parts."
+            f"{said}. The clock of {signal} jumps from {begin:.6g} to {end:.6g} s at sample {k + 1}.",
+            {"span": (float(signal.time[0]), float(begin))},
+            {"span": (float(end), float(signal.time[-1]))},
         )
     return start + step * np.arange(int(span / step + 1e-6) + 1), step

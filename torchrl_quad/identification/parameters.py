@@ -121,11 +121,21 @@ class Model:
         jx = arm[1] * k2 / c["roll"].exp() if "roll" in c else prior.inertia[0] * grown
         jy = arm[0] * k2 / c["pitch"].exp() if "pitch" in c else prior.inertia[1] * grown
         ratio = c["z_ratio"].exp() if "z_ratio" in c else prior.inertia[2] / prior.inertia[:2].prod().sqrt()
+        if "z_ratio" not in c:
+            low, high = _possible(jx, jy)
+            ratio = ratio.maximum(low).minimum(high)
         if {"roll", "pitch", "z_ratio"} & set(c):
             fields["inertia"] = torch.stack([jx, jy, ratio * (jx * jy).sqrt()])
         if "yaw" in c:
             fields["yaw_torque_coefficient"] = (c["yaw"].exp() * fields["inertia"][2] / k2).reshape(1)
         return RawParams(**fields)
+
+    def bounded(self, x: Tensor) -> Tensor:
+        """The nearest coordinates (n) with an inertia that a body can have."""
+        if "z_ratio" not in self.free:
+            return x
+        i, (low, high) = self.free.index("z_ratio"), _possible(*self.params(x).inertia[:2])
+        return torch.cat((x[:i], x[i : i + 1].clamp(low.log(), high.log()), x[i + 1 :]))
 
     def plant(self, x: Tensor, stream_delay: Tensor) -> Plant:
         """What windows read, at coordinates (n), with the stream delay of each (W) [s]."""
@@ -133,6 +143,13 @@ class Model:
         if "delay" in self.free:
             plant = plant._replace(delay=x[self.free.index("delay")] * UNKNOWNS["delay"].scale)
         return plant
+
+
+def _possible(jx: Tensor, jy: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the largest ratio of the inertia about z to the others, sqrt(Jx Jy): each principal moment of a
+    body is at most the sum of the other two."""
+    root = (jx * jy).sqrt()
+    return (jx - jy).abs() / root + 1e-9, (jx + jy) / root
 
 
 #: What motion fixes whatever the mass is, as logarithms in the coordinates.
@@ -208,8 +225,13 @@ def report(
         main = UNKNOWNS[next(iter(factors))]
         low = value * math.exp(-half) if main.is_log else value - half * main.scale
         high = value * math.exp(half) if main.is_log else value + half * main.scale
+        if next(iter(factors)) == "z_ratio":  # as far as a body can have it
+            least, most = (float(share) * value / ratio for share in _possible(*inertia[:2]))
+            low, high = max(low, least), min(high, most)
         return {"value": value, "low": low, "high": high, "unit": unit}
 
+    inertia = fitted.params.inertia
+    ratio = float(inertia[2] / inertia[:2].prod().sqrt())
     parameters: dict[str, Estimate] = {}
     for name, number in _NUMBERS.items():
         replaced = name == "motor_time_constant" and "asymmetry" in place  # by two of them

@@ -13,6 +13,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from torchrl_quad.allocation import quarters
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams, load_drone, quaternion
 from torchrl_quad.dynamics.rigid_body import RigidBodyState, Rotors, accelerations, rk4
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
@@ -91,6 +92,21 @@ def predict(
     return windows, windows.fly(plant, states_at(seen, 0), speed, windows.push(plant, speed)), seen
 
 
+@torch.no_grad()
+def trim(logs: Sequence[FlightLog], drone: QuadrotorParams, past: float = PAST) -> Push | None:
+    """What moves the flights beyond a drone with a ``motor_command``, on average over windows of ``past`` [s], (3)
+    each: as a share of its weight, and [rad/s2]; None where the flights are too short for a window."""
+    motors = drone.motor_command or MotorCommand(1.0, 1.0)
+    try:
+        windows = cut(logs, 0.1, past or PAST, 0.1, nominal_voltage=motors.nominal_voltage)
+    except TooShort:
+        return None
+    late = torch.tensor([stream_delay(log) for log in logs], dtype=torch.float64)[windows.log]
+    plant = plant_of(drone, motors, late)
+    force, torque = windows.push(plant, windows.rotor_speed(plant))
+    return Push(force.mean(0) / drone.gravity, torque.mean(0))
+
+
 def as_logs(log: FlightLog | Sequence[FlightLog], whose: str) -> list[FlightLog]:
     """One flight or several, as a list."""
     logs = [log] if isinstance(log, FlightLog) else list(log) if isinstance(log, Sequence) else [log]
@@ -133,10 +149,25 @@ def as_params(drone: Any) -> QuadrotorParams:
     drone = getattr(drone, "drone", drone)
     if not isinstance(drone, QuadrotorParams):
         drone = load_drone(drone, torch.float64)
+    if drone.rotor_spin.shape[-1] != 4:
+        raise UserValueError(
+            f"A FlightLog is of a drone with four rotors, and this one has {drone.rotor_spin.shape[-1]}."
+        )
     for name, value in drone.fields().items():
         if value.dim() != drone.dim(name):
             raise UserValueError(f"A flight is of one drone, and {name} has shape {tuple(value.shape)}, of several.")
+    columns(drone)
     return drone.detach().to(dtype=torch.float64, device="cpu")
+
+
+def columns(drone: QuadrotorParams) -> list[int]:
+    """For each rotor, in whatever order the drone lists them, the column of its motor in a log: by its place."""
+    if found := quarters(drone.rotor_positions.detach().cpu().numpy()):
+        return found
+    raise UserValueError(
+        "Flight logs hold the commands of four motors of an X: front left, back left, back right, front right. This "
+        f"drone has rotors at {drone.rotor_positions.tolist()} m. Give one with a rotor in each of the four quarters."
+    )
 
 
 def carrying_speed(params: QuadrotorParams, log: FlightLog, nominal_voltage: float = 1.0) -> float:
@@ -220,7 +251,7 @@ class Windows:
         late = (plant.stream_delay - plant.delay) / self.dt
         command = self._between(self.command, self.start[:, None] + steps + 0.5 + late[:, None])
         slope, zero = (x.reshape(-1, 1, 1) for x in (plant.speed_per_volt, plant.speed_at_zero))
-        wanted = (zero + slope * command).clamp_min(0.0).unbind(1)
+        wanted = (zero + slope * command[..., columns(plant.params)]).clamp_min(0.0).unbind(1)
         rotors, speed, speeds = Rotors(plant.params), wanted[0], []
         for k, target in enumerate(wanted):
             if k >= warm:

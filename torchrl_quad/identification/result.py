@@ -18,7 +18,7 @@ from torchrl_quad.dynamics.rigid_body import RigidBodyState
 from torchrl_quad.files import make_folder, replacing
 from torchrl_quad.identification.log import FlightLog
 from torchrl_quad.identification.parameters import Estimate
-from torchrl_quad.identification.prediction import ERRORS, differences, predict
+from torchrl_quad.identification.prediction import CONSTANT_VELOCITY, ERRORS, differences, predict
 from torchrl_quad.identification.signals import Array
 from torchrl_quad.options import checked
 
@@ -62,9 +62,23 @@ class IdentificationResult:
     time_constants: str  #: what the flights say about rotors that speed up and slow down at a different pace
     #: by model, quantity and horizon [s], in held-out windows
     errors: Mapping[str, Mapping[str, Mapping[float, float]]]
+    errors_by_flight: Mapping[str, Mapping[str, Mapping[str, float]]]  #: by flight, model and quantity, at the horizon
+    #: what the fitted drone leaves over on average, body frame: ``force_per_weight`` (3), and ``torque`` (3) [rad/s2]
+    trim: Mapping[str, Sequence[float]]
     settings: Mapping[str, Any]  #: of the fit
     logs: Sequence[str]  #: names of the flights
     flights: Sequence[FlightLog] = dataclasses.field(repr=False, default=())  #: for pictures
+
+    @property
+    def verdict(self) -> str:
+        """Whether the fit predicts the held-out windows better than constant velocity does, and where it does not."""
+        fitted, coasting = (self.errors[name] for name in ("fitted", CONSTANT_VELOCITY))
+        horizon = max(fitted["position"])
+        pairs = {name: (fitted[name][horizon], coasting[name][horizon]) for name in ERRORS}
+        worse = [f"{name} ({a:.2g} against {b:.2g} {ERRORS[name]})" for name, (a, b) in pairs.items() if not a < b]
+        if worse:
+            return f"after {horizon:g} s the fit predicts worse than constant velocity: {', '.join(worse)}"
+        return f"after {horizon:g} s the fit predicts better than constant velocity in all"
 
     def __str__(self) -> str:
         lines = [
@@ -80,7 +94,13 @@ class IdentificationResult:
             last = {name: list(x.items())[-1] for name, x in table.items()}
             said = ", ".join(f"{name} {value:.3g}" for name, (_, value) in last.items())
             lines.append(f"held-out error after {next(iter(last.values()))[0]:g} s, {model}: {said}")
-        return "\n".join(lines)
+        for name, table in self.errors_by_flight.items():
+            said = [f"{model} {x['attitude']:.3g} rad" for model, x in table.items() if model != "prior"]
+            lines.append(f"attitude in {name}: {', '.join(said)}")
+        if self.trim:
+            x, y, z = self.trim["force_per_weight"]
+            lines.append(f"trim left over: {x:+.3f}, {y:+.3f}, {z:+.3f} of the weight along x, y, z")
+        return "\n".join([*lines, f"verdict: {self.verdict}"])
 
     def randomization(self) -> dict[str, dict[str, list[float]]]:
         """What ``randomize`` of an environment takes: the drone's fields within the 95 % intervals.
@@ -106,7 +126,7 @@ class IdentificationResult:
         for name, value in self.drone.fields().items():
             plain = [_rounded(x) for x in value.reshape(-1).tolist()]
             if name == "rotor_positions":
-                content[name] = [plain[i : i + 2] for i in range(0, 8, 2)]
+                content[name] = [[_rounded(x) for x in place] for place in value.tolist()]
             else:
                 content[name] = plain[0] if len(plain) == 1 else plain
         motors = self.drone.motor_command
@@ -121,7 +141,7 @@ class IdentificationResult:
     def report(self) -> dict[str, Any]:
         """Everything but the flights, as plain numbers and strings."""
         names = [f.name for f in dataclasses.fields(self) if f.name not in ("drone", "prior", "flights")]
-        return {name: to_jsonable_python(getattr(self, name), inf_nan_mode="null") for name in names}
+        return {name: to_jsonable_python(getattr(self, name), inf_nan_mode="null") for name in [*names, "verdict"]}
 
     @checked
     def save(self, folder: str | Path, pictures: bool = True) -> Path:

@@ -66,7 +66,7 @@ class Signal:
 def clean(signal: Signal) -> tuple[Signal, list[str]]:
     """Without samples that are not finite or repeat a time, and notes of what was dropped."""
     time, values = signal.time, signal.values
-    finite = np.isfinite(values).all(-1) & (np.abs(time) < 1e15)
+    finite = np.isfinite(values).all(-1) & (np.abs(time) < 1e19)  # of nanoseconds since 1970, too
     if finite.sum() < 2:  # of tables that join several rates, most rows of the slower ones are empty
         raise NotFiniteLog(
             f"{finite.sum()} of {len(finite)} samples of {signal} are finite: nothing was recorded there. Name other "

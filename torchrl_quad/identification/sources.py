@@ -19,8 +19,9 @@ import numpy as np
 
 from torchrl_quad.identification.autopilots import read_ulog, read_usd
 from torchrl_quad.identification.bags import MAGIC, read_bag
+from torchrl_quad.identification.dataflash import HEAD, read_dataflash
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog
-from torchrl_quad.identification.layouts import LAYOUTS, Asked, Layout, choose, match
+from torchrl_quad.identification.layouts import LAYOUTS, NEEDED, Asked, Layout, blackbox, choose, listed, match
 from torchrl_quad.identification.signals import MAX_COLUMNS, Array, Stream, open_plain, too_many
 
 Read = tuple[list[Stream], Layout, list[str]]
@@ -28,7 +29,9 @@ Read = tuple[list[Stream], Layout, list[str]]
 MAX_BYTES, MAX_UNPACKED = 2 * 10**9, 500 * 10**6
 MAX_LINE, MAX_ROWS = 4 * 10**6, 5 * 10**6  # bytes and lines of a CSV file
 _CUT = "Cut it into shorter logs."
-_READERS = {b"ULog\x01\x12\x35": (read_ulog, "px4"), b"\xbc": (read_usd, "crazyflie")}  # by the first bytes
+# By the first bytes.
+_READERS = {b"ULog\x01\x12\x35": (read_ulog, "px4"), b"\xbc": (read_usd, "crazyflie")}
+_READERS[HEAD] = (read_dataflash, "ardupilot")
 
 
 def read_streams(path: Path, columns: Asked) -> Read:
@@ -54,6 +57,8 @@ def read_streams(path: Path, columns: Asked) -> Read:
 
 def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) -> Read:
     start = file.peek(8192)
+    if start.startswith(b"H Product:Blackbox"):
+        raise blackbox(name)
     for magic, (reader, preset) in _READERS.items():
         if start.startswith(magic):
             layout = LAYOUTS[preset] if columns is None else choose(columns, LAYOUTS[preset])
@@ -64,8 +69,8 @@ def _read(file: io.BufferedReader[Any], name: str, columns: Asked, most: int) ->
         codecs.getincrementaldecoder("utf-8")().decode(start)
     except UnicodeDecodeError as error:
         raise UnreadableLog(
-            f"{name} is not a log of a known kind: it is not text, and does not begin like a ULog, ROS bag or uSD log "
-            "(versions 1 and 2). Export it as CSV."
+            f"{name} is not a log of a known kind: it is not text, and does not begin like a ULog, dataflash log, ROS "
+            "bag or uSD log (versions 1 and 2). Export it as CSV."
         ) from error
     return _read_csv(_counted(iter(lambda: file.readline(MAX_LINE + 1), b""), name, most), name, columns)
 
@@ -82,10 +87,10 @@ def _counted(parts: Iterator[bytes], name: str, most: int) -> Iterator[bytes]:
 def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     """Only the columns that are asked for become numbers; cells without a number become NaN."""
     rows = _rows(lines, name)
-    first = next(rows, "").removeprefix("\ufeff")
+    first = next(rows, "")
     if not first:
         raise UnreadableLog(f"{name} is empty. Give a log that has samples.")
-    mark = max(",;\t", key=first.count)
+    mark = _mark(first)
     header = [part.strip().strip('"') for part in first.split(mark)]
     if len(header) > MAX_COLUMNS:
         raise too_many(name, MAX_COLUMNS, "columns", "Leave some out.")
@@ -94,15 +99,11 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
         raise UnreadableLog(f"{name} has fewer than two samples below its header. Give the log of a flight.")
     for k, row in enumerate(samples):  # before anything is said of its columns: it may be no table
         _cells(row, mark, len(header), name, k)
-    if columns is None:
-        layout = match(header, name)
-    else:  # a mapping without a position changes a preset; one with it describes the whole file
-        partial = isinstance(columns, Mapping) and "position" not in columns
-        layout = choose(columns, match(header, name) if partial else None)
+    layout = match(header, name) if columns is None else choose(columns, _preset(header, name, columns))
     (clock,) = layout.time.names
     if clock not in header:
         raise MissingColumns(
-            f"{name} has no column {clock} of the time. There are: {', '.join(header[:60])}. "
+            f"{name} has no column {clock} of the time. There are{listed(header, [clock, 'time', 'stamp'])}. "
             'Name it: columns={"time": ...}.'
         )
     asked = layout.names | {clock}
@@ -117,8 +118,22 @@ def _read_csv(lines: Iterator[bytes], name: str, columns: Asked) -> Read:
     return [Stream("csv", time, values)], layout, []
 
 
+def _preset(header: list[str], name: str, columns: Asked) -> Layout | None:
+    """What a mapping changes; None for one that describes the whole file."""
+    if not isinstance(columns, Mapping) or all(set(columns) & set(quantities) for quantities in NEEDED):
+        return None
+    try:
+        return match(header, name)
+    except MissingColumns:
+        if "position" in columns:
+            return None  # of which it will be told what it lacks
+        raise
+
+
 def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
-    """The rows of a table as text, without comments and empty ones."""
+    """The rows of a table as text, without comments and empty ones. The last comment above rows of numbers is the first
+    row, which names their columns."""
+    remark, begun = "", False
     for k, line in enumerate(lines):
         if k >= MAX_ROWS:
             raise too_many(name, MAX_ROWS, "lines", _CUT)
@@ -128,14 +143,26 @@ def _rows(lines: Iterator[bytes], name: str) -> Iterator[str]:
             text = line.decode()
         except UnicodeDecodeError as error:
             raise UnreadableLog(f"{name}: line {k + 1} is not text in UTF-8. Export it as CSV again.") from error
-        if k and "#" in text:
-            text = text.partition("#")[0]
-        text = text.strip(" \r\n")
+        text = text.strip(" \r\n\ufeff")
+        if not begun and text[:1] in ("#", "%"):
+            remark = text.lstrip("#% ") or remark
+            continue
+        text = text.partition("#")[0].strip(" ") if begun and "#" in text else text
+        if not begun and text:
+            begun, mark = True, _mark(remark)
+            if remark and all(_number(x, mark) == _number(x, mark) for x in text.split(mark) if x.strip()):
+                yield remark
         if text:
             yield text
 
 
-def _numbers(rows: Iterator[str], mark: str, width: int, places: list[int], name: str) -> Array:
+def _mark(header: str) -> str | None:
+    """What separates the cells; None is white space."""
+    mark = max(",;\t", key=header.count)
+    return mark if mark in header else None
+
+
+def _numbers(rows: Iterator[str], mark: str | None, width: int, places: list[int], name: str) -> Array:
     """Some columns of a table (N, len(places))."""
     flat, pick = array("d"), itemgetter(*places, places[0])  # of a single place it would not give a tuple
     for k, row in enumerate(rows):
@@ -143,11 +170,11 @@ def _numbers(rows: Iterator[str], mark: str, width: int, places: list[int], name
         try:
             flat.extend([float(cell) for cell in picked])
         except ValueError:
-            flat.extend([_number(cell) for cell in picked])
+            flat.extend([_number(cell, mark) for cell in picked])
     return np.frombuffer(flat).reshape(-1, len(places))
 
 
-def _cells(row: str, mark: str, width: int, name: str, k: int) -> list[str]:
+def _cells(row: str, mark: str | None, width: int, name: str, k: int) -> list[str]:
     cells = row.split(mark)
     if len(cells) != width:
         raise UnreadableLog(
@@ -157,8 +184,8 @@ def _cells(row: str, mark: str, width: int, name: str, k: int) -> list[str]:
     return cells
 
 
-def _number(cell: str) -> float:
+def _number(cell: str, mark: str | None) -> float:
     try:
-        return float(cell)
+        return float(cell if mark == "," else cell.replace(",", "."))
     except ValueError:
         return np.nan

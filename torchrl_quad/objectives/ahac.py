@@ -43,7 +43,7 @@ class AHACLoss(SHACLoss):
         loss.adapt_horizon(losses["stiffness"])
 
     Args:
-        actor_network: the policy that flew the rollout, as :func:`~torchrl_quad.make_actor` builds it.
+        actor_network: the policy that flew the rollout, whose action is a TanhNormal or an IndependentNormal.
         horizon: control steps of the first rollout.
         min_horizon: the shortest horizon; null for a quarter of the first.
         max_horizon: the longest horizon; null for twice the first.
@@ -58,7 +58,7 @@ class AHACLoss(SHACLoss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        value_network: TensorDictModule,
+        value_network: TensorDictModule | list[TensorDictModule],
         *,
         horizon: Horizon = 32,
         min_horizon: Horizon | None = None,

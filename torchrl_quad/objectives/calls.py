@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, cast
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_quad.data.unwrap import check_tensordict, leaf
 from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError
+from torchrl_quad.objectives.gaussian import GaussianPolicy
 
 
 def sample_action(actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase) -> TensorDictBase:
@@ -84,6 +85,13 @@ def takes_rollout(forward: Callable[..., Any]) -> Callable[..., Any]:
     return method
 
 
+def picked(tensordict: TensorDictBase, keys: Iterable[NestedKey], where: Tensor) -> TensorDict:
+    """Some entries of a rollout (*, horizon) where bool (*, horizon, 1) says so: (n)."""
+    rows = where.squeeze(-1).nonzero(as_tuple=True)  # once for all entries: to a compiler each mask has a count anew
+    found: dict[Any, Tensor] = {key: leaf(tensordict, key)[rows] for key in keys if key in tensordict}
+    return TensorDict(found, rows[0].shape, tensordict.device)
+
+
 def with_fixed(loss: Any, given: Mapping[str, Any], **fixed: Any) -> dict[str, Any]:
     """Options for SHACLoss, with those that a loss sets itself: a UserTypeError if one of these is given, too."""
     for name in sorted(set(given) & set(fixed)):
@@ -120,6 +128,15 @@ def step_in_segment(done: Tensor) -> Tensor:
 def discounts(done: Tensor, gamma: Tensor) -> Tensor:
     """gamma^t, for a scalar gamma, where t counts the steps of each segment from 0."""
     return gamma ** step_in_segment(done)
+
+
+def td_lambda(reward: Tensor, done: Tensor, next_value: Tensor, gamma: Tensor, lmbda: Tensor) -> Tensor:
+    """TD(lambda) targets, each (*, horizon, 1), as one product: a compiler would unroll a loop over time."""
+    index, apart = step_in_segment(done), torch.arange(done.shape[-2], device=done.device)
+    apart = apart - apart.unsqueeze(-1)
+    later = (apart >= 0) & (index.mT - index == apart)  # in the same segment
+    gains = reward + gamma * torch.where(segments(done)[1], 1.0, 1.0 - lmbda) * next_value
+    return torch.where(later, (gamma * lmbda).to(reward.dtype) ** apart.clamp_min(0), 0.0) @ gains
 
 
 # -- gradients in single actions, and how a policy learns from them ----------------------------------------------------
@@ -166,7 +183,7 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
     from that at the start. Actions within 1e-6 of a bound count as if they were that far from it.
     """
     with params.to_module(actor):
-        plain = plain_of(actor)
+        plain = plain_of(actor, tensordict)
         if hasattr(plain, "replay"):
             return plain.replay(tensordict)
         return act(plain, tensordict.select(*plain.in_keys).detach(), plain.drawn_again(tensordict))
@@ -177,20 +194,21 @@ def distribution_again(
 ) -> tuple[Tensor, Tensor]:
     """loc and scale, before the tanh, in a rollout's states, (*, k); otherwise as :func:`act_again`."""
     with params.to_module(actor):
-        return plain_of(actor).distribution(tensordict)
+        return plain_of(actor, tensordict).distribution(tensordict)
 
 
-def plain_of(actor: TensorDictModule) -> Any:
-    """A policy whose noise follows from its actions, as functions of tensors: a ``PlainTanhGaussian``."""
+def plain_of(actor: TensorDictModule, tensordict: TensorDictBase) -> Any:
+    """A policy whose noise follows from the actions of a rollout: a ``PlainTanhGaussian``, or a GaussianPolicy."""
     make = getattr(actor, "replayed", None) or getattr(actor, "plain", lambda: None)
     plain = make()
-    if not hasattr(plain, "drawn_again"):
+    if hasattr(plain, "drawn_again"):
+        return plain
+    if "noise_before" in actor.out_keys:
         raise Unsupported(
-            "Gradients of single actions need a policy of make_actor or make_visual_actor, whose noise follows from "
-            "its actions, and RANDOM or DETERMINISTIC exploration. Build it so, without hooks or changed parts, or "
-            "leave clip_action_gradient=None with a loss other than AHACLoss and HybridLoss."
+            "Gradients of single actions need a policy with noise_correlation as make_actor builds it, without hooks "
+            "or changed parts, and RANDOM or DETERMINISTIC exploration. Build it so, or without noise_correlation."
         )
-    return plain
+    return GaussianPolicy(actor, tensordict)
 
 
 def median_length(length: Tensor) -> Tensor:

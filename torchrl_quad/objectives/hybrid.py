@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.distributions import Normal, kl_divergence
+from torch.distributions import Normal
 from torch.distributions.transforms import TanhTransform
 from torchrl.objectives.utils import ValueEstimators
 
@@ -21,7 +21,6 @@ from torchrl_quad.errors import UserValueError, WrongState
 from torchrl_quad.objectives.calls import (
     action_gradient,
     discounts,
-    distribution_again,
     plain_of,
     segments,
     takes_rollout,
@@ -58,7 +57,7 @@ class HybridLoss(SHACLoss):
             (losses["loss_actor"] + losses["loss_value"]).backward()
 
     Args:
-        actor_network: the policy that flew the rollout, as ``make_actor`` builds it.
+        actor_network: the policy that flew the rollout, whose action is a TanhNormal or an IndependentNormal.
         value_network: the critic V(s).
         gradient_lmbda: the lambda of the return that the pathwise gradient differentiates; 0.9 is usual. That of the
             advantage and of the critic's targets is ``make_value_estimator(lmbda=...)``.
@@ -86,7 +85,7 @@ class HybridLoss(SHACLoss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        value_network: TensorDictModule,
+        value_network: TensorDictModule | list[TensorDictModule],
         *,
         gradient_lmbda: Share = 0.9,
         clip_epsilon: Annotated[float, Field(gt=0, lt=1)] = 0.2,
@@ -95,8 +94,9 @@ class HybridLoss(SHACLoss):
         decay: Below1 = 0.9,
         average: Callable[[Tensor], Tensor] | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
+        loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
     ) -> None:
-        own = {"clip_action_gradient": clip_action_gradient, "reduction": reduction}
+        own = {"clip_action_gradient": clip_action_gradient, "reduction": reduction, "loss_function": loss_function}
         super().__init__(actor_network, value_network, delay_value=False, **own)
         self.gradient_lmbda, self.clip_epsilon, self.entropy_coeff = gradient_lmbda, clip_epsilon, entropy_coeff
         self.decay, self.average = decay, average
@@ -106,14 +106,14 @@ class HybridLoss(SHACLoss):
         self.register_buffer("pathwise_weight", weight)
 
     def _network_in_keys(self) -> set[NestedKey]:
-        noise = set(self.actor_network.out_keys) & {"noise", "noise_before"}
-        return {*super()._network_in_keys(), "loc", "scale", *noise}
+        return super()._network_in_keys() | self._drawn_keys
 
     @takes_rollout
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The losses and their metadata, the ``out_keys``, of samples (*) with targets or of a rollout (*, horizon)."""
         return super().forward(self._with_targets(tensordict))
 
+    @torch.compiler.disable(reason="gradients of single actions are read off the graph of the flight")
     def write_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Differentiate a rollout (*, horizon), update the weight, and return what the minibatches read.
 
@@ -125,7 +125,7 @@ class HybridLoss(SHACLoss):
             raise WrongState("write_targets differentiates the rollout: call it with gradients enabled.")
         keys, grad = self.tensor_keys, self._own_gradient(tensordict)
         data = self.write_value_target(tensordict.detach())
-        grad, latent = self._in_location(data, grad)
+        grad, latent, loc = self._in_location(data, grad)
         with torch.no_grad():
             advantage = leaf(data, keys.value_target) - self._value(data, target=False)
             counts = self._counts(data)
@@ -134,7 +134,7 @@ class HybridLoss(SHACLoss):
             advantage, grad = (advantage - seen.mean()) / deviation, grad / deviation
             if counts is not None:
                 advantage, grad = torch.where(counts, advantage, 0.0), torch.where(counts, grad, 0.0)
-            predicted = (grad * (latent - leaf(data, "loc"))).sum(-1, keepdim=True)
+            predicted = (grad * (latent - loc)).sum(-1, keepdim=True)
             weight = self._regress(advantage, predicted)
         data.set(keys.advantage, advantage - weight * (predicted - predicted.mean()))
         return data.set(keys.location_gradient, weight * grad).set(keys.latent, latent)
@@ -142,19 +142,23 @@ class HybridLoss(SHACLoss):
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss of what :meth:`forward` takes, and the weight, KL(policy that flew || policy), entropy."""
         keys, tensordict = self.tensor_keys, self._with_targets(tensordict)
-        new = Normal(*distribution_again(self.actor_network, self.actor_network_params, tensordict))
-        old = Normal(leaf(tensordict, "loc"), leaf(tensordict, "scale"))
+        with self.actor_network_params.to_module(self.actor_network):
+            plain = plain_of(self.actor_network, tensordict)
+            new, old = Normal(*plain.distribution(tensordict)), Normal(*plain.recorded(tensordict))
         advantage, latent = leaf(tensordict, keys.advantage), leaf(tensordict, keys.latent)
         ratio = (new.log_prob(latent) - old.log_prob(latent)).sum(-1, keepdim=True).exp()
         clipped = ratio.clamp(1.0 - self.clip_epsilon, 1.0 + self.clip_epsilon)
         score = torch.minimum(ratio * advantage, clipped * advantage).squeeze(-1)
         pathwise = (leaf(tensordict, keys.location_gradient) * (new.loc - old.loc)).sum(-1)
-        kl = kl_divergence(old, new).sum(-1).mean().detach()
+        # Written out, since a compiler cannot trace torch's dispatch.
+        ratio, shift = (old.scale / new.scale).square(), ((old.loc - new.loc) / new.scale).square()
+        kl = (0.5 * (ratio + shift - 1 - ratio.log())).sum(-1).mean().detach()
         objective, metadata = score + pathwise, {"pathwise_weight": self.pathwise_weight.clamp(0.0, 1.0), "kl": kl}
         if self.entropy_coeff:
-            # Of tanh(u), which has no closed form: estimated by one u in each state.
-            jacobian = TanhTransform().log_abs_det_jacobian(new.rsample(), None)
-            entropy = (new.entropy() + jacobian).sum(-1)
+            entropy = new.entropy()
+            if plain.squashes:  # that of tanh(u) has no closed form: estimated by one u in each state
+                entropy = entropy + TanhTransform().log_abs_det_jacobian(new.rsample(), None)
+            entropy = entropy.sum(-1)
             objective = objective + self.entropy_coeff * entropy
             metadata["entropy"] = entropy.detach().mean()
         return self._reduce_loss(-objective, tensordict), metadata
@@ -190,12 +194,13 @@ class HybridLoss(SHACLoss):
         grad = action_gradient(objective, leaf(tensordict, self.tensor_keys.action)) / discount
         return grad if self.clip is None else self.clip(grad)[0]
 
-    def _in_location(self, data: TensorDictBase, grad: Tensor) -> tuple[Tensor, Tensor]:
+    def _in_location(self, data: TensorDictBase, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """From the gradient in the actions (*, k) that in their means before the tanh; u, and these means."""
         with self.actor_network_params.to_module(self.actor_network):
-            plain = plain_of(self.actor_network)
+            plain = plain_of(self.actor_network, data)
             xi = plain.drawn_again(data)[:, : plain.size].view_as(grad)
-            scale = leaf(data, "scale").detach()
-            loc = leaf(data, "loc").detach().requires_grad_()
+            loc, scale = (x.detach() for x in plain.recorded(data))
+            loc.requires_grad_()
             with torch.enable_grad():
                 (grad,) = torch.autograd.grad((plain.squash(loc, scale, xi)["action"] * grad).sum(), loc)
         if plain.rho:
@@ -206,7 +211,7 @@ class HybridLoss(SHACLoss):
                 in_noise = g * s + decay * torch.where(end, 0.0, in_noise)
                 steps.append(in_noise / s)
             grad = torch.stack(steps[::-1], -2)
-        return grad, (loc + scale * xi).detach()
+        return grad, (loc + scale * xi).detach(), loc.detach()
 
     def _regress(self, advantage: Tensor, predicted: Tensor) -> Tensor:
         """Update the weight with the slope of the advantages over what was predicted, each (*, horizon, 1)."""

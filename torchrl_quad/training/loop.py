@@ -223,6 +223,8 @@ class Run:
             if loss is not None:
                 loss.loss_actor(rollout)[0].backward()
                 loss.zero_grad()
+            if hasattr(self.loss, "warm_up"):
+                self.loss.warm_up(rollout, min(self.cfg.batch_size, self.cfg.num_envs * self.cfg.horizon))
         self.loss.load_state_dict(before)  # such as running means
 
     def _evaluate(self) -> dict[str, float]:

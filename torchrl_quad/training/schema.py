@@ -112,6 +112,11 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "episodes": (Size, "Fresh episodes to fly, side by side."),
     "folder": (str | None, "The folder to write."),
     "logs": (Annotated[list[str], Field(min_length=1)], "The paths of flights of one drone, in a list."),
+    "columns": (str | dict[str, Any] | None, "Which columns of the logs are which quantity, as for read_log."),
+    "convention": (
+        Literal["px4", "ardupilot", "betaflight", "crazyflie", "mavros", "mujoco", "rotorpy", "crazyflow"] | None,
+        "The frames and orders of the logs.",
+    ),
     "drone": (str | dict[str, Any], "Where the fit starts: a preset, a YAML file, or a mapping."),
     "mass": (Positive | None, "The mass in kg, from a scale; null if unknown."),
     "known": (dict[str, Any] | None, "Fields of the drone that are known by measurement."),

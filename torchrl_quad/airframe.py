@@ -1,0 +1,120 @@
+"""What follows from the numbers of a drone: whether there can be such a drone, and how its rate loop answers.
+
+Nothing here imports torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from torchrl_quad.errors import shown
+
+Array = NDArray[np.float64]
+NEARLY_LINEAR = 1e-3  # of a thrust map, k2 / k1 times the highest speed, below which single precision loses the speed
+
+
+def contradictions(fields: Mapping[str, ArrayLike]) -> Iterator[str]:
+    """Why there is no drone with these fields, of one drone or (n, ...) of several, in words."""
+    drone = {name: np.asarray(x, float) for name, x in fields.items() if x is not None}
+    inertia, k2, k1 = drone["inertia"], drone["thrust_map"][..., 0], drone["thrust_map"][..., 1]
+    mass, low, high = (drone[x].reshape(-1) for x in ("mass", "rotor_speed_min", "rotor_speed_max"))
+    units = "Check the order of the axes and the unit: 1 g cm2 is 1e-7 kg m2"
+    if (2.0 * inertia.max(-1) > inertia.sum(-1) * (1.0 + 1e-5)).any():
+        yield f"inertia {listed(inertia)} kg m2: in a body none of the three exceeds the sum of the others. {units}"
+    arm = np.sqrt((drone["rotor_positions"] ** 2).sum(-1)).max(-1)
+    radius = np.sqrt(inertia.max(-1) / mass)
+    if (radius > 2.0 * arm).any():
+        worst = (radius - 2.0 * arm).argmax()
+        arm, radius = (np.broadcast_to(x, (radius - arm).shape).flat[worst] for x in (arm, radius))
+        yield (
+            f"inertia {listed(inertia)} kg m2: with this mass it is that of a ring of {radius:.3g} m radius, and "
+            f"the farthest rotor is {arm:.3g} m from the centre. {units}"
+        )
+    if not (low < high).all():
+        yield f"rotor_speed_min must be below rotor_speed_max, got {listed(low)} and {listed(high)}"
+    slow, fast = k1 + 2.0 * k2 * low, k1 + 2.0 * k2 * high
+    if not ((slow >= 0.0) & (fast >= 0.0) & (slow + fast > 0.0)).all():
+        yield (
+            "thrust_map must rise with rotor speed: k1 + 2 k2 w is "
+            f"{listed(slow)} at rotor_speed_min and {listed(fast)} at rotor_speed_max"
+        )
+    least = NEARLY_LINEAR * abs(k1) / high
+    if (abs(k2) < least).any():
+        yield (
+            f"thrust_map must bend, so that a speed follows from a thrust: k2 is {listed(k2)}. Write "
+            f"{1.1 * least.max():.2g}, which changes thrust by 0.1 %"
+        )
+
+
+def listed(x: ArrayLike) -> str:
+    """Numbers in four digits."""
+    return shown([float(f"{value:.4g}") for value in np.asarray(x, float).flat])
+
+
+class RateLoop:
+    """The rate loop as it is flown, in steps, about each body axis, in arrays (3), or (n, 3) for several drones.
+
+    About hover a physics step of dt takes the body rate w and the angular acceleration A of an axis to
+
+    .. math:: \\begin{pmatrix} w \\\\ A \\end{pmatrix} \\leftarrow \\begin{pmatrix} 1 & dt \\\\
+        -(1 - a) K & a - (1 - a) D / J \\end{pmatrix} \\begin{pmatrix} w \\\\ A \\end{pmatrix}
+        + \\begin{pmatrix} 0 \\\\ (1 - a) K \\end{pmatrix} w^c, \\qquad a = e^{-dt / \\tau_m},
+
+    with every integrator: the present rotor speeds turn the body, while the controller commands the next ones.
+
+    Args:
+        gain: K [1/s].
+        inertia: J [kg m2].
+        damping: D [kg m2], on the angular acceleration.
+        motor_time_constant: (1) or (n, 1) [s]. Of two, for speeding up and slowing down, half of the rotors have each:
+            the loop then overshoots by up to 0.02 more of the step than this says.
+        dt: the physics step [s]; 0 is continuous time.
+
+    Attributes:
+        poles: (\\*, 2), the eigenvalues of the step; within the unit circle the loop is stable.
+        natural_frequency: [rad/s].
+        damping_ratio: 1 and more where no pole rings.
+    """
+
+    def __init__(
+        self, gain: ArrayLike, inertia: ArrayLike, damping: ArrayLike, motor_time_constant: ArrayLike, dt: float
+    ) -> None:
+        gain, inertia, damping, tau = (np.asarray(x, float) for x in (gain, inertia, damping, motor_time_constant))
+        self.dt = max(dt, 1e-6 * float(np.min(tau)))
+        share = np.mean(-np.expm1(-self.dt / np.atleast_1d(tau)), -1, keepdims=True)  # 1 - a
+        # Of a pole z the distance y = 1 - z solves y^2 - m y + g = 0, which keeps its digits in short steps.
+        self._m, self._g = share * (1.0 + damping / inertia), share * gain * self.dt
+        root = np.sqrt(0.25 * self._m**2 - self._g + 0j)
+        root = np.where(abs(root) < 1e-6 * self._m, 1e-6 * self._m, root)  # two equal poles, a little apart
+        y = 0.5 * self._m[..., None] + np.stack((-root, root), -1)
+        self._error = y[..., 1] / (y[..., 1] - y[..., 0])  # of a step of the command: twice its part along the first
+        self.poles = 1.0 - y
+        s = np.log1p(np.where(abs(self.poles) < 1e-12, 1e-12 - 1.0, -y)) / self.dt  # as of continuous time
+        rings = (self.poles.imag != 0.0) | (self.poles.real < 0.0)
+        self.natural_frequency = np.sqrt(abs(s.prod(-1)))
+        ringing = (-s.real / abs(s)).min(-1)
+        self.damping_ratio = np.where(rings.any(-1), ringing, -s.real.sum(-1) / (2.0 * self.natural_frequency))
+        self.is_stable = (abs(self.poles) < 1.0).all(-1)
+
+    @property
+    def bandwidth(self) -> Array:
+        """At which the answer to a sine has fallen by 3 dB [rad/s]; at most that of one change of sign in each step."""
+        m, g = self._m, self._g
+        d = 1.0 - m + g  # the product of the poles
+        b = (m - g) ** 2 - g * (2.0 - m + g)  # u = 1 - cos(w dt) solves 4 d u^2 + 2 b u = g^2
+        u = g**2 / np.maximum(b + np.sqrt(np.maximum(b**2 + 4.0 * d * g**2, 0.0)), 1e-300)
+        return 2.0 * np.arcsin(np.sqrt(np.clip(0.5 * u, 0.0, 1.0))) / self.dt
+
+    @property
+    def overshoot(self) -> Array:
+        """By which the rate exceeds a small step of the command at most, as a share of it; infinite where unstable."""
+        first, second = np.moveaxis(np.where(self.is_stable[..., None], self.poles, 0.5), -1, 0)
+        angle, phase = np.angle(first), np.angle(self._error)
+        early = np.arange(2.0, 8.0)  # where poles lie on the negative axis
+        turn = (np.pi + np.arctan2(np.log(abs(first)), angle) - phase) / np.maximum(angle, 1e-9)
+        steps = [turn // 1.0, turn // 1.0 + 1.0, *(np.full_like(turn, k) for k in early)]
+        error = [self._error * first**k + (1.0 - self._error) * second**k for k in steps]
+        return np.where(self.is_stable, np.maximum(-np.real(error).min(0), 0.0), np.inf)

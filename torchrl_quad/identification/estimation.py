@@ -190,7 +190,7 @@ def _check_turning(prior: QuadrotorParams, logs: Sequence[FlightLog]) -> None:
     places, spin, mine = prior.rotor_positions.numpy(), prior.rotor_spin.numpy(), log_columns(prior)
     signs = np.stack((places[:, 1], -places[:, 0], spin))  # of roll, pitch and yaw
     rows = [np.concatenate([np.arange(a, b) for a, b in x.segments]) for x in logs]
-    fits = np.mean([turning_fits(x.angular_velocity, x.motor_command[:, mine], x.dt, r, signs)[0]
+    fits = np.mean([turning_fits(x.angular_velocity, x.motor_command[:, mine], x.dt, [r], signs)[0, 0]
                     for x, r in zip(logs, rows, strict=True)], 0)  # fmt: skip
     if fits[2] < -_CONTRARY:
         raise UserValueError(

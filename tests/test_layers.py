@@ -27,7 +27,7 @@ ALLOWED = {
     ),
     "modules": ({UNWRAP}, TORCHRL),
     "objectives": ({UNWRAP}, TORCHRL),
-    "data": (set(), TORCHRL),
+    "data": ({"engine"}, TORCHRL),
     "deploy": (
         {"allocation", "data", "dynamics", "engine", "envs", "files", "airframe", "rotations", "vision"},
         {*TORCHRL, "jsonschema", "numpy", "onnx", "onnxruntime", "onnxscript", "mujoco", "rotorpy", "crazyflow", "jax"},

@@ -36,7 +36,7 @@ class PlainClipPPOLoss(ClipPPOLoss):
         self, actor_network: ProbabilisticActor, critic_network: ValueOperator, *, compile: bool = False, **options: Any
     ) -> None:
         super().__init__(actor_network, critic_network, **options)
-        plain: Any = None if hasattr(actor_network, "replayed") else plain_of(actor_network)
+        plain: Any = None if hasattr(actor_network, "replayed") else getattr(actor_network, "plain", lambda: None)()
         predict, names = cast("Any", critic_network).plain(), [name for name, _ in critic_network.named_parameters()]
 
         def actor(weights: list[Tensor], inputs: list[Tensor], drawn: list[Tensor], *flown: Tensor) -> Any:

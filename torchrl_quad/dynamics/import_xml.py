@@ -77,7 +77,7 @@ def _xml(path: Path) -> ET.Element:
 def _numbers(text: str | None, n: int, source: str) -> Array:
     """So many numbers, of which zeros are left out as a whole."""
     try:
-        values = np.array(("0 " * n if text is None else text).split(), float)
+        values = np.array((text or "").split() or [0.0] * n, float)
     except ValueError:
         values = np.empty(0)
     if len(values) != n:

@@ -24,7 +24,7 @@ def racing(env: RacingEnv) -> Reference:
 
     A drone that has missed its gate has to come back, and stop at the gate.
     """
-    lap, lead = plan_lap(env.gates, env.nominal, env.track["gate_radius"]), env.action_delay * env.control_dt
+    lap, lead = plan_lap(env.gates, env.nominal, env.gate_radius), env.action_delay * env.control_dt
 
     def reference(state: dict[Any, Tensor], t: Tensor) -> Tensor:
         begin, is_missed = lap.locate(state["position"], state["gate"][:, 0], lead)

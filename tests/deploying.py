@@ -64,11 +64,11 @@ def build(name, num_envs=16):
     return env, actor
 
 
-def pilot(env, sink=2.0, after=0, beyond=0.0):
+def pilot(env, sink=2.0, after=0, beyond=0.0, directed=False):
     """A policy by hand, a single layer: fly to the first point that is observed, level and without turning.
 
     ``sink`` is the stiffness of the height; ``after`` numbers come behind the body's in the observation;
-    it flies ``beyond`` the point [m], along x.
+    it flies ``beyond`` the point [m], along x, or 1 m along the direction that is observed after two points.
     """
     actor = make_actor(env, ())
     (layer,) = (x for x in actor[0].module.mlp if isinstance(x, nn.Linear))
@@ -80,6 +80,7 @@ def pilot(env, sink=2.0, after=0, beyond=0.0):
             weight[axis, x + along], weight[axis, v + along] = sign * 0.8, sign * -1.0
             weight[axis, q + axis] = -0.6
         weight[3, q + 3] = -0.3
+        weight[:, 6:9] += 0.1 * directed * weight[:, :3]
         weight[1:4, w : w + 3] += -0.02 * torch.eye(3)
         layer.weight.copy_(weight)
         layer.bias[1:4] = torch.tensor([0.0, 0.8 * beyond, 0.0])

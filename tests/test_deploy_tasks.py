@@ -45,15 +45,18 @@ HARDER = {  # so that some episodes succeed, some do not, and some crash
     "hovering": {"box_height": 1.7},
     "tracking": {"success_radius": 1.24, "ceiling": 1.15},
     "landing": {"success_speed": 0.28, "box_half_width": 0.9},
-    "racing": {"success_gates": 1, "ceiling": 1.5},
+    "racing": {"success_gates": 2},
     **{"relay": {}, "ring": {}},
 }
-PILOTS = {"relay": {"after": 6}, "ring": {"beyond": 0.5}}
+RANDOM_TRACK = {"file": "random", "random": {"gates": 3, "spacing": [2, 4]}, "frame": 0.3}
+OPTIONS = {"racing": {"track": RANDOM_TRACK, "observe_directions": True}}
+PILOTS = {"relay": {"after": 6}, "ring": {"beyond": 0.5}, "racing": {"directed": True}}
 
 
 def harder(name):
     task = name.removesuffix(", harder")
     options = {"num_envs": 16, "max_episode_steps": 130, "seed": 1, "random_start": {"velocity": 2.0, "tilt": 0.3}}
+    options |= OPTIONS.get(task, {})
     env = OWN[task](**options) if task in OWN else make_env(task, **options)
     vars(env).update(HARDER[task])
     return env, pilot(env, **PILOTS.get(task, {}))
@@ -222,10 +225,15 @@ CHANGES = [  # of a contract whose checksums fit
     ("output.order", ["thrust"] * 4, "output.order: .* was expected"),
     ("simulator.integrator", "rk9", "simulator.integrator: 'rk9' is not one of"),
     ("drone.thrust_map", [1e-9, 0, 0], "drone: to hover each rotor must give"),
-    ("drone.rotor_positions", [[0.1, 0.1]] * 4, "drone.rotor_positions and rotor_spin cannot make thrust"),
+    (
+        "drone.rotor_positions",
+        [[0.1, 0.1]] * 4,
+        "drone.rotor_positions and rotor_spin cannot control roll and pitch",
+    ),
     ("plant", {"mass": 0}, "plant.mass: 0 is less than the minimum of 0.001"),
+    ("plant", {"inertia": [1e-3, 1e-3, 3e-3]}, "plant.inertia .* kg m2: in a body none of the three exceeds"),
     ("plant", {"wings": 2}, "plant: .*'wings' was unexpected"),
-    ("plant", {"rotor_speed_min": 9000}, "plant.rotor_speed_min is 9000, and must be below"),
+    ("plant", {"rotor_speed_min": 9000}, "plant.rotor_speed_min must be below rotor_speed_max"),
 ]
 
 

@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import json
 import re
 from pathlib import Path
 
@@ -11,9 +12,10 @@ import torch
 import yaml
 from refusals import cases, refuses
 
-from torchrl_quad import HoveringEnv, QuadrotorParams, available_drones, load_drone
+from torchrl_quad import HoveringEnv, QuadrotorParams, available_drones, load_drone, suggest_gains
 from torchrl_quad.dynamics import FlightController, presets
-from torchrl_quad.errors import UserValueError, shown
+from torchrl_quad.dynamics.gains import rate_loop
+from torchrl_quad.errors import DroneWarning, UserValueError, shown
 
 VISFLY = {name: value.squeeze().tolist() for name, value in load_drone("visfly").fields().items()}
 
@@ -40,9 +42,18 @@ def test_a_drone_comes_from_a_file_or_a_mapping_as_well(tmp_path):
     ({"inertia": [1e-3, 1e-3]}, r"mine.yaml: field 'inertia' has shape \(2,\); it must be \(3,\)"),
     ({"linear_drag": [0.0, -0.1, 0.0]}, r"mine.yaml: field 'linear_drag' must be between 0 and 100"),
     ({"rotor_spin": [1, 1, 0, -1]}, r"mine.yaml: field 'rotor_spin' must be \+1 or -1"),
-    ({"thrust_map": [0.0, 1.0, 0.0]}, r"mine.yaml: field 'thrust_map' must be rising at high speed, k2 above zero"),
+    ({"inertia": [1e-3, 1e-3, 2.1e-3]}, r"inertia \[0.001, 0.001, 0.0021\] kg m2: in a body none .* exceeds the sum"),
+    (
+        {"inertia": [0.02, 0.02, 0.03]},
+        r"it is that of a ring of 0.255 m radius, and the farthest rotor is 0.075 m from",
+    ),
+    (
+        {"thrust_map": [-1e-6, 5e-3, 0.0]},
+        r"must rise .* is \[0.0046\] at rotor_speed_min and \[-0.002\] at rotor_speed_max",
+    ),
+    ({"thrust_map": [0.0, 1e-3, 0.0]}, r"thrust_map must bend, .* k2 is \[0.0\]. Write 3.1e-10, which"),
     ({"mass": "1:59:59"}, r"mine.yaml: field 'mass' is not a number or a list of numbers: '1:59:59'"),
-    ({"thrust_map": [4e-7, -5e-3, 0.0]}, r"thrust_map must not fall with rotor speed"),
+    ({"thrust_map": [4e-7, -5e-3, 0.0]}, r"thrust_map must rise with rotor speed"),
     ({"rotor_speed_min": 4000.0}, r"rotor_speed_min must be below rotor_speed_max, got \[4000.0\] and \[3500.0\]"),
 )
 def test_a_bad_file_is_refused_with_its_field_and_what_is_allowed(change, message, tmp_path):
@@ -80,11 +91,85 @@ def test_gradients_flow_through_replace_to_and_construction_and_a_drone_in_float
     QuadrotorParams(**params.fields()).mass.sum().backward()
     assert (mass.grad == 1.0).all() and params.mass.shape == (5, 1)
     assert not params.detach().mass.requires_grad
-    drone = {**VISFLY, "mass": 0.027, "inertia": [1e-8, 1e-8, 1e-8], "yaw_torque_coefficient": 1e-5}
+    drone = {
+        **VISFLY,
+        "mass": 0.027,
+        "inertia": [1e-8] * 3,
+        "yaw_torque_coefficient": 1e-5,
+        "rate_gain": [20.0] * 3,
+        "rate_damping": [0.0] * 3,
+    }
     env = HoveringEnv(num_envs=1, drone=drone, dtype=torch.float64)
     assert (env.params.mass.item(), env.params.inertia[..., 0].item()) == (0.027, 1e-8)
     rounded = load_drone(drone, torch.float32)  # whose 1e-8 is a little less
     assert rounded.to(dtype=torch.float64).inertia[0] < 1e-8
+
+
+# Gazebo's iris with gains of PX4, and motors so quick that the loop is unstable in these steps.
+IRIS = {**VISFLY, "mass": 1.535, "inertia": [0.029125, 0.029125, 0.055225], "thrust_map": [5.84e-6, 0.0, 0.0]}
+IRIS |= {"rotor_positions": [[0.13, 0.22], [-0.13, 0.20], [-0.13, -0.20], [0.13, -0.22]], "rotor_speed_max": 1100.0}
+IRIS |= {"motor_time_constant": [0.0125, 0.025], "yaw_torque_coefficient": 0.06, "max_thrust_to_weight": 1.8}
+IRIS |= {"rate_gain": [146.08, 146.08, 8.18], "rate_damping": [0.029125] * 3, "max_body_rate": [3.84, 3.84, 3.49]}
+QUICK = {**VISFLY, "motor_time_constant": 0.005, "rate_damping": VISFLY["inertia"], "max_body_rate": [0.2] * 3}
+
+
+@cases(
+    (IRIS, r"about roll and pitch overshoots by 25% \(in continuous time by 7%\) and asks at full rate .* torque"),
+    (
+        {**IRIS, "rate_gain": [75.0] * 3, "max_body_rate": [8.0, 8.0, 0.1]},
+        r"about roll and pitch asks .* 10.2 times the torque",
+    ),
+    ({**QUICK, "rate_gain": [365.0, 365.0, 50.0]}, r"about roll and pitch overshoots by 100%"),
+    ({**QUICK, "rate_gain": [20.0, 20.0, 730.0]}, r"about yaw is unstable, .* Write rate_gain: \[20.0, 20.0, "),
+    ({**QUICK, "rate_damping": [0.03] * 3}, r"about roll and pitch and yaw is unstable"),
+)
+def test_gains_that_the_physics_steps_do_not_bear_are_refused_and_each_advice_flies(drone, message):
+    advice = refuses(message, HoveringEnv, num_envs=1, drone=drone).split("Write ")[1]
+    gain, damping = (json.loads(numbers) for numbers in re.findall(r"\[.*?\]", advice))
+    choices = [{"drone": {**drone, "rate_gain": gain, "rate_damping": damping}}]
+    if "torque" not in message:  # of which rotors have no more in shorter steps
+        choices.append({"drone": drone, "dt": float(re.search(r"dt=(.*)\.", advice)[1])})
+    for options in choices:
+        env = HoveringEnv(num_envs=1, **options)
+        stick = functools.partial(fly_stick, env.hover_action + torch.tensor([0.0, 0.02, 0.02, 0.02]))
+        rates = env.rollout(15, stick, break_when_any_done=False)["next", "state", "angular_velocity"][0]
+        rates = rates / (0.02 * env.nominal.max_body_rate)
+        assert rates.max() < 1.35 and rates[-1].min() > 0.3
+
+
+def fly_stick(action, td):
+    return td.set("action", action.expand(1, 4))
+
+
+@pytest.mark.parametrize("dt", [1e-3, 5e-3, 2e-2])
+def test_suggested_gains_are_well_damped_and_ask_no_more_of_the_rotors_than_they_have(dt):
+    several = load_drone().replace(mass=torch.tensor([[0.4], [0.5]]))
+    for drone in (*map(load_drone, available_drones()), several, load_drone(IRIS)):
+        params = drone.replace(**suggest_gains(drone, dt))
+        assert (rate_loop(params, dt).damping_ratio >= 0.799).all() and (params.rate_gain > 2).all()
+        asked = params.inertia * params.rate_gain * params.max_body_rate
+        assert (asked <= 1.001 * FlightController(params).spare_torque()).all()
+    bare = {name: value for name, value in IRIS.items() if not name.startswith("rate_")}
+    assert torch.allclose(suggest_gains(bare, dt)["rate_gain"].float(), params.rate_gain)
+
+
+def test_a_command_beyond_the_reach_of_the_rotors_is_warned_of_and_the_advice_flies_without():
+    with pytest.warns(
+        DroneWarning, match="commands max_thrust_to_weight=6, and the rotors reach 4.446 times"
+    ) as warned:
+        HoveringEnv(num_envs=1, drone={**VISFLY, "max_thrust_to_weight": 6.0})
+    most = float(str(warned[0].message).rpartition(" ")[2].removesuffix("."))
+    HoveringEnv(num_envs=1, drone={**VISFLY, "max_thrust_to_weight": most})
+
+
+def test_drones_drawn_have_bodies_and_none_has_an_unstable_rate_loop():
+    env = HoveringEnv(num_envs=200, randomize={"inertia": {"scale": [0.7, 1.3]}})
+    inertia = env.reset()["state", "drone", "inertia"]
+    assert (2 * inertia.amax(-1) <= inertia.sum(-1) * (1 + 1e-6)).all() and inertia[:, 2].std() > 1e-4
+    unstable = {"inertia": {"scale": [0.1, 1.0]}}
+    refuses("randomize: a drone: in steps of dt=0.005 s .* unstable", HoveringEnv, num_envs=1, randomize=unstable)
+    HoveringEnv(num_envs=1, randomize=unstable, dt=0.001)
+    refuses("unstable with an inertia of", env.set_params, env.params.replace(inertia=env.params.inertia * 0.1))
 
 
 def test_a_drone_shows_itself_as_a_table_with_units():

@@ -2,14 +2,17 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
 from torchrl_quad import HoveringEnv
-from torchrl_quad.dynamics import FlightController, Quadrotor, available_drones, load_drone, quaternion, rigid_body
+from torchrl_quad.deploy.simulators import vehicle
+from torchrl_quad.dynamics import FlightController, Quadrotor, load_drone, quaternion, rigid_body
 from torchrl_quad.dynamics.control import Setpoint
+from torchrl_quad.dynamics.gains import rate_loop
 from torchrl_quad.dynamics.model import QuadrotorState
 from torchrl_quad.dynamics.rigid_body import INTEGRATORS, RigidBodyState, Rotors, accelerations
 from torchrl_quad.dynamics.vector import matvec
@@ -162,7 +165,7 @@ def test_allocation_is_r_cross_f_for_any_layout(tilted):
     torch.testing.assert_close(worn @ thrust, rigid_body.allocation_matrix(params) @ (share * thrust))
 
 
-@pytest.mark.parametrize("name", available_drones())
+@pytest.mark.parametrize("name", FLOWN)
 def test_a_body_rate_command_turns_the_drone_that_way(name):
     params = drone(name, drag_height=0.0)  # a drag moment that changes with the speed disturbs the loop
     controller = FlightController(params)
@@ -174,28 +177,48 @@ def test_a_body_rate_command_turns_the_drone_that_way(name):
         torch.testing.assert_close(end.angular_velocity, wanted, atol=0.02 * params.max_body_rate[0].item(), rtol=0.02)
 
 
-@pytest.mark.parametrize("name", available_drones())
-def test_the_rate_loop_is_damped_as_its_gains_say(name):
+@pytest.mark.parametrize("dt", [5e-4, 5e-3, 1e-2])
+@pytest.mark.parametrize("name", FLOWN)
+def test_the_rate_loop_is_damped_as_its_poles_say_in_the_steps_that_are_flown(name, dt):
     params = drone(name, drag_height=0.0)
     controller = FlightController(params)
-    step = torch.nn.functional.pad(0.2 * torch.eye(3, dtype=F64), (1, 0))  # about one axis each, no rotor saturates
-    history = fly(hovering(controller, 3), controller.hover_action + step, params, controller, 1.0, 5e-4)
-    peak = torch.stack([state.angular_velocity.diagonal() for state in history]).amax(0)
-    # Of the second-order loop that rotor lag, rate gain and damping form.
-    lag = 2 * (params.rate_gain * params.motor_time_constant).sqrt()
-    ratios = (1 + params.rate_damping / params.inertia) / lag
-    for overshoot, ratio in zip((peak / (0.2 * params.max_body_rate) - 1).tolist(), ratios.tolist(), strict=True):
-        assert ratio >= 0.7 or name == "visfly"  # its published gains: 0.71, 0.64 and 0.74
-        expected = math.exp(-math.pi * ratio / math.sqrt(1 - ratio**2)) if ratio < 1 else 0.0
-        assert overshoot == pytest.approx(expected, abs=0.01)
+    step = torch.nn.functional.pad(0.02 * torch.eye(3, dtype=F64), (1, 0))  # about one axis each
+    history = fly(hovering(controller, 3), controller.hover_action + step, params, controller, 1.0, dt)
+    rates = torch.stack([state.angular_velocity.diagonal() for state in history]) / (0.02 * params.max_body_rate)
+    loop, fields = rate_loop(params, dt), (params.rate_gain, params.rate_damping / params.inertia)
+    torch.testing.assert_close((rates.amax(0) - 1).clamp_min(0), torch.tensor(loop.overshoot), atol=2e-3, rtol=0)
+    for axis, (gain, ratio) in enumerate(zip(*(x.tolist() for x in fields), strict=True)):
+        share = -math.expm1(-dt / params.motor_time_constant.item())
+        a = np.array([[1.0, dt], [-share * gain, 1.0 - share - share * ratio]])
+        np.testing.assert_allclose(np.sort(np.linalg.eigvals(a)), np.sort(loop.poles[axis]), rtol=1e-9)
+        state, flown = np.zeros(2), []
+        for _ in history:
+            state = a @ state + [0.0, share * gain]
+            flown.append(state[0])
+        np.testing.assert_allclose(rates[:, axis], flown, atol=5e-3)
+        answer = np.linalg.solve(np.exp(1j * loop.bandwidth[axis] * dt) * np.eye(2) - a, [0.0, share * gain])[0]
+        assert abs(answer) == pytest.approx(0.5**0.5, rel=1e-9)
+        of_continuous_time = (1 + ratio) / (2 * math.sqrt(gain * params.motor_time_constant))
+        assert rate_loop(params, 0.0).damping_ratio[axis] == pytest.approx(of_continuous_time, rel=1e-5)
 
 
-@pytest.mark.parametrize("name", available_drones())
-def test_the_thrust_map_and_its_inverse_agree_over_the_speed_range(name):
-    rotors = Rotors(drone(name))
-    low, high = rigid_body.thrust_limits(drone(name))
+FALLING_SLOPE = {"thrust_map": [-2.0, 8.0, 0.1], "rotor_speed_min": 0.0, "rotor_speed_max": 1.0}  # of a motor command
+
+
+@pytest.mark.parametrize("changes", [{}, FALLING_SLOPE, {**FALLING_SLOPE, "thrust_map": [0.01, 6.0, -0.1]}])
+@pytest.mark.parametrize("name", FLOWN)
+def test_the_thrust_map_and_its_inverse_agree_over_the_speed_range(name, changes):
+    params = drone(name, **changes)
+    rotors, apart = (
+        Rotors(params),
+        vehicle.Drone({k: x.squeeze().numpy() for k, x in params.fields().items() if k != "drag_height"}),
+    )
+    low, high = rigid_body.thrust_limits(params)
     thrust = low + torch.linspace(0.01, 1, 50, dtype=F64) * (high - low)
-    torch.testing.assert_close(rotors.thrust(rotors.speed(thrust)), thrust)
+    speed = rotors.speed(thrust)
+    torch.testing.assert_close(rotors.thrust(speed), thrust)
+    assert ((params.rotor_speed_min <= speed) & (speed <= params.rotor_speed_max * (1 + 1e-9))).all()
+    np.testing.assert_allclose(apart.speed(thrust.numpy()), speed.numpy(), rtol=1e-12)
 
 
 @pytest.mark.parametrize("dt", [1e-3, 5e-3, 0.05])
@@ -245,7 +268,7 @@ def test_components_fly_as_tensors_do_with_two_time_constants_and_drag_above_the
 
 # -- where rotors saturate: yaw gives way first, and nothing changes where they do not ---------------------------------
 
-each_drone = pytest.mark.parametrize("controller", available_drones(), indirect=True)
+each_drone = pytest.mark.parametrize("controller", FLOWN, indirect=True)
 
 
 @pytest.fixture

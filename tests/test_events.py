@@ -11,12 +11,15 @@ from torchrl.envs import check_env_specs
 from torchrl_quad import LandingEnv, RacingEnv, audit_reward, make_env
 from torchrl_quad.envs import Event, ball_entry, level_crossing
 from torchrl_quad.envs.terms import time_terms
+from torchrl_quad.envs.track import forward
 
 GAMMA = 0.97
 STEPS = 8
-PAID = {"racing": "gate", "landing": "success"}  # by the terms that an event pays
-TIMED = {"racing": "gate_time", "landing": "touchdown_time"}
-EVENT_PAYS = {"racing": 5.0, "landing": 20.0}
+PAID = {"racing": "gate", "gates": "gate", "landing": "success"}  # by the terms that an event pays
+TIMED = {"racing": "gate_time", "gates": "gate_time", "landing": "touchdown_time"}
+EVENT_PAYS = {"racing": 5.0, "gates": 5.0, "landing": 20.0}
+GATES = {"gates": [{"position": [4 * i, 4 * i % 8, 2], "yaw": 1.4 * i, "pitch": 0.3 * i} for i in range(4)]}
+GATES |= {"width": 1.0, "height": 0.8}
 each_task = pytest.mark.parametrize("task", PAID)
 
 
@@ -33,6 +36,17 @@ def racers(**options):
     return env, state
 
 
+def racers_through_gates(**options):
+    """The same before gates with a direction, along it within half a radian."""
+    env, state = racers(track=GATES, **options)
+    along = forward(env.rotations)[state["gate"][:, 0]]
+    way = torch.nn.functional.normalize(along + 0.3 * torch.randn(6, 3, dtype=torch.float64).clamp(-1.0, 1.0), dim=-1)
+    speed = state["velocity"].norm(dim=-1, keepdim=True)
+    off = 0.2 * torch.nn.functional.normalize(torch.linalg.cross(way, torch.randn(6, 3, dtype=torch.float64)), dim=-1)
+    state["position"], state["velocity"] = state["target"] + off - way * (0.1 + 0.07 * speed), speed * way
+    return env, state
+
+
 def landers(**options):
     """Two each lack in the height, on the side (along x, along y), and in the speed; the last two have to brake."""
     env = LandingEnv(num_envs=6, dtype=torch.float64, **options)
@@ -44,7 +58,7 @@ def landers(**options):
     return env, state
 
 
-STARTS = {"racing": racers, "landing": landers}
+STARTS = {"racing": racers, "gates": racers_through_gates, "landing": landers}
 
 
 def flight(env, state, actions):
@@ -54,7 +68,15 @@ def flight(env, state, actions):
 
 def bisected(env, steps):
     """The fraction of each step (n, STEPS, 1) at which its event happens, by bisection; 0 where none does."""
-    if isinstance(env, RacingEnv):
+    if isinstance(env, RacingEnv) and env.is_directed:
+        gate = steps["state", "gate"][..., 0]
+        start, end = (x - env.gates[gate] for x in (steps["state", "position"], steps["next", "state", "position"]))
+        along, high = forward(env.rotations)[gate], torch.ones_like(steps["next", "reward"])
+
+        def inside(fraction):
+            ahead = (torch.lerp(start, end, fraction) * along).sum(-1, keepdim=True) >= 0.0
+            return ahead & steps["next", "state", "gate_passed"]
+    elif isinstance(env, RacingEnv):
         centre = steps["state", "target"]
         start, end = (x - centre for x in (steps["state", "position"], steps["next", "state", "position"]))
         way = end - start
@@ -112,7 +134,7 @@ def test_gradients_in_actions_and_start_are_those_of_the_return_in_continuous_ti
     before, after = rates(env, task, flown)
     assert (bisected(env, flown)[1] * counted(flown) > 0).any(1).all(), "each drone has an event"
     returns = {"events": (counted(steps) * steps["next", "reward_terms", TIMED[task]]).sum((1, 2))}
-    if task == "racing":  # the descent of landing has a scale without gradient
+    if task != "landing":  # the descent of landing has a scale without gradient
         returns["all"] = (counted(steps) * steps["next", "reward"]).sum((1, 2))
 
     def reference(values):
@@ -179,7 +201,11 @@ def test_the_audit_says_that_a_term_has_a_gradient_in_time_only(task):
 )
 @each_task
 def test_tumbling_and_standing_drones_have_finite_gradients_and_specs_hold(task, options):
-    check_env_specs(make_env(task, num_envs=2, event_discount=0.99, **options), break_when_any_done="both")
+    task_options = {"track": GATES} if task == "gates" else {}
+    name = "landing" if task == "landing" else "racing"
+    check_env_specs(
+        make_env(name, num_envs=2, event_discount=0.99, **task_options, **options), break_when_any_done="both"
+    )
     env, state = STARTS[task](event_discount=0.99, **options)
     state["velocity"][0] = 0.0
     inputs = [state["position"].requires_grad_(), state["velocity"].requires_grad_()]

@@ -221,7 +221,7 @@ def test_compiled_flights_equal_eager_ones_and_never_recompile(monkeypatch):
 
 
 def test_drones_that_break_crash_alone_in_a_compiled_step():
-    env = HoveringEnv(num_envs=3, integrator="rk4", action_delay=0, dt=0.02)
+    env = HoveringEnv(num_envs=3, integrator="rk4", action_delay=0, dt=0.01, control_dt=0.01)
     mass = env.nominal.mass.clone().requires_grad_()
     env.params = env.nominal.replace(mass=mass)
     expected, expected_grads = break_drones(env, mass)

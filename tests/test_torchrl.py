@@ -1,17 +1,37 @@
-"""The environment in TorchRL's own hands: under its transforms, losses and collectors, and in several processes."""
+"""The environment in TorchRL's own hands: under its transforms, losses and collectors, and in several processes.
+
+The last section follows TorchRL's own tests (pytorch/rl, test/envs), and names them. These do not apply: environments
+that reset themselves (TestAutoReset), as ours do not, and refuse to be called so; sums of ("reward_terms", name), which
+RewardSum takes of the reward spec alone, while our terms are observations that a reset writes; nested done flags,
+several agents, strings, tensorclasses, dynamic specs and discrete actions, of which there are none; and a batch in
+AsyncEnvPool, which in TorchRL 0.14 does not fly its own CountingEnv(batch_size=[3]) either.
+"""
 
 import multiprocessing
+import pickle
 import signal
 from functools import partial
 
 import pytest
 import torch
 from refusals import refuses
+from tensordict import assert_close
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
-from torchrl.collectors import MultiCollector
-from torchrl.envs import Compose, ParallelEnv, RewardSum, SerialEnv, StepCounter, TransformedEnv, check_env_specs
+from torchrl.collectors import Collector, MultiCollector
+from torchrl.data import Unbounded
+from torchrl.envs import (
+    AsyncEnvPool,
+    Compose,
+    EnvCreator,
+    ParallelEnv,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+    check_env_specs,
+)
 from torchrl.envs import transforms as of_torchrl
-from torchrl.envs.utils import ExplorationType
+from torchrl.envs.utils import ExplorationType, step_mdp
 from torchrl.objectives import SoftUpdate
 
 from torchrl_quad import HoveringEnv, ObservationNormalizer, VisitedStateBuffer, differentiable_rollout
@@ -253,3 +273,102 @@ def test_environments_in_several_processes_fly_and_the_loss_says_that_they_cut_t
     finally:
         env.close(raise_if_closed=False)
     refuses("carries no gradient. Collectors, ParallelEnv, .* cut it", BPTTLoss(actor), rollout, error=RuntimeError)
+
+
+# -- what TorchRL's own tests ask of an environment --------------------------------------------------------------------
+
+each_task = pytest.mark.parametrize("task", TASKS)
+
+
+def short(task, num_envs=3, **options):
+    return make_env(task, num_envs=num_envs, max_episode_steps=4, **options)
+
+
+@each_task
+def test_specs_are_locked_have_an_unbatched_form_and_are_what_a_step_writes(task):
+    env = short(task)
+    check_env_specs(env, break_when_any_done="both")
+    for _ in range(2):  # TestEnvBase::test_env_lock, also of a copy from another process
+        assert env.is_spec_locked and env.input_spec.is_locked and env.output_spec.is_locked
+        with pytest.raises(RuntimeError, match="lock"):
+            env.input_spec["full_action_spec", "action"] = Unbounded(())
+        env = pickle.loads(pickle.dumps(env))
+    assert not short(task, spec_locked=False).is_spec_locked
+    # TestEnvBase::test_single_env_spec
+    assert env.full_action_spec_unbatched["action"].shape == (4,) and env.full_reward_spec_unbatched.shape == ()
+    for batched, single in ((env.output_spec, env.output_spec_unbatched), (env.input_spec, env.input_spec_unbatched)):
+        assert not single.shape and batched.is_in(single.zeros(env.shape))
+    fake, step = env.fake_tensordict(), env.rand_step(env.reset())
+    assert set(fake.keys(True, True)) == set(step.keys(True, True)) and env.output_spec["full_done_spec"].is_in(step)
+    # TestEnvBase::test_batch_locked
+    refuses("Expected a tensordict with shape==env.batch_size", env.step, step.expand(2, 3).clone(), error=RuntimeError)
+
+
+@each_task
+def test_a_seed_repeats_a_flight_and_gives_the_seed_of_the_next_environment(task):
+    env, actions = short(task), 0.1 * torch.randn(4, 3, 4)
+    # TestEnvBase::test_env_seed
+    following = env.set_seed(5)
+    first = env.rollout(9, actions=actions)
+    assert env.set_seed(5) == following != 5 and env.set_seed(5, static_seed=True) == 5
+    assert_close(env.rollout(9, actions=list(actions)), first)
+    assert torch.equal(first["action"], actions.transpose(0, 1)) and first.names == [None, "time"]
+    env.set_seed(following)
+    assert not torch.equal(env.rollout(9, actions=actions)["observation"], first["observation"])
+    # TestRollout::test_rollout_set_truncated, TestEnvBase::test_storing_device
+    flight = env.rollout(2, set_truncated=True, storing_device="cpu", break_when_any_done=False)
+    assert flight["next", "truncated"][:, -1].all() and flight["next", "done"][:, -1].all()
+
+
+@each_task
+def test_resets_of_some_and_steps_that_reset_leave_the_others_alone(task):
+    env = short(task).append_transform(StepCounter())
+    before = step_mdp(env.rollout(2, actions=env.base_env.hover_action.expand(2, 3, 4))[:, -1])
+    mask = torch.tensor([[True], [False], [True]])
+    after = env.reset(before.clone().set("_reset", mask), set_state=False)  # TestEnvBase::test_env_base_reset_flag
+    assert after["state", "step"].flatten().tolist() == after["step_count"].flatten().tolist() == [0, 2, 0]
+    assert_close(after[1].exclude("_reset", "action"), before[1].exclude("action"))
+    steps, root = [], env.reset()
+    for _ in range(6):  # TestStepMdp::test_step_and_maybe_reset
+        step, root = env.step_and_maybe_reset(root.set("action", env.base_env.hover_action.expand(3, 4)))
+        steps.append(step["state", "step"][0].item())
+    assert steps == [0, 1, 2, 3, 0, 1] and env.maybe_reset(root.clone())["state", "step"].tolist() == [[2]] * 3
+    # TestCollector, of one process, goes on where a batch ends
+    batches = list(Collector(env, env.rand_action, frames_per_batch=9, total_frames=18))
+    assert torch.cat([x["step_count"] for x in batches], 1)[0].flatten().tolist() == [0, 1, 2, 3, 0, 1]
+
+
+@each_task
+def test_environments_are_copied_by_creators_and_moved_to_a_device_as_they_are(task):
+    env = SerialEnv(2, EnvCreator(partial(short, task)))  # TestEnvCreator::test_env_creator
+    assert env.rollout(5, break_when_any_done=False)["next", "done"].sum(2).tolist() == [[[1]] * 3] * 2
+    copy, device = short(task), torch.device("cpu")
+    assert copy.to(device) is copy and copy.device == device and copy.rollout(2).device == device
+    assert copy.load_state_dict(copy.state_dict()).missing_keys == []
+
+
+def alone(task):
+    """One drone, without a batch."""
+    return TransformedEnv(short(task, 1), of_torchrl.BatchSizeTransform(reshape_fn=lambda td: td.reshape(())))
+
+
+in_processes = pytest.param("hovering", "multiprocessing", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("task", "backend"), [*((x, "threading") for x in TASKS), in_processes])
+def test_drones_one_by_one_fly_asynchronously(task, backend, processes):
+    exchange = {"exchange": "queue"} if backend == "multiprocessing" else {}
+    env = AsyncEnvPool([partial(alone, task)] * 2, backend=backend, **exchange)
+    try:  # TestAsyncEnvPool::test_specs, test_async_reset_and_step
+        assert env.rand_step(env.reset()).shape == env.shape == (2,)
+        if task == "hovering":
+            env.check_env_specs(break_when_any_done="both")
+        assert env.rollout(6, break_when_any_done=False)["state", "step"][..., 0].tolist() == [[0, 1, 2, 3, 0, 1]] * 2
+        env.async_step_send(env.rand_action(env.reset()))
+        assert env.async_step_recv(min_get=2)["next", "state", "step"].tolist() == [[1], [1]]
+    finally:
+        env.close(raise_if_closed=False)
+
+
+def test_an_environment_that_is_said_to_reset_itself_is_refused():
+    refuses("auto_reset=True is for environments that reset themselves", make_env, "hovering", auto_reset=True)

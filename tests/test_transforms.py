@@ -30,17 +30,22 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor
+from torchrl_quad import HoveringEnv, differentiable_rollout, make_actor, make_visual_actor
 from torchrl_quad.data import flight_mode
-from torchrl_quad.data.transforms import transforms_of
+from torchrl_quad.data.transforms import transforms_of, under_transforms
 from torchrl_quad.objectives.calls import action_gradient
 
 OBSERVATION = ["observation"]
+COUNTED = ["observation", "step_count", "is_init"]
 
 
 def normalizer(key="observation", size=13, **keys):
     loc, scale = torch.linspace(-1, 1, size).double(), torch.linspace(0.5, 2, size).double()
     return ObservationNorm(loc, scale, in_keys=[key], standard_normal=True, **keys)
+
+
+def frames(count, key="observation", out_keys=None, **padding):
+    return CatFrames(count, -1, [key], out_keys, **padding)
 
 
 TRANSFORMS = {
@@ -63,21 +68,22 @@ TRANSFORMS = {
     "scaled action": lambda: ActionScaling(loc=torch.tensor(0.1).double(), scale=torch.tensor(0.7).double()),
     "clipped action": lambda: ClipTransform(in_keys_inv=["action"], in_keys=[], low=-0.1, high=0.3),
     "renamed": lambda: RenameTransform(["observation"], ["seen"]),
-    "frames": lambda: CatFrames(3, -1, OBSERVATION),
-    "frames after a number": lambda: CatFrames(2, -1, OBSERVATION, padding="constant", padding_value=0.5),
-    "frames of frames": lambda: Compose(CatFrames(2, -1, OBSERVATION), normalizer(size=26), CatFrames(3, -1, OBSERVATION)),
-    "frames of an entry": lambda: CatFrames(3, -1, [("state", "velocity")], ["seen"]),
+    "frames": lambda: frames(3),
+    "frames after a number": lambda: frames(2, padding="constant", padding_value=0.5),
+    "frames of frames": lambda: Compose(frames(2), normalizer(size=26), frames(3)),
+    "frames of an entry": lambda: frames(3, ("state", "velocity"), ["seen"]),
     "limited": lambda: StepCounter(max_steps=3),
     "limited twice": lambda: Compose(StepCounter(max_steps=4), StepCounter(3, step_count_key="more")),
     "read": lambda: Compose(RewardScaling(0.3, 2.0), TargetReturn(7.0), RewardSum()),
-    "counted": lambda: Compose(StepCounter(7), InitTracker(), CatTensors(["observation", "step_count", "is_init"], "seen", del_keys=False)),
+    "counted": lambda: Compose(StepCounter(7), InitTracker(), CatTensors(COUNTED, "seen", del_keys=False)),
     "left out": lambda: ExcludeTransform(("metrics", "position_error"), "success"),
     "selected": lambda: SelectTransform("observation", *HoveringEnv().state_keys, ("reward_terms", "velocity")),
 }
 
 
-KEYS = {"copied": ["seen"], "renamed": ["seen"], "concatenated": ["features"], "concatenated alone": ["features"], "counted": ["seen"]}
-KEYS |= {"frames of an entry": ["observation", "seen"], "read": ["observation", "target_return", "episode_reward"]}
+KEYS = {"copied": ["seen"], "renamed": ["seen"], "concatenated": ["features"], "concatenated alone": ["features"]}
+KEYS |= {"frames of an entry": ["observation", "seen"], "counted": ["seen"]}
+KEYS |= {"read": ["observation", "target_return", "episode_reward"]}
 
 
 def fly(env, actor, *, inside):
@@ -133,7 +139,7 @@ def test_transforms_and_memory_fly_inside_the_compiled_step():
             CatTensors(["observation", ("state", "rotor_speed")], "both", del_keys=False),
             normalizer("both", 17),
             ClipTransform(in_keys=["both"], low=-3.0, high=3.0),
-            CatFrames(3, -1, ["both"]),
+            frames(3, "both"),
             RewardScaling(0.1, 3.0),
             RewardSum(),
             TargetReturn(7.0),
@@ -160,7 +166,8 @@ def test_any_order_of_transforms_flies_inside_with_torchrl_s_numbers(names, coun
     except (IndexError, KeyError, NotImplementedError, RuntimeError):
         assume(False)  # TorchRL itself cannot fly it
     assume("drops it before the next" not in flight_mode(env, make_actor(env)).reason)
-    check(Compose(*(TRANSFORMS[name]() for name in names)), ["observation", *sorted(counters & set(env.observation_spec.keys()))])
+    counters &= set(env.observation_spec.keys())
+    check(Compose(*(TRANSFORMS[name]() for name in names)), ["observation", *sorted(counters)])
 
 
 def test_what_flies_in_torchrl_s_loop_says_why():
@@ -172,12 +179,33 @@ def test_what_flies_in_torchrl_s_loop_says_why():
     assert reason(compile=False).reason.startswith("the environment is not compiled")
     assert reason(StepCounter(max_steps=5)) == ("inside", "")
     assert reason(RewardSum(), FrameSkipTransform(2)).reason.startswith("FrameSkipTransform is none of")
+    env, flights = HoveringEnv(num_envs=2), []
+    for flown in (env, TransformedEnv(env, FrameSkipTransform(3))):  # it flies no further, as docs/engine.md says
+        env.set_seed(0)
+        flights.append(flown.rollout(2, actions=env.hover_action.expand(2, 2, 4))["next"])
+    torch.testing.assert_close(flights[1]["state"].to_dict(), flights[0]["state"].to_dict(), rtol=0, atol=0)
+    torch.testing.assert_close(flights[1]["reward"], 3 * flights[0]["reward"])
     reads = TensorDictModule(lambda x, y: x[:, :4].tanh(), ["observation", "step_count"], ["action"])
     assert reason(StepCounter(), policy=reads).mode == "called"
     reads.in_keys[1] = "traj_count"
     assert reason(TrajCounter(), policy=reads) == ("loop", "the policy reads 'traj_count', which is counted outside")
     called = TensorDictModule(lambda x: x[:, :4].tanh(), ["observation"], ["action"])
     assert reason(RewardSum(), policy=called).reason.startswith("TensorDictModule has no form on plain tensors")
+
+
+def test_of_what_a_policy_reads_the_image_alone_has_no_gradient_whatever_it_is_called():
+    base = HoveringEnv(num_envs=2, camera={"width": 6, "height": 4})
+
+    def without_gradient(*transforms, make=make_actor, **options):
+        env = TransformedEnv(base, Compose(*transforms))
+        plain = under_transforms(env, make(env, (5,), **options)).policy.plain()
+        plain.without_gradient = base.control_step.constants
+        return plain.without_gradient
+
+    stacked = CatFrames(3, -3, ["depth"], ["images"])
+    assert without_gradient(stacked, make=make_visual_actor, image_key="images") == {"images"}
+    renamed = ExcludeTransform("depth"), RenameTransform(["observation"], ["depth"])
+    assert without_gradient(*renamed, in_keys=["depth"]) == set()
 
 
 def test_the_first_step_reads_what_the_start_says():

@@ -112,7 +112,7 @@ def test_a_policy_in_a_compiled_horizon_sees_and_remembers_as_in_an_eager_flight
 
     monkeypatch.setattr("torchrl_quad.engine.program.Compiled", Direct)
     monkeypatch.setattr("torch.compiler.nested_compile_region", lambda function: function)
-    env = forest(max_episode_steps=3, dt=0.02)
+    env = forest(max_episode_steps=3, dt=0.01, control_dt=0.01)
     actor, results = actor_for(env) if sees else make_actor(env, (4,), recurrent=True, hidden_size=5), []
     if way == "called":
         actor[0][0].register_forward_hook(lambda *_: None)

@@ -24,9 +24,20 @@ def matrix(drone: Mapping[str, Any]) -> Array:
     spin, places = np.array(drone["rotor_spin"], float), np.array(drone["rotor_positions"], float)
     arms = np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
     up = np.array(drone.get("rotor_direction") or [(0.0, 0.0, 1.0)] * len(spin), float)
-    up = up / np.linalg.norm(up, axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):  # a rotor without a direction is NaN
+        up = up / np.linalg.norm(up, axis=1, keepdims=True)
     torque = np.cross(arms, up) + float(drone["yaw_torque_coefficient"]) * spin[:, None] * up
     return np.concatenate((up[:, 2:], torque, up[:, :2]), 1).T
+
+
+def quarters(positions: ArrayLike) -> list[int]:
+    """For each rotor of an X quadrotor its quarter: 0 front left, 1 back left, 2 back right, 3 front right; [] of none.
+
+    ``positions`` (n, 2 or 3) stand in any order.
+    """
+    x, y = np.asarray(positions, float).T[:2]
+    found = np.where(x > 0.0, np.where(y > 0.0, 0, 3), np.where(y > 0.0, 1, 2))
+    return found.tolist() if sorted(found.tolist()) == [0, 1, 2, 3] and (x * y != 0.0).all() else []
 
 
 def uncontrolled(allocation: ArrayLike) -> str:

@@ -35,6 +35,10 @@ class MissingPackage(UserError, ImportError):
     """An optional package is not installed."""
 
 
+class DroneWarning(UserWarning):
+    """A drone flies, and less than its numbers promise."""
+
+
 _SHORT = reprlib.Repr()  # which looks at no more of a value than it shows
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 100
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 30

@@ -142,6 +142,12 @@ def rates(args: Namespace) -> None:
     _fly_changed(args, "factor", [(*job, scaled(*job[:3])) for job in jobs])
 
 
+def drones(args: Namespace) -> None:
+    """ABPT hovers every drone that ships, with the recipe as it is."""
+    jobs = product(args.seeds, args.drones)
+    _fly_changed(args, "drone", [("hovering", "abpt", name, seed, [f"env.drone={name}"]) for seed, name in jobs])
+
+
 def scaled(task: str, method: str, factor: str) -> list[str]:
     """Multiply the learning rates of the policy, from first to last; the hybrid has a bound on its KL instead."""
     names = ["actor.max_kl"] if method == "hybrid" else ["actor.lr", "actor.final_lr"]

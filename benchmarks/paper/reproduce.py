@@ -23,6 +23,7 @@ from benchmarks.paper import elsewhere, flights, gradients, matrix
 from benchmarks.paper.evidence import best_learning_rate
 from benchmarks.paper.matrix import EXPERIMENTS, LEARNING_RATES, SEEDS, TASKS, VARIANTS, Job
 from benchmarks.paper.running import DATA, QUICK, composed, kept, run, ships, side_by_side
+from torchrl_quad.dynamics import available_drones
 from torchrl_quad.envs import task_class
 from torchrl_quad.files import add_rows, machine, read_rows, write_rows
 
@@ -123,6 +124,7 @@ def command_line() -> argparse.ArgumentParser:
     of = {"tasks": flights.CHANGED_TASKS, "methods": flights.CHANGED_METHODS, "changes": flights.CHANGES}
     add(flights.ablations, range(5), **of)
     add(flights.rates, (101, 102, 103), tasks=flights.TASKS, methods=flights.METHODS, factors=flights.FACTORS)
+    add(flights.drones, range(5), drones=available_drones())
     add(flights.starts, (0,), tasks=flights.TASKS, methods=flights.METHODS)
     own = add(flights.forest, range(5), policies=flights.POLICIES, difficulties=flights.DIFFICULTIES)
     own.add_argument("--speeds", nargs="+", type=float, default=list(flights.SPEEDS), help="commanded [m/s]")

@@ -14,10 +14,10 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor, nn
 from torchrl.data import Composite
-from torchrl.envs import EnvBase, TargetReturn, TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_quad.data.transforms import check_statistics, transforms_of, under_transforms
+from torchrl_quad.data.transforms import check_statistics, under_transforms
 from torchrl_quad.data.unwrap import base_env, check_actor, check_env, check_whole_state, leaf, memory_keys, observed
 from torchrl_quad.data.visited_states import restart
 from torchrl_quad.errors import UserTypeError, UserValueError
@@ -76,11 +76,6 @@ def differentiable_rollout(
         check_whole_state(env)
         check_statistics(env)
         carry = env.reset() if carry is None else carry.copy()
-        for transform in transforms_of(env):
-            # TorchRL's own resets write it in single precision, whatever the environment's is.
-            for key in transform.out_keys if isinstance(transform, TargetReturn) else ():
-                if key in carry:
-                    carry.set(key, leaf(carry, key).to(observed(env)[key].dtype))
         _check_start(env, actor, carry)
         with set_exploration_type(exploration_type):
             rollout = _rollout(env, actor, carry, horizon)
@@ -132,7 +127,8 @@ def _check_start(env: EnvBase, actor: TensorDictModuleBase, carry: TensorDictBas
             f"carry has batch size {tuple(carry.batch_size)}, and the environment {tuple(size)}. Start from "
             "the tensordict of its own reset(), or of its last rollout."
         )
-    for key in (key for key in actor.in_keys if key in carry and key in observed(env).keys(True, True)):
+    # Transforms have a precision of their own: TargetReturn resets in float32.
+    for key in (key for key in actor.in_keys if key in carry and key in observed(base_env(env)).keys(True, True)):
         x, spec = leaf(carry, key), observed(env)[key]
         if x.dtype != spec.dtype or (env.device is not None and x.device != env.device):
             raise UserValueError(

@@ -36,7 +36,6 @@ from torchrl_quad.data.values import (
     ELEMENTWISE,
     OF_KEYS,
     OF_REWARDS,
-    STEPS,
     Followed,
     Known,
     Value,
@@ -45,7 +44,6 @@ from torchrl_quad.data.values import (
     inverse,
     written_by,
 )
-from torchrl_quad.engine.packing import like
 from torchrl_quad.engine.policy import ENDS
 from torchrl_quad.errors import UserValueError
 
@@ -80,8 +78,6 @@ class Flown(NamedTuple):
         memory = {key: after.pop(key) for key in ("is_init", *memory_keys(actor)) if key in after}
         if remembered and not memory_keys(actor):
             del written["is_init"], memory["is_init"]
-        elif remembered:
-            written["is_init"][:, 0] = leaf(start, "is_init")
         frames = iter(x for key, x in remembered.items() if self.memory[key].kind == "frames")
         for transform in self.transforms:
             if isinstance(transform, COUNTERS):
@@ -116,22 +112,15 @@ class Flown(NamedTuple):
         wanted = {*spec, *self.memory}
         for is_entry in (True, False):
             for key, value in self.known.items():
-                if value is not None and (value.kind == "entry") == is_entry and key in start:
-                    if not wanted.isdisjoint(value.sources()):
-                        value.undo(leaf(start, key), found, spec)
-        if STEPS in self.memory:
-            left = [t.max_steps - leaf(start, key) for t in _limits(self.transforms) for key in written_by(t)]
-            steps = min(t.max_steps for t in _limits(self.transforms)) - torch.stack(left).amin(0)
-            found[STEPS] = steps.to(spec["observation"].dtype)
+                if value is None or (value.kind == "entry") != is_entry or wanted.isdisjoint(value.sources()):
+                    continue
+                if key in start:
+                    value.undo(leaf(start, key), found, spec)
         if not spec.keys() <= found.keys():  # a transform leaves some out
             again = base.reset(entries.select("state"), set_state=True)
             found |= {key: leaf(again, key) for key in spec.keys() - found.keys()}
         own = {unravel_key(key) for key in (*self.policy.in_keys, *self.policy.out_keys)}
         kept = start.select(*(key for key in own if key not in found and key != "action"), strict=False)
-        if self.memory and "is_init" in kept:  # it would reset what transforms remember, too
-            is_init = kept.pop("is_init").flatten()
-            for key in set(memory_keys(self.policy)) - set(self.memory):
-                kept.set(key, torch.where(like(is_init, leaf(kept, key)), 0.0, leaf(kept, key)))
         found = {key: x for key, x in found.items() if key in {*spec, *own}}
         return TensorDict(cast(Any, found), start.batch_size, start.device).update(kept)
 
@@ -164,7 +153,7 @@ class PolicyUnder(TensorDictModuleBase):
         self.out_keys += [*(["action"] if changes else []), *writes]
         super().__init__()
         self.policy, self.reads, self.action, self.changes = policy, reads, action, changes
-        self.writes, self.memory = writes, memory
+        self.writes, self.transform_memory = writes, memory
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the policy writes, and the action inside; all else stays as it is."""
@@ -210,7 +199,7 @@ class _PlainUnder:
         self.command = OUTER if self.action else "action"
         values = [*self.reads, *self.writes.values(), *([self.action] if self.action else [])]
         self.signature = (inner.signature, *map(str, (self.out_keys, *(value.describe() for value in values))))
-        self.inner, self.count, self.memory = inner, len(inner.weights), {**inner.memory, **under.memory}
+        self.inner, self.count, self.memory = inner, len(inner.weights), {**inner.memory, **under.transform_memory}
         self.constants = tuple(x for value in values for x in value.tensors())
 
     @property
@@ -222,6 +211,18 @@ class _PlainUnder:
     def weights(self, weights: tuple[Tensor, ...]) -> None:
         self.inner = copy.copy(self.inner)
         self.inner.weights, self.constants = weights[: self.count], weights[self.count :]
+
+    @property
+    def without_gradient(self) -> frozenset[Any]:
+        """What the policy reads that is made of nothing but such entries, and of what was remembered of them."""
+        return self.inner.without_gradient
+
+    @without_gradient.setter
+    def without_gradient(self, names: frozenset[Any]) -> None:
+        free = {key for key in self.in_keys if (key if isinstance(key, str) else key[0]) in names}
+        free |= self.memory.keys() - self.inner.memory.keys()
+        pairs = zip(self.inner.in_keys, self.reads, strict=True)
+        self.inner.without_gradient = frozenset(unravel_key(key) for key, x in pairs if free.issuperset(x.sources()))
 
     def fits(self, inputs: Sequence[Tensor]) -> bool:
         """Whether the policy can read what the transforms make of these."""
@@ -377,11 +378,9 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
     if (action := actions.get("action")) is None or action.sources()[0] not in map(unravel_key, actor.out_keys):
         return "the policy writes no action that the transforms pass on"
     writes, used = {}, {key for x in reads.values() for key in x.sources()}
-    if limits := _limits(transforms):
-        steps = Value("entry", STEPS)
-        remembered[STEPS] = Value("scale", None, (steps,), (1.0, 1.0))
-        writes[ENDS] = Value("limit", min(t.max_steps for t in limits), (steps,))
-    used |= {STEPS, *(key for key, x in remembered.items() if x.kind == "frames")}
+    if limits := followed.limits:
+        writes[ENDS] = Value("limit", tuple(limits.values()), tuple(Value("entry", key) for key in limits))
+    used |= {*limits, *(key for key, x in remembered.items() if x.kind == "frames")}
     for key in reversed(remembered):  # each is made of earlier ones
         used |= {*remembered[key].sources()} if key in used else set()
     remembered = {key: x for key, x in remembered.items() if key in used}
@@ -391,11 +390,6 @@ def under_transforms(env: EnvBase, actor: TensorDictModuleBase) -> Flown | str:
     spec = dict(observed(base).items(True, True)) if remembered else {}
     sizes = {key: tuple(x.shape(spec)) for key, x in remembered.items()}
     return Flown(transforms, known, PolicyUnder(actor, reads, action, writes, sizes), remembered)
-
-
-def _limits(transforms: Sequence[Any]) -> list[Any]:
-    """The transforms that end episodes."""
-    return [t for t in transforms if isinstance(t, StepCounter) and t.max_steps is not None]
 
 
 def _parts(transform: Transform) -> list[Transform]:

@@ -59,7 +59,8 @@ class Value(NamedTuple):
         if self.kind == "clip":
             return x.clamp(a, b)
         if self.kind == "limit":
-            return (x + 1 >= self.about).to(x.dtype)
+            ends = [y + 1 >= most for y, most in zip((x, *more), self.about, strict=True)]
+            return torch.cat(ends, -1).any(-1, keepdim=True).to(x.dtype)
         if self.kind == "sum":
             return torch.where(more[1] > 0, x.to(more[0].dtype) + b * more[0], a)
         if self.kind == "frames":
@@ -121,7 +122,6 @@ class Value(NamedTuple):
 
 Known = dict[Any, Value | None]  # by key; None for what is known only after the flight, such as a trajectory's number
 
-STEPS = "_steps"  # what is remembered of the steps of an episode, for a limit of them
 FLOWN = "_flown"  # what is remembered of an episode that is under way: 1, and in its first step 0
 
 
@@ -131,12 +131,13 @@ class Followed(NamedTuple):
     known: Known
     rewards: Known  # those of the step before
     memory: dict[Any, Value]  # by name, what it is in the next step; an episode begins with zeros
+    limits: dict[Any, int]  # of steps, by the name under which they are remembered
 
     @classmethod
     def begin(cls, keys: Iterable[Any]) -> Followed:
         """Without transforms."""
         flown = Value("scale", None, (Value("entry", FLOWN),), (1.0, 0.0))
-        return cls({key: Value("entry", key) for key in keys}, {"reward": Value("entry", "reward")}, {FLOWN: flown})
+        return cls({key: Value("entry", key) for key in keys}, {"reward": Value("entry", "reward")}, {FLOWN: flown}, {})
 
     def evolve(self, transform: Any) -> Value | None:
         """What a counter writes, as it evolves along a horizon."""
@@ -144,6 +145,8 @@ class Followed(NamedTuple):
         if isinstance(transform, StepCounter | InitTracker):
             counts = isinstance(transform, StepCounter)
             self.memory[own.about] = Value("scale", None, (own,), (1.0, float(counts)))
+            if (most := getattr(transform, "max_steps", None)) is not None:
+                self.limits[own.about] = cast(int, most)
             is_init = Value("scale", None, (own,), (1.0, -1.0))
             return Value("cast", torch.int64, (own,)) if counts else Value("cast", torch.bool, (is_init,))
         if reward is None or len(transform.in_keys) > 1 or not isinstance(transform, RewardSum | TargetReturn):
@@ -152,13 +155,6 @@ class Followed(NamedTuple):
         if isinstance(transform, TargetReturn):
             first, sign = float(transform.target_return), -1.0 if transform.mode == "reduce" else 0.0
         self.memory[own.about] = value = Value("sum", None, (own, reward, Value("entry", FLOWN)), (first, sign))
-        return value
-
-    def stack(self, x: Value, dim: int, count: int, padding: float | None) -> Value:
-        """The last values, the oldest first; before an episode there was ``padding``, or None for its first value."""
-        own = f"_{len(self.memory)}"
-        parts = x, Value("entry", own), Value("entry", FLOWN)
-        self.memory[own] = value = Value("frames", (dim, count, padding), parts)
         return value
 
 
@@ -181,7 +177,9 @@ def follow(transform: Any, followed: Followed) -> None:
         for a, b in zip(ins, outs, strict=True):
             if (x := known[a]) is None or transform.reset_key != "_reset":
                 raise NotImplementedError("frames are followed of what a step writes, with the reset_key of all")
-            known[b] = followed.stack(x, transform.dim, transform.N, padding)
+            own = Value("entry", f"_{len(followed.memory)}")
+            value = Value("frames", (transform.dim, transform.N, padding), (x, own, Value("entry", FLOWN)))
+            known[b] = followed.memory[own.about] = value
     elif isinstance(transform, ExcludeTransform):
         if transform.inverse:
             raise NotImplementedError("inverse=True is left to TorchRL")
@@ -228,10 +226,9 @@ def _below(key: Any, groups: Sequence[NestedKey]) -> bool:
 
 def elementwise(transform: Any, x: Value) -> Value:
     """What a transform makes of an entry."""
-    if isinstance(transform, ObservationNorm):
-        if not transform.initialized or max(transform.loc.ndim, transform.scale.ndim) > 1:
-            raise NotImplementedError("statistics are vectors, or numbers; call init_stats")
     if isinstance(transform, ObservationNorm | RewardScaling):
+        if not getattr(transform, "initialized", True) or max(transform.loc.ndim, transform.scale.ndim) > 1:
+            raise NotImplementedError("statistics are vectors, or numbers; call init_stats")
         kind = "normalize" if transform.standard_normal else "scale"
         return Value(kind, None, (x,), (transform.loc, transform.scale))
     if isinstance(transform, RewardClipping):

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.airframe import contradictions
+from torchrl_quad.allocation import matrix, uncontrolled
 from torchrl_quad.errors import MissingPackage, UserError, UserValueError, one_line, shown
 
 VERSION = 4  # of the contract; raise it when a reader of the older one would misunderstand the new one
@@ -143,17 +145,18 @@ def files(contract: Contract) -> tuple[str, ...]:
 def _contradictions(drone: Contract, name: str, hovers: bool = False) -> Iterator[str]:
     """Why these parts do not make a drone, or one that hovers."""
     (k2, k1, k0), low, high = drone["thrust_map"], drone["rotor_speed_min"], drone["rotor_speed_max"]
-    if not (k2 > 0 and k1 + 2 * k2 * low >= 0):
-        yield f"{name}.thrust_map is {drone['thrust_map']}, and must rise from rotor_speed_min on"
-    if not low < high:
-        yield f"{name}.rotor_speed_min is {low:g}, and must be below rotor_speed_max, {high:g}"
-    x, y = np.array(drone["rotor_positions"], float).T
-    allocation = np.array([np.ones(4), y, -x, drone["yaw_torque_coefficient"] * np.array(drone["rotor_spin"], float)])
-    rows = allocation / np.maximum(np.linalg.norm(allocation, axis=1, keepdims=True), 1e-30)
-    if not np.linalg.cond(rows) < 1e4:  # as the package's own controller asks
-        yield f"{name}.rotor_positions and rotor_spin cannot make thrust and torque about each axis on their own"
+    each = [drone[k] for k in ("rotor_positions", "rotor_spin", "rotor_direction", "rotor_effectiveness") if k in drone]
+    if len({len(x) for x in each}) > 1 or len({len(x) for x in each[0]}) > 1:
+        yield f"{name}: rotor_positions and the other fields of rotors must be equally long"
+        return
+    yield from (f"{name}.{why}" for why in contradictions(drone))
+    allocation = matrix(drone)[:4]
+    if not np.isfinite(allocation).all():
+        yield f"{name}.rotor_direction has a rotor without a direction"
+    elif axes := uncontrolled(allocation):  # as the package's own controller asks
+        yield f"{name}.rotor_positions and rotor_spin cannot control {axes} independently"
     elif hovers:
-        share = np.linalg.inv(allocation)[:, 0] * drone["mass"] * drone["gravity"]
+        share = np.linalg.pinv(allocation)[:, 0] * drone["mass"] * drone["gravity"]
         least, most = (k2 * w * w + k1 * w + k0 for w in (low, high))
-        if not ((least < share) & (share < most)).all():
+        if not ((max(least, 0.0) < share) & (share < most)).all():
             yield f"{name}: to hover each rotor must give {shown(share.round(4).tolist())} N, of {least:g} to {most:g}"

@@ -14,12 +14,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.linalg import vector_norm
 
+from torchrl_quad.airframe import RateLoop
 from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.deploy.contract import GRAPHS, MEASURED, Contract, Fields, schema_table
 from torchrl_quad.deploy.network import fill_in
-from torchrl_quad.deploy.simulators.vehicle import bandwidth, damping_ratio
 from torchrl_quad.deploy.tracing import Rules
 from torchrl_quad.dynamics import DYNAMICS, QuadrotorParams
+from torchrl_quad.dynamics.parameters import LIMITS
 from torchrl_quad.envs import TASKS, QuadrotorEnv
 from torchrl_quad.envs.disturbances import DroneRandomization, Sensors, Wind
 from torchrl_quad.envs.metrics import describe_metric
@@ -58,7 +59,11 @@ def numbers(x: Any) -> Any:
 def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, ModelProto], memory: int, visual: bool) -> Fields:
     """What a contract says of an environment whose policy keeps ``memory`` numbers, before anything has flown."""
     camera = env.camera if visual else None
-    nominal, delay = _fields(env.nominal), getattr(env.disturbances.get("sensors"), "delay", 0)
+    nominal, believed, delay = (
+        _fields(env.nominal),
+        _fields(env.nominal, all=True),
+        getattr(env.disturbances.get("sensors"), "delay", 0),
+    )
     weight = nominal["mass"] * nominal["gravity"]
     most = float(np.float32(nominal["max_thrust_to_weight"] * weight))
     return {
@@ -86,7 +91,7 @@ def describe(env: QuadrotorEnv, rules: Rules, models: Mapping[str, ModelProto], 
         "action_delay": env.action_delay,
         "observation_delay": delay,
         "drone": nominal,
-        "plant": {k: v for k, v in _fields(env.params).items() if v != nominal[k]},
+        "plant": {k: v for k, v in _fields(env.params, all=True).items() if v != believed[k]},
         "randomized": _randomized(env),
         "disturbances": _disturbances(env),
         "rate_loop": _rate_loop(env, nominal),
@@ -156,9 +161,10 @@ def _single(name: str, value: Tensor, dim: int) -> Tensor:
     return value[0]
 
 
-def _fields(params: QuadrotorParams) -> Fields:
+def _fields(params: QuadrotorParams, all: bool = False) -> Fields:
+    """Those that are given, or all, with what None stands for."""
     fields = {}
-    for name, value in params.fields().items():
+    for name, value in ((name, params.value(name)) for name in (LIMITS if all else params.fields())):
         one = numbers(_single(f"drone field {name!r}", value, QuadrotorParams.dim(name)))
         fields[name] = one[0] if len(one) == 1 else one
     return fields
@@ -191,18 +197,17 @@ def _is_plain(x: Any) -> bool:
 
 
 def _rate_loop(env: QuadrotorEnv, drone: Contract) -> Fields | None:
-    """The rate loop about hover, a second-order system per axis; None where rates follow the command at once."""
+    """The rate loop about hover, in the steps that were flown; None where rates follow the command at once."""
     if "rotor_speed" not in env.dynamics.sizes:
         return None
-    gain, inertia, loss = (np.array(drone[k]) for k in ("rate_gain", "inertia", "rate_damping"))
-    tau = np.mean(drone["motor_time_constant"])  # where it differs up and down, their mean
-    values = {
-        "natural_frequency": np.sqrt(gain / tau),
-        "damping_ratio": damping_ratio(gain, inertia, loss, tau),
-        "bandwidth": bandwidth(gain, inertia, loss, tau),
-    }
-    law = "tau w'' + 2 damping_ratio sqrt(gain tau) w' + gain w = gain desired, tau = motor_time_constant"
-    return {"law": law, "gain": drone["rate_gain"], **{k: numbers(np.float32(v)) for k, v in values.items()}}
+    tau, dt = drone["motor_time_constant"], getattr(env.dynamics, "dt")  # noqa: B009
+    loop = RateLoop(drone["rate_gain"], drone["inertia"], drone["rate_damping"], tau, dt)
+    values = {k: numbers(np.float32(getattr(loop, k))) for k in ("natural_frequency", "damping_ratio", "bandwidth")}
+    law = (
+        "every simulator.dt: w += dt a and, at once, a += (1 - exp(-dt / motor_time_constant)) "
+        "(gain (desired - w) - (1 + rate_damping / inertia) a)"
+    )
+    return {"law": law, "gain": drone["rate_gain"], **values}
 
 
 # -- what has flown ----------------------------------------------------------------------------------------------------

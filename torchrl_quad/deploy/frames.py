@@ -9,7 +9,8 @@
     thrust_z = px4.thrust(thrust, full_thrust=weight / hover_thrust)
 
 Ours: a world with z up, in which x and y may point anywhere; body x forward, y left, z up (FLU); quaternions
-(w, x, y, z) from body to world; rotors front left, back left, back right, front right. Where a target has a north, say
+(w, x, y, z) from body to world; rotors front left, back left, back right, front right, unless
+:meth:`Convention.of` is told otherwise. Where a target has a north, say
 where our x and y point: ``world="enu"``, x east and y north, or ``world="nwu"``, x north and y west.
 
 Everything broadcasts over leading dimensions. ``docs/deploy_autopilots.md`` says which facts were read in the source of
@@ -19,11 +20,12 @@ a target, and which in its documentation; check them against your version.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchrl_quad.allocation import quarters
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.rotations import conjugate, multiply, rotate
 
@@ -52,7 +54,8 @@ class Convention:
     ``quaternion``        4      attitude; ours w x y z
     ``angular_velocity``  3      [rad/s], as measured, body frame
     ``body_rate``         3      as commanded: ours [rad/s], body frame; theirs in ``rates``, see below
-    ``motors``            4      anything that belongs to a motor each
+    ``motors``            4      anything that belongs to a motor each; ours front left, back left, back right, front
+                                 right, as the presets list them, or as a drone does: see :meth:`of`
     ====================  =====  ===================================================================================
     """
 
@@ -65,6 +68,19 @@ class Convention:
     thrust_range: tuple[float, float] | None = None  #: their commands for no and full thrust; None where in newtons
     thrust_limit: float = 1.0  #: the share of this range that may be commanded
     whole_thrust: bool = False  #: whether their command is a whole number
+
+    def of(self, rotor_positions: ArrayLike) -> Convention:
+        """The same for a drone with its rotors at (4, 2 or 3) [m], as its contract lists them, in any order.
+
+        Raises:
+            ValueError: they are not those of an X, one in each quarter.
+        """
+        if not (places := quarters(rotor_positions)):
+            raise UserValueError(
+                f"{self.name} numbers the motors of an X, one in each quarter, and this drone has rotors at "
+                f"{np.asarray(rotor_positions).tolist()}. Map its motors by hand."
+            )
+        return replace(self, motors=tuple(places.index(place) for place in self.motors))
 
     def to(self, quantities: Mapping[str, ArrayLike]) -> dict[str, Array]:
         """Our quantities as theirs.

@@ -255,7 +255,7 @@ class _Cut:
         while todo:
             value = todo.pop()
             if value not in found and value in self.maker:
-                todo += self.maker[value].input
+                todo += filter(None, self.maker[value].input)  # "" is an input that is left out
             found.add(value)
         return found
 

@@ -11,8 +11,9 @@ from torchrl_quad.dynamics.control import (
     make_controller,
 )
 from torchrl_quad.dynamics.gains import suggest_gains
+from torchrl_quad.dynamics.importing import import_drone, load_drone
 from torchrl_quad.dynamics.model import Dynamics, PointMass, Quadrotor, QuadrotorState
-from torchrl_quad.dynamics.parameters import MotorCommand, QuadrotorParams, available_drones, load_drone
+from torchrl_quad.dynamics.parameters import MotorCommand, QuadrotorParams, available_drones
 from torchrl_quad.dynamics.rigid_body import INTEGRATORS, RigidBodyState, accelerations
 
 #: The dynamics models by name.
@@ -36,6 +37,7 @@ __all__ = [
     "VelocityController",
     "accelerations",
     "available_drones",
+    "import_drone",
     "load_drone",
     "make_controller",
     "quaternion",

@@ -91,6 +91,10 @@ class FlightController:
         self.hover_action = pad(2.0 / nominal.max_thrust_to_weight - 1.0, (0, 3))
         _check_hover(nominal, self.hover_speed, self.share)
 
+    def reach(self) -> Tensor:
+        """The greatest collective thrust without torque, (*, 1), in weights."""
+        return (self.middle + self.half_span) / (self.nominal.mass * self.nominal.gravity)
+
     def spare_torque(self) -> Tensor:
         """Torque (*, 3) [N m] about each axis that the rotors have at hover, to either side, at the same thrust."""
         hover = self.rotors.thrust(self.hover_speed)

@@ -10,19 +10,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_quad.airframe import Array, RateLoop, listed
 from torchrl_quad.dynamics.control import FlightController
-from torchrl_quad.dynamics.parameters import QuadrotorParams, load_drone
+from torchrl_quad.dynamics.parameters import QuadrotorParams, read_drone, read_fields
+from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import between, checked
-from torchrl_quad.rate_loop import Array, RateLoop
 
 # [s]. In a shorter step a drone at 1 m/s does not move in single precision; with a longer one the rate loop of no drone
 # that ships is stable.
 PhysicsStep = Annotated[float, between(1e-6, 0.1)]
+MAX_SUBSTEPS = 200  # physics steps of a control step, which take half a second without compilation
+FAR = 0.15  # of a step of the command
+STRONG = 5.0  # times the torque of the rotors
 WELL_DAMPED = 0.8  # a damping ratio with which a step of the command overshoots by 2 %
 
 
 def rate_loop(drone: QuadrotorParams, dt: float, **changed: Array) -> RateLoop:
-    """The rate loop of a drone in physics steps of dt [s]; gain or damping may be others than its own."""
+    """The rate loop of a drone in physics steps of dt [s]; fields of the loop may be others than its own."""
     names = {"gain": "rate_gain", "inertia": "inertia", "damping": "rate_damping", "motor_time_constant": ""}
     fields = {k: _numbers(getattr(drone, name or k)) for k, name in names.items()}
     return RateLoop(**{**fields, **changed}, dt=dt)
@@ -36,7 +40,7 @@ def suggest_gains(drone: str | Path | Mapping | QuadrotorParams, dt: PhysicsStep
     command of the full body rate asks for no more torque than the rotors have. D is at most J.
 
     Args:
-        drone: :class:`QuadrotorParams`, or what :func:`load_drone` takes; a mapping may leave out the gains.
+        drone: :class:`QuadrotorParams`, a preset, a YAML file or a mapping, which may leave out the gains.
         dt: the physics step of the environment, 1e-6 to 0.1 s.
 
     Returns:
@@ -45,12 +49,13 @@ def suggest_gains(drone: str | Path | Mapping | QuadrotorParams, dt: PhysicsStep
     Raises:
         ValueError: the drone cannot be, or cannot hover.
     """
-    if isinstance(drone, Mapping):
-        drone = {"rate_gain": [1.0] * 3, "rate_damping": [0.0] * 3, **drone}
-    params = drone if isinstance(drone, QuadrotorParams) else load_drone(drone, torch.float64)
+    if isinstance(drone, QuadrotorParams):
+        params = drone
+    else:
+        source, fields = read_fields(drone)
+        params = read_drone({"rate_gain": [1.0] * 3, "rate_damping": [0.0] * 3, **fields}, torch.float64, source)
     inertia = _numbers(params.inertia)
-    torque = _numbers(FlightController(params).spare_torque())
-    most = torque / (inertia * _numbers(params.max_body_rate))
+    most = _numbers(FlightController(params).spare_torque()) / _full_torque(params)
     gain, ratio, best = np.zeros_like(most), np.zeros_like(most), np.zeros_like(most)
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
         low, high = np.zeros_like(most), most
@@ -64,6 +69,65 @@ def suggest_gains(drone: str | Path | Mapping | QuadrotorParams, dt: PhysicsStep
     unit = 10.0 ** (np.floor(np.log10(np.maximum(gain, 1e-3))) - 1.0)  # of its second digit
     found = {"rate_gain": np.maximum(np.floor(gain / unit) * unit, 1e-3), "rate_damping": ratio * inertia}
     return {name: torch.from_numpy(x).to(params.mass) for name, x in found.items()}
+
+
+def check_gains(controller: FlightController, dt: float, substeps: int) -> None:
+    """Refuse a nominal drone whose rate loop does not fly as its gains say, in physics steps of dt [s].
+
+    That is one that is unstable; or overshoots a small step of the command by 0.15 of it more than in continuous time;
+    or asks, for the full body rate, for more than five times the torque that the rotors have at hover. Policies learn
+    with shipped drones, at up to three times it, and with Gazebo's iris at four, but not at nine.
+    """
+    nominal = controller.nominal
+    loop, smooth = rate_loop(nominal, dt), rate_loop(nominal, 0.0).overshoot
+    asked = _full_torque(nominal) * _numbers(nominal.rate_gain) / _numbers(controller.spare_torque())
+    strong = asked > STRONG
+    bad = strong | ~(loop.overshoot <= smooth + FAR)
+    if not bad.any():
+        return
+    row = np.atleast_2d(bad).any(-1).argmax()  # the first such drone, of several
+
+    def of(x: Any) -> Array:
+        numbers = np.atleast_2d(_numbers(x) if isinstance(x, Tensor) else x)
+        return numbers[min(row, len(numbers) - 1)]
+
+    axes = " and ".join(np.array(["roll", "pitch", "yaw"])[of(bad)])
+    worst, by, torque = (of(x)[of(bad)].max() for x in (loop.overshoot, smooth, asked))
+    rings = f"overshoots by {worst:.0%} (in continuous time by {by:.0%})"
+    what = "is unstable" if np.isinf(worst) else rings if worst > by + FAR else ""
+    much = f"asks at full rate for {torque:.1f} times the torque that the rotors have at hover"
+    what = " and ".join(x for x in (what, much if torque > STRONG else "") if x)
+    found = {k: np.where(of(bad), of(x), of(getattr(nominal, k))) for k, x in suggest_gains(nominal, dt).items()}
+    mend = " and ".join(f"{name}: {listed(x)}" for name, x in found.items())
+    for k in () if strong.any() else range(2, MAX_SUBSTEPS // substeps + 1):
+        if (rate_loop(nominal, dt / k).overshoot <= smooth + FAR).all():
+            mend += f", or dt={dt / k:.10g}"
+            break
+    raise UserValueError(
+        f"drone: in steps of dt={dt:g} s the rate loop about {axes} {what}, with rate_gain "
+        f"{listed(of(nominal.rate_gain))} 1/s, rate_damping {listed(of(nominal.rate_damping))} kg m2 and motors of "
+        f"{listed(of(nominal.motor_time_constant))} s. Write {mend}."
+    )
+
+
+def check_flown(nominal: QuadrotorParams, flown: QuadrotorParams, dt: float) -> None:
+    """Refuse a drone that flies, if with its inertia and motors the rate loop is unstable in physics steps of dt [s].
+
+    How well it is damped is left to the drone: a policy has to bear that.
+    """
+    believed, true = ((_numbers(x.inertia), _numbers(x.motor_time_constant)) for x in (nominal, flown))
+    gain = _numbers(nominal.rate_gain) * believed[0] / true[0]
+    if not rate_loop(nominal, dt, gain=gain, motor_time_constant=true[1]).is_stable.all():
+        raise UserValueError(
+            f"drone: in steps of dt={dt:g} s the rate loop is unstable with an inertia of {listed(true[0])} kg m2 and "
+            f"motors of {listed(true[1])} s, since its gains are for {listed(believed[0])} and {listed(believed[1])}. "
+            "Choose them nearer to these, a smaller dt, or a drone with a lower rate_gain."
+        )
+
+
+def _full_torque(drone: QuadrotorParams) -> Array:
+    """What the full body rate asks for at first [N m], with a gain of 1 1/s."""
+    return _numbers(drone.inertia * drone.max_body_rate)
 
 
 def _numbers(x: Any) -> Array:

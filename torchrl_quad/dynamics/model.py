@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, Protocol
 
@@ -10,11 +12,11 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.control import FlightController, Nominal, RotorThrustController, make_controller
-from torchrl_quad.dynamics.gains import PhysicsStep
+from torchrl_quad.dynamics.gains import PhysicsStep, check_flown, check_gains
 from torchrl_quad.dynamics.parameters import PLANT_FIELDS, QuadrotorParams, RawParams
 from torchrl_quad.dynamics.rigid_body import INTEGRATORS, Integrator, RigidBodyState, Rotors, accelerations, drag
 from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, clamp, stack
-from torchrl_quad.errors import UserValueError
+from torchrl_quad.errors import DroneWarning, UserValueError
 from torchrl_quad.options import between, checked
 
 Substeps = Annotated[int, between(1, 200)]
@@ -36,6 +38,8 @@ class Dynamics(Protocol):
     plant_fields: tuple[str, ...]
     #: Greatest absolute values of its own entries, beyond which the numbers mean nothing and the episode ends.
     limits: dict[str, Tensor]
+    #: Entries that follow the command within a control step, so that nothing else can hold them; it may leave this out.
+    commanded: tuple[str, ...]
     nominal: QuadrotorParams  #: the drone that the controller is built for
     hover_action: Tensor  #: (k), holds the nominal drone where it is; (num_envs, k) where drones differ in it
     action_units: dict[str, str]  #: the entries of an action by name, with their units; a model may leave this out
@@ -72,6 +76,7 @@ class ControlledModel:
 
     sizes: dict[str, int]
     plant_fields: tuple[str, ...]
+    commanded: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -89,7 +94,10 @@ class ControlledModel:
         self.finish()
 
     def finish(self) -> None:
-        """What a model adds to its construction: its limits, or a refusal of what it cannot fly."""
+        """What a model adds to its construction: its limits, or a refusal of what it cannot fly.
+
+        A method ``check_flown(params)`` can refuse another drone that is to fly.
+        """
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
         """Level and still, at the positions (n, 3) [m]."""
@@ -155,12 +163,29 @@ class Quadrotor(ControlledModel):
     """
 
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3, "rotor_speed": 4}
-    plant_fields = PLANT_FIELDS
+    plant_fields, commanded = PLANT_FIELDS, ("rotor_speed",)
 
     def finish(self) -> None:
-        """Count the rotors, and limit their speeds."""
+        """Count the rotors, limit their speeds, and refuse or question what such steps, or the rotors, do not fly."""
         self.sizes = {**self.sizes, "rotor_speed": self.nominal.rotor_spin.shape[-1]}
         self.limits = {"rotor_speed": 2.0 * self.nominal.rotor_speed_max}
+        if not isinstance(self.controller, RotorThrustController):
+            check_gains(self.controller, self.dt, self.substeps)
+        asked, reach = self.nominal.max_thrust_to_weight, self.controller.reach()
+        if (asked > reach * (1.0 + 1e-5)).any():
+            warnings.warn(
+                f"drone: full throttle commands max_thrust_to_weight={asked.max():.4g}, and the rotors reach "
+                f"{reach.min():.4g} times the weight. Actions above that do nothing and have no gradient. Write "
+                f"max_thrust_to_weight: {math.floor(1e3 * reach.min()) / 1e3:g}.",
+                DroneWarning,
+                stacklevel=2,
+            )
+
+    def check_flown(self, params: QuadrotorParams) -> None:
+        """Refuse a drone with which the rate loop is unstable."""
+        same = (torch.equal(getattr(params, k), getattr(self.nominal, k)) for k in ("inertia", "motor_time_constant"))
+        if not (isinstance(self.controller, RotorThrustController) or all(same)):
+            check_flown(self.nominal, params, self.dt)
 
     def rest(self, position: Tensor) -> dict[str, Tensor]:
         """Level, still, rotors at hover speed, at the positions (n, 3) [m]."""
@@ -199,7 +224,7 @@ class PointMass(ControlledModel):
     """
 
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}
-    plant_fields = ("mass", "linear_drag", "quadratic_drag", "gravity")
+    plant_fields, commanded = ("mass", "linear_drag", "quadratic_drag", "gravity"), ("angular_velocity",)
 
     def finish(self) -> None:
         """Refuse what it cannot fly."""

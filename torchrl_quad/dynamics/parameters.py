@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_quad.airframe import JUDGED, contradictions
 from torchrl_quad.dynamics import presets
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import between, build, checked
@@ -68,7 +69,8 @@ class QuadrotorParams:
     #: (n), sign of the torque that each rotor exerts on the body, about the direction of its thrust
     rotor_spin: Tensor = _field(("n",), -1.0, 1.0)
     yaw_torque_coefficient: Tensor = _field((1,), 1e-5, 1e1, "m")  #: (1) [m], kappa, yaw torque per thrust
-    #: (3), k2 [N s2], k1 [N s] and k0 [N] of thrust = k2 w^2 + k1 w + k0
+    #: (3), k2 [N s2], k1 [N s] and k0 [N] of thrust = k2 w^2 + k1 w + k0, which rises from rotor_speed_min to
+    #: rotor_speed_max; w may be another measure of speed, such as the motor command
     thrust_map: Tensor = _field((3,), -1e3, 1e3, "N s2, N s, N")
     rotor_speed_min: Tensor = _field((1,), 0.0, 1e5, "rad/s")  #: (1) [rad/s]
     rotor_speed_max: Tensor = _field((1,), 1e0, 1e5, "rad/s")  #: (1) [rad/s]
@@ -95,28 +97,21 @@ class QuadrotorParams:
         fields = self.fields()
         for name, value in fields.items():
             object.__setattr__(self, name, _checked(name, value, like, "QuadrotorParams", fields["rotor_positions"]))
-        low, high = self.rotor_speed_min.detach(), self.rotor_speed_max.detach()
-        k2, k1, _ = self.thrust_map.detach().split(1, -1)
-        slope, broken = k1 + 2.0 * k2 * low, ""
-        if not (slope >= 0).all():
-            broken = f"thrust_map must not fall with rotor speed: k1 + 2 k2 rotor_speed_min is {slope.tolist()}"
-        if not (low < high).all():
-            broken = f"rotor_speed_min must be below rotor_speed_max, got {low.tolist()} and {high.tolist()}"
-        if broken:
+        for broken in contradictions({name: getattr(self, name).detach().cpu().numpy() for name in JUDGED}):
             raise UserValueError(f"QuadrotorParams: {broken}.")
 
     def __repr__(self) -> str:
         """A table with units."""
         rows = {"motor_command": str(self.motor_command)} if self.motor_command else {}
         for name, value in reversed(self.fields().items()):
-            unit = _FIELDS[name]["unit"]
+            unit = FIELDS[name]["unit"]
             rows = {f"{name} [{unit}]" if unit else name: _table(value, self.dim(name)), **rows}
         width = max(map(len, rows))
         return "\n  ".join(["QuadrotorParams", *(f"{label:{width}}  {value}" for label, value in rows.items())])
 
     def fields(self) -> dict[str, Tensor]:
         """The fields by name, in the order of their declaration, without those that are None."""
-        return {name: x for name in _FIELDS if (x := getattr(self, name)) is not None}
+        return {name: x for name in FIELDS if (x := getattr(self, name)) is not None}
 
     def value(self, name: str) -> Tensor:
         """A field by its name; of one that is None, the tensor that it stands for."""
@@ -128,8 +123,8 @@ class QuadrotorParams:
 
     def replace(self, **changes: Any) -> QuadrotorParams:
         """A copy with some fields changed, to tensors (with their graph), numbers, lists: ``replace(mass=0.5)``."""
-        for unknown in (name for name in changes if name not in _FIELDS):
-            raise UserValueError(f"QuadrotorParams has no field {unknown!r}. Choose from: {', '.join(_FIELDS)}.")
+        for unknown in (name for name in changes if name not in FIELDS):
+            raise UserValueError(f"QuadrotorParams has no field {unknown!r}. Choose from: {', '.join(FIELDS)}.")
         none = {k: None for k, v in changes.items() if v is None and _OPTIONAL.get(k, 0.0) is None}
         changes = {k: v for k, v in changes.items() if k not in none}
         changed = {k: _tensor(k, v, self.mass, "QuadrotorParams").to(self.mass) for k, v in changes.items()}
@@ -151,12 +146,12 @@ class QuadrotorParams:
     @staticmethod
     def dim(name: str) -> int:
         """The number of dimensions of a field of a single drone."""
-        return len(_FIELDS[name]["shape"])
+        return len(FIELDS[name]["shape"])
 
 
-_FIELDS = {field.name: field.metadata for field in dataclasses.fields(QuadrotorParams) if field.metadata}
-LIMITS = {name: (about["low"], about["high"]) for name, about in _FIELDS.items()}
-PLANT_FIELDS = tuple(name for name in _FIELDS if name not in CONTROLLER_FIELDS)  # of the drone that flies
+FIELDS = {field.name: field.metadata for field in dataclasses.fields(QuadrotorParams) if field.metadata}
+LIMITS = {name: (about["low"], about["high"]) for name, about in FIELDS.items()}
+PLANT_FIELDS = tuple(name for name in FIELDS if name not in CONTROLLER_FIELDS)  # of the drone that flies
 
 if TYPE_CHECKING:
 
@@ -168,32 +163,30 @@ if TYPE_CHECKING:
 
 else:
     # As QuadrotorParams, but unchecked and of any form: for drones that are drawn at random, and for compiled code.
-    RawParams = collections.namedtuple("RawParams", _FIELDS, defaults=[None] * len(_FIELDS))
+    RawParams = collections.namedtuple("RawParams", FIELDS, defaults=[None] * len(FIELDS))
 
 
-def load_drone(drone: str | Path | Mapping = "visfly", dtype: torch.dtype = torch.float32) -> QuadrotorParams:
-    """A preset by its name (:func:`available_drones`), a YAML file by its path, or a mapping of fields to numbers.
-
-    Raises:
-        ValueError: the preset is unknown, a field is missing, unknown, of the wrong shape, or out of its range, or the
-            dtype is none of floating point.
-        FileNotFoundError: the path does not exist.
-    """
+def read_drone(values: Mapping, dtype: torch.dtype = torch.float32, source: str = "drone") -> QuadrotorParams:
+    """A drone from a mapping of fields to numbers; errors name the source, and what to write."""
     if not (isinstance(dtype, torch.dtype) and dtype.is_floating_point):
         raise UserValueError(f"load_drone: dtype must be torch.float32 or torch.float64, got {shown(dtype)}.")
-    source, values = presets.read("drone", drone, _DRONES)
     motors, values = values.get("motor_command"), {**_OPTIONAL, **values}
-    required = [name for name in _FIELDS if name not in _OPTIONAL]
+    required = [name for name in FIELDS if name not in _OPTIONAL]
     for missing in (name for name in required if name not in values):
         raise UserValueError(f"{source}: missing field {missing!r}. Required: {', '.join(required)}.")
-    for unknown in (name for name in values if name not in (*_FIELDS, "motor_command")):
-        raise UserValueError(f"{source}: unknown field {shown(unknown)}. Allowed: {', '.join(_FIELDS)}, motor_command.")
+    for unknown in (name for name in values if name not in (*FIELDS, "motor_command")):
+        raise UserValueError(f"{source}: unknown field {shown(unknown)}. Allowed: {', '.join(FIELDS)}, motor_command.")
     like = torch.empty(0, dtype=torch.float64)
-    given = {k: values[k] for k in _FIELDS if values[k] is not None or k not in _OPTIONAL}
+    given = {k: values[k] for k in FIELDS if values[k] is not None or k not in _OPTIONAL}
     places = _tensor("rotor_positions", given["rotor_positions"], like, source)
     fields = {name: _checked(name, x, like, source, places).to(torch.float64) for name, x in given.items()}
     command = None if motors is None else build(MotorCommand, f"{source}: motor_command", motors)
     return QuadrotorParams(**fields, motor_command=command).to(dtype=dtype)
+
+
+def read_fields(drone: str | Path | Mapping) -> tuple[str, Mapping[str, Any]]:
+    """What the file of a drone, a preset's or another, or a mapping says, and its name in errors."""
+    return presets.read("drone", drone, _DRONES)
 
 
 def available_drones() -> list[str]:
@@ -225,7 +218,7 @@ def _tensor(name: str, value: Any, like: Tensor, source: str) -> Tensor:
 def _checked(name: str, value: Any, like: Tensor, source: str, places: Any) -> Tensor:
     value = _tensor(name, value, like, source)
     value = value if value.dim() else value.reshape(1)
-    shape, low, high, _ = _FIELDS[name].values()
+    shape, low, high, _ = FIELDS[name].values()
     rotors = places.shape[-2] if isinstance(places, Tensor) and places.dim() > 1 else 4
     shapes = [tuple(rotors if k == "n" else k for k in x) for x in (shape, _OTHER_SHAPES.get(name)) if x]
     if value.shape not in shapes and value.shape[1:] not in shapes:
@@ -241,8 +234,6 @@ def _checked(name: str, value: Any, like: Tensor, source: str, places: Any) -> T
         fits, rule = numbers.abs() == 1, "+1 or -1"
     if name == "rotor_direction" and not (numbers.norm(dim=-1) > 1e-3).all():
         fits, rule = numbers.norm(dim=-1) > 1e-3, "a direction for each rotor, such as [0, 0, 1] for up"
-    if name == "thrust_map" and not (numbers[..., 0] > 0).all():
-        fits, rule = numbers > 0, "rising at high speed, k2 above zero"
     if not fits.all():
         raise UserValueError(f"{source}: field {name!r} must be {rule}, in SI units; got {shown(value.tolist())}.")
     return value

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.dynamics.parameters import QuadrotorParams
-from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, cross, matvec, where_positive
+from torchrl_quad.dynamics.vector import Components, Vector, along_z, cat, cross, larger, matvec, where_positive
 
 
 class Rotors:
@@ -29,7 +29,9 @@ class Rotors:
         self.curvature = k2
         self.vertex_speed = -k1 / (k2 * 2.0)
         self.vertex_thrust = k0 - k1 * k1 / (k2 * 4.0)
-        self.least_root = (params.rotor_speed_max - self.vertex_speed).square() * 1e-6
+        self.side = k2.sign()  # of the vertex on which speeds lie: above the lowest point, or below the highest
+        far = (params.rotor_speed_max - self.vertex_speed).square()
+        self.least_root = larger(far, (params.rotor_speed_min - self.vertex_speed).square()) * 1e-6
         self.time_constant = params.motor_time_constant
         self.allocation = allocation_matrix(params)
 
@@ -40,11 +42,11 @@ class Rotors:
     def speed(self, thrust: Vector) -> Vector:
         """Rotor speed (*, n) [rad/s] that gives the thrust (*, n) [N]: the inverse of :meth:`thrust`.
 
-        Next to the lowest point of the thrust map, where the slope of the inverse is infinite, the speed is held one
-        thousandth of its range above that point, so that derivatives stay finite.
+        Next to the vertex of the thrust map, where the slope of the inverse is infinite, the speed is held one
+        thousandth of its range away from that point, so that derivatives stay finite.
         """
         squared = (thrust - self.vertex_thrust) / self.curvature
-        return squared.maximum(self.least_root).sqrt() + self.vertex_speed
+        return self.vertex_speed.addcmul(self.side, squared.maximum(self.least_root).sqrt())
 
     def wrench(self, speed: Vector) -> Vector:
         """The wrench (*, 4 or 6) on the body at the rotor speeds (*, n) [rad/s]."""

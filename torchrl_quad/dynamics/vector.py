@@ -61,7 +61,8 @@ else:
 
         __add__, __sub__ = _of_both(operator.add), _of_both(operator.sub)
         __mul__, __truediv__ = _of_both(operator.mul), _of_both(operator.truediv)
-        __neg__, abs, sqrt, rsqrt = map(_of_each, (operator.neg, operator.abs, torch.sqrt, torch.rsqrt))
+        __neg__, abs, sign = map(_of_each, (operator.neg, operator.abs, torch.sign))
+        sqrt, rsqrt = map(_of_each, (torch.sqrt, torch.rsqrt))
 
         def __rtruediv__(self, other):
             return Components([other / x for x in self.components])

@@ -85,7 +85,9 @@ class _Loop:
         own = (*policy.out_keys, *self.memory, "is_init")
         # What the policy has written in the step before.
         self.before = _entries(tensordict, [key for key in own if key in tensordict and key != "action"])
-        for key in self.memory if {"is_init", *self.memory} <= self.before.keys() else ():
+        # What transforms remember is as it was given; the memory of a network is empty where an episode begins.
+        cleared = [key for key in self.memory if key not in getattr(policy, "transform_memory", ())]
+        for key in cleared if {"is_init", *cleared} <= self.before.keys() else ():
             self.before[key] = torch.where(like(self.before["is_init"], self.before[key]), 0.0, self.before[key])
 
     def inside(self, acts: PlainPolicy | GivenActions, start: Record, valid: Tensor, steps: int) -> tuple[Entries, ...]:
@@ -215,8 +217,7 @@ def _plain(stepper: Stepper, policy: Any) -> PlainPolicy | GivenActions | None:
     acts = make() if stepper.is_compiled and callable(make) else None
     if acts is None:
         return None
-    if hasattr(acts, "without_gradient"):
-        acts.without_gradient = stepper.simulation.constants
+    acts.without_gradient = stepper.simulation.constants
     known = {"observation", *acts.memory, *stepper.output_layout.place, *map(_in_state, stepper.layout.place)}
     if not set(map(unravel_key, acts.in_keys)) <= known:
         return None

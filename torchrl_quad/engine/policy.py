@@ -25,12 +25,14 @@ class PlainPolicy(Protocol):
     #: Policies with the same signature compute the same function of their tensors, and share what is compiled.
     signature: Hashable
     in_keys: Sequence[Any]  #: what it reads of observation, state, other outputs and its memory
-    out_keys: Sequence[Any]  #: the entries that it writes
+    out_keys: Sequence[Any]  #: the entries that it writes; ``"ends_episode"`` ends one where it is above zero
     weights: tuple[Tensor, ...]  #: the tensors that it learns, of which gradients are wanted
     size: int | None  #: the entries of an action, of those drawn; None for all of them
     #: What it reads as it was written below "next" in the step before, with the shape apart from n; an episode begins
     #: with zeros.
     memory: Mapping[Any, tuple[int, ...]]
+    #: Entries, or groups of them, whose gradient nobody wants, such as that of an image; the engine sets it.
+    without_gradient: frozenset[Any]
 
     def fits(self, inputs: Sequence[Tensor]) -> bool:
         """Whether it can read inputs of this width, precision and device; otherwise it is called, and can complain."""
@@ -65,6 +67,7 @@ class GivenActions:
 
     in_keys, out_keys, weights, size = (), ("action",), (), None
     memory: Mapping[Any, tuple[int, ...]] = {}
+    without_gradient: frozenset[Any] = frozenset()
 
     def __init__(self, take: Callable[[int], Tensor]) -> None:
         self.take = take  # from a number of steps to their actions (steps, n, k)

@@ -26,8 +26,18 @@ from torchrl_quad.errors import UserValueError
 from torchrl_quad.options import Delay, Device, Horizon, Seed, Share, Size, check_value, checked
 
 
+class _Build(type(EnvBase)):
+    def __call__(cls, *args: Any, auto_reset: bool = False, **kwargs: Any) -> Any:
+        if auto_reset:  # TorchRL would wrap it, and no episode would ever begin again
+            raise UserValueError(
+                "auto_reset=True is for environments that reset themselves in the step that ends an episode, and this "
+                "one waits for a reset. Leave it out: rollouts and collectors reset where an episode ends."
+            )
+        return super().__call__(*args, **kwargs)
+
+
 @checked
-class QuadrotorEnv(Task, EnvBase):
+class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
     """Base of all tasks: a batch of quadrotors, stateless and differentiable.
 
     A step is a pure function of its tensordict. The complete Markov state is in ``"state"``, and gradients flow from
@@ -164,7 +174,9 @@ class QuadrotorEnv(Task, EnvBase):
         """Set :attr:`params`, also through a TransformedEnv, where an assignment would not reach this environment."""
         config.check_params(params, self.num_envs, self.nominal)
         fits = all(x.dtype == self.dtype and x.device == self.device for x in params.fields().values())
-        self._params = params if fits else params.to(device=self.device, dtype=self.dtype)
+        params = params if fits else params.to(device=self.device, dtype=self.dtype)
+        config.check_flown(self.dynamics, params)
+        self._params = params
 
     def set_initial_state_source(self, source: Callable[[int], TensorDictBase] | None) -> None:
         """Choose where resets start, also through a TransformedEnv: ``source(n)`` returns n complete states, the

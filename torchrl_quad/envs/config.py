@@ -13,13 +13,13 @@ import torch
 from pydantic import AfterValidator
 
 from torchrl_quad.dynamics import DYNAMICS, Dynamics, QuadrotorParams
+from torchrl_quad.dynamics.gains import MAX_SUBSTEPS
 from torchrl_quad.envs.disturbances import Disturbance, DroneRandomization, RandomStart, Sensors, Wind
 from torchrl_quad.envs.scenes import MountedCamera, Scene
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.options import Explained, accepted, between, build, buildable, check_value, imported
 from torchrl_quad.vision import DepthCamera
 
-MAX_SUBSTEPS = 200  # physics steps of a control step, which take half a second without compilation
 # A larger weight would leave none of the seven digits of single precision to the others.
 Weight = Annotated[float, between(-1e6, 1e6)]
 
@@ -123,7 +123,10 @@ def build_disturbances(dynamics: Dynamics, options: Mapping[str, Any]) -> dict[s
     if options["random_start"]:
         chosen["random_start"] = build(RandomStart, "random_start", options["random_start"])
     if options["randomize"]:
-        chosen["randomize"] = DroneRandomization(options["randomize"], dynamics.nominal, dynamics.plant_fields)
+        drawn = DroneRandomization(options["randomize"], dynamics.nominal, dynamics.plant_fields)
+        chosen["randomize"] = drawn
+        for params in drawn.liveliest(dynamics.nominal):
+            check_flown(dynamics, params, "randomize: a ")
     if options["wind"] is not None:
         chosen["wind"] = build(Wind, "wind", options["wind"])
     noise, delay = options["observation_noise"] or {}, options["observation_delay"]
@@ -138,6 +141,14 @@ def build_disturbances(dynamics: Dynamics, options: Mapping[str, Any]) -> dict[s
         if camera is not None:
             chosen["camera"] = MountedCamera(DepthCamera.of(camera), scene)
     return chosen
+
+
+def check_flown(dynamics: Dynamics, params: QuadrotorParams, which: str = "") -> None:
+    """Let the model refuse a drone that is to fly; models may leave this out."""
+    try:
+        getattr(dynamics, "check_flown", lambda _: None)(params)
+    except UserValueError as error:
+        raise UserValueError(f"{which}{error}") from None
 
 
 def full_signature(cls: type, base: type) -> inspect.Signature:

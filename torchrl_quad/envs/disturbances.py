@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -36,7 +36,8 @@ class Disturbance:
     """The protocol of all disturbances. A new one overrides some methods; ``disturbances=[MyOwn()]`` switches it on.
 
     Its memory is in entries of the state, each (n, ...), which are restored, stored and compiled with it.
-    An entry ``("drone", field)`` changes a parameter of the drone that flies, ``wind`` the air it flies in.
+    An entry ``("drone", field)`` changes a parameter of the drone that flies, from then on: a
+    ``("drone", "rotor_effectiveness")`` of 0 is a dead rotor. ``wind`` changes the air it flies in.
     """
 
     @property
@@ -49,7 +50,11 @@ class Disturbance:
         return {}
 
     def advance(self, state: State, noise: Tensor | None, dt: float) -> State:
-        """The entries that a control step of dt [s] changes, from the state after it and noise (n, noise_size)."""
+        """The entries that a control step of dt [s] changes, from the state after it and noise (n, noise_size).
+
+        It acts once per control step, and the physics goes on from there. What follows the command within a step, the
+        rotor speeds (with ``dynamics="point_mass"`` the body rates), is refused, as the change would be undone.
+        """
         return {}
 
     def observe(self, state: State) -> State:
@@ -74,10 +79,12 @@ class DroneRandomization(Disturbance):
         linear_drag: {normal: [0.005, 0.001]}        # cut off at three standard deviations
 
     "uniform" and "normal" give all entries of a field the same two numbers, "scale" each its own nominal value. The
-    values drawn are entries of the state, ``("drone", field)``. The controller keeps the nominal drone.
+    values drawn are entries of the state, ``("drone", field)``. The controller keeps the nominal drone. A moment of
+    inertia that exceeds the sum of the two others, as in no body, is lowered to that.
 
     Raises:
-        ValueError: a field or distribution is unknown, belongs to the controller, or may give an impossible drone.
+        ValueError: a field or distribution is unknown, belongs to the controller, or may give an impossible drone, or,
+            in an environment, one whose rate loop is unstable.
     """
 
     def __init__(
@@ -122,8 +129,17 @@ class DroneRandomization(Disturbance):
             shape = (len(state["position"]), *nominal.shape[-QuadrotorParams.dim(name) :])
             is_normal = "normal" in self.spec[name]
             unit = random.normal(*shape).clamp(-3.0, 3.0) / 3.0 if is_normal else random.uniform(*shape)
-            drawn["drone", name] = self._value(name, unit)
+            drawn["drone", name] = value = self._value(name, unit)
+            if name == "inertia":  # in a body none exceeds the sum of the other two
+                drawn["drone", name] = torch.minimum(value, value.sum(-1, keepdim=True) - value)
         return drawn
+
+    def liveliest(self, nominal: QuadrotorParams) -> Iterator[QuadrotorParams]:
+        """Of the drones that may be drawn those of the least inertia, with the quickest and with the slowest motors."""
+        for sign in (-1.0, 1.0):
+            ends = {"inertia": -1.0, "motor_time_constant": sign}
+            ends = {k: self._value(k, torch.full_like(x, ends[k])) for k, x in self.nominal.items() if k in ends}
+            yield nominal.replace(**ends)
 
     def _value(self, name: str, unit: Tensor) -> Tensor:
         """From the range [-1, 1] to the one asked for."""

@@ -168,7 +168,8 @@ class RacingEnv(QuadrotorEnv):
             self.half_width, self.floor, self.ceiling = 0.5 * (high - low)[:2], low[2].item(), high[2].item()
         self.centre = 0.5 * (low + high)
         for start, point in zip(self.starts, track["starts"], strict=True):
-            corners = torch.stack((start - self.start_range, start + self.start_range))
+            room = self.tensor(self.moved) + self.start_range  # starts move with their gates
+            corners = torch.stack((start - room, start + room))
             if self.is_crash({"position": corners}).any():
                 raise UserValueError(
                     f"track: drones start within {self.start_range} m of {point}, which is not all inside the box: x "
@@ -182,8 +183,11 @@ class RacingEnv(QuadrotorEnv):
             gate = torch.full_like(gate, self.first_gate)
         state = self.draw_track(n)
         starts = self.starts[gate[:, 0]]
+        if any(self.moved):
+            starts = starts + self.pose(state, gate)[0] - self.gates[gate[:, 0]]
         if self.course is not None:
-            starts = _at(starts_before(state[GATES], state.get(ROTATIONS), self.floor), gate)
+            every = starts_before(state[GATES], state.get(ROTATIONS), self.floor)
+            starts = every[torch.arange(n, device=self.device), gate[:, 0]]
         start = self.hover_state(starts + self.start_range * self.uniform(n, 3))
         return {
             **start,
@@ -214,7 +218,9 @@ class RacingEnv(QuadrotorEnv):
         """Centres (n, 3) [m] and, where gates have a direction, rotations (n, 4) of gates by their index (n, 1)."""
         if not self.is_drawn:
             return self.gates[gate[:, 0]], self.rotations[gate[:, 0]] if self.is_directed else self.rotations
-        return _at(state[GATES], gate), _at(state[ROTATIONS], gate) if self.is_directed else self.rotations
+        chosen = (gate == self.gate_indices).unsqueeze(-1)  # by weights: bundles know no gather along shapes
+        found = [(x * chosen).sum(1) for x in (state[GATES], state[ROTATIONS] if self.is_directed else state[GATES])]
+        return found[0], found[1]
 
     def local(self, previous: State, state: State) -> tuple[Tensor, Tensor]:
         """Both ends of a step, each (n, 3) [m], in the frame of the gate that was next: x in its direction."""
@@ -243,7 +249,7 @@ class RacingEnv(QuadrotorEnv):
         way = end - start
         share = torch.arange(SAMPLES + 1, device=self.device, dtype=self.dtype) / SAMPLES
         crossing = (-start[..., :1] / torch.where(way[..., :1] == 0.0, 1.0, way[..., :1])).clamp(0.0, 1.0)
-        share = torch.cat((share.expand(*way.shape[:2], -1), crossing), -1).unsqueeze(-1)  # (n, k, instants, 1)
+        share = torch.cat((share + 0.0 * crossing, crossing), -1).unsqueeze(-1)  # (n, k, instants, 1)
         along, aside = (start.unsqueeze(2) + share * way.unsqueeze(2)).split((1, 2), -1)
         aside = terms.norm(aside) if self.openings.shape[-1] == 1 else aside.abs()
         beyond = aside - self.openings.unsqueeze(1)  # the edges of the opening
@@ -364,11 +370,6 @@ class RacingEnv(QuadrotorEnv):
             )
             marked["shapes"] = [Shape.line(outer.flatten(0, 1))]
         return Markers("next gate", **marked, progress="gates_passed", success=success)
-
-
-def _at(x: Tensor, index: Tensor) -> Tensor:
-    """The entries (n, j) of x (n, k, j) at an index (n, 1)."""
-    return x.gather(1, index.unsqueeze(-1).expand(-1, -1, x.shape[-1])).squeeze(1)
 
 
 def _box(beyond: Tensor) -> Tensor:

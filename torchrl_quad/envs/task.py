@@ -230,6 +230,7 @@ def check_task(env: Task, state: State) -> None:
     for key in taken & set(env.task_entries):
         check(False, f"initial_state: entry {key!r} is the environment's own; give yours another name.")
     fields, kinds = env.dynamics.plant_fields, (env.dtype, torch.int64, torch.bool)
+    check_changes(env, state)
     for key, x in state.items():
         check(
             isinstance(x, Tensor) and x.dim() > 1 and len(x) == n and x.dtype in kinds,
@@ -238,6 +239,11 @@ def check_task(env: Task, state: State) -> None:
         )
         if isinstance(key, tuple) and key[0] == "drone" and key[1] not in fields:
             raise UserValueError(f"Entry {key!r} changes no parameter of the drone. Choose from: {', '.join(fields)}.")
+        if isinstance(key, tuple) and key[0] == "drone":
+            one = env.nominal.value(key[1])
+            shape = (n, *one.shape[-env.nominal.dim(key[1]) :])
+            fits = x.shape == shape or key[1] == "motor_time_constant"  # which may be two
+            check(fits, f"initial_state: entry {key!r} must have shape {shape}, got {tuple(x.shape)}.")
     check_tensor("observe(state)", env.observe(state), env.dtype, None)
     terms, metrics, events = env.reward_terms(state), env.metrics(state), env.events(state, state)
     for method, term in named("reward_terms(state)", terms):
@@ -268,3 +274,25 @@ def check_task(env: Task, state: State) -> None:
             f"advance must return the whole state, and {key!r} as initial_state gives it, ({wanted}); got ({got}). "
             "Start from {**state, ...}.",
         )
+
+
+def check_changes(env: Task, state: State) -> None:
+    """Check that disturbances change what their ``start`` gives or the drone has, and nothing that the physics sets."""
+    commanded = getattr(env.dynamics, "commanded", ())
+    for disturbance in env.disturbances.values():
+        noise = state["position"].new_zeros(env.num_envs, disturbance.noise_size) if disturbance.noise_size else None
+        who = f"{type(disturbance).__name__}.advance"
+        for key, x in disturbance.advance(dict(state), noise, env.control_dt).items():
+            if key in commanded:
+                raise UserValueError(
+                    f"{who} writes {key!r}, which follows the command within the next control step: the change would "
+                    'be undone. A motor that fails has a ("drone", "rotor_effectiveness") of 0: give that in start and '
+                    "in advance, (num_envs, n) for n rotors."
+                )
+            if key not in state:
+                raise UserValueError(
+                    f"{who} writes {key!r}, which the state lacks, so that it would be lost. Give it in start, too."
+                )
+            if x.shape != state[key].shape or x.dtype != state[key].dtype:
+                got, wanted = (f"{tuple(y.shape)}, {y.dtype}" for y in (x, state[key]))
+                raise UserValueError(f"{who} must give {key!r} as the state has it, ({wanted}); got ({got}).")

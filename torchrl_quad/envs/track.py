@@ -268,7 +268,7 @@ def starts_before(gates: Tensor, rotations: Tensor | None, floor: float) -> Tens
 
 def forward(rotations: Tensor) -> Tensor:
     """The direction (*, 3) in which gates with these rotations (*, 4) are flown."""
-    return quaternion.rotate(rotations, torch.zeros_like(rotations[..., 1:]) + rotations.new_tensor([1.0, 0.0, 0.0]))
+    return quaternion.rotate(rotations, 0.0 * rotations[..., 1:] + rotations.new_tensor([1.0, 0.0, 0.0]))
 
 
 def _gates(centres: list, rotations: list) -> list[dict[str, Any]]:

@@ -19,6 +19,7 @@ AXES = {name: from_euler(np.array([0.0, 0.0, yaw])) for name, yaw in _YAWS.items
 # Of lsy_drone_racing, in the comments of its files: "0.72m wide (outer dimensions of the frame) with a 0.4m wide
 # opening", and obstacles are "cylinders with a diameter of 0.03m", whose position is that of their top.
 LSY_OPENING, LSY_FRAME, LSY_POLE = 0.4, 0.16, 0.015
+LSY_RUN_UP = 0.25  # [m], from a start to its gate, before which poles stand
 
 
 def own_format(source: str, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -34,7 +35,11 @@ def own_format(source: str, values: Mapping[str, Any]) -> dict[str, Any]:
     try:
         if isinstance(values.get("env"), Mapping):
             return lsy_drone_racing(source, values)
-        if isinstance(gates, Mapping) and all({"position", "rotation"} <= set(gate) for gate in named.values()):
+        if (
+            isinstance(gates, Mapping)
+            and named
+            and all({"position", "rotation"} <= set(gate) for gate in named.values())
+        ):
             return agile_flight(source, values, _in_order(named))
         if named and all({"pos", "yaw"} <= set(gate) for gate in named.values()):
             return isaac_drone_racer(source, values, _in_order(named))
@@ -67,7 +72,7 @@ def agile_flight(source: str, values: dict[str, Any], gates: list[Mapping[str, A
     axis = values.get("axis")
     if axis is None:
         flown = {name: rotate(multiply(rotations, turn), [1.0, 0.0, 0.0]) for name, turn in AXES.items()}
-        fit = [name for name, along in flown.items() if ((ways[:-1] + ways[1:]) * along).sum(1).min() > 0.0]
+        fit = [name for name, along in flown.items() if ((ways[:-1] + ways[1:]) * along).sum(1).min() > 1e-3]
         if len(fit) != 1:
             raise UserValueError(
                 f"{source}: its gates are flown along one of their axes, and their order does not show which. Give "
@@ -119,7 +124,7 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
         "gates are open 0.4 m, with frames of 0.16 m; poles are 0.03 m thick, and end at their position",
         "the drone hovers above its start; drone, sensors and disturbances are not read",
     ]
-    own |= {"start_range": 0.1, "floor": box[0][2], "notes": notes}
+    own |= {"start_range": 0.05, "floor": box[0][2], "notes": notes}
     if track.get("randomize", False):  # of positions it says nothing but the limits
         low, high = box
         reach = min(high[i] - low[i] for i in (0, 1)) / 2.0
@@ -135,13 +140,13 @@ def lsy_drone_racing(source: str, values: dict[str, Any]) -> dict[str, Any]:
         return own
     drawn = {name: _spread(source, x) for name, x in values["env"].get("randomizations", {}).items()}
     middle, spread = drawn.get("gate_pos", (np.zeros(3), None))
-    own["gates"] = [
-        {"position": p, "rotation": from_euler(as_array(gate["rpy"])).tolist()}
-        for p, gate in zip((centres + middle).tolist(), track["gates"], strict=True)
-    ]
+    centres, rotations = centres + middle, from_euler(as_array([gate["rpy"] for gate in track["gates"]]))
+    listed = zip(centres.tolist(), rotations.tolist(), strict=True)
+    own["gates"] = [{"position": position, "rotation": rotation} for position, rotation in listed]
+    before = (centres - LSY_RUN_UP * rotate(rotations, [1.0, 0.0, 0.0])).tolist()
     own |= {"position_jitter": spread.tolist()} if spread is not None else {}
     own |= {"rotation_jitter": drawn["gate_rpy"][1].tolist()} if "gate_rpy" in drawn else {}
-    own["start"] = [*start[:2], max(start[2], box[0][2] + 0.25)]
+    own["starts"] = [[*start[:2], max(start[2], box[0][2] + 0.25)], *before[1:]]
     tops = as_array([pole["pos"] for pole in track["obstacles"]])
     middle, spread = drawn.get("obstacle_pos", (np.zeros(3), np.zeros(3)))
     low, high = (np.c_[tops[:, :2] + middle[:2] + sign * spread[:2], 0.0 * tops[:, 2]].tolist() for sign in (-1, 1))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Hashable, Sequence
 from typing import Annotated, Any, NamedTuple, cast
 
 import torch
@@ -288,12 +289,15 @@ class PlainParts(PlainTanhGaussian):
         self.sees, gru = bool(parts.convolutions), cast(Any, parts.memory)
         self.memory = {MEMORY: (1, gru.hidden_size)} if gru else {}
         self.in_keys, self.out_keys = [*map(unravel_key, first.in_keys), *self.memory], list(actor.out_keys)
-        self.without_gradient: frozenset[NestedKey] = frozenset()
         self._take_head(actor)
         before = [(x.weight, x.bias) for x in cast(Any, [*parts.convolutions[::2], *parts.trunk[::2]])]
         gates = [(gru.weight_ih_l0, gru.bias_ih_l0), (gru.weight_hh_l0, gru.bias_hh_l0)] if gru else []
         self.weights = tuple(x for pair in (*before, *gates, (parts.head.weight, parts.head.bias)) for x in pair)
-        self.signature = (*self._describe(), str((self.lenses, self.activations, self.nearest, list(self.memory))))
+
+    @functools.cached_property
+    def signature(self) -> Hashable:
+        """What it computes."""
+        return (*self._describe(), str((self.lenses, self.activations, self.nearest, list(self.memory))))
 
     def fits(self, inputs: Sequence[Tensor]) -> bool:
         """Whether the network can read inputs of this width, precision and device."""

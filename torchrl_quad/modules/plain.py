@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -64,13 +65,17 @@ def tanh_gaussian(
         action = (high + low) / 2 + (high - low) / 2 * squashed
     written: dict[NestedKey, Tensor] = {"loc": loc, "scale": scale, "action": action}
     if log_prob_key is not None:
-        x = x + (torch.atanh(squashed) - x).detach()
-        density = -((x - loc) ** 2) / (2 * scale**2) - scale.log() - 0.5 * math.log(2 * math.pi)
-        slope = 2.0 * (math.log(2.0) - x - nn.functional.softplus(-2.0 * x))
-        if bounds is not None:
-            slope = slope + ((bounds[1] - bounds[0]) / 2).log()
-        written[log_prob_key] = (density - slope).sum(-1)
+        written[log_prob_key] = log_density(x + (torch.atanh(squashed) - x).detach(), loc, scale, bounds)
     return written
+
+
+def log_density(x: Tensor, loc: Tensor, scale: Tensor, bounds: tuple[Tensor, Tensor] | None) -> Tensor:
+    """The log-probability (*) of the action that the tanh makes of x (*, k), which is normal with loc and scale."""
+    density = -((x - loc) ** 2) / (2 * scale**2) - scale.log() - 0.5 * math.log(2 * math.pi)
+    slope = 2.0 * (math.log(2.0) - x - nn.functional.softplus(-2.0 * x))
+    if bounds is not None:
+        slope = slope + ((bounds[1] - bounds[0]) / 2).log()
+    return (density - slope).sum(-1)
 
 
 class Network(nn.Module):
@@ -194,6 +199,7 @@ class TanhGaussianActor(ProbabilisticActor):
 class PlainTanhGaussian:
     """A tanh-Gaussian policy on plain tensors; see the engine's ``PlainPolicy``."""
 
+    without_gradient: frozenset[NestedKey] = frozenset()
     squashes = True  # the action is a tanh
 
     def __init__(self, actor: TanhGaussianActor) -> None:
@@ -204,7 +210,11 @@ class PlainTanhGaussian:
         self.activations, layers = list(network.mlp)[1::2], cast(list[nn.Linear], list(network.mlp)[::2])
         self.weights = tuple(x for layer in layers for x in (layer.weight, layer.bias))
         self._take_head(actor)
-        self.signature = (*self._describe(), str(self.activations))
+
+    @functools.cached_property
+    def signature(self) -> Hashable:
+        """What it computes; a compiler of a loss need not describe it."""
+        return (*self._describe(), str(self.activations))
 
     def _describe(self) -> tuple[Any, ...]:
         """What it computes, apart from its activations."""
@@ -249,11 +259,19 @@ class PlainTanhGaussian:
             noise, before = (leaf(tensordict, key).detach() for key in ("noise", "noise_before"))
             return torch.cat((self.head.innovation(before, noise), before), -1).flatten(0, -2)
         action, loc, scale = (leaf(tensordict, key).detach() for key in ("action", "loc", "scale"))
+        return ((self._latent(action) - loc) / scale).flatten(0, -2)
+
+    def log_prob(self, loc: Tensor, scale: Tensor, action: Tensor) -> Tensor:
+        """The log-probability (*) of actions (*, k)."""
+        return log_density(self._latent(action), loc, scale, self._bounds(loc))
+
+    def _latent(self, action: Tensor) -> Tensor:
+        """Actions (*, k) before the tanh; within 1e-6 of a bound they count as if they were that far from it."""
         if self.low is not None:
             low, high = (action.new_tensor(x) for x in (self.low, self.high))
             action = (2.0 * action - (high + low)) / (high - low)
         limit = 1.0 - torch.finfo(action.dtype).resolution
-        return ((torch.atanh(action.clamp(-limit, limit)) - loc) / scale).flatten(0, -2)
+        return torch.atanh(action.clamp(-limit, limit))
 
     def recorded(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """loc and scale (*, k), before the tanh, with which a rollout was flown."""
@@ -264,14 +282,14 @@ class PlainTanhGaussian:
         keys = [*self.in_keys, *(["noise_before"] if self.rho else [])]
         read = [leaf(tensordict, key).detach().flatten(0, -2) for key in keys]
         own = len(self.in_keys)
-        loc, scale = self.head(self._layers(self.weights, read[:own])[-1], *read[own:])
+        loc, scale = self.head(self.layers(self.weights, read[:own])[-1], *read[own:])
         return loc.view(*tensordict.shape, -1), scale.view(*tensordict.shape, -1)
 
     def forward(
         self, weights: Sequence[Tensor], inputs: Sequence[Tensor], drawn: Tensor
     ) -> tuple[list[Tensor], dict[NestedKey, Tensor]]:
         """What each layer returns before its activation, and loc, scale, action, and log-probability if wanted."""
-        kept = self._layers(weights, inputs)
+        kept = self.layers(weights, inputs)
         return kept, self._sample(kept[-1], drawn)
 
     def adjoint(
@@ -301,7 +319,7 @@ class PlainTanhGaussian:
         pairs = zip(traces[:count], traces[count:], strict=True)
         return [g for x, grad in pairs for g in (grad.t() @ x, grad.sum(0))]
 
-    def _layers(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
+    def layers(self, weights: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
         """What each layer returns before its activation, for inputs (n, k_i)."""
         x, kept = concatenated(inputs, self.scales), []
         for weight, bias, activation in zip(weights[::2], weights[1::2], [*self.activations, None], strict=True):
@@ -313,8 +331,10 @@ class PlainTanhGaussian:
         self, loc: Tensor, scale: Tensor, xi: Tensor, log_prob_key: NestedKey | None = None
     ) -> dict[NestedKey, Tensor]:
         """What :func:`tanh_gaussian` writes, within the bounds of the action."""
-        bounds = None if self.low is None else (loc.new_tensor(self.low), loc.new_tensor(self.high))
-        return tanh_gaussian(loc, scale, xi, bounds, log_prob_key)
+        return tanh_gaussian(loc, scale, xi, self._bounds(loc), log_prob_key)
+
+    def _bounds(self, like: Tensor) -> tuple[Tensor, Tensor] | None:
+        return None if self.low is None else (like.new_tensor(self.low), like.new_tensor(self.high))
 
     def _sample(self, raw: Tensor, drawn: Tensor) -> dict[NestedKey, Tensor]:
         xi, *before = drawn.split(self.size, -1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_quad.data.unwrap import leaf
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.objectives.calls import sample_action, segments, step_in_segment, total
+from torchrl_quad.objectives.calls import picked, sample_action, segments, step_in_segment, total
 from torchrl_quad.objectives.critic import PathwiseCriticLoss
 from torchrl_quad.options import Copies, Field
 
@@ -42,7 +42,8 @@ class ABPTLoss(PathwiseCriticLoss):
 
     Args:
         actor_network: the policy that flew the rollout.
-        qvalue_network: the critic Q(s, a), which writes ``state_action_value`` (see ``set_keys``).
+        qvalue_network: the critic Q(s, a), which writes ``state_action_value`` (see ``set_keys``); or a list of such
+            critics, of the same layers.
         num_qvalue_nets: the critics made from it, each initialised independently, whose smallest value counts.
         n_step_return: whether J includes J_N.
         zero_step_return: whether J includes J_0.
@@ -51,7 +52,7 @@ class ABPTLoss(PathwiseCriticLoss):
             in a_0 is the simulator's, not the critic's, which may be noise. With an action delay of d steps a_0 moves
             nothing before step d + 1: take 1 + d or more. J_0 ends with its segment at the latest.
         delay_qvalue: whether the critics have target networks, updated with :class:`torchrl.objectives.SoftUpdate`.
-        **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
+        **kwargs: as for :class:`~torchrl_quad.objectives.PathwiseCriticLoss`.
     """
 
     @dataclass
@@ -63,6 +64,7 @@ class ABPTLoss(PathwiseCriticLoss):
     critic_loss_key = "loss_qvalue"
     prediction_key = "state_action_value"
     value_part = "zero_step_return"
+    samples_actions = True
     out_keys = ["loss_actor", "loss_qvalue", "pred_value", "target_value", "explained_variance"]
 
     qvalue_network: TensorDictModule
@@ -72,7 +74,7 @@ class ABPTLoss(PathwiseCriticLoss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        qvalue_network: TensorDictModule,
+        qvalue_network: TensorDictModule | list[TensorDictModule],
         *,
         num_qvalue_nets: Copies = 2,
         n_step_return: bool = True,
@@ -89,8 +91,7 @@ class ABPTLoss(PathwiseCriticLoss):
         self.simulated_steps = simulated_steps
         self.n_step_return, self.zero_step_return = n_step_return, zero_step_return
         self.out_keys = [*self.out_keys, *["n_step_return"] * n_step_return, *["zero_step_return"] * zero_step_return]
-        copies = {"expand_dim": num_qvalue_nets, "create_target_params": delay_qvalue}
-        self.convert_to_functional(qvalue_network, "qvalue_network", **copies)
+        self._add_critics(qvalue_network, num_qvalue_nets, "num_qvalue_nets", delay_qvalue)
 
     def loss_qvalue(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The critics' loss (paper, equation 16), summed over critics, and its metadata; takes what SHAC's does."""
@@ -119,8 +120,7 @@ class ABPTLoss(PathwiseCriticLoss):
         self._check_graph(leaf(tensordict, self.tensor_keys.action), self.tensor_keys.action)
         start, counts = segments(self._next(tensordict, "done"))[0], self._counts(tensordict)
         start = start if counts is None else start & counts
-        first = cast(TensorDictBase, tensordict.select(*self.qvalue_network.in_keys)[start.squeeze(-1)])
-        value = self._critics(first).amin(0)
+        value = self._critics(picked(tensordict, self.qvalue_network.in_keys, start)).amin(0)
         return torch.zeros_like(start, dtype=value.dtype).masked_scatter(start, value).sum((-2, -1))
 
     def _simulated(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:

@@ -58,7 +58,7 @@ class AHACLoss(SHACLoss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        value_network: TensorDictModule,
+        value_network: TensorDictModule | list[TensorDictModule],
         *,
         horizon: Horizon = 32,
         min_horizon: Horizon | None = None,

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, cast
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -85,6 +85,13 @@ def takes_rollout(forward: Callable[..., Any]) -> Callable[..., Any]:
     return method
 
 
+def picked(tensordict: TensorDictBase, keys: Iterable[NestedKey], where: Tensor) -> TensorDict:
+    """Some entries of a rollout (*, horizon) where bool (*, horizon, 1) says so: (n)."""
+    rows = where.squeeze(-1).nonzero(as_tuple=True)  # once for all entries: to a compiler each mask has a count anew
+    found = {key: leaf(tensordict, key)[rows] for key in keys if key in tensordict}
+    return TensorDict(cast(Any, found), rows[0].shape, tensordict.device)
+
+
 def with_fixed(loss: Any, given: Mapping[str, Any], **fixed: Any) -> dict[str, Any]:
     """Options for SHACLoss, with those that a loss sets itself: a UserTypeError if one of these is given, too."""
     for name in sorted(set(given) & set(fixed)):
@@ -121,6 +128,15 @@ def step_in_segment(done: Tensor) -> Tensor:
 def discounts(done: Tensor, gamma: Tensor) -> Tensor:
     """gamma^t, for a scalar gamma, where t counts the steps of each segment from 0."""
     return gamma ** step_in_segment(done)
+
+
+def td_lambda(reward: Tensor, done: Tensor, next_value: Tensor, gamma: Tensor, lmbda: Tensor) -> Tensor:
+    """TD(lambda) targets, each (*, horizon, 1), as one product: a compiler would unroll a loop over time."""
+    index, apart = step_in_segment(done), torch.arange(done.shape[-2], device=done.device)
+    apart = apart - apart.unsqueeze(-1)
+    later = (apart >= 0) & (index.mT - index == apart)  # in the same segment
+    gains = reward + gamma * torch.where(segments(done)[1], 1.0, 1.0 - lmbda) * next_value
+    return torch.where(later, (gamma * lmbda).to(reward.dtype) ** apart.clamp_min(0), 0.0) @ gains
 
 
 # -- gradients in single actions, and how a policy learns from them ----------------------------------------------------
@@ -171,14 +187,6 @@ def act_again(actor: TensorDictModule, params: TensorDictParams, tensordict: Ten
         if hasattr(plain, "replay"):
             return plain.replay(tensordict)
         return act(plain, tensordict.select(*plain.in_keys).detach(), plain.drawn_again(tensordict))
-
-
-def distribution_again(
-    actor: TensorDictModule, params: TensorDictParams, tensordict: TensorDictBase
-) -> tuple[Tensor, Tensor]:
-    """loc and scale, before the tanh, in a rollout's states, (*, k); otherwise as :func:`act_again`."""
-    with params.to_module(actor):
-        return plain_of(actor, tensordict).distribution(tensordict)
 
 
 def plain_of(actor: TensorDictModule, tensordict: TensorDictBase) -> Any:

@@ -3,26 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, Literal, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.objectives.utils import ValueEstimators
+from torchrl.objectives.utils import ValueEstimators, distance_loss
 
 from torchrl_quad.data.unwrap import check_tensordict, group, leaf
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.objectives.calls import (
+    picked,
     predict,
     segments,
     takes_rollout,
+    td_lambda,
 )
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 
 
 class PathwiseCriticLoss(PathwiseLoss):
-    """A pathwise loss with a critic, whose value ends each segment and which learns TD(lambda) targets."""
+    """A pathwise loss with a critic, whose value ends each segment and which learns TD(lambda) targets.
+
+    Args:
+        actor_network: the policy that flew the rollout.
+        loss_function: the distance of a prediction from its target: l2, its square; l1; or smooth_l1.
+        **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
+    """
 
     @dataclass
     class _AcceptedKeys(PathwiseLoss._AcceptedKeys):
@@ -37,6 +46,30 @@ class PathwiseCriticLoss(PathwiseLoss):
     prediction_key: str  # the tensor key under which the critic writes its prediction
     value_part = "terminal_value"
     target_bootstrap = False  # whether the terminal value comes from the target network
+    samples_actions = False  # whether the value of a state is that of an action that the policy samples there
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        *,
+        loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(actor_network, **kwargs)
+        self.loss_function = loss_function
+
+    def _add_critics(
+        self, networks: TensorDictModule | list[TensorDictModule], count: int | None, option: str, delay: bool
+    ) -> None:
+        """Take one critic, make ``count`` of it, or take a list of them."""
+        if isinstance(networks, list | tuple):
+            if count not in (None, len(networks)):
+                raise UserValueError(
+                    f"{self.critic_name} lists {len(networks)} networks, and {option} is {count}: write "
+                    f"{option}={len(networks)}."
+                )
+            count = len(networks)
+        self.convert_to_functional(networks, self.critic_name, expand_dim=count, create_target_params=delay)
 
     @takes_rollout
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -65,7 +98,11 @@ class PathwiseCriticLoss(PathwiseLoss):
             if self._counts(data) is not None:
                 for name in ("reward", "done", "terminated"):
                     data.set(("next", getattr(self.tensor_keys, name)), self._next(data, name))
-            target = self.value_estimator.value_estimate(data, next_value=next_value)
+            if torch.compiler.is_compiling() and not getattr(self._value_estimator, "average_rewards", False):
+                numbers = self._gamma, self._of_returns("lmbda")
+                target = td_lambda(self._next(data, "reward"), self._next(data, "done"), next_value, *numbers)
+            else:
+                target = self.value_estimator.value_estimate(data, next_value=next_value)
         return tensordict.set(self.tensor_keys.value_target, target)
 
     def _critics(self, tensordict: TensorDictBase, *, target: bool = False, learning: bool = False) -> Tensor:
@@ -97,7 +134,7 @@ class PathwiseCriticLoss(PathwiseLoss):
                 f"{key!r} has shape {tuple(target.shape)}, and the critic's predictions {tuple(prediction.shape[1:])}: "
                 "give targets as write_value_target writes them."
             )
-        error = (prediction - target).square().sum(0).squeeze(-1)
+        error = distance_loss(prediction, target.expand_as(prediction), self.loss_function).sum(0).squeeze(-1)
         residual = (target - prediction.detach()).var(correction=0) / target.var(correction=0).clamp_min(1e-12)
         return self._reduce_loss(error, tensordict), {
             "pred_value": prediction.detach().mean(),
@@ -112,11 +149,18 @@ class PathwiseCriticLoss(PathwiseLoss):
     def _discounted_value(self, tensordict: TensorDictBase, after: Tensor) -> Tensor:
         """gamma^(t+1) V(s_(t+1)) after steps (*, horizon, 1), but for those that terminated, summed over steps: (*)."""
         where = after & ~self._next(tensordict, "terminated")
-        next_state = group(tensordict, "next").select(*self._critic_inputs(), strict=False)[where.squeeze(-1)]
+        states, inputs = group(tensordict, "next"), self._critic_inputs()
         discount = self._gamma * self._discounts(tensordict)
-        if next_state.shape[0] == 0:  # a recurrent policy refuses an empty batch
+        if torch.compiler.is_compiling() and not self.samples_actions:
+            # All states, since a compiler is slow where a mask gives the shape; earlier ones stand in for the others.
+            known, stand_in = (td.select(*inputs, strict=False) for td in (states, tensordict.detach()))
+            dense = cast(TensorDictBase, known.where(where.squeeze(-1), stand_in).reshape(-1))
+            value = self._value(dense, target=self.target_bootstrap).view(where.shape).to(discount.dtype)
+            return (discount * torch.where(where, value, 0.0)).sum((-2, -1))
+        next_state = picked(states, inputs, where)
+        if not torch.compiler.is_compiling() and len(next_state) == 0:  # a recurrent policy refuses an empty batch
             return torch.zeros_like(discount).sum((-2, -1))
-        value = self._value(cast(TensorDictBase, next_state), target=self.target_bootstrap)
+        value = self._value(next_state, target=self.target_bootstrap)
         return (discount * torch.zeros_like(discount).masked_scatter(where, value.to(discount.dtype))).sum((-2, -1))
 
     def _critic_inputs(self) -> set[NestedKey]:

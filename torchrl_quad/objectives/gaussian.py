@@ -38,12 +38,12 @@ class GaussianPolicy:
         if sampler is None:
             raise Unsupported(f"{_NEEDED}; {type(actor).__name__} has no distribution. {_INSTEAD}")
         self.actor, self.sampler, self.action_key = actor, sampler, sampler.dist_sample_keys[0]
-        parts = list(actor.modules())
-        for part in parts[parts.index(sampler) + 1 :]:
+        parts = list(actor.named_modules())
+        for name, part in parts[[part for _, part in parts].index(sampler) + 1 :]:
             if isinstance(part, TensorDictModuleBase) and self.action_key in part.out_keys:
                 raise Unsupported(
-                    f"{_NEEDED}, and here {type(part).__name__} changes the action afterwards. Let the distribution "
-                    "write the action that is flown."
+                    f"{_NEEDED}, and here {type(part).__name__} ({name}) changes the action afterwards. "
+                    "Let the distribution write the action that is flown."
                 )
         self.flown = self._distribution(tensordict.select(*sampler.in_keys).detach())
         self.squashes = isinstance(self.flown, TanhNormal)
@@ -81,7 +81,7 @@ class GaussianPolicy:
         states = cast(TensorDictBase, states if has_memory else states.reshape(-1))  # as it was flown
         with set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(has_time):
             loc, scale = _normal(self._distribution(self._call(states)))
-        return loc.view(*shape, -1), scale.view(*shape, -1)
+        return loc.reshape(*shape, -1), scale.reshape(*shape, -1)
 
     def replay(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
         """What it writes in the states of a rollout (*, horizon), with the noise of the rollout."""
@@ -95,37 +95,24 @@ class GaussianPolicy:
         return dist
 
     def _call(self, states: TensorDictBase) -> TensorDictBase:
-        """What the policy writes in states, once it is sure to write the same again."""
-        parts = list(self.actor.named_modules())
-        for name, part in parts:
+        """What the policy writes in states; an error for a layer that would not write the same again."""
+        names, before = {part: name for name, part in self.actor.named_modules()}, {}
+        for part in names:
+            if isinstance(part, ProbabilisticTensorDictModule) and part is not self.sampler:
+                raise _changing(part, names[part], _CHANGES[0])
             if isinstance(part, _BatchNorm) and (part.training or part.running_mean is None):
-                raise _changing(name, part, "uses the statistics of its batch")
+                raise _changing(part, names[part], "uses the statistics of its batch")
         if torch.compiler.is_compiling():
             return self.actor(states)
-        random, versions = _random_state(), [_versions(part) for _, part in parts]
-        written = self.actor(states.copy())
-        for (name, part), version in zip(parts, versions, strict=True):
-            if _versions(part) != version:
-                raise _changing(name, part, "changes its statistics")
-        if _random_state() != random:
-            name, part = self._random_part(states)
-            raise _changing(name, part, "draws random numbers")
-        return written
 
-    def _random_part(self, states: TensorDictBase) -> tuple[str, nn.Module]:
-        """The innermost part of the policy that draws random numbers, and its name."""
-        before: dict[nn.Module, Any] = {}
-        found: list[nn.Module] = [self.actor]
+        def leave(part: nn.Module, *_: Any) -> None:  # the innermost part returns first
+            for does, now, then in zip(_CHANGES, _changeable(part), before[part], strict=True):
+                if now != then:
+                    raise _changing(part, names.get(part, ""), does)
 
-        def leave(part: nn.Module, *_: Any) -> None:
-            if _random_state() != before[part]:
-                found.append(part)  # the innermost returns first
-
-        enter = register_module_forward_pre_hook(lambda part, _: before.update({part: _random_state()}))
+        enter = register_module_forward_pre_hook(lambda part, _: before.update({part: _changeable(part)}))
         with enter, register_module_forward_hook(leave):
-            self.actor(states)
-        part = found[min(1, len(found) - 1)]
-        return {part: name for name, part in self.actor.named_modules()}.get(part, ""), part
+            return self.actor(states)
 
 
 def sampler_of(actor: TensorDictModuleBase) -> ProbabilisticTensorDictModule | None:
@@ -147,19 +134,18 @@ def _normal(dist: Any) -> tuple[Tensor, Tensor]:
     return base.loc, base.scale
 
 
-def _random_state() -> list[bytes]:
-    """Where the generators of torch stand."""
+_CHANGES = ("draws random numbers", "changes its statistics")
+
+
+def _changeable(part: nn.Module) -> tuple[Any, Any]:
+    """Where torch's generators stand, and how often the statistics of a part were changed in place."""
     devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
-    states = torch.get_rng_state(), *(torch.cuda.get_rng_state(i) for i in devices)
-    return [x.numpy().tobytes() for x in states]
+    random = torch.get_rng_state(), *(torch.cuda.get_rng_state(i) for i in devices)
+    statistics = (x for x in part._buffers.values() if x is not None and x.is_floating_point())
+    return [x.numpy().tobytes() for x in random], [x._version for x in statistics]
 
 
-def _versions(part: nn.Module) -> list[int]:
-    """How often each of the statistics of a part was changed in place."""
-    return [x._version for x in part._buffers.values() if x is not None and x.is_floating_point()]
-
-
-def _changing(name: str, part: nn.Module, does: str) -> Unsupported:
+def _changing(part: nn.Module, name: str, does: str) -> Unsupported:
     return Unsupported(
         "Gradients of single actions let the policy act again in the same states, and its layer "
         f"{type(part).__name__}{f' ({name})' * bool(name)} {does}, so that it writes something else. Call actor.eval() "

@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.distributions import Normal, kl_divergence
+from torch.distributions import Normal
 from torch.distributions.transforms import TanhTransform
 from torchrl.objectives.utils import ValueEstimators
 
@@ -65,6 +65,7 @@ class HybridLoss(SHACLoss):
         entropy_coeff: the weight of the entropy bonus, next to advantages of standard deviation 1; 0 for none.
         clip_action_gradient: the longest gradient in one action, in running medians of their lengths; null for none.
         reduction: mean, sum or none, over samples.
+        loss_function: the distance of the critic from its targets: l2, its square; l1; or smooth_l1.
         decay: the share of the running weight that a rollout leaves as it is.
         average: of a scalar over the processes that train together, if there are several.
     """
@@ -85,7 +86,7 @@ class HybridLoss(SHACLoss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        value_network: TensorDictModule,
+        value_network: TensorDictModule | list[TensorDictModule],
         *,
         gradient_lmbda: Share = 0.9,
         clip_epsilon: Annotated[float, Field(gt=0, lt=1)] = 0.2,
@@ -94,12 +95,14 @@ class HybridLoss(SHACLoss):
         decay: Below1 = 0.9,
         average: Callable[[Tensor], Tensor] | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
+        loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
     ) -> None:
-        own = {"clip_action_gradient": clip_action_gradient, "reduction": reduction}
+        own = {"clip_action_gradient": clip_action_gradient, "reduction": reduction, "loss_function": loss_function}
         super().__init__(actor_network, value_network, delay_value=False, **own)
         self.gradient_lmbda, self.clip_epsilon, self.entropy_coeff = gradient_lmbda, clip_epsilon, entropy_coeff
         self.decay, self.average = decay, average
-        self.out_keys = [name for name in self.out_keys if name != "clipped"]  # minibatches clip no gradient
+        self.measured_of_actions = []  # minibatches clip no gradient
+        self.out_keys = [name for name in self.out_keys if name != "clipped"]
         self.out_keys += ["entropy"] * (entropy_coeff > 0)
         weight = torch.full((), math.nan, device=self._default_device, dtype=self._precision)
         self.register_buffer("pathwise_weight", weight)
@@ -112,6 +115,7 @@ class HybridLoss(SHACLoss):
         """The losses and their metadata, the ``out_keys``, of samples (*) with targets or of a rollout (*, horizon)."""
         return super().forward(self._with_targets(tensordict))
 
+    @torch.compiler.disable(reason="gradients of single actions are read off the graph of the flight")
     def write_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Differentiate a rollout (*, horizon), update the weight, and return what the minibatches read.
 
@@ -148,7 +152,9 @@ class HybridLoss(SHACLoss):
         clipped = ratio.clamp(1.0 - self.clip_epsilon, 1.0 + self.clip_epsilon)
         score = torch.minimum(ratio * advantage, clipped * advantage).squeeze(-1)
         pathwise = (leaf(tensordict, keys.location_gradient) * (new.loc - old.loc)).sum(-1)
-        kl = kl_divergence(old, new).sum(-1).mean().detach()
+        # Written out, since a compiler cannot trace torch's dispatch.
+        ratio, shift = (old.scale / new.scale).square(), ((old.loc - new.loc) / new.scale).square()
+        kl = (0.5 * (ratio + shift - 1 - ratio.log())).sum(-1).mean().detach()
         objective, metadata = score + pathwise, {"pathwise_weight": self.pathwise_weight.clamp(0.0, 1.0), "kl": kl}
         if self.entropy_coeff:
             entropy = new.entropy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Self, cast
 
@@ -76,6 +77,8 @@ class PathwiseLoss(LossModule):
 
     out_keys = ["loss_actor", "n_step_return"]  # pyrefly: ignore[bad-override-mutable-attribute]  # as in TorchRL
     value_part: str | None = None  # the part of the objective that comes from a critic
+    has_entropy_bonus = False
+    _schedulable_buffers = frozenset({"fixed_alpha"})
     # What is measured of the gradients in single actions; if anything is, the policy learns from these.
     measured_of_actions: list[str] = []
 
@@ -111,19 +114,26 @@ class PathwiseLoss(LossModule):
             self.log_alpha = torch.nn.Parameter(torch.tensor(float(alpha_init), **number).log())
         else:
             self.register_coeff_buffer("fixed_alpha", float(alpha), **number)
-        self.has_entropy_bonus = alpha == "auto" or alpha > 0
         self.measured_of_actions = self.measured_of_actions + ["clipped"] * (self.clip is not None)
-        of_entropy = ["entropy", "alpha"] * self.has_entropy_bonus + ["loss_alpha"] * self.automatic_alpha
-        self.out_keys = [*self.out_keys, *self.measured_of_actions, *of_entropy]
+        self.out_keys = [*self.out_keys, *self.measured_of_actions]
+        if alpha == "auto" or alpha > 0:
+            self._add_entropy_bonus()
 
-    def convert_to_functional(self, module: TensorDictModule, module_name: str, *args: Any, **kwargs: Any) -> None:
-        """As TorchRL's, for a TensorDictModule alone."""
-        if not isinstance(module, TensorDictModuleBase):
-            raise UserTypeError(
-                f"{module_name} must be a TensorDictModule, got {type(module).__name__}. Wrap a plain module: "
-                'TensorDictModule(module, in_keys=["observation"], out_keys=[...]).'
-            )
+    def convert_to_functional(self, module: Any, module_name: str, *args: Any, **kwargs: Any) -> None:
+        """As TorchRL's, for a TensorDictModule, or for a list of networks that differ in their weights alone."""
+        networks: list[Any] = list(module) if isinstance(module, list | tuple) else [module]
+        for network in networks:
+            if not isinstance(network, TensorDictModuleBase):
+                raise UserTypeError(
+                    f"{module_name} must be a TensorDictModule, got {type(network).__name__}. Wrap a plain module: "
+                    'TensorDictModule(module, in_keys=["observation"], out_keys=[...]).'
+                )
+        if len({re.sub(" at 0x[0-9a-f]+", "", str((x, x.in_keys))) for x in networks}) != 1:
+            raise UserValueError(f"{module_name} must list networks that differ in their weights alone, at least one.")
         super().convert_to_functional(module, module_name, *args, **kwargs)
+
+    def _make_vmap(self) -> None:
+        """Nothing: critics are called one after the other, and each draws random numbers of its own."""
 
     def __repr__(self) -> str:
         names = [name for name in ("actor_network", "value_network", "qvalue_network") if hasattr(self, name)]
@@ -152,8 +162,28 @@ class PathwiseLoss(LossModule):
 
     @property
     def alpha(self) -> Tensor:
-        """The present entropy coefficient, without gradient."""
+        """The present entropy coefficient, without gradient; a number may be assigned, as in a schedule."""
         return self.log_alpha.detach().exp() if self.automatic_alpha else cast(Tensor, self.fixed_alpha)
+
+    @alpha.setter
+    def alpha(self, value: float) -> None:
+        if self.automatic_alpha:
+            self.log_alpha.data.fill_(math.log(check_value("alpha", value, Scale)))
+        else:
+            self.fixed_alpha = check_value("alpha", value, Coefficient)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "fixed_alpha":
+            if self.automatic_alpha:
+                raise UserValueError("fixed_alpha is not in use with alpha=auto: write loss.alpha = ... instead.")
+            value = value if isinstance(value, Tensor) else check_value("alpha", value, Coefficient)
+            if value > 0 and not self.has_entropy_bonus:
+                self._add_entropy_bonus()
+        super().__setattr__(name, value)
+
+    def _add_entropy_bonus(self) -> None:
+        self.has_entropy_bonus = True
+        self.out_keys = [*self.out_keys, "entropy", "alpha", *["loss_alpha"] * self.automatic_alpha]
 
     @property
     def _precision(self) -> torch.dtype:
@@ -229,8 +259,13 @@ class PathwiseLoss(LossModule):
     @takes_rollout
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss and its metadata, the ``out_keys``, of a rollout that carries its graph."""
-        loss, metadata = self.loss_actor(tensordict)
+        compute = self._loss_of_actions if self.measured_of_actions else self.loss_actor
+        loss, metadata = compute(tensordict)
         return TensorDict({"loss_actor": loss, **metadata}, [])
+
+    @torch.compiler.disable(reason="gradients of single actions are read off the graph of the flight")
+    def _loss_of_actions(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        return self.loss_actor(tensordict)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss of a rollout (*, horizon) with its graph, -J minus the entropy bonus, and its metadata."""
@@ -275,9 +310,10 @@ class PathwiseLoss(LossModule):
         return torch.where(counts, x, 0.0) if name == "reward" else x | ~counts
 
     def _counts(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Which steps count, bool (*, horizon, 1), if a collector says so."""
-        mask = tensordict.get(("collector", "mask"), None)
-        return None if mask is None else mask.reshape(*tensordict.shape, 1)
+        """Which steps count, bool (*, horizon, 1), if a collector says so; see TorchRL's ``loss_mask_key``."""
+        masks = (tensordict.get(key, None) for key in self._loss_mask_keys())
+        given = [mask.reshape(*tensordict.shape, 1) for mask in masks if mask is not None]
+        return torch.stack(given).all(0) if given else None
 
     def _reward(self, tensordict: TensorDictBase) -> Tensor:
         reward = self._next(tensordict, "reward")
@@ -286,7 +322,15 @@ class PathwiseLoss(LossModule):
 
     @property
     def _gamma(self) -> Tensor:
-        return cast(Tensor, self.value_estimator.gamma)
+        return self._of_returns("gamma")
+
+    def _of_returns(self, name: str) -> Tensor:
+        """gamma or lmbda of the value estimator. A compiler cannot make that one, and takes its defaults."""
+        if self._value_estimator is None and torch.compiler.is_compiling():
+            number = default_value_kwargs(self.default_value_estimator).get(name, 0.0)
+        else:
+            number = getattr(self.value_estimator, name, 0.0)
+        return torch.as_tensor(number, dtype=self._precision)
 
     def _discounts(self, tensordict: TensorDictBase) -> Tensor:
         return discounts(self._next(tensordict, "done"), self._gamma.to(self._next(tensordict, "reward").dtype))

@@ -47,7 +47,7 @@ class SAPOLoss(SHACLoss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        value_network: TensorDictModule,
+        value_network: TensorDictModule | list[TensorDictModule],
         *,
         num_value_nets: Copies = 2,
         alpha: Scale | Literal["auto"] = "auto",

@@ -35,7 +35,8 @@ class SHACLoss(PathwiseCriticLoss):
 
     Args:
         actor_network: the policy that flew the rollout.
-        value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``).
+        value_network: the critic V(s), which writes ``state_value`` (see ``set_keys``); or a list of such critics, of
+            the same layers.
         terminal_gradient: whether the terminal value keeps its gradient in the state. False cuts it, as the code
             published with the paper does: the actor then climbs the rewards of the horizon alone.
         target_bootstrap: whether the terminal value is the target critic's. False takes it from the critic itself.
@@ -44,7 +45,7 @@ class SHACLoss(PathwiseCriticLoss):
         num_value_nets: the critics made from ``value_network``, whose smallest value counts. Several are each
             initialised independently; a single one is taken as it is.
         delay_value: whether the critic has a target network, to be updated with :class:`torchrl.objectives.SoftUpdate`.
-        **kwargs: as for :class:`~torchrl_quad.objectives.pathwise.PathwiseLoss`.
+        **kwargs: as for :class:`~torchrl_quad.objectives.PathwiseCriticLoss`.
     """
 
     @dataclass
@@ -64,7 +65,7 @@ class SHACLoss(PathwiseCriticLoss):
     def __init__(
         self,
         actor_network: TensorDictModule,
-        value_network: TensorDictModule,
+        value_network: TensorDictModule | list[TensorDictModule],
         *,
         terminal_gradient: bool = True,
         target_bootstrap: bool = False,
@@ -76,8 +77,7 @@ class SHACLoss(PathwiseCriticLoss):
         super().__init__(actor_network, **kwargs)
         self.terminal_gradient, self.target_bootstrap = terminal_gradient, target_bootstrap
         self.average_over_horizon = average_over_horizon
-        copies = None if num_value_nets == 1 else num_value_nets
-        self.convert_to_functional(value_network, "value_network", expand_dim=copies, create_target_params=delay_value)
+        self._add_critics(value_network, None if num_value_nets == 1 else num_value_nets, "num_value_nets", delay_value)
         critic, keys = self.value_network, self.tensor_keys
         if keys.action in critic.in_keys and getattr(keys, self.prediction_key) in critic.out_keys:
             raise UserValueError(f"{type(self).__name__} needs a V(s), which reads no action: make_value builds one.")

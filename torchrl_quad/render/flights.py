@@ -105,14 +105,14 @@ class Flight:
         """The entries of the rollout below a key, by name; none if it holds none."""
         return dict(cast("Mapping[str, Tensor]", self.rollout.get(key, {})).items())
 
-    def state(self, name: str) -> Tensor | None:
+    def state(self, *name: str) -> Tensor | None:
         """An entry of the state (num_envs, time + 1, k), at the start of the first episode and after each step.
 
         It ends with the episode's last value, and is NaN where it is infinite or not known. None if there is no such
         entry, or if the target is not a position.
         """
-        ends, starts = self.entry("next", "state", name), self.entry("state", name)
-        if ends is None or (name == "target" and ends.shape != self.rollout["next", "state", "position"].shape):
+        ends, starts = self.entry("next", "state", *name), self.entry("state", *name)
+        if ends is None or (name == ("target",) and ends.shape != self.rollout["next", "state", "position"].shape):
             return None
         start = torch.full_like(ends[:, :1], math.nan) if starts is None else starts[:, :1]
         return self._at_instants(start, ends).nan_to_num(math.nan, math.nan, math.nan)

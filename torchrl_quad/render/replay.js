@@ -57,15 +57,15 @@ class Pen {
 }
 
 const plus = (a, b, scale = 1) => a.map((value, j) => value + scale * b[j]);
-const arm = Math.hypot(...rotors.slice(0, 2));
+const arm = Math.hypot(...rotors.slice(0, 2)), hubs = rotors.length / (2 * environments);
 
 function drawBody(pen, i, centre, world) {
-  for (let j = 0; j < 4; j++) {
+  for (let j = 0; j < hubs; j++) {
     pen.to(centre);
     pen.to(plus(centre, world(hub(i, j)), size));
   }
   pen.lift();
-  for (let j = 0; j < 4; j++) {
+  for (let j = 0; j < hubs; j++) {
     for (let k = 0; k <= 8; k++) {
       const angle = (k * Math.PI) / 4, radius = 0.45 * arm;
       const rim = plus(hub(i, j), [radius * Math.cos(angle), radius * Math.sin(angle), 0]);
@@ -76,7 +76,8 @@ function drawBody(pen, i, centre, world) {
 }
 
 function hub(i, j) {
-  return [rotors[8 * i + 2 * j], rotors[8 * i + 2 * j + 1], 0];
+  const k = 2 * (hubs * i + j);
+  return [rotors[k], rotors[k + 1], 0];
 }
 
 function drawTrail(pen, i, centre) {
@@ -122,8 +123,8 @@ function moving() {
     pens.crash.to(endings[i] === "crashed" && frame >= ended[i] ? centre : NOWHERE);
     if (pens.target) pens.target.to(centre === NOWHERE ? NOWHERE : between(target, 3, i));
     if (lift) {
-      const thrust = between(lift, 4, i);
-      for (let j = 0; j < 4; j++) {
+      const thrust = between(lift, hubs, i);
+      for (let j = 0; j < hubs; j++) {
         pens.thrust.to(plus(centre, world(hub(i, j)), size));
         pens.thrust.to(plus(centre, world(plus(hub(i, j), [0, 0, arm * thrust[j]])), size));
         pens.thrust.lift();
@@ -251,7 +252,7 @@ function drawSpace() {
   const traces = {
     shadow: () => markers("shadow", pens.shadow, "#b9bec4", "circle", grounded ? 2.5 : 0),
     trail: () => line("trail", pens.trail, trailColors(), 2),
-    body: () => line("body", pens.body, each(49, (i) => colors[i]), 4),
+    body: () => line("body", pens.body, each(12 * hubs + 1, (i) => colors[i]), 4),
     nose: () => line("nose", pens.nose, RED, 6),
     thrust: () => line("thrust", pens.thrust, ORANGE, 3),
     target: () => markers("target", pens.target, RED, "diamond", 7),

@@ -24,7 +24,6 @@ from torchrl_quad.files import replacing
 from torchrl_quad.options import Positive, Size, checked
 from torchrl_quad.render.flights import Flight, depth_image, obstacle_shapes
 
-_X_FRAME = [[0.053, 0.053], [-0.053, 0.053], [-0.053, -0.053], [0.053, -0.053]]  # [m], of a drone that is not known
 _Panel = tuple[str, dict[str, Tensor], dict[str, Any]]  # a label, lines (num_envs, time + 1) by name, how to draw them
 
 
@@ -109,7 +108,8 @@ def _content(flight: Flight) -> dict[str, Any]:
         values = torch.stack([x.masked_fill(over, math.nan) for x in lines.values()], -1)
         return {"label": label, "names": list(lines), "values": values[:, first:]}
 
-    rotors, lift = _rotors(flight, frames(flight.state("rotor_speed")))
+    of_rotors = (["rotor_speed"], ["drone", "rotor_effectiveness"])
+    rotors, lift = _rotors(flight, *(frames(flight.state(*name)) for name in of_rotors))
     markers, of_each = flight.named, range(len(flight) if flight.tracks else 1)
     rings = [x for i in of_each if (x := flight.markers_of(i).rings()) is not None]
     return {
@@ -190,19 +190,23 @@ def _endings(rollout: TensorDictBase) -> list[str]:
     return endings
 
 
-def _rotors(flight: Flight, speed: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Positions of the rotors (num_envs, 4, 2) [m], and the lift of each (num_envs, frames, 4), in thrusts that hover.
+def _rotors(flight: Flight, speed: Tensor | None, works: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Positions of m rotors (num_envs, m, 2) [m], and the lift of each (num_envs, frames, m), in thrusts that hover.
+
+    It follows from their speeds [rad/s] and effectiveness.
 
     Without the environment the unit is half of the greatest squared speed of the flight.
     """
     n = len(flight)
     if flight.env is None:
         lift = None if speed is None else 2.0 * speed.square() / speed.nan_to_num().square().amax().clamp_min(1e-12)
-        return torch.tensor(_X_FRAME).expand(n, 4, 2), lift
+        m = 4 if speed is None else speed.shape[-1]
+        angles = 2.0 * math.pi * (torch.arange(m) + 0.5) / m
+        return 0.075 * torch.stack((angles.cos(), angles.sin()), -1).expand(n, m, 2), lift
 
     def field(name: str) -> Tensor:
         """A field of each drone (num_envs or 1, 1, ...)."""
-        value, dim = getattr(flight.env.params, name), QuadrotorParams.dim(name)
+        value, dim = flight.env.params.value(name), QuadrotorParams.dim(name)
         if (randomised := flight.entry("next", "state", "drone", name)) is not None:
             value = randomised[:, 0]
         elif value.dim() > dim and 1 < len(value) < n:
@@ -214,8 +218,10 @@ def _rotors(flight: Flight, speed: Tensor | None) -> tuple[Tensor, Tensor | None
 
     if speed is not None:
         k2, k1, k0 = field("thrust_map").split(1, -1)
-        speed = ((k2 * speed + k1) * speed + k0) * 4.0 / (field("mass") * field("gravity"))
-    return field("rotor_positions")[:, 0].expand(n, 4, 2), speed
+        speed = ((k2 * speed + k1) * speed + k0) * speed.shape[-1] / (field("mass") * field("gravity"))
+        speed = speed * (field("rotor_effectiveness") if works is None else works)
+    places = field("rotor_positions")[:, 0, :, :2]
+    return places.expand(n, *places.shape[1:]), speed
 
 
 def _encoded(value: Tensor) -> str:

@@ -27,17 +27,19 @@ class Simulator:
     Args:
         contract: of a bundle. Its ``plant`` flies; its ``drone`` is what the rate loop believes in.
         loop: the rate loop, one of ``loops``.
-        motors: for each rotor the index of the motor whose command it gets.
+        motors: for each rotor the index of the motor whose command it gets; the other rotors get their own.
     """
 
     version: str  #: name and version
     loops: tuple[str, ...] = tuple(LOOPS)  #: the rate loops that it can fly with
+    lacks: frozenset[str] = frozenset()  #: what it cannot fly of :func:`special`
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         self.substeps = max(round(1000.0 * contract["control_dt"]), 1)
         self.dt = contract["control_dt"] / self.substeps
         nominal, self.drone = Drone(contract["drone"]), Drone(contract["drone"] | contract["plant"])
-        self.loop, self.hover_speed, self.motors = LOOPS[loop](nominal, self.dt), nominal.hover_speed, list(motors)
+        self.loop, self.hover_speed = LOOPS[loop](nominal, self.dt), nominal.hover_speed
+        self.motors = [*motors, *range(len(motors), len(self.hover_speed))]
 
     def reset(self, starts: Mapping[str, Array]) -> None:
         """Begin in these states (n, ...), with the rotors at the nominal hover speed."""
@@ -78,4 +80,16 @@ def make_simulator(
     kind = simulator_class(name)
     if loop not in kind.loops:
         raise UserValueError(f"{name} has no rate loop {shown(loop)}. Choose from: {', '.join(kind.loops)}.")
+    if cannot := special(contract["drone"] | contract["plant"]) & kind.lacks:
+        raise UserValueError(
+            f"{name} does not fly drones with {' and '.join(sorted(cannot))}. Fly this one in mujoco or torchrl_quad."
+        )
     return kind(contract, loop, motors)
+
+
+def special(drone: Contract) -> frozenset[str]:
+    """In what a drone differs from one with four upright, whole rotors."""
+    up, works = np.array(drone.get("rotor_direction", [[0.0, 0.0, 1.0]])), drone.get("rotor_effectiveness", [1.0])
+    found = {"tilted rotors": up[:, :2].any(), "rotors that are not whole": set(works) != {1.0}}
+    found |= {"more than four rotors": len(drone["rotor_spin"]) > 4}
+    return frozenset(what for what, has in found.items() if has)

@@ -31,6 +31,7 @@ class Crazyflow(Simulator):
     float32, and hold drones above the ground. Physics and rate loop run at 1 kHz, by symplectic Euler.
     """
 
+    lacks = frozenset({"more than four rotors", "tilted rotors", "rotors that are not whole"})
     version, frame = f"Crazyflow {version('crazyflow')}", frames.crazyflow()
 
     def reset(self, starts: Mapping[str, Array]) -> None:
@@ -80,8 +81,8 @@ def _parameters(drone: Drone, frame: frames.Convention) -> Fields:
     order = list(frame.motors)
     k2, k1, k0 = drone.thrust_map
     curve = np.array([[k0, k1 / RPM, k2 / RPM**2]])
-    x, y = drone.rotor_positions[order].T
-    lag = 1.0 / drone.motor_time_constant
+    x, y = drone.rotor_positions[order, :2].T
+    up, down = 1.0 / drone.motor_time_constant
     return {
         "mass": drone.mass,
         "L": [1.0],
@@ -93,5 +94,5 @@ def _parameters(drone: Drone, frame: frames.Convention) -> Fields:
         "rpm2torque": curve * drone.yaw_torque_coefficient,
         "mixing_matrix": [y, -x, drone.rotor_spin[order]],
         "drag_matrix": -np.diag(drone.linear_drag),
-        "rotor_dyn_coef": [[lag, 0.0, lag, 0.0]],
+        "rotor_dyn_coef": [[up, 0.0, down, 0.0]],
     }

@@ -1,4 +1,4 @@
-"""Fly the drone of a contract in MuJoCo: a rigid body with four rotors, built only from numbers."""
+"""Fly the drone of a contract in MuJoCo: a rigid body with rotors, built only from numbers."""
 
 from __future__ import annotations
 
@@ -12,31 +12,33 @@ from numpy.typing import NDArray
 from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.deploy.simulators import Simulator
 from torchrl_quad.deploy.simulators.vehicle import Array, Drone
-from torchrl_quad.errors import UserValueError
 
 # qpos of a free joint: position and quaternion (w, x, y, z), body to world. qvel: velocity in the world frame, angular
 # velocity in the body frame. act: the rotor speeds.
 STATE = {"position": slice(1, 4), "quaternion": slice(4, 8), "velocity": slice(8, 11)}
-STATE |= {"angular_velocity": slice(11, 14), "rotor_speed": slice(14, 18)}
+STATE |= {"angular_velocity": slice(11, 14), "rotor_speed": slice(14, None)}
 
 
 def model(drone: Drone, timestep: float) -> str:
     """The drone as MJCF.
 
     It states everything that the motion depends on: mass and inertia, gravity, the integrator (semi-implicit Euler), no
-    contact, no fluid. The first four actuators make no force: they are the lag of the rotors, of first order in the
-    speed and exact for any step. The other four push along z at the place of a rotor, by the thrust [N]
-    written into them, and turn by its drag torque.
+    contact, no fluid. The first half of the actuators makes no force: they are the lag of the rotors, of first order in
+    the speed and exact for any step; of two time constants it is the shorter. The others push and turn the body by what
+    the thrust [N] written into them does at the place and along the direction of a rotor, with what it has left of its
+    effectiveness.
     """
-    places, spins = drone.rotor_positions.tolist(), drone.rotor_spin.tolist()
-    sites = "".join(f'<site name="rotor{i}" pos="{x!r} {y!r} 0"/>' for i, (x, y) in enumerate(places))
-    lag = f'dyntype="filterexact" dynprm="{drone.motor_time_constant!r}" gaintype="fixed" gainprm="0" biastype="none"'
-    lags = "".join(f'<general site="rotor{i}" {lag} gear="0 0 1 0 0 0" ctrllimited="false"/>' for i in range(4))
-    thrusts = "".join(
-        f'<motor site="rotor{i}" gear="0 0 1 0 0 {spin * drone.yaw_torque_coefficient!r}" ctrllimited="false"/>'
-        for i, spin in enumerate(spins)
-    )
-    inertia = " ".join(map(repr, drone.inertia.tolist()))
+    n = len(drone.rotor_spin)
+    places = np.pad(drone.rotor_positions, ((0, 0), (0, 3 - drone.rotor_positions.shape[1])))
+    force = drone.allocation[[4, 5, 0]].T * drone.rotor_effectiveness[:, None]
+    gears = np.concatenate((force, force * (drone.rotor_spin * drone.yaw_torque_coefficient)[:, None]), 1)
+    sites = "".join(f'<site name="rotor{i}" pos="{_words(place)}"/>' for i, place in enumerate(places))
+    shortest = float(drone.motor_time_constant.min())
+    lag = f'dyntype="filterexact" dynprm="{shortest!r}" gaintype="fixed" gainprm="0" biastype="none"'
+    lags = "".join(f'<general site="rotor{i}" {lag} gear="0 0 1 0 0 0" ctrllimited="false"/>' for i in range(n))
+    motors = (f'<motor site="rotor{i}" gear="{_words(gear)}" ctrllimited="false"/>' for i, gear in enumerate(gears))
+    most = (1.0 - 1e-12) * (drone.inertia.sum() - drone.inertia)  # rounding may put a flat body a little beyond
+    thrusts, inertia = "".join(motors), _words(np.minimum(drone.inertia, most))
     return f"""<mujoco>
   <compiler inertiafromgeom="false" balanceinertia="false" boundmass="0" boundinertia="0"/>
   <option timestep="{timestep!r}" integrator="Euler" gravity="0 0 {-drone.gravity!r}" wind="0 0 0" density="0"
@@ -54,6 +56,10 @@ def model(drone: Drone, timestep: float) -> str:
 </mujoco>"""
 
 
+def _words(numbers: Array) -> str:
+    return " ".join(map(repr, numbers.tolist()))
+
+
 class MuJoCo(Simulator):
     """Independent drones in MuJoCo.
 
@@ -65,12 +71,9 @@ class MuJoCo(Simulator):
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         super().__init__(contract, loop, motors)
-        inertia = self.drone.inertia
-        if 2.0 * inertia.max() > inertia.sum():
-            raise UserValueError(
-                f"MuJoCo flies no body with the inertia {inertia.tolist()}, since there is none: each of the three is "
-                "at most the sum of the other two. Fly it in another simulator."
-            )
+        # In MuJoCo a rotor lags alike in both directions: where it is the slower one it is asked for less.
+        pulls = -np.expm1(-self.dt / self.drone.motor_time_constant)
+        self.pulls = pulls / pulls.max()
         self.model = mujoco.MjModel.from_xml_string(model(self.drone, self.dt))
         self.data = mujoco.MjData(self.model)
         self.rollout = rollout.Rollout(nthread=0)
@@ -88,12 +91,15 @@ class MuJoCo(Simulator):
 
     def step(self, thrust: Array, rates: Array) -> None:
         drone, limits = self.drone, (self.drone.rotor_speed_min, self.drone.rotor_speed_max)
-        command, lift, force = self.control[:, 0, :4], self.control[:, 0, 4:8], self.control[:, 0, 14:17]
+        n, control = len(self.motors), self.control[:, 0]
+        command, lift, force = control[:, :n], control[:, n : 2 * n], control[:, 2 * n + 6 : 2 * n + 9]
         for _ in range(self.substeps):
             x = self.x
             speed = x[:, STATE["rotor_speed"]]
             asked = self.loop(thrust, rates, x[:, STATE["angular_velocity"]], speed)
             np.clip(asked[:, self.motors], *limits, out=command)
+            if self.pulls.min() < 1.0:
+                command[:] = speed + np.where(command > speed, *self.pulls) * (command - speed)
             lift[:] = drone.thrust(speed)
             force[:] = drone.drag(x[:, STATE["quaternion"]], x[:, STATE["velocity"]])
             self.rollout.rollout(self.model, [self.data], x, self.control, control_spec=self.inputs, state=self.after)
@@ -105,6 +111,6 @@ class MuJoCo(Simulator):
         self._allocate()
 
     def _allocate(self) -> None:
-        # Of each drone the eight controls, then force and torque on the world, and on the drone.
-        self.control = np.zeros((len(self.x), 1, 8 + 12))
+        # Of each drone two controls for each rotor, then force and torque on the world, and on the drone.
+        self.control = np.zeros((len(self.x), 1, 2 * len(self.motors) + 12))
         self.after = np.zeros((len(self.x), 1, self.x.shape[1]))

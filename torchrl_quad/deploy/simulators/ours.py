@@ -22,7 +22,7 @@ class Ours(Simulator):
     loops = ("contract",)
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
-        if tuple(motors) != (0, 1, 2, 3):
+        if list(motors) != sorted(motors):
             raise UserValueError("torchrl_quad flies motors as they are: swap them in another simulator.")
         about = contract["simulator"]
         self.version = contract["origin"]["package"]

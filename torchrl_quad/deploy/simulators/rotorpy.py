@@ -12,7 +12,7 @@ from rotorpy.vehicles.multirotor import Multirotor
 from torchrl_quad.deploy import frames
 from torchrl_quad.deploy.contract import Contract, Fields
 from torchrl_quad.deploy.simulators import Simulator
-from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone, damping_ratio
+from torchrl_quad.deploy.simulators.vehicle import LOOPS, Array, Drone
 
 NAMES = {"position": "x", "quaternion": "q", "velocity": "v", "angular_velocity": "w"}
 
@@ -31,7 +31,7 @@ class RotorPy(Simulator):
     The loop "own" is its ``cmd_ctbr``, proportional, with the gain that gives the damping of the contract's loop.
     """
 
-    loops = (*LOOPS, "own")
+    loops, lacks = (*LOOPS, "own"), frozenset({"more than four rotors", "tilted rotors", "rotors that are not whole"})
 
     def __init__(self, contract: Contract, loop: str, motors: Sequence[int]) -> None:
         self.version = f"RotorPy {version('rotorpy')}"
@@ -39,11 +39,11 @@ class RotorPy(Simulator):
         self.substeps = round(contract["control_dt"] / self.dt)
         speed = Drone(contract["drone"]).hover_speed
         nominal, drone = (_squared(x, speed) for x in (contract["drone"], contract["drone"] | contract["plant"]))
-        self.frame, self.hover_speed, self.motors = frames.rotorpy(), nominal.hover_speed, list(motors)
+        self.drone, self.frame = drone, frames.rotorpy()
+        self.hover_speed, self.motors = nominal.hover_speed, list(motors)
         self.own = loop == "own"
         self.loop = LOOPS["contract" if self.own else loop](nominal, self.dt)
-        tau = nominal.motor_time_constant
-        ratio = damping_ratio(nominal.rate_gain, nominal.inertia, nominal.rate_damping, tau)
+        ratio, tau = nominal.rate_loop(0.0).damping_ratio, nominal.motor_time_constant.mean()  # of continuous time
         gain = float((1.0 / (4.0 * ratio**2 * tau))[:2].mean())
         kind = "cmd_ctbr" if self.own else "cmd_motor_speeds"
         solver = {"method": "RK23", "first_step": self.dt}  # half the time of its defaults
@@ -71,7 +71,12 @@ class RotorPy(Simulator):
                 state = self.state()
                 speeds = self.loop(thrust, rates, state["angular_velocity"], state["rotor_speed"])[:, self.motors]
                 commands = [{"cmd_motor_speeds": x} for x in self.frame.to({"motors": speeds})["motors"]]
-            self.now = [self.vehicle.step(x, c, self.dt) for x, c in zip(self.now, commands, strict=True)]
+            self.now = [self._step(x, c) for x, c in zip(self.now, commands, strict=True)]
+
+    def _step(self, state: Fields, command: Fields) -> Fields:
+        wanted = self.vehicle.get_cmd_motor_speeds(state, command)  # holds in the step, and so do the time constants
+        self.vehicle.tau_m = self.drone.time_constant(wanted - state["rotor_speeds"])
+        return self.vehicle.step(state, command, self.dt)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
         self.now = [x for x, on in zip(self.now, chosen, strict=True) if on]
@@ -90,7 +95,7 @@ def _parameters(drone: Drone, frame: frames.Convention) -> Fields:
     """RotorPy's parameters of a drone."""
     k, order = float(drone.thrust_map[0]), list(frame.motors)
     at_hover = 4.0 * float(drone.hover_speed.mean())
-    places = np.c_[drone.rotor_positions[order], np.zeros(4)]
+    places = np.c_[drone.rotor_positions[order, :2], np.zeros(4)]
     return {
         "mass": drone.mass,
         **{f"I{a}{b}": float(np.diag(drone.inertia)[i, j]) for i, a in enumerate("xyz") for j, b in enumerate("xyz")},
@@ -104,5 +109,5 @@ def _parameters(drone: Drone, frame: frames.Convention) -> Fields:
         "k_m": k * drone.yaw_torque_coefficient,
         "k_d": float(drone.linear_drag[:2].mean()) / at_hover,
         "k_z": float(drone.linear_drag[2]) / at_hover,
-        "tau_m": drone.motor_time_constant,
+        "tau_m": drone.motor_time_constant[0],
     }

@@ -8,24 +8,25 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_quad.airframe import Array, RateLoop
+from torchrl_quad.allocation import matrix
 from torchrl_quad.deploy.contract import Contract
 from torchrl_quad.errors import UserValueError
 from torchrl_quad.rotations import cross, rotate, rotate_inverse
 
-Array = NDArray[np.float64]
-
 
 class Drone:
-    """A quadrotor from the fields of a contract's ``drone``: what :class:`~torchrl_quad.QuadrotorParams` documents.
+    """A drone from the fields of a contract's ``drone``: what :class:`~torchrl_quad.QuadrotorParams` documents.
 
     Attributes:
-        allocation: (4, 4), from four rotor thrusts [N] to collective thrust [N] and torque [N m].
-        mixer: its inverse.
+        allocation: (6, n), from rotor thrusts [N] to force and torque, see :func:`torchrl_quad.allocation.matrix`.
+        mixer: (n, 4), the pseudo-inverse of its first four rows.
         thrust_limits: the least and the greatest thrust [N] that may be commanded of one rotor.
-        hover_speed: of each rotor (4) [rad/s].
+        motor_time_constant: of rotors that speed up, and of those that slow down (2) [s].
+        hover_speed: of each rotor (n) [rad/s].
 
     Raises:
-        ValueError: its drag acts above its centre of mass, or its rotors have two time constants.
+        ValueError: its drag acts above its centre of mass.
     """
 
     mass: float
@@ -33,7 +34,7 @@ class Drone:
     yaw_torque_coefficient: float
     rotor_speed_min: float
     rotor_speed_max: float
-    motor_time_constant: float
+    motor_time_constant: Array
     inertia: Array
     rotor_positions: Array
     rotor_spin: Array
@@ -45,22 +46,22 @@ class Drone:
 
     def __init__(self, fields: Contract) -> None:
         arrays = {name: np.array(value, float) for name, value in fields.items()}
-        unknown = ["drag_height"] if arrays.get("drag_height", np.zeros(1)).any() else []
-        unknown += ["two motor_time_constants"] if arrays["motor_time_constant"].size > 1 else []
-        if unknown:
+        if arrays.get("drag_height", np.zeros(1)).any():
             raise UserValueError(
-                f"Third-party simulators do not fly drones with {' and '.join(unknown)}. Export the "
-                "policy of a drone without: env.drone with drag_height: 0 and one motor_time_constant."
+                "Third-party simulators do not fly drones with drag_height. Export the policy of a drone without: "
+                "env.drone with drag_height: 0."
             )
         for name, value in arrays.items():
             setattr(self, name, value if value.ndim else float(value))
+        self.rotor_effectiveness = arrays.get("rotor_effectiveness", np.ones(len(self.rotor_spin)))
+        self.motor_time_constant = np.broadcast_to(self.motor_time_constant, 2)
         k2, k1, k0 = self.thrust_map
         self.vertex_speed, self.vertex_thrust = -k1 / (2.0 * k2), k0 - k1 * k1 / (4.0 * k2)
-        self.least_root = 1e-6 * (self.rotor_speed_max - self.vertex_speed) ** 2
-        x, y = self.rotor_positions.T
-        self.allocation = np.array([np.ones(4), y, -x, self.yaw_torque_coefficient * self.rotor_spin])
-        self.mixer = np.linalg.inv(self.allocation)
-        least, greatest = self.thrust(np.array([self.rotor_speed_min, self.rotor_speed_max]))
+        ends = np.array([self.rotor_speed_min, self.rotor_speed_max])
+        self.least_root = 1e-6 * ((ends - self.vertex_speed) ** 2).max()
+        self.allocation, four = matrix(fields), len(self.rotor_spin) == 4
+        self.mixer = np.asarray((np.linalg.inv if four else np.linalg.pinv)(self.allocation[:4]), np.float64)
+        least, greatest = self.thrust(ends)
         self.thrust_limits = max(least, 0.0), greatest
         self.weight = self.mass * self.gravity
         self.hover_speed = self.speed(self.mixer[:, 0] * self.weight)
@@ -72,7 +73,16 @@ class Drone:
     def speed(self, thrust: Array) -> Array:
         """Speed [rad/s] at which rotors have a thrust [N]."""
         squared = (thrust - self.vertex_thrust) / self.thrust_map[0]
-        return np.sqrt(np.maximum(squared, self.least_root)) + self.vertex_speed
+        return np.sign(self.thrust_map[0]) * np.sqrt(np.maximum(squared, self.least_root)) + self.vertex_speed
+
+    def time_constant(self, change: Array) -> Array:
+        """The time constant [s] of rotors whose speed is to change by so much [rad/s]."""
+        rises, falls = self.motor_time_constant
+        return np.where(change > 0.0, rises, falls)
+
+    def rate_loop(self, dt: float) -> RateLoop:
+        """The loop of :class:`ContractLoop` about hover, in steps of dt [s]."""
+        return RateLoop(self.rate_gain, self.inertia, self.rate_damping, self.motor_time_constant, dt)
 
     def drag(self, quaternion: Array, velocity: Array) -> Array:
         """The force of the air (n, 3) [N], world frame, at an attitude (n, 4) and a velocity (n, 3) [m/s]."""
@@ -98,17 +108,17 @@ class ContractLoop:
         self.yaw_share, self.tiny = drone.mixer[:, 3] * self.per_share, 1e-6 * drone.weight
 
     def __call__(self, thrust: Array, rates: Array, angular_velocity: Array, rotor_speed: Array) -> Array:
-        """Rotor speeds (n, 4) [rad/s] to command, for a collective thrust (n) [N] and body rates (n, 3) [rad/s], from
-        the body rates (n, 3) [rad/s] and rotor speeds (n, 4) [rad/s] of this moment."""
+        """Rotor speeds (n, m) [rad/s] to command, for a collective thrust (n) [N] and body rates (n, 3) [rad/s], from
+        the body rates (n, 3) [rad/s] and rotor speeds (n, m) [rad/s] of this moment."""
         drone = self.drone
         gyroscopic = cross(angular_velocity, drone.inertia * angular_velocity)
-        believed = drone.thrust(rotor_speed) @ drone.allocation[1:].T
+        believed = drone.thrust(rotor_speed) @ drone.allocation[1:4].T
         acceleration = (believed - gyroscopic) / drone.inertia
         torque = gyroscopic + self.gain * (rates - angular_velocity) - drone.rate_damping * acceleration
         return self.mix(thrust, torque)
 
     def mix(self, collective: Array, torque: Array) -> Array:
-        """Rotor speeds (n, 4) [rad/s] for a collective thrust (n) [N] and a torque (n, 3) [N m], within the limits."""
+        """Rotor speeds (n, m) [rad/s] for a collective thrust (n) [N] and a torque (n, 3) [N m], within the limits."""
         drone, collective = self.drone, collective[:, None]
         thrust = np.concatenate((collective, torque), 1) @ drone.mixer.T
         limited = np.clip(thrust, *drone.thrust_limits)
@@ -140,9 +150,9 @@ class PIDLoop(ContractLoop):
     """A PID rate loop as in firmware: it only reads a gyro, and has no model of the drone.
 
     Its gains follow from the contract by a rule. P is the contract's gain times the inertia, and D the contract's
-    damping, but of the measured body rate: with a perfect derivative the loop would have the bandwidth and the damping
-    of the contract's ``rate_loop``. The derivative passes a low-pass filter of first order at 100 Hz. I is P times a
-    tenth of the bandwidth; the integral is held while a rotor saturates. Mixer and limits are those of the contract.
+    damping, but of the measured body rate: with a perfect derivative the loop would be that of the contract in steps of
+    dt. The derivative passes a low-pass filter of first order at 100 Hz. I is P times a tenth of that loop's bandwidth;
+    the integral is held while a rotor saturates. Mixer and limits are those of the contract.
     """
 
     cutoff = 100.0  # [Hz], of the derivative
@@ -150,8 +160,7 @@ class PIDLoop(ContractLoop):
 
     def __init__(self, drone: Drone, dt: float) -> None:
         super().__init__(drone, dt)
-        loop = drone.rate_gain, drone.inertia, drone.rate_damping, drone.motor_time_constant
-        self.integral_gain = self.gain * self.integral_share * bandwidth(*loop)
+        self.integral_gain = self.gain * self.integral_share * drone.rate_loop(dt).bandwidth
         self.smoothing = 1.0 - np.exp(-2.0 * np.pi * self.cutoff * dt)
         self.integral, self.derivative = np.zeros(3), np.zeros(3)
         self.before: Array | None = None
@@ -180,21 +189,6 @@ class PDLoop(PIDLoop):
     """The same without the integral, which firmware holds back while the setpoint moves fast."""
 
     integral_share = 0.0
-
-
-def damping_ratio(gain: Array, inertia: Array, damping: Array, motor_time_constant: float) -> Array:
-    """The damping ratio (3) of a rate loop about hover, which is a second-order system about each axis.
-
-    The torque of :class:`ContractLoop`, with gain K (3) [1/s], inertia J (3) [kg m2], damping D (3) [kg m2], and rotors
-    that lag by tau [s], give tau w'' + (1 + D / J) w' + K w = K desired.
-    """
-    return (1.0 + damping / inertia) / (2.0 * np.sqrt(gain * motor_time_constant))
-
-
-def bandwidth(gain: Array, inertia: Array, damping: Array, motor_time_constant: float) -> Array:
-    """At which the answer of a rate loop to a sine has fallen by 3 dB (3) [rad/s]; see :func:`damping_ratio`."""
-    part = 1.0 - 2.0 * damping_ratio(gain, inertia, damping, motor_time_constant) ** 2
-    return np.sqrt(gain / motor_time_constant) * np.sqrt(part + np.sqrt(part**2 + 1.0))
 
 
 LOOPS: dict[str, type[ContractLoop]] = {"contract": ContractLoop, "pid": PIDLoop, "pd": PDLoop}

@@ -1,25 +1,71 @@
-"""The rate loop of a drone as it is flown, in steps: its poles, damping, bandwidth and overshoot about each body axis.
+"""What follows from the numbers of a drone: whether there can be such a drone, and how its rate loop answers.
 
-About hover a physics step of dt takes the body rate w and the angular acceleration A of an axis to
-
-.. math:: \\begin{pmatrix} w \\\\ A \\end{pmatrix} \\leftarrow
-    \\begin{pmatrix} 1 & dt \\\\ -(1 - a) K & a - (1 - a) D / J \\end{pmatrix} \\begin{pmatrix} w \\\\ A \\end{pmatrix}
-    + \\begin{pmatrix} 0 \\\\ (1 - a) K \\end{pmatrix} w^c, \\qquad a = e^{-dt / \\tau_m},
-
-with every integrator: the present rotor speeds turn the body, while the controller commands the next ones. Nothing here
-imports torch.
+Nothing here imports torch.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchrl_quad.errors import shown
+
 Array = NDArray[np.float64]
+NEARLY_LINEAR = 1e-3  # of a thrust map, k2 / k1 times the highest speed, below which single precision loses the speed
+
+JUDGED = ("mass", "inertia", "rotor_positions", "thrust_map", "rotor_speed_min", "rotor_speed_max")
+
+
+def contradictions(fields: Mapping[str, ArrayLike]) -> Iterator[str]:
+    """Why there is no drone with these fields, of one drone or (n, ...) of several, in words."""
+    drone = {name: np.asarray(fields[name], float) for name in JUDGED}
+    inertia, k2, k1 = drone["inertia"], drone["thrust_map"][..., 0], drone["thrust_map"][..., 1]
+    mass, low, high = (drone[x].reshape(-1) for x in ("mass", "rotor_speed_min", "rotor_speed_max"))
+    units = "Check the order of the axes and the unit: 1 g cm2 is 1e-7 kg m2"
+    if (2.0 * inertia.max(-1) > inertia.sum(-1) * (1.0 + 1e-5)).any():
+        yield f"inertia {listed(inertia)} kg m2: in a body none of the three exceeds the sum of the others. {units}"
+    arm = np.sqrt((drone["rotor_positions"] ** 2).sum(-1)).max(-1)
+    radius = np.sqrt(inertia.max(-1) / mass)
+    if (radius > 2.0 * arm).any():
+        worst = (radius - 2.0 * arm).argmax()
+        arm, radius = (np.broadcast_to(x, (radius - arm).shape).flat[worst] for x in (arm, radius))
+        yield (
+            f"inertia {listed(inertia)} kg m2: with this mass it is that of a ring of {radius:.3g} m radius, and "
+            f"the farthest rotor is {arm:.3g} m from the centre. {units}"
+        )
+    if not (low < high).all():
+        yield f"rotor_speed_min must be below rotor_speed_max, got {listed(low)} and {listed(high)}"
+    slow, fast = k1 + 2.0 * k2 * low, k1 + 2.0 * k2 * high
+    if not ((slow >= 0.0) & (fast >= 0.0) & (slow + fast > 0.0)).all():
+        yield (
+            "thrust_map must rise with rotor speed: k1 + 2 k2 w is "
+            f"{listed(slow)} at rotor_speed_min and {listed(fast)} at rotor_speed_max"
+        )
+    least = NEARLY_LINEAR * abs(k1) / high
+    if (abs(k2) < least).any():
+        yield (
+            f"thrust_map must bend, so that a speed follows from a thrust: k2 is {listed(k2)}. Write "
+            f"{1.1 * least.max():.2g}, which changes thrust by 0.1 %"
+        )
+
+
+def listed(x: ArrayLike) -> str:
+    """Numbers in four digits."""
+    return shown([float(f"{value:.4g}") for value in np.asarray(x, float).flat])
 
 
 class RateLoop:
-    """The rate loop of one drone, in arrays (3), or of several, in arrays (n, 3).
+    """The rate loop as it is flown, in steps, about each body axis, in arrays (3), or (n, 3) for several drones.
+
+    About hover a physics step of dt takes the body rate w and the angular acceleration A of an axis to
+
+    .. math:: \\begin{pmatrix} w \\\\ A \\end{pmatrix} \\leftarrow \\begin{pmatrix} 1 & dt \\\\
+        -(1 - a) K & a - (1 - a) D / J \\end{pmatrix} \\begin{pmatrix} w \\\\ A \\end{pmatrix}
+        + \\begin{pmatrix} 0 \\\\ (1 - a) K \\end{pmatrix} w^c, \\qquad a = e^{-dt / \\tau_m},
+
+    with every integrator: the present rotor speeds turn the body, while the controller commands the next ones.
 
     Args:
         gain: K [1/s].
@@ -67,7 +113,7 @@ class RateLoop:
     @property
     def overshoot(self) -> Array:
         """By which the rate exceeds a small step of the command at most, as a share of it; infinite where unstable."""
-        first, second = self.poles[..., 0], self.poles[..., 1]
+        first, second = np.moveaxis(np.where(self.is_stable[..., None], self.poles, 0.5), -1, 0)
         angle, phase = np.angle(first), np.angle(self._error)
         early = np.arange(2.0, 8.0)  # where poles lie on the negative axis
         turn = (np.pi + np.arctan2(np.log(abs(first)), angle) - phase) / np.maximum(angle, 1e-9)

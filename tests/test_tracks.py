@@ -1,0 +1,185 @@
+"""Gates with a shape and a direction, tracks of other projects, and tracks that each episode draws."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from flying import fly, hold, start
+from refusals import cases, refuses
+from torchrl.envs import check_env_specs
+
+from torchrl_quad import RacingEnv, load_track, random_track
+from torchrl_quad.envs.track import forward
+
+WILD = sorted(Path("/work/shared/wild/tracks").glob("*"))
+OPEN = {"width": 2.0, "height": 1.0}
+BOTH_WAYS = [{"position": [0, 0, 3], "yaw": 0.0}, {"position": [0, 0, 3], "yaw": math.pi}]
+
+
+def one_step(track, position, velocity, **entries):
+    env = RacingEnv(num_envs=len(position), track=track, dtype=torch.float64, action_delay=0)
+    td = start(env, position=position, velocity=velocity, gate=0, target=[0.0, 0.0, 3.0], **entries)
+    return env, fly(env, td, hold(env, 1))["next"]
+
+
+def test_a_gate_is_passed_in_its_direction_and_within_its_opening_only():
+    ways = {  # relative to the centre, in m: where a step of 0.2 m begins along x, y, z, and its direction along x
+        (-0.1, 0.9, 0.0): (1, "all"), (-0.1, 1.1, 0.0): (1, ""), (-0.1, 0.0, 0.45): (1, "all"),
+        (-0.1, 0.0, 0.55): (1, "round"), (-0.1, 0.9, 0.45): (1, "square"), (0.1, 0.0, 0.0): (-1, ""),
+        (-0.3, 0.0, 0.0): (1, ""), (0.05, 0.0, 0.0): (1, ""),
+    }  # fmt: skip
+    position = [[x, y, 3.0 + z] for x, y, z in ways]
+    velocity = [[10.0 * sign, 0.0, 0.0] for sign, _ in ways.values()]
+    for kind, shape in (("square", OPEN), ("round", {"radius": 1.0})):
+        _, ends = one_step({"gates": BOTH_WAYS, **shape}, position, velocity)
+        expected = [who in ("all", kind) for _, who in ways.values()]
+        assert ends["state", "gate_passed"].flatten().tolist() == expected
+        assert ends["state", "gate"].flatten().tolist() == [int(x) for x in expected]
+    _, ends = one_step({"gates": BOTH_WAYS[::-1], **OPEN}, position, velocity)  # the same place from the other side
+    assert ends["state", "gate_passed"].flatten().tolist() == [sign < 0 for sign, _ in ways.values()]
+
+
+def test_touching_a_frame_is_a_crash_from_wherever_it_comes():
+    position = torch.tensor([[-0.1, 0, 3], [-0.1, 1.05, 3], [0, 0, 3.9], [-0.1, 2, 3], [-0.1, 0, 3.4], [0.5, 1.1, 3]])
+    velocity = torch.tensor([[10.0, 0, 0], [10, 0, 0], [0, 0, -10], [10, 0, 0], [10, 0, 0], [0, 10, 0]])
+    touching = [False, True, True, False, True, False]  # in the middle; a bar; from above; outside; by its side; before
+    for gates, frame in ((BOTH_WAYS, 0.1), (BOTH_WAYS, 0.0)):
+        track = {"gates": gates, **OPEN, **({"frame": frame} if frame else {})}
+        env, ends = one_step(track, position.double(), velocity.double())
+        assert 0.1 < env.drone_radius < 0.35  # so that 0.1 m from an edge is too near, and 0.5 m is not
+        assert ends["crash"].flatten().tolist() == [bool(frame) and x for x in touching]
+        assert ends["crash"].equal(ends["terminated"])
+
+
+def test_an_open_track_ends_at_its_last_gate_and_times_the_way_from_the_first():
+    gates = [{"position": [x, 0.0, 2.0], "yaw": 0.0} for x in (1.0, 1.3)]
+    env = RacingEnv(num_envs=2, track={"gates": gates, "closed": False, **OPEN}, first_gate=0, action_delay=0)
+    td = start(env, position=[0.95, 0.0, 2.0], velocity=[8.0, 0.0, 0.0])
+    td["state", "gate"][1] = 1  # it does not fly the whole way
+    flight = fly(env, td, hold(env, 3))
+    assert flight["next", "success"][..., 0].tolist() == [[False, False, True], [False, False, True]]
+    metrics = env.episode_metrics(flight)
+    assert metrics["solved"].tolist() == [1.0, 1.0] and metrics["lap_time"].isnan().tolist() == [False, True]
+    assert metrics["lap_time"][0].item() == pytest.approx(0.06) and flight["next", "terminated"][:, 2].all()
+
+
+def test_each_episode_draws_a_track_by_the_rules_and_flies_on_bit_for_bit():
+    rules = {"gates": 5, "spacing": [2.0, 5.0], "turn": 1.9, "heights": [1.0, 2.0], "yaw": 0.2}
+    env = RacingEnv(num_envs=300, track={"random": rules, "radius": 0.5}, seed=4, observe_directions=True)
+    td = env.reset()
+    gates, course = td["state", "track", "gates"], torch.cat((td["state", "track", "gates"],) * 2, 1)[:, :7, :2]
+    way = course[:, 1:] - course[:, :-1]
+    cosine = torch.nn.functional.cosine_similarity(way[:, 1:], way[:, :-1], dim=-1)
+    assert (cosine >= math.cos(1.9) - 1e-5).all() and (way.norm(dim=-1) <= 5.0 + 1e-4).all()
+    flat = torch.cdist(gates[..., :2], gates[..., :2]) + 9.0 * torch.eye(5)
+    assert (flat >= 2.0 - 1e-4).all() and (gates[..., 2] >= 1.0).all() and (gates[..., 2] <= 2.0).all()
+    assert len(gates[:, 0].unique(dim=0)) == 300 and not env.is_crash(td["state"]).any()
+    ahead = forward(td["state", "track", "rotations"])
+    first = td["state", "gate"][:, 0]
+    torch.testing.assert_close(td["observation"][:, 6:9], 10.0 * ahead[torch.arange(300), first])
+    torch.testing.assert_close(td["state", "target"], gates[torch.arange(300), first])
+    saved, actions = env.randomness.state(), hold(env, 3)
+    again = env.reset()["state"]
+    assert not (again["track", "gates"] == gates).all(-1).any()
+    env.randomness.set_state(saved)
+    assert (env.reset()["state"] == again).all()
+    assert (fly(env, td, actions)["next", "state", "track"] == td["state", "track"].unsqueeze(1)).all()
+    check_env_specs(RacingEnv(num_envs=2, track={"file": "random", "gate_radius": 0.4}, event_discount=0.99))
+
+
+def test_a_random_track_is_that_of_its_seed_and_gates_move_by_their_jitter():
+    track = random_track(3, gates=4, radius=0.5, frame=0.1)
+    assert track == random_track(3, gates=4, radius=0.5, frame=0.1) and track != random_track(4, gates=4, radius=0.5)
+    assert len(track["gates"]) == 4 and track["gates"][0]["radius"] == 0.5 and "random" not in track
+    moving = {**track, "position_jitter": [0.1, 0.2, 0.0], "rotation_jitter": [0.0, 0.0, 0.3]}
+    env = RacingEnv(num_envs=400, track=moving)
+    drawn = env.reset()["state", "track"]
+    off = (drawn["gates"] - env.gates).abs().amax((0, 1))
+    assert (off <= torch.tensor([0.1, 0.2, 0.0]) + 1e-5).all() and (off[:2] > torch.tensor([0.09, 0.18])).all()
+    turned = (forward(drawn["rotations"]) * forward(env.rotations)).sum(-1).clamp(-1.0, 1.0).acos()
+    assert 0.28 < turned.max() < 0.3 + 1e-3
+
+
+SPLIT_S = """
+start_pos: [-5, -4, 3]
+goal_pos: [0, 0, 3]
+gates:
+  Gate1: {position: [0, 0, 3], rotation: [0.7071068, 0, 0, 0.7071068], scale: [0.6, 0.6, 0.6]}
+  Gate10: {position: [6, -6, 1], rotation: [-0.7071068, 0, 0, 0.7071068], scale: [0.6, 0.6, 0.6]}
+  Gate2: {position: [9, 6, 3], rotation: [0.7071068, 0, 0, 0.7071068], scale: [0.6, 0.6, 0.6]}
+  N: 3
+"""
+LSY = """
+[env.track]
+randomize = false
+safety_limits = {pos_limit_low = [-2.5, -1.5, -0.001], pos_limit_high = [2.5, 1.5, 2.0]}
+gates = [{pos = [0.5, 0.25, 0.7], rpy = [0.0, 0.0, -0.78]}, {pos = [-1.0, -0.25, 1.2], rpy = [0.0, 0.0, 3.14]}]
+obstacles = [{pos = [1.0, 0.75, 1.5]}]
+drones = [{pos = [-1.5, 0.75, 0.01], rpy = [0.0, 0.0, 0.0]}]
+[env.randomizations]
+gate_pos = {fn = "uniform", kwargs = {minval = [-0.1, -0.2, 0.0], maxval = [0.1, 0.2, 0.0]}}
+obstacle_pos = {fn = "uniform", kwargs = {minval = [-0.1, -0.1, 0.0], maxval = [0.1, 0.1, 0.0]}}
+"""
+POINTS = {"initial": {"position": [-5, 4, 1]}, "end": {"position": [4, 0, 1]}, "gate_radius": 0.4}
+
+
+def test_tracks_of_other_projects_are_read_and_what_was_assumed_is_said(tmp_path):
+    (tmp_path / "split.yaml").write_text(SPLIT_S)
+    split = load_track(tmp_path / "split.yaml", width=1.5, height=1.2)
+    assert [gate["position"] for gate in split["gates"]] == [[0, 0, 3], [9, 6, 3], [6, -6, 1]]
+    assert split["starts"][0] == [-5, -4, 3] and split["closed"]
+    assert split["notes"][0] == "gates are flown along their -y axis"
+    ways = forward(torch.tensor([gate["rotation"] for gate in split["gates"]], dtype=torch.float64)).tolist()
+    np.testing.assert_allclose(ways, [[1, 0, 0], [1, 0, 0], [-1, 0, 0]], atol=1e-6)
+    (tmp_path / "level.toml").write_text(LSY)
+    level = load_track(str(tmp_path / "level.toml"))
+    assert (level["gates"][0]["width"], level["frame"], level["closed"]) == (0.4, 0.16, False)
+    assert level["position_jitter"] == [0.1, 0.2, 0.0] and level["box"][1] == [2.5, 1.5, 2.0]
+    assert level["scene"]["cylinders"][0]["low"] == [0.9, 0.65, 0.0]
+    env = RacingEnv(num_envs=2, track=tmp_path / "level.toml", drone="crazyflie", first_gate=0)
+    assert not env.is_crash(env.reset()["state"]).any() and env.scene.touchable is not None
+    assert forward(env.rotations)[0].tolist() == pytest.approx([math.cos(0.78), -math.sin(0.78), 0.0], abs=1e-6)
+    lap = load_track({**POINTS, "gates": [[0, 0, 1], [4, 0, 1], [4, 4, 1], [0, 0, 1]]})
+    assert not lap["closed"] and len(lap["gates"]) == 5
+    rounds = load_track({**POINTS, "gates": [[0, 0, 1], [4, 0, 1], [4, 4, 1]] * 2 + [[0, 0, 1]]})
+    assert rounds["closed"] and len(rounds["gates"]) == 3 and rounds["starts"][0] == [-5, 4, 1]
+    poses = {"2": {"pos": (4.0, 0.0, 1.0), "yaw": 1.0}, "1": {"pos": (0.0, 0.0, 0.0), "yaw": 0.0}}
+    isaac = load_track(poses, lift=0.9, radius=0.7)
+    assert [gate["position"] for gate in isaac["gates"]] == [[0, 0, 0.9], [4, 0, 1.9]]
+
+
+AGILE = {"start_pos": [-5, 0, 2], "goal_pos": [8, 0, 2]}
+UPRIGHT = {"rotation": [1, 0, 0, 0]}
+ROW = {"Gate1": {"position": [0, 0, 2], **UPRIGHT}, "Gate2": {"position": [8, 0, 2], **UPRIGHT}}
+SQUARE = {"position": [0, 0, 2], "yaw": 0.0, **OPEN}
+
+
+@cases(
+    ({**AGILE, "gates": ROW}, {}, "how far it is open is not said. Give width and height, or radius"),
+    ({**AGILE, "gates": {**ROW, "Gate2": {"position": [8, 0, 2], "rotation": [0.7071, 0, 0, 0.7071]}}}, {"radius": 1.0},
+     "their order does not show which. Give axis="),
+    ({**AGILE, "gates": ROW}, {"radius": 1.0, "axis": "z"}, "axis must be one of x, y, -x, -y; got 'z'"),
+    ({"gates": [[0, 0, 1], [1, 1, 1]], "initial": {}}, {}, "how near to a gate counts is not said. Give gate_radius"),
+    ({"1": {"pos": [0, 0, 0], "yaw": 0}, "2": {"pos": [1, 0, 0], "yaw": 0}}, {"radius": 1.0}, "is not said. Give lift"),
+    ({"gates": {"first": [0, 0, 1]}}, {}, "its gates have names, .* of no format that is known"),
+    ({"gates": [[0, 0, 1], SQUARE]}, {}, "gates must be all points, or all mappings"),
+    ({"gates": [SQUARE, {**SQUARE, "rotation": [1, 0, 0, 0]}]}, {}, "gate 2: give a yaw, .* or a rotation"),
+    ({"gates": [SQUARE, {**SQUARE, "wide": 1}]}, {}, "gate 2: unknown key 'wide'. Allowed: position, yaw"),
+    ({"gates": [[0, 0, 1], [1, 1, 1]], "frame": 0.1}, {}, "frame is of gates with a direction; these are points"),
+    ({"random": {"gates": 3, "turn": 2.0}}, {"radius": 1.0}, "3 gates need a turn of at least 2.09 rad, got 2"),
+    ({"random": {"spacing": [4, 2]}}, {"radius": 1.0}, "spacing and heights are the least and then the greatest"),
+    ({"env": {"track": {"gates": []}}}, {}, "track: cannot be read, "),
+)  # fmt: skip
+def test_a_track_that_does_not_say_enough_is_refused_and_asks_by_name(track, settings, message):
+    refuses(message, load_track, track, **settings)
+
+
+@pytest.mark.skipif(not WILD, reason="files of other projects, which are not in the repository")
+def test_tracks_as_other_projects_publish_them_start_without_a_crash():
+    for path in WILD:
+        shape, drone = ({}, "crazyflie") if path.suffix == ".toml" else ({"width": 1.5, "height": 1.5}, "visfly")
+        env = RacingEnv(num_envs=50, track={"file": str(path), **shape}, drone=drone)
+        ends = fly(env, env.reset(), hold(env, 5))["next"]
+        assert not ends["crash"].any(), path

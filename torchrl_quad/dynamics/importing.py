@@ -1,0 +1,168 @@
+"""Drones from files: our own, and those of other projects, with a name for every assumption."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchrl_quad.dynamics.control import FlightController
+from torchrl_quad.dynamics.gains import suggest_gains
+from torchrl_quad.dynamics.import_mappings import MAPPINGS, READABLE, Array, Found, Said, read_json
+from torchrl_quad.dynamics.import_xml import read_xml
+from torchrl_quad.dynamics.parameters import FIELDS, QuadrotorParams, read_drone, read_fields
+from torchrl_quad.errors import UserValueError, one_line, shown
+
+CONVERT = {  # programs that write such files, and how to run them
+    ".xacro": "Expand it first: xacro FILE.xacro > FILE.urdf.",
+    ".py": "Of RotorPy, write the parameters as JSON first: json.dump(quad_params, file, default=list).",
+}
+ASKED = {  # what nobody can guess, as one could give it
+    "mass": "0.5",
+    "inertia": "[2e-3, 2e-3, 4e-3]",
+    "rotor_positions": "[[0.1, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.1, -0.1]]",
+    "rotor_spin": "[1, -1, 1, -1]",
+    "yaw_torque_coefficient": "0.016",
+    "thrust_map": "[2e-6, 0, 0]",
+    "rotor_speed_max": "1500",
+    "motor_time_constant": "0.03",
+    "linear_drag": "[0.1, 0.1, 0.1]",
+}
+
+
+def load_drone(
+    drone: str | Path | Mapping = "visfly",
+    dtype: torch.dtype = torch.float32,
+    *,
+    entry: str | None = None,
+    **fields: Any,
+) -> QuadrotorParams:
+    """A preset by its name (:func:`available_drones`), a file by its path, or a mapping of fields to numbers.
+
+    Args:
+        drone: the file may be of another project, as in :func:`import_drone`.
+        dtype: of its tensors.
+        entry: which drone, of a file that has several.
+        **fields: of :class:`QuadrotorParams`, which count instead of those that the drone says.
+
+    Raises:
+        ValueError: the preset is unknown, a field is missing, unknown, of the wrong shape, or out of its range, or the
+            dtype is none of floating point. What a file of another project lacks is named all at once.
+        FileNotFoundError: the path does not exist.
+    """
+    source, kind, found, _ = _read(drone, entry)
+    found = _completed(source, kind, found, fields) if kind else found
+    return read_drone({k: v for k, (v, _) in found.items()} | fields, dtype, source)
+
+
+def import_drone(path: str | Path, *, entry: str | None = None, **fields: Any) -> str:
+    """The YAML of a drone from a file of another project, with comments on all that the file does not say.
+
+    It reads URDF, with the attributes of gym-pybullet-drones or the motors of RotorS; SDF, with Gazebo's motors or
+    without; YAML of Flightmare and Agilicious; TOML of drone-models and Crazyflow; JSON of l2f, and of RotorPy's
+    ``quad_params``. Frames become ours, and all links one rigid body with principal axes along x, y and z. Drag that
+    grows with rotor speed is that at hover. Only gains and limits of the rates are chosen where nobody says them.
+
+    Args:
+        path: of that file.
+        entry: which drone, of a file that has several.
+        **fields: what the file does not say, in SI units, such as ``motor_time_constant=0.03``.
+
+    Raises:
+        ValueError: it cannot be read, or lacks fields that are not given; all of them are named.
+        FileNotFoundError: the path does not exist.
+    """
+    source, kind, found, unread = _read(Path(path), entry)
+    if not kind:
+        raise UserValueError(f"{source} is no file of another project. {READABLE}")
+    found = _completed(source, kind, found, fields)
+    name = one_line(Path(path).name + (f", {entry}" if entry else ""))
+    text = [f"Source: {name} ({kind})."] + ([f"Not read: {', '.join(map(one_line, unread))}."] if unread else [])
+    lines = [line for x in text for line in textwrap.wrap(x, 120, initial_indent="# ", subsequent_indent="# ")]
+    for field in (x for x in FIELDS if x in found):
+        value, note = np.asarray(found[field][0], float), found[field][1]
+        comment = "; ".join(x for x in (FIELDS[field]["unit"], note) if x)
+        rows = [_flow(x) for x in (value if value.ndim > 1 else [value])]
+        lines.append(f"{field}:{' ' + rows[0] if value.ndim < 2 else ''}{'  # ' + comment if comment else ''}")
+        lines += [f"  - {row}" for row in rows] if value.ndim > 1 else []
+    lines += [f"motor_command: {found['motor_command'][0]}"] if "motor_command" in found else []
+    return "\n".join(lines) + "\n"
+
+
+def _flow(value: Array) -> str:
+    return f"{value:.7g}" if value.ndim == 0 else f"[{', '.join(f'{x:.7g}' for x in value)}]"
+
+
+def _completed(source: str, kind: str, found: Found, fields: Mapping[str, Any]) -> Found:
+    """What a file and a user say, and what is ours; an error names all that is missing."""
+    found = found | {k: (v, "given, not in the file") for k, v in fields.items()}
+    if missing := [name for name in ASKED if found.get(name, (None,))[0] is None]:
+        why = [f": {found[x][1]}" if x in found and found[x][1] else "" for x in missing]
+        names = ", ".join(f"{x} [{FIELDS[x]['unit'] or '1'}]{y}" for x, y in zip(missing, why, strict=True))
+        like = ", ".join(f"{x}={ASKED[x]}" for x in missing)
+        raise UserValueError(
+            f"{source} ({kind}) does not say {names}. Give your own numbers, in SI units and our frame, such as "
+            f"load_drone({source!r}, {like}), or the same as arguments of recipes/import_drone.py."
+        )
+    ours = {
+        "rotor_speed_min": (0.0, "assumed: rotors may stop"),
+        "quadratic_drag": ([0.0] * 3, "not in the file"),
+        "gravity": (9.81, "not in the file"),
+    }
+    found = ours | {k: v for k, v in found.items() if v[0] is not None}
+    plain = {"rate_gain": [1.0] * 3, "rate_damping": [0.0] * 3, "max_thrust_to_weight": 1.5, "max_body_rate": [6.0] * 3}
+    drone = read_drone(plain | {k: v for k, (v, _) in found.items()}, torch.float64, source)
+    rotors = FlightController(drone)
+    most = ((rotors.middle + rotors.half_span) / (drone.mass * drone.gravity)).clamp(1.1, 5.0)
+    rates = rotors.spare_torque() / drone.inertia * torch.tensor([0.1, 0.1, 0.5])
+    rates = rates.minimum(torch.tensor([6.0, 6.0, 2.0])).clamp_min(0.1)
+    limits = {
+        "max_body_rate": (
+            (10.0 * rates).floor() / 10.0,
+            "chosen here: at most what hovering rotors reach in 0.1, 0.1, 0.5 s",
+        ),
+        "max_thrust_to_weight": ((10.0 * most).floor().item() / 10.0, "chosen here: at most what the rotors reach"),
+    }
+    found = limits | found
+    gains = suggest_gains({k: v for k, (v, _) in found.items()})
+    return {k: (v.numpy(), "chosen here: suggest_gains, for steps of 5 ms") for k, v in gains.items()} | found
+
+
+def _read(drone: Any, entry: str | None) -> tuple[str, str, Found, list[str]]:
+    """Of a drone: its source, the kind of file if it is no drone of ours, what it says, and what of it was not read."""
+    suffix = Path(drone).suffix.lower() if isinstance(drone, str | Path) else ""
+    if suffix in CONVERT:
+        raise UserValueError(
+            f"{drone}: a {suffix} file has to be run before its numbers can be read. {CONVERT[suffix]}"
+        )
+    if suffix in (".urdf", ".sdf", ".xml", ".jinja"):
+        return read_xml(Path(drone))
+    if suffix == ".json":
+        source, data = str(drone), read_json(Path(drone))
+    elif isinstance(drone, Path) and suffix not in ("", ".yaml", ".yml", ".toml"):
+        raise UserValueError(f"{drone}: no drone can be read from a {suffix} file. {READABLE}")
+    else:
+        source, data = read_fields(drone)
+    drones = {
+        str(name): (kind, reader, part)
+        for name, part in ({"": data, **data} if isinstance(data, Mapping) else {}).items()
+        for kind, (reader, *keys) in MAPPINGS.items()
+        if isinstance(part, Mapping) and any(key in part for key in keys)
+    }
+    if (entry is None and len(drones) > 1) or (entry is not None and entry not in drones):
+        raise UserValueError(
+            f"{source}: choose one drone of the file, by entry={next(iter(drones), '')!r} or another of "
+            f"{shown(list(drones))}; got {shown(entry)}."
+        )
+    if not drones and suffix == ".json":
+        raise UserValueError(f"{source}: this JSON is of no kind that is known. {READABLE}")
+    if not drones:
+        return source, "", {k: (v, "") for k, v in data.items()}, []
+    kind, reader, part = drones[entry] if entry is not None else next(iter(drones.values()))
+    said = Said(part, source)
+    found = reader(said)
+    return source, kind, found, [str(key) for key in part if key not in said.asked]

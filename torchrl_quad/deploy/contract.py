@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_quad.airframe import contradictions
-from torchrl_quad.allocation import matrix, uncontrolled
+from torchrl_quad.airframe import contradictions, matrix, uncontrolled
 from torchrl_quad.errors import MissingPackage, UserError, UserValueError, one_line, shown
 
 VERSION = 4  # of the contract; raise it when a reader of the older one would misunderstand the new one

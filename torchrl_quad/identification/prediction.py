@@ -13,7 +13,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from torchrl_quad.allocation import quarters
+from torchrl_quad.airframe import quarters
 from torchrl_quad.dynamics import MotorCommand, QuadrotorParams, load_drone, quaternion
 from torchrl_quad.dynamics.rigid_body import RigidBodyState, Rotors, accelerations, rk4
 from torchrl_quad.errors import UserTypeError, UserValueError, shown

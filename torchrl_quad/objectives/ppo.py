@@ -13,7 +13,7 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss, distance_loss
 
 from torchrl_quad.data.unwrap import group, leaf
-from torchrl_quad.objectives.calls import plain_of, segments
+from torchrl_quad.objectives.calls import segments
 
 
 class PlainClipPPOLoss(ClipPPOLoss):

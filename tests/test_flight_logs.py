@@ -80,7 +80,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
     "gyro in degrees": (
         lambda t: scaled(t, GYRO, 180 / np.pi),
         "WrongUnit",
-        "imu_gyro_x.*degrees/s. Write .*pi / 180",
+        "imu_gyro_x.*degrees/s. Write .*0.0174",
     ),
     "gyro in milliradians": (lambda t: scaled(t, GYRO, 1e3), "WrongUnit", "imu_gyro_x.*milliradians"),
     "gyro three times too fast": (lambda t: scaled(t, GYRO, 6.0), "WrongUnit", "times the derivative"),
@@ -95,7 +95,7 @@ FAULTS = {  # a fault: what changes, the error, and what its message must name
         "px.*millimetres.*0.001.*vx.*0.001",
     ),
     "mixed lengths": (lambda t: scaled(t, SPEED, 1e3), "WrongUnit", "vx, vy, vz.*1e\\+03 times"),
-    "z down": (lambda t: scaled(t, ("pz", "vz"), -1), "WrongFrame", "z points down. If only z.*scale=.1, 1, -1"),
+    "z down": (lambda t: scaled(t, ("pz", "vz"), -1), "WrongFrame", "z points down. If only z.*scale=.1.0, 1.0, -1"),
     "accelerometer down": (
         lambda t: scaled(t, FORCE[2:], -1),
         "WrongFrame",

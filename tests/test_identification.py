@@ -227,6 +227,28 @@ def test_arguments_of_fits_and_predictions_are_refused_in_one_line_and_a_flight_
         refuses(name, dataclasses.replace, real, error=UserError, **{name: value})
 
 
+def test_what_contradicts_the_drone_is_found_and_no_inertia_is_one_that_no_body_has(real):
+    short, options = dataclasses.replace(real, segments=((300, 700),)), {"fields": ["linear_drag"], "draws": 0} | BRIEF
+    turned = "the other way than the drone's.*Write rotor_spin: .1, -1, 1, -1. in the drone"
+    refuses(turned, identify, short, "crazyflie", {"rotor_spin": [-1, 1, -1, 1]}, **options)
+    heavy = r"left over .*mass of 0.06 kg or its thrust.*name \"thrust_map\" in fields"
+    refuses(heavy, identify, short, "crazyflie", {"mass": 0.06}, iterations=1, **options)
+    result = identify(short, iterations=1, **options)
+    assert max(map(abs, result.trim["force_per_weight"])) < 0.1 and set(result.errors_by_flight) == {"figure8"}
+    worse = {**result.errors, "fitted": {name: {0.2: 9.0} for name in result.errors["fitted"]}}
+    assert "the fit predicts worse than constant velocity: position (9 against" in dataclasses.replace(
+        result, errors=worse).verdict  # fmt: skip
+    prior = load_drone("crazyflie", torch.float64)
+    for free, steps in (
+        (("roll", "pitch", "z_ratio"), ([0.3, -0.4, 20.0], [0.3, -0.4, -20.0])),
+        (("roll",), ([3.0], [-3.0])),
+    ):
+        model = Model(prior, prior.motor_command, free)
+        for step in steps:
+            inertia = model.params(model.bounded(model.start + torch.tensor(step, dtype=torch.float64))).inertia
+            assert 2.0 * inertia.max() <= inertia.sum() * (1.0 + 1e-9)
+
+
 BROKEN = ("{", "[]", "5", '{"stages": 5}', "[" * 100_000, "\xff", '{"fingerprint": "F", "stages": 5}')
 DRAG = {"free": ["drag_xy", "drag_z"]}
 BROKEN_STAGES = (5, {}, {"free": 5}, DRAG, DRAG | {"x": [0], "streams": [0]})

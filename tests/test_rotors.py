@@ -1,6 +1,7 @@
 """Any number and place of rotors, and rotors that fail."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +11,15 @@ from flying import fly, hold
 from refusals import cases, refuses
 from tensordict import TensorDict
 
+import torchrl_quad
 from torchrl_quad import HoveringEnv, load_drone
 from torchrl_quad.controllers import GeometricController
 from torchrl_quad.deploy import contract, frames
 from torchrl_quad.deploy.simulators import make_simulator, special
 from torchrl_quad.dynamics import FlightController, Quadrotor
 from torchrl_quad.envs import Disturbance
-from torchrl_quad.identification.prediction import columns
+from torchrl_quad.identification import prediction_error, read_log
+from torchrl_quad.identification.prediction import log_columns
 
 F64 = torch.float64
 
@@ -289,6 +292,9 @@ def test_the_motors_of_an_autopilot_and_of_a_log_belong_to_rotors_by_their_place
     known = frames.px4().of(other.rotor_positions)
     assert known.to({"motors": thrust[[*order]]})["motors"].tolist() == theirs.tolist()
     assert known.back({"motors": theirs})["motors"].tolist() == thrust[[*order]].tolist()
-    assert thrust[columns(other)].tolist() == thrust[[*order]].tolist() and columns(usual) == [0, 1, 2, 3]
-    for call in (lambda: frames.px4().of(LAYOUTS["plus"]["rotor_positions"]), lambda: columns(drone("hexarotor"))):
+    assert thrust[log_columns(other)].tolist() == thrust[[*order]].tolist() and log_columns(usual) == [0, 1, 2, 3]
+    log = read_log(Path(torchrl_quad.__file__).parents[1] / "examples/data/figure8.csv.gz")
+    errors = [prediction_error(log, x)["body_rate"][0.5] for x in (usual, other)]
+    assert errors[0] == pytest.approx(errors[1], rel=1e-9)
+    for call in (lambda: frames.px4().of(LAYOUTS["plus"]["rotor_positions"]), lambda: log_columns(drone("hexarotor"))):
         refuses("of an X.* has rotors at ", call)

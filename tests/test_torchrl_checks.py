@@ -1,12 +1,14 @@
 """TorchRL's own checks of losses, for each of ours; the sentence under a test names the one that it follows.
 
 They are in pytorch/rl, test/objectives: ``_objectives_common.py`` (common), ``test_loss_module.py`` (module) and
-``test_sac.py`` (sac). Masks, reductions of zero steps, keys and checkpoints have tests in ``test_loss_modules.py``, too.
+``test_sac.py`` (sac). Masks, keys and checkpoints have tests in ``test_loss_modules.py``, too.
 What does not apply: prioritised weights, multi-step targets and ``skip_done_states`` belong to replayed samples, and
 these losses differentiate a rollout; composite and discrete distributions have no derivative of single actions;
 ``separate_losses``, ``delay_actor`` and ``action_spec`` are options of others. Value estimators are chosen by name, not
 given, since their numbers take the precision of the actor; GAE and V-trace are refused (``test_objectives.py``).
 """
+
+import copy
 
 import pytest
 import torch
@@ -67,7 +69,7 @@ def test_entries_may_be_arguments_and_some_outputs_chosen(env, name):
     loss, _ = build(env, name)
     rollout, _ = differentiable_rollout(env, loss.actor_network, None, 6)
     entries = {"_".join([key] if isinstance(key, str) else key): rollout[key] for key in loss.in_keys}
-    whole, given = seeded(loss, rollout), seeded(loss, **entries)
+    whole, given = seeded(copy.deepcopy(loss), rollout), seeded(copy.deepcopy(loss), **entries)
     assert set(whole.keys()) == set(loss.out_keys)
     torch.testing.assert_close(dict(zip(loss.out_keys, given, strict=True)), dict(whole.items()))
     loss.select_out_keys("loss_actor")

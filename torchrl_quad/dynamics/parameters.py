@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_quad.airframe import contradictions
+from torchrl_quad.airframe import JUDGED, contradictions
 from torchrl_quad.dynamics import presets
 from torchrl_quad.errors import UserValueError, shown
 from torchrl_quad.options import between, build, checked
@@ -97,7 +97,7 @@ class QuadrotorParams:
         fields = self.fields()
         for name, value in fields.items():
             object.__setattr__(self, name, _checked(name, value, like, "QuadrotorParams", fields["rotor_positions"]))
-        for broken in contradictions({name: x.detach().cpu().numpy() for name, x in self.fields().items()}):
+        for broken in contradictions({name: getattr(self, name).detach().cpu().numpy() for name in JUDGED}):
             raise UserValueError(f"QuadrotorParams: {broken}.")
 
     def __repr__(self) -> str:

@@ -173,9 +173,10 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
     def set_params(self, params: QuadrotorParams) -> None:
         """Set :attr:`params`, also through a TransformedEnv, where an assignment would not reach this environment."""
         config.check_params(params, self.num_envs, self.nominal)
-        config.check_flown(self.dynamics, params)
         fits = all(x.dtype == self.dtype and x.device == self.device for x in params.fields().values())
-        self._params = params if fits else params.to(device=self.device, dtype=self.dtype)
+        params = params if fits else params.to(device=self.device, dtype=self.dtype)
+        config.check_flown(self.dynamics, params)
+        self._params = params
 
     def set_initial_state_source(self, source: Callable[[int], TensorDictBase] | None) -> None:
         """Choose where resets start, also through a TransformedEnv: ``source(n)`` returns n complete states, the

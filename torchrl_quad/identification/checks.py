@@ -286,8 +286,8 @@ def check_order(
     """Refuse motors in another order than the one in which they turn the drone, as far as the flight tells it."""
     signal, rows = signals["motor_command"], np.concatenate([np.arange(start, stop) for start, stop in pieces])
     parts = (rows, rows[: len(rows) // 2], rows[len(rows) // 2 :])  # what is chance in one half is not in the other
-    fits = [turning_fits(at["angular_velocity"], at["motor_command"], dt, part) for part in parts]
-    worth = np.array([x[:, 0] + x[:, 1] + np.abs(x[:, 2]) for x in fits])  # yaw: which turn alike, not which way
+    fits = turning_fits(at["angular_velocity"], at["motor_command"], dt, parts)
+    worth = fits[..., 0] + fits[..., 1] + np.abs(fits[..., 2])  # yaw: which turn alike, not which way
     best = int(worth[0].argmax())
     if worth[:, best].min() < 0.4:
         return f"the order of {signal} was not checked: the flight hardly tells it ({worth[0, best]:.2f} of 3)"
@@ -302,24 +302,23 @@ def check_order(
     return f"the order of {signal} fits how the drone turns: {worth[0, 0]:.2f} of 3, and {others:.2f} in another order"
 
 
-def turning_fits(rates: Array, command: Array, dt: float, rows: NDArray[np.int_], signs: ArrayLike = _X) -> Array:
-    """How well the motors explain the angular acceleration about each axis in each order (24, 3), as correlations;
-    ``signs`` (3, 4) are those of roll, pitch and yaw by each motor."""
-    turning = slope(rates, dt)[rows]
-    turning = turning - turning.mean(0)
+def turning_fits(
+    rates: Array, command: Array, dt: float, parts: Sequence[NDArray[np.int_]], signs: ArrayLike = _X
+) -> Array:
+    """How well the motors explain the angular acceleration about each axis in each order, as correlations
+    (parts, 24, 3); ``signs`` (3, 4) are those of roll, pitch and yaw by each motor."""
     mixing = np.zeros((len(_ORDERS), 4, 3))  # the signs of a command in each order, about each axis
     for mix, order in zip(mixing, _ORDERS, strict=True):
         mix[list(order)] = np.transpose(signs)
-    best = np.zeros((len(_ORDERS), 3))
-    for lag in (0.03, 0.06):  # of the rotors [s]
-        weights = np.exp(-dt / lag * np.arange(max(2, round(6.0 * lag / dt))))
-        late = convolved(np.pad(command**2, ((len(weights) - 1, 0), (0, 0)), "edge"), weights / weights.sum())
-        late = smooth(late, dt, 0.08)[rows]
-        late = late - late.mean(0)
-        size = np.einsum("pka,kl,pla->pa", mixing, late.T @ late, mixing) * (turning**2).sum(0)
-        fits = np.einsum("pka,ka->pa", mixing, late.T @ turning) / np.sqrt(np.maximum(size, 1e-24))
-        best = max(best, fits, key=lambda x: x.sum(1).max())
-    return best
+    weights = np.exp(-dt / 0.04 * np.arange(max(2, round(0.2 / dt))))  # rotors follow with a lag, of 0.04 s or so
+    thrusts = convolved(np.pad(command**2, ((len(weights) - 1, 0), (0, 0)), "edge"), weights / weights.sum())
+    thrusts, turning = smooth(thrusts, dt, 0.08), slope(rates, dt)
+    fits = []
+    for rows in parts:
+        late, turned = (x[rows] - x[rows].mean(0) for x in (thrusts, turning))
+        size = np.einsum("pka,kl,pla->pa", mixing, late.T @ late, mixing) * (turned**2).sum(0)
+        fits.append(np.einsum("pka,ka->pa", mixing, late.T @ turned) / np.sqrt(np.maximum(size, 1e-24)))
+    return np.array(fits)
 
 
 def _compare(late: Array, early: Array, dt: float, moving: Mask) -> tuple[float, float, float]:

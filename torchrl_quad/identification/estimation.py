@@ -32,6 +32,7 @@ from torchrl_quad.identification.prediction import (
     as_params,
     carrying_speed,
     cut,
+    log_columns,
     predict,
     rms_errors,
     stream_delay,
@@ -186,10 +187,10 @@ def _with_motors(
 
 def _check_turning(prior: QuadrotorParams, logs: Sequence[FlightLog]) -> None:
     """Refuse rotors whose places or spins turn the drone against what its flights show."""
-    places, spin = prior.rotor_positions.numpy(), prior.rotor_spin.numpy()
+    places, spin, mine = prior.rotor_positions.numpy(), prior.rotor_spin.numpy(), log_columns(prior)
     signs = np.stack((places[:, 1], -places[:, 0], spin))  # of roll, pitch and yaw
     rows = [np.concatenate([np.arange(a, b) for a, b in x.segments]) for x in logs]
-    fits = np.mean([turning_fits(x.angular_velocity, x.motor_command, x.dt, r, signs)[0]
+    fits = np.mean([turning_fits(x.angular_velocity, x.motor_command[:, mine], x.dt, [r], signs)[0, 0]
                     for x, r in zip(logs, rows, strict=True)], 0)  # fmt: skip
     if fits[2] < -_CONTRARY:
         raise UserValueError(
@@ -199,8 +200,8 @@ def _check_turning(prior: QuadrotorParams, logs: Sequence[FlightLog]) -> None:
     if fits[:2].min() < -_CONTRARY:
         raise UserValueError(
             f"identify: motors turn these flights against where the drone's rotor_positions are (correlations "
-            f"{fits[0]:.2f} in roll, {fits[1]:.2f} in pitch). Name its rotors front left, back left, back right, front "
-            "right, as motors of a FlightLog are."
+            f"{fits[0]:.2f} in roll, {fits[1]:.2f} in pitch). Name the motors of the log front left, back left, back "
+            "right, front right, when it is read."
         )
 
 

@@ -100,13 +100,13 @@ def read_log(
     max_gap: NonNegative = 0.05,
     min_duration: NonNegative = 0.5,
 ) -> FlightLog:
-    """Read the log of a flight: CSV (also gz), PX4 ULog, ROS bag, or the uSD log of a Crazyflie.
+    """Read the log of a flight: CSV (also gz), PX4 ULog, ArduPilot dataflash log, ROS bag, or uSD log of a Crazyflie.
 
     Bags need rosbags: ``pip install '.[logs]'`` in a clone. ``docs/flight_logs.md`` has examples and limits.
 
     Args:
         path: a file, or the folder of a ROS 2 bag. Its first bytes say of what kind it is.
-        columns: which columns are which quantity: a preset's name ("nanobench", "px4", "crazyflie"), a
+        columns: which columns are which quantity: a preset's name ("nanobench", "px4", "ardupilot", "crazyflie"), a
             :class:`Layout`, or a mapping from quantities to names or :class:`Columns`, in the order of the convention.
             By default the kind of file and the header decide. A mapping replaces entries of the preset for the file,
             and None leaves one out; it describes all of a CSV file, if it names position, attitude and motors.
@@ -120,7 +120,7 @@ def read_log(
         min_duration: the shortest piece in flight that is kept [s].
 
     Raises:
-        LogError: the log cannot be used. Its subclasses name the reason.
+        LogError: the log cannot be used. Its subclasses name the reason, and what its message tells to write was tried.
     """
     path = Path(path)
     options = {"onboard": onboard, "dt": dt, "clearance": clearance, "max_gap": max_gap, "min_duration": min_duration}

@@ -144,15 +144,5 @@ def _said(value: object) -> str:
     for name, usual in (("scale", 1.0), ("offset", 0.0)):
         x = getattr(value, name)
         if x != usual:
-            parts.append(f"{name}=({', '.join(map(_number, x))})" if isinstance(x, tuple) else f"{name}={_number(x)}")
+            parts.append(f"{name}={f'{x:.10g}' if isinstance(x, float) else tuple(float(f'{y:.10g}') for y in x)}")
     return f"Columns({', '.join(parts)})"
-
-
-def _number(x: float) -> str:
-    for text, value in (("np.pi / 180", np.pi / 180.0), ("-np.pi / 180", -np.pi / 180.0)):
-        if np.isclose(x, value, rtol=1e-12, atol=0.0):
-            return text
-    share = round(1.0 / x) if x else 0
-    if len(f"{x:g}") > 5 and share and np.isclose(x, 1.0 / share, rtol=1e-12, atol=0.0):
-        return f"1 / {share}"
-    return f"{x:.10g}"

@@ -63,7 +63,7 @@ class IdentificationResult:
     #: by model, quantity and horizon [s], in held-out windows
     errors: Mapping[str, Mapping[str, Mapping[float, float]]]
     errors_by_flight: Mapping[str, Mapping[str, Mapping[str, float]]]  #: by flight, model and quantity, at the horizon
-    #: what the fitted drone leaves over on average, body frame: ``force_per_weight`` (3), and ``torque`` (3) [rad/s2]
+    #: ``force_per_weight`` (3) and ``torque`` (3) [rad/s2] that the fitted drone leaves over on average, body frame
     trim: Mapping[str, Sequence[float]]
     settings: Mapping[str, Any]  #: of the fit
     logs: Sequence[str]  #: names of the flights

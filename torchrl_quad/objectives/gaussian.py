@@ -38,12 +38,12 @@ class GaussianPolicy:
         if sampler is None:
             raise Unsupported(f"{_NEEDED}; {type(actor).__name__} has no distribution. {_INSTEAD}")
         self.actor, self.sampler, self.action_key = actor, sampler, sampler.dist_sample_keys[0]
-        parts = list(actor.modules())
-        for part in parts[parts.index(sampler) + 1 :]:
+        parts = list(actor.named_modules())
+        for name, part in parts[[part for _, part in parts].index(sampler) + 1 :]:
             if isinstance(part, TensorDictModuleBase) and self.action_key in part.out_keys:
                 raise Unsupported(
-                    f"{_NEEDED}, and here {type(part).__name__} changes the action afterwards. Let the distribution "
-                    "write the action that is flown."
+                    f"{_NEEDED}, and here {type(part).__name__} ({name}) changes the action afterwards. "
+                    "Let the distribution write the action that is flown."
                 )
         self.flown = self._distribution(tensordict.select(*sampler.in_keys).detach())
         self.squashes = isinstance(self.flown, TanhNormal)
@@ -81,7 +81,7 @@ class GaussianPolicy:
         states = cast(TensorDictBase, states if has_memory else states.reshape(-1))  # as it was flown
         with set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(has_time):
             loc, scale = _normal(self._distribution(self._call(states)))
-        return loc.view(*shape, -1), scale.view(*shape, -1)
+        return loc.reshape(*shape, -1), scale.reshape(*shape, -1)
 
     def replay(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
         """What it writes in the states of a rollout (*, horizon), with the noise of the rollout."""
@@ -98,6 +98,8 @@ class GaussianPolicy:
         """What the policy writes in states; an error for a layer that would not write the same again."""
         names, before = {part: name for name, part in self.actor.named_modules()}, {}
         for part in names:
+            if isinstance(part, ProbabilisticTensorDictModule) and part is not self.sampler:
+                raise _changing(part, names[part], _CHANGES[0])
             if isinstance(part, _BatchNorm) and (part.training or part.running_mean is None):
                 raise _changing(part, names[part], "uses the statistics of its batch")
         if torch.compiler.is_compiling():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Self, cast
 
@@ -120,11 +119,9 @@ class PathwiseLoss(LossModule):
         if alpha == "auto" or alpha > 0:
             self._add_entropy_bonus()
 
-    def convert_to_functional(
-        self, module: TensorDictModule | Sequence[TensorDictModule], module_name: str, *args: Any, **kwargs: Any
-    ) -> None:
+    def convert_to_functional(self, module: Any, module_name: str, *args: Any, **kwargs: Any) -> None:
         """As TorchRL's, for a TensorDictModule, or for a list of networks that differ in their weights alone."""
-        networks = list(module) if isinstance(module, list | tuple) else [module]
+        networks: list[Any] = list(module) if isinstance(module, list | tuple) else [module]
         for network in networks:
             if not isinstance(network, TensorDictModuleBase):
                 raise UserTypeError(

@@ -375,4 +375,5 @@ def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(tmp_path, m
     monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "frame.sdf")])
     with pytest.raises(SystemExit):
         runpy.run_path(str(script), run_name="__main__")
-    assert "does not say" in capsys.readouterr().err
+    advice = re.search(r"load_drone\(.*\)(?=, or)", capsys.readouterr().err)[0]
+    assert HoveringEnv(num_envs=1, drone=eval(advice)).nominal.mass.item() == 2.0

@@ -99,7 +99,7 @@ def test_what_is_no_drone_is_refused_by_name(tmp_path):
         (lambda: load_drone("visfly", torch.int64), "dtype must be torch.float32 or torch.float64"),
     ):
         refuses(message, make)
-    with pytest.raises(FileNotFoundError, match="No drone file at .*none.yaml. Choose from: crazyflie"):
+    with pytest.raises(FileNotFoundError, match="No drone file at .*none.yaml. Choose from: cf2p"):
         load_drone(tmp_path / "none.yaml")
 
 

@@ -85,10 +85,9 @@ class QuadrotorParams:
     gravity: Tensor = _field((1,), 1e-2, 1e3, "m/s2")  #: (1) [m/s2]
     #: (1) [m], above the centre of mass, where the drag acts
     drag_height: Tensor = _field((1,), -1e0, 1e0, "m", default=0.0)
-    #: (n, 3), along the thrust of each rotor, body frame; its length does not count. None: all upright, (0, 0, 1)
+    #: (n, 3), along the thrust of each rotor, body frame; its length does not count. All upright where None
     rotor_direction: Tensor | None = _field(("n", 3), -1e1, 1e1, default=None)
-    #: (n), a factor on thrust and torque of each rotor: 0 is a dead one. It belongs to the drone that flies, and its
-    #: controller does not know of it. None: all whole, 1
+    #: (n), a factor on thrust and torque of each rotor, 0 for a dead one, 1 where None; the controller does not use it
     rotor_effectiveness: Tensor | None = _field(("n",), 0.0, 1e1, default=None)
     motor_command: MotorCommand | None = None  #: from motor commands of logs to rotor speeds; None if unknown
 

@@ -167,8 +167,8 @@ class RacingEnv(QuadrotorEnv):
             reach, heights = self.course.reach, self.course.heights
             low, high = self.tensor([-reach, -reach, min(heights)]), self.tensor([reach, reach, max(heights)])
         moved = self.tensor(self.moved)
-        places = [("gates stand", low - moved, high + moved)]
-        low, high = places[0][1:]
+        low, high = low - moved, high + moved
+        places = [(f"gates stand from {listed(low.cpu())} to {listed(high.cpu())}", low, high)]
         self.half_width = 0.5 * (high - low)[:2] + self.box_margin
         self.ceiling = max(self.box_height, high[2].item() + self.box_margin)
         if "box" in track:
@@ -179,14 +179,14 @@ class RacingEnv(QuadrotorEnv):
         self.half_box = torch.cat((self.half_width, self.centre[2:] - self.floor))
         if self.course is None:  # else starts are put inside the box
             room = moved + self.start_range  # starts move with their gates
-            places += [("drones start", start - room, start + room) for start in self.starts]
+            for start, point in zip(self.starts, track["starts"], strict=True):
+                places.append((f"drones start within {self.start_range} m of {point}", start - room, start + room))
         for what, *corners in places:
             if self.is_crash({"position": torch.stack(corners)}).any():
-                box = self.centre - self.half_box, self.centre + self.half_box
-                ends = [listed(x.cpu()) for x in (*corners, *box)]
+                low, high = (listed((self.centre + sign * self.half_box).cpu()) for sign in (-1.0, 1.0))
                 raise UserValueError(
-                    f"track: {what} from {ends[0]} to {ends[1]}, which is not all inside the box from {ends[2]} to "
-                    f"{ends[3]} m. Move them, or give a wider box, or less position_jitter or start_range."
+                    f"track: {what}, which is not all inside the box from {low} to {high} m. Move them, or give a "
+                    "wider box, or less position_jitter or start_range."
                 )
 
     def initial_state(self, n: int) -> State:

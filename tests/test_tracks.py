@@ -198,6 +198,8 @@ def test_what_is_given_with_a_track_replaces_what_the_track_says_and_its_result_
     assert other["starts"] == [[2, 0, 1]] * 2 and other["gate_radius"] == 0.3
     for name in ("random", "six_gates"):
         assert load_track(load_track(name)) == load_track(name)
+    changed = load_track(load_track("random"), width=2.0, height=1.0, floor=0.9)
+    assert changed["gates"][0]["width"] == 2.0 and changed["random"] == load_track("random")["random"]
     assert len(load_track(load_track("random"), random={"gates": 4})["gates"]) == 4
     as_tensors = [
         {"position": torch.tensor(g["position"]), "rotation": np.array(g["rotation"])} for g in track["gates"]

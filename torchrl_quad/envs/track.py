@@ -247,8 +247,10 @@ def load_track(track: str | Path | Mapping = "visfly", **settings: Any) -> dict[
         raise UserValueError(f"{source}: there must be one start before each gate, got {given} for {len(gates)}.")
     if "start" in values:
         found["starts"][:1] = _points(source, "start", [values["start"]], floor)
-    for key in ("gates", "starts") if "random" in values else ():
-        if (key in values and str(values[key]) != str(found[key])) or "start" in values:
+    if "random" in values:
+        stand = [gate.get("position") if isinstance(gate, Mapping) else gate for gate in _rows(values.get("gates"))]
+        is_own = str(stand) == str(gates)  # what this function returned
+        if "start" in values or (not is_own and {"gates", "starts"} & set(values)):
             raise UserValueError(f"{source}: random draws gates and their starts. Leave out gates, start and starts.")
     return found
 
@@ -286,8 +288,7 @@ def _read(track: Any, settings: Mapping[str, Any]) -> tuple[str, dict[str, Any]]
         source, said = presets.read("track", track, _TRACKS)
         replaced = {name for key in values for name in _REPLACES.get(key, ())}
         said = {key: x for key, x in said.items() if key not in replaced}
-        gates = said.get("gates")
-        if replaced.issuperset(_SIZES) and isinstance(gates, Sequence):
+        if replaced.issuperset(_SIZES) and (gates := _rows(said.get("gates"))):
             own = (({k: x for k, x in g.items() if k not in _SIZES} if isinstance(g, Mapping) else g) for g in gates)
             said["gates"] = list(own)
         values = {**said, **values}
@@ -310,6 +311,10 @@ def starts_before(gates: Tensor, rotations: Tensor | None, floor: float) -> Tens
 def forward(rotations: Tensor) -> Tensor:
     """The direction (*, 3) in which gates with these rotations (*, 4) are flown."""
     return quaternion.rotate(rotations, 0.0 * rotations[..., 1:] + rotations.new_tensor([1.0, 0.0, 0.0]))
+
+
+def _rows(gates: Any) -> Sequence[Any]:
+    return gates if isinstance(gates, Sequence) and not isinstance(gates, str) else ()
 
 
 def _gates(centres: Tensor, rotations: Tensor) -> list[dict[str, Any]]:

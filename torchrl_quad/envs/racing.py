@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_quad.airframe import listed
 from torchrl_quad.dynamics import quaternion
 from torchrl_quad.engine.packing import Key
 from torchrl_quad.engine.simulation import State
@@ -168,7 +167,7 @@ class RacingEnv(QuadrotorEnv):
             low, high = self.tensor([-reach, -reach, min(heights)]), self.tensor([reach, reach, max(heights)])
         moved = self.tensor(self.moved)
         low, high = low - moved, high + moved
-        places = [(f"gates stand from {listed(low.cpu())} to {listed(high.cpu())}", low, high)]
+        places = [(f"gates stand from {_metres(low)} to {_metres(high)}", low, high)]
         self.half_width = 0.5 * (high - low)[:2] + self.box_margin
         self.ceiling = max(self.box_height, high[2].item() + self.box_margin)
         if "box" in track:
@@ -183,7 +182,7 @@ class RacingEnv(QuadrotorEnv):
                 places.append((f"drones start within {self.start_range} m of {point}", start - room, start + room))
         for what, *corners in places:
             if self.is_crash({"position": torch.stack(corners)}).any():
-                low, high = (listed((self.centre + sign * self.half_box).cpu()) for sign in (-1.0, 1.0))
+                low, high = (_metres(self.centre + sign * self.half_box) for sign in (-1.0, 1.0))
                 raise UserValueError(
                     f"track: {what}, which is not all inside the box from {low} to {high} m. Move them, or give a "
                     "wider box, or less position_jitter or start_range."
@@ -385,6 +384,10 @@ class RacingEnv(QuadrotorEnv):
             )
             marked["shapes"] = [Shape.line(outer.flatten(0, 1))]
         return Markers("next gate", **marked, progress="gates_passed", success=success)
+
+
+def _metres(point: Tensor) -> list[float]:
+    return point.double().round(decimals=3).tolist()
 
 
 def _box(beyond: Tensor) -> Tensor:

@@ -224,6 +224,9 @@ def test_a_worn_drone_flies_worn_while_its_controller_believes_it_whole_and_othe
     drawn = {"rotor_effectiveness": {"uniform": [0.7, 1.0]}}
     works = HoveringEnv(num_envs=500, randomize=drawn).reset()["state", "drone", "rotor_effectiveness"]
     assert works.shape == (500, 4) and 0.7 <= works.min() < 0.71 and works.std(0).min() > 0.07
+    drawn = {"rotor_effectiveness": {"scale": [0.9, 1.0]}}
+    works = HoveringEnv(num_envs=500, drone=worn, randomize=drawn).reset()["state", "drone", "rotor_effectiveness"]
+    assert works[:, 0].max() <= 0.5 and works[:, 1].min() >= 0.9
     with pytest.raises(ValueError, match="this drone has 6 rotors, and the one that the controller believes in has 4"):
         whole.params = drone("hexarotor")
 

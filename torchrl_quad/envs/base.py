@@ -229,7 +229,7 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
             return self
         super().to(device)
         flying = None if self.params is self.nominal else self.params.to(device=self.device)
-        self._place(self.nominal.to(device=self.device))
+        self._place(self._built.to(device=self.device))
         self._params = self.nominal if flying is None else flying
         self.set_up()
         safe_state = {key: x.to(self.device) for key, x in self.control_step.safe_state.items()}
@@ -246,10 +246,11 @@ class QuadrotorEnv(Task, EnvBase, metaclass=_Build):
 
         return draw_frame(self, drones, size)
 
-    def _place(self, nominal: QuadrotorParams) -> None:
+    def _place(self, drone: QuadrotorParams) -> None:
         """Build what holds tensors on the device and in the precision of the environment."""
-        self.dynamics = config.build_dynamics(nominal, self._options)
-        self.disturbances = config.build_disturbances(self.dynamics, self._options)
+        self._built = drone = drone.detach()
+        self.dynamics = config.build_dynamics(drone, self._options)
+        self.disturbances = config.build_disturbances(self.dynamics, drone, self._options)
         self.randomness = Randomness(self.device, self.dtype)
 
     def _connect(self, safe_state: State, options: dict[str, Any] | None = None) -> None:

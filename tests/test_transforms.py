@@ -103,7 +103,7 @@ def fly(env, actor, *, inside):
         rollout, carry = differentiable_rollout(env, actor, carry, 9)
     loss = 0.0
     for flight in (first, rollout):
-        for _, x in sorted(flight.items(True, True), key=str):
+        for _, x in sorted(flight.items(True, True), key=lambda item: str(item[0])):
             if x.requires_grad and x.is_floating_point():
                 loss = loss + (x.double() * torch.linspace(0.5, 1.5, x.numel()).double().view_as(x)).sum()
     flown = {i: dict(x.items(True, True)) for i, x in enumerate((first, rollout, carry))}

@@ -14,13 +14,7 @@ from torchrl.objectives.utils import ValueEstimators, distance_loss
 
 from torchrl_quad.data.unwrap import check_tensordict, group, leaf
 from torchrl_quad.errors import UserValueError
-from torchrl_quad.objectives.calls import (
-    picked,
-    predict,
-    segments,
-    takes_rollout,
-    td_lambda,
-)
+from torchrl_quad.objectives.calls import picked, predict, segments, takes_rollout, td_lambda
 from torchrl_quad.objectives.pathwise import PathwiseLoss
 
 

@@ -99,15 +99,15 @@ class GaussianPolicy:
         names, before = {part: name for name, part in self.actor.named_modules()}, {}
         for part in names:
             if isinstance(part, ProbabilisticTensorDictModule) and part is not self.sampler:
-                raise _changing(part, names[part], _CHANGES[0])
+                raise _changing(part, names[part], "draws random numbers")
             if isinstance(part, _BatchNorm) and (part.training or part.running_mean is None):
                 raise _changing(part, names[part], "uses the statistics of its batch")
         if torch.compiler.is_compiling():
             return self.actor(states)
 
         def leave(part: nn.Module, *_: Any) -> None:  # the innermost part returns first
-            for does, now, then in zip(_CHANGES, _changeable(part), before[part], strict=True):
-                if now != then:
+            for does, now in _changeable(part).items():
+                if now != before[part][does]:
                     raise _changing(part, names.get(part, ""), does)
 
         enter = register_module_forward_pre_hook(lambda part, _: before.update({part: _changeable(part)}))
@@ -134,15 +134,15 @@ def _normal(dist: Any) -> tuple[Tensor, Tensor]:
     return base.loc, base.scale
 
 
-_CHANGES = ("draws random numbers", "changes its statistics")
-
-
-def _changeable(part: nn.Module) -> tuple[Any, Any]:
-    """Where torch's generators stand, and how often the statistics of a part were changed in place."""
+def _changeable(part: nn.Module) -> dict[str, list[Any]]:
+    """Where torch's generators stand, and how often a part's statistics were changed in place; by what moves it."""
     devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
     random = torch.get_rng_state(), *(torch.cuda.get_rng_state(i) for i in devices)
     statistics = (x for x in part._buffers.values() if x is not None and x.is_floating_point())
-    return [x.numpy().tobytes() for x in random], [x._version for x in statistics]
+    return {
+        "draws random numbers": [x.numpy().tobytes() for x in random],
+        "changes its statistics": [x._version for x in statistics],
+    }
 
 
 def _changing(part: nn.Module, name: str, does: str) -> Unsupported:

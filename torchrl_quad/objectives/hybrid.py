@@ -18,13 +18,7 @@ from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_quad.data.unwrap import check_tensordict, group, leaf
 from torchrl_quad.errors import UserValueError, WrongState
-from torchrl_quad.objectives.calls import (
-    action_gradient,
-    discounts,
-    plain_of,
-    segments,
-    takes_rollout,
-)
+from torchrl_quad.objectives.calls import action_gradient, discounts, plain_of, segments, takes_rollout
 from torchrl_quad.objectives.shac import SHACLoss
 from torchrl_quad.options import Below1, Coefficient, Field, Positive, Share
 

@@ -17,14 +17,7 @@ from torchrl.objectives.utils import ValueEstimators, default_value_kwargs, disp
 
 from torchrl_quad.data.unwrap import check_tensordict, leaf
 from torchrl_quad.errors import Unsupported, UserTypeError, UserValueError, WrongState, shown
-from torchrl_quad.objectives.calls import (
-    MedianClip,
-    act_again,
-    action_gradient,
-    discounts,
-    takes_rollout,
-    total,
-)
+from torchrl_quad.objectives.calls import MedianClip, act_again, action_gradient, discounts, takes_rollout, total
 from torchrl_quad.objectives.gaussian import sampler_of
 from torchrl_quad.options import Coefficient, Entry, Fraction, Positive, Scale, between, check_value, checked
 

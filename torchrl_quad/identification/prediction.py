@@ -158,7 +158,7 @@ def as_params(drone: Any) -> QuadrotorParams:
 
 def log_columns(drone: QuadrotorParams) -> list[int]:
     """For each rotor, in whatever order the drone lists them, the column of its motor in a log: by its place."""
-    if found := quarters(drone.rotor_positions.detach().cpu().numpy()):
+    if found := quarters(drone.rotor_positions.tolist()):
         return found
     raise UserValueError(
         "Flight logs hold the commands of four motors of an X: front left, back left, back right, front right. This "

@@ -13,18 +13,7 @@ import numpy as np
 
 from torchrl_quad.errors import UserError, one_line
 from torchrl_quad.identification.errors import MissingColumns, UnreadableLog, WrongMotors
-from torchrl_quad.identification.layouts import (
-    BY_IMU,
-    RIVALS,
-    ROS,
-    Asked,
-    Columns,
-    Layout,
-    choose,
-    listed,
-    named_alike,
-    shipped,
-)  # fmt: skip
+from torchrl_quad.identification.layouts import BY_IMU, RIVALS, ROS, Asked, Layout, choose, listed, named_alike, shipped
 from torchrl_quad.identification.signals import Array, Stream, open_plain
 
 LIKELY = ("pose", "odometry", "imu", "motors", "actuators", "battery")
@@ -116,12 +105,12 @@ def _layout(bag: Any, topics: Mapping[str, str], columns: Asked, name: str) -> L
     if named & {"position", "quaternion"}:  # the caller means the pose of that topic only
         named |= {"position", "quaternion", "velocity_body"}
     named |= {second for first, second in RIVALS if first in named}
-    found: dict[str, tuple[Columns, ...]] = {}
-    onboard = BY_IMU
+    rivals = {second: first for first, second in RIVALS}
+    found, onboard = {}, BY_IMU
     for kind, quantities in shipped("ros_messages.yaml").items():
         topics_of_kind = sorted(topic for topic in topics if topics[topic] == kind)
         for quantity, fields in quantities.items():
-            own, rival = topics_of_kind, {second: first for first, second in RIVALS}.get(quantity)
+            own, rival = topics_of_kind, rivals.get(quantity)
             if kind.endswith("/Actuators"):  # whose messages hold commands, or speeds
                 own = [topic for topic in own if _length(bag, topic, fields["of"], name)]
             if not own or {quantity, rival} & named or quantity in found or (rival in found and rival != "velocity"):

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from torchrl_quad.identification.autopilots import pick
+from torchrl_quad.identification.autopilots import numbers, pick
 from torchrl_quad.identification.errors import UnreadableLog, WrongMotors
 from torchrl_quad.identification.signals import Array, Stream
 
@@ -60,7 +60,7 @@ def read_dataflash(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
         if "TimeUS" not in fields:
             continue
         columns = {
-            field: rows[field].astype(float) * _SCALES.get(letter, 1.0)
+            field: numbers(rows[field]) * _SCALES.get(letter, 1.0)
             for field, letter in zip(fields, letters, strict=True)
             if letter not in "nNZa"
         }

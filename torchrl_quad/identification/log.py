@@ -15,7 +15,7 @@ from pydantic import Field
 from torchrl_quad.deploy.frames import Convention
 from torchrl_quad.errors import UserTypeError, UserValueError, shown
 from torchrl_quad.identification import checks
-from torchrl_quad.identification.errors import GapsTooLarge, LogError, NoFlight, UnreadableLog, WrongUnit
+from torchrl_quad.identification.errors import GapsTooLarge, LogError, NoFlight, UnreadableLog, WrongUnit, in_units
 from torchrl_quad.identification.layouts import QUANTITIES, Columns, Layout, gather
 from torchrl_quad.identification.pieces import broken, find_pieces, motors_on
 from torchrl_quad.identification.remedies import Mended, remedy_for
@@ -265,11 +265,8 @@ def _grid(signals: Mapping[str, Signal], main: Sequence[Signal], dt: float | Non
     attitude = signals["quaternion"]
     step = dt or max(round(attitude.step, 5), LEAST_STEP)
     if not 0.0 < attitude.step < 0.5:
-        units = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
-        raise WrongUnit(
-            f"{name}: the clock steps by {attitude.step:.4g} s, which is not a flight.",
-            *({"quantity": "time", "factor": x, "when": f"it is in {unit}"} for unit, x in units.items()),
-        )
+        units = in_units("time", "it is in", milliseconds=1e-3, microseconds=1e-6, nanoseconds=1e-9)
+        raise WrongUnit(f"{name}: the clock steps by {attitude.step:.4g} s, which is not a flight.", *units)
     start, stop = max(s.time[0] for s in main), min(s.time[-1] for s in main)
     span = stop - start
     if span < 20.0 * step:

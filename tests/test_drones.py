@@ -99,7 +99,7 @@ def test_what_is_no_drone_is_refused_by_name(tmp_path):
         (lambda: load_drone("visfly", torch.int64), "dtype must be torch.float32 or torch.float64"),
     ):
         refuses(message, make)
-    with pytest.raises(FileNotFoundError, match="No drone file at .*none.yaml. Choose from: crazyflie"):
+    with pytest.raises(FileNotFoundError, match="No drone file at .*none.yaml. Choose from: cf2p"):
         load_drone(tmp_path / "none.yaml")
 
 
@@ -225,49 +225,43 @@ def test_what_is_no_number_is_refused_in_every_field_however_a_drone_is_made(val
 
 # -- files of other projects -------------------------------------------------------------------------------------------
 
-PLUGIN = (
-    "<plugin name='m{0}'><linkName>rotor_{0}</linkName><turningDirection>{1}</turningDirection>"
-    "<timeConstantUp>0.0125</timeConstantUp><timeConstantDown>0.025</timeConstantDown><maxRotVelocity>1000</maxRotVelocity>"
-    "<motorConstant>{2}</motorConstant><momentConstant>0.02</momentConstant><motorNumber>{0}</motorNumber>"
-    "<rotorDragCoefficient>1e-4</rotorDragCoefficient></plugin>"
-)
-ROTOR = (
-    "<joint name='j{0}'><pose relative_to='base_link'>{1} {2} 0.1 0 0 0</pose></joint><link name='rotor_{0}'>"
-    "<pose relative_to='j{0}'/><inertial><mass>0.25</mass></inertial></link>"
-)
+MOTOR = {"timeConstantUp": 0.0125, "timeConstantDown": 0.025, "maxRotVelocity": 1000, "momentConstant": 0.02}
+MOTOR |= {"motorConstant": 1e-5, "rotorDragCoefficient": 1e-4}
 CORNERS = ((0.2, -0.1), (-0.2, 0.1), (0.2, 0.1), (-0.2, -0.1))
-BASE = (
-    "<link name='base_link'><inertial><mass>1</mass><inertia><ixx>0.01</ixx><iyy>0.02</iyy><izz>0.025</izz></inertia>"
-    "</inertial></link>"
-)
+J = "<inertia><ixx>0.01</ixx><iyy>0.02</iyy><izz>0.025</izz></inertia>"
 
 
 def sdf(content):
     return f"<sdf version='1.9'><model name='x'>{content}</model></sdf>"
 
 
-FRAME = sdf(BASE + "".join(ROTOR.format(i, *xy) for i, xy in enumerate(CORNERS)))
-MOTORS = "".join(PLUGIN.format(i, turns, 1e-5) for i, turns in enumerate(("ccw", "ccw", "cw", "cw")))
-PROP = "<link name='prop{}_link'><inertial><origin xyz='{} {} 0'/><mass value='0'/></inertial></link>"
+def motors(**changes):
+    """Of an SDF: of four rotors, the first of which may differ."""
+    turns = ({"turningDirection": x} for x in ("ccw", "ccw", "cw", "cw"))
+    said = [MOTOR | {"linkName": f"rotor_{i}", "motorNumber": i} | x for i, x in enumerate(turns)]
+    said[0] |= changes
+    return "".join(f"<plugin>{''.join(f'<{k}>{v}</{k}>' for k, v in x.items())}</plugin>" for x in said)
+
+
+FRAME = f"<link name='base_link'><inertial><mass>1</mass>{J}</inertial></link>" + "".join(
+    f"<joint name='j{i}'><pose relative_to='base_link'>{x} {y} 0.1 0 0 0</pose></joint><link name='rotor_{i}'>"
+    f"<pose relative_to='j{i}'/><inertial><mass>0.25</mass></inertial></link>"
+    for i, (x, y) in enumerate(CORNERS)
+)
 URDF = (
     "<robot name='{}'><properties kf='1e-9' km='2e-11' thrust2weight='2' drag_coeff_xy='1e-6'/><link name='base_link'>"
     "<inertial><mass value='0.4'/><inertia ixx='1e-3' ixy='{}' iyy='1e-3' izz='1.5e-3'/></inertial></link>"
-    + "".join(PROP.format(i, *CORNERS[corner]) for i, corner in enumerate((0, 3, 1, 2)))
+    + "".join(
+        f"<link name='prop{i}_link'><inertial><origin xyz='{CORNERS[k][0]} {CORNERS[k][1]} 0'/></inertial></link>"
+        for i, k in enumerate((0, 3, 1, 2))
+    )
     + "</robot>"
 )
-L2F = {
-    "mass": 1.0,
-    "gravity": [0, 0, 9.8],  # with z down, and so y to the right
-    "J": [[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.015]],
-    "rotor_positions": [[x, -y, 0] for x, y in CORNERS],
-    "rotor_thrust_directions": [[0, 0, -1]] * 4,
-    "rotor_torque_directions": [[0, 0, x] for x in (1, 1, -1, -1)],
-    "rotor_thrust_coefficients": [[0.1, 0.5, 5.0]] * 4,
-    "rotor_torque_constants": [0.02] * 4,
-    "rotor_time_constants_rising": [0.03] * 4,
-    "rotor_time_constants_falling": [0.06] * 4,
-    "action_limit": [0, 1],
-}
+L2F = {"mass": 1.0, "gravity": [0, 0, 9.8], "J": np.diag([0.01, 0.01, 0.015]).tolist(), "action_limit": [0, 1]}
+L2F |= {"rotor_positions": [[x, -y, 0] for x, y in CORNERS], "rotor_thrust_directions": [[0, 0, -1]] * 4}  # z is down
+L2F |= {"rotor_torque_directions": [[0, 0, x] for x in (1, 1, -1, -1)], "rotor_torque_constants": [0.02] * 4}
+L2F |= {"rotor_thrust_coefficients": [[0.1, 0.5, 5.0]] * 4, "rotor_time_constants_rising": [0.03] * 4}
+L2F |= {"rotor_time_constants_falling": [0.06] * 4}
 HEXAGON = [[0.2 * np.cos(x), 0.2 * np.sin(x), 0.0] for x in np.arange(6) * np.pi / 3]
 ROTORPY = {
     "mass": 1.0,
@@ -278,39 +272,24 @@ ROTORPY = {
 }
 ROTORPY |= {"rotor_directions": [1, -1] * 3, "k_eta": 1e-5, "k_m": 2e-7, "k_d": 1e-4, "k_z": 2e-4, "tau_m": 0.02}
 ROTORPY |= {"rotor_speed_min": 0, "rotor_speed_max": 900, "c_Dx": 0.01, "c_Dy": 0.01, "c_Dz": 0.02}
-MODELS = """[{}]
-mass = 0.03
-L = 0.03
-J = [[1e-5, 0, 0], [0, 1e-5, 0], [0, 0, 2e-5]]
-rpm2thrust = [0, 0, 4e-10]
-rpm2torque = [0, 0, 8e-12]
-thrust_tau = 0.05
-thrust_max = 0.12
-mixing_matrix = [[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]
-"""
-AGILICIOUS = """mass: 0.75
-tbm_fr: [0.2, -0.1, 0]
-tbm_bl: [-0.2, 0.1, 0]
-tbm_br: [-0.2, -0.1, 0]
-tbm_fl: [0.2, 0.1, 0]
-inertia: [0.0025, 0.0021, 0.0043]
-motor_omega_min: 150
-motor_omega_max: 2000
-motor_tau: 0.033
-kappa: 0.022
-thrust_max: 8
-aero_coeff_1: [0.1, 0.1, 0.2]
-omega_max: [10, 10, 4]
-"""
+MODELS = {"mass": 0.03, "L": 0.03, "J": np.diag([1e-5, 1e-5, 1.9e-5]).tolist(), "thrust_tau": 0.05, "thrust_max": 0.12}
+MODELS |= {"rpm2thrust": [0, 0, 4e-10], "rpm2torque": [0, 0, 8e-12]}
+MODELS |= {"mixing_matrix": [[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]}
+TOML = "\n".join(f"[{x}]\n" + "\n".join(f"{k} = {v}" for k, v in MODELS.items()) for x in "ab")
+AGILICIOUS = {"mass": 0.75, "tbm_fr": [0.2, -0.1, 0], "tbm_bl": [-0.2, 0.1, 0], "tbm_br": [-0.2, -0.1, 0]}
+AGILICIOUS |= {"tbm_fl": [0.2, 0.1, 0], "inertia": [0.0025, 0.0021, 0.0043], "motor_omega_min": 150, "motor_tau": 0.033}
+AGILICIOUS |= {"motor_omega_max": 2000, "kappa": 0.022, "thrust_max": 8, "aero_coeff_1": [0.1, 0.1, 0.2]}
+AGILICIOUS |= {"omega_max": [10, 10, 4]}
 FLIGHTMARE = "quadrotor_dynamics: {mass: 0.73, arm_l: 0.17, thrust_map: [1.3e-6, 0, 0], kappa: 0.016, motor_tau: 0.03}"
 HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the SDF [rad/s]; of one rpm
 
 
 @cases(
-    ("x.sdf", FRAME.replace("</model>", MOTORS + "</model>"), {}, {"mass": 2.0, "inertia": [0.025, 0.065, 0.075],
+    ("x.sdf", sdf(FRAME + motors()), {}, {"mass": 2.0, "inertia": [0.025, 0.065, 0.075],
      "rotor_positions": CORNERS, "rotor_spin": [-1, -1, 1, 1], "motor_time_constant": [0.0125, 0.025],
      "thrust_map": [1e-5, 0, 0], "linear_drag": [4e-4 * HOVER, 4e-4 * HOVER, 0]}),
-    ("x.urdf", URDF.format("racer", 0), {"motor_time_constant": 0.05}, {"rotor_positions": [CORNERS[i] for i in (0, 3, 1, 2)],
+    ("x.urdf", URDF.format("racer", 0), {"motor_time_constant": 0.05}, {
+     "rotor_positions": [CORNERS[i] for i in (0, 3, 1, 2)],
      "rotor_spin": [1, -1, 1, -1], "thrust_map": [1e-9 / FAST**2, 0, 0], "yaw_torque_coefficient": 0.02,
      "rotor_speed_max": np.sqrt(2 * 0.4 * 9.81 / 4e-9) * FAST, "motor_time_constant": 0.05}),
     ("x.json", json.dumps({"dynamics": L2F}), {"linear_drag": [0.1] * 3}, {"rotor_positions": CORNERS, "gravity": 9.8,
@@ -318,11 +297,12 @@ HOVER, FAST = np.sqrt(9.81 * 2 / 4 / 1e-5), 2 * np.pi / 60  # of a rotor of the 
     ("x.json", json.dumps(ROTORPY), {}, {"rotor_positions": np.array(HEXAGON)[:, :2], "rotor_spin": [1, -1] * 3,
      "yaw_torque_coefficient": 0.02, "quadratic_drag": [0.01, 0.01, 0.02],
      "linear_drag": 6 * np.sqrt(9.81 / 6e-5) * np.array([1e-4, 1e-4, 2e-4])}),
-    ("x.toml", MODELS.format("a") + MODELS.format("b").replace("0.03", "0.04"), {"entry": "b", "linear_drag": [0.01] * 3},
-     {"mass": 0.04, "rotor_positions": 0.04 * np.array([[1, -1], [-1, -1], [-1, 1], [1, 1]]), "rotor_spin": [-1, 1, -1, 1],
+    ("x.toml", TOML, {"entry": "b", "linear_drag": [0.01] * 3}, {"rotor_spin": [-1, 1, -1, 1], "mass": 0.03,
+     "rotor_positions": 0.03 * np.array([[1, -1], [-1, -1], [-1, 1], [1, 1]]),
       "yaw_torque_coefficient": 0.02, "rotor_speed_max": np.sqrt(0.12 / 4e-10) * FAST}),
-    ("x.yaml", AGILICIOUS, {}, {"rotor_positions": CORNERS[:2] + ((-0.2, -0.1), (0.2, 0.1)), "rotor_spin": [-1, -1, 1, 1],
-     "thrust_map": [2e-6, 0, 0], "max_body_rate": [10, 10, 4], "linear_drag": [0.1, 0.1, 0.2]}),
+    ("x.yaml", json.dumps(AGILICIOUS), {}, {"rotor_positions": [CORNERS[i] for i in (0, 1, 3, 2)],
+     "rotor_spin": [-1, -1, 1, 1], "thrust_map": [2e-6, 0, 0], "max_body_rate": [10, 10, 4],
+     "linear_drag": [0.1, 0.1, 0.2]}),
     ("x.yaml", FLIGHTMARE, {"linear_drag": [0.1] * 3, "rotor_speed_max": 3000}, {"rotor_spin": [1, -1, 1, -1],
      "inertia": [0.00791138, 0.00791138, 0.01230658]}),
 )  # fmt: skip
@@ -350,7 +330,7 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
 @cases(
     (
         "x.sdf",
-        FRAME,
+        sdf(FRAME),
         r"does not say rotor_spin \[1\], yaw_torque_coefficient \[m\], thrust_map .*, motor_time_constant",
     ),
     (
@@ -361,21 +341,22 @@ def test_drones_of_other_projects_become_ours_and_their_yaml_says_what_is_not_th
     ("x.urdf", URDF.format("cf", 4e-4), r"inertia \[kg m2\]: its products of inertia are not small, 0.0004 kg m2"),
     (
         "x.sdf",
-        FRAME.replace("</model>", MOTORS.replace("1e-05", "2e-05", 1) + "</model>"),
+        sdf(FRAME + motors(motorConstant=2e-5)),
         "rotors differ in motorConstant",
     ),
     ("x.sdf", sdf("<include><uri>model://other</uri></include>"), "includes the model 'other': put it at "),
     ("x.urdf", "<!DOCTYPE x [<!ENTITY a 'b'>]><robot>&a;</robot>", "declares entities or a type"),
-    ("x.sdf", sdf(BASE.replace("0.02", "much")), "expected 1 number, got 'much'"),
+    ("x.sdf", sdf(FRAME.replace("0.02<", "much<")), "expected 1 number, got 'much'"),
     ("x.xml", "<mujoco/>", "XML with the root <mujoco> is no URDF or SDF .* These can be read: URDF"),
-    ("x.json", "[1]", "this JSON is of no kind that is known. These can be read"),
+    ("x.json", "[1]", "this file is of no kind that is known. These can be read"),
     (
         "x.json",
         json.dumps({"dynamics": {**L2F, "rotor_positions": [1, 2]}}),
         r"'rotor_positions' has shape \(2,\); it must be",
     ),
-    ("x.toml", MODELS.format("a") + MODELS.format("b"), r"choose one drone of the file, by entry='a' or another of"),
+    ("x.toml", TOML, r"choose one drone of the file, by entry='a' or another of"),
     ("x.xacro", "", "a .xacro file has to be run before its numbers can be read. Expand it first"),
+    ("x.toml", "[cf2x]\nacc_coef = 1", "this file is of no kind that is known. These can be read"),
     ("x.stl", "", "no drone can be read from a .stl file. These can be read"),
     ("x.yaml", "mass: 1", "is no file of another project"),
 )
@@ -386,12 +367,13 @@ def test_what_cannot_become_a_drone_is_refused_with_all_that_is_missing(file, te
 
 def test_the_recipe_writes_a_drone_from_a_model_and_what_it_includes(tmp_path, monkeypatch, capsys):
     script = Path(__file__).parents[1] / "recipes/import_drone.py"
-    (tmp_path / "frame.sdf").write_text(FRAME)
-    (tmp_path / "x.sdf").write_text(sdf(f"<include><uri>model://frame</uri></include>{MOTORS}"))
+    (tmp_path / "frame.sdf").write_text(sdf(FRAME))
+    (tmp_path / "x.sdf").write_text(sdf(f"<include><uri>model://frame</uri></include>{motors()}"))
     monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "x.sdf"), "mass=3", f"output={tmp_path}/o/x.yaml"])
     runpy.run_path(str(script), run_name="__main__")
     assert load_drone(tmp_path / "o/x.yaml").mass == 3.0 and f"env.drone={tmp_path}/o/x.yaml" in capsys.readouterr().out
     monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "frame.sdf")])
     with pytest.raises(SystemExit):
         runpy.run_path(str(script), run_name="__main__")
-    assert "does not say" in capsys.readouterr().err
+    advice = re.search(r"load_drone\(.*\)(?=, or)", capsys.readouterr().err)[0]
+    assert HoveringEnv(num_envs=1, drone=eval(advice)).nominal.mass.item() == 2.0

@@ -33,7 +33,7 @@ def read_text(path: Path) -> str:
         content = file.read(presets.MAX_BYTES + 1)
     if len(content) > presets.MAX_BYTES:
         raise UserValueError(f"{path}: has more than {presets.MAX_BYTES:,} bytes. A drone needs less.")
-    return content.decode("utf-8", "replace")
+    return content.decode("utf-8-sig", "replace")
 
 
 def read_json(path: Path) -> Any:
@@ -168,10 +168,10 @@ def _l2f(said: Said) -> Found:
     if times[0] is not None and times[1] is not None:
         found["motor_time_constant"] = same(np.stack(times, -1), "their time constants")
     if curves is not None and limit is not None and limit.size == 2:
-        scale, note = (1000.0, "of a throttle of 0 to 1, times 1000") if limit[1] <= 1.0 else (1.0, "")
+        scale, note = (1000.0, "of a throttle of 0 to 1, times 1000") if max(limit) <= 1.0 else (1.0, "")
         curve, why = same(curves, "rotor_thrust_coefficients")
         found["thrust_map"] = (None, why) if curve is None else (curve[::-1] / [scale**2, scale, 1.0], note)
-        found |= {f"rotor_speed_{end}": (scale * x, note) for end, x in zip(("min", "max"), limit, strict=True)}
+        found |= {f"rotor_speed_{end}": (scale * x, note) for end, x in zip(("min", "max"), sorted(limit), strict=True)}
     return found
 
 
@@ -191,8 +191,10 @@ def _drone_models(said: Said) -> Found:
     for end, newton in ends:
         if newton is not None and curve is not None:
             found[end] = speed_at(newton, curve), f"at {newton:g} N"
-    if found["yaw_torque_coefficient"][0] is None and torque is not None and curve is not None and mix is not None:
-        powers = (speed_at(9.81 * found["mass"][0] / mix.shape[1], curve) / RPM) ** np.arange(3)
+    mass = found["mass"][0]
+    known = curve is not None and not any(x is None for x in (mass, mix, torque))
+    if known and found["yaw_torque_coefficient"][0] is None:
+        powers = (speed_at(9.81 * mass / mix.shape[1], curve) / RPM) ** np.arange(3)
         found["yaw_torque_coefficient"] = torque @ powers / (force @ powers), "rpm2torque per rpm2thrust, at hover"
     return found
 

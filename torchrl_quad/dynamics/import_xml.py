@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_quad.dynamics import presets
 from torchrl_quad.dynamics.import_mappings import (
     AXES,
     READABLE,
@@ -27,6 +28,7 @@ from torchrl_quad.dynamics.import_mappings import (
 )
 from torchrl_quad.errors import UserValueError, one_line, shown
 
+DEPTH = 20  # of models, joints and frames within each other
 Links = dict[str, tuple[float, Array, Array]]  # of each: its mass, the frame of its centre of mass, its inertia there
 
 
@@ -48,13 +50,14 @@ def read_xml(path: Path) -> tuple[str, str, Found, list[str]]:
     )
     short = {re.split("/|::", name)[-1]: name for name in links}
     rotors = [short.get(re.split("/|::", (x.findtext("linkName") or "").strip())[-1], "") for x in motors]
-    rotors = rotors or sorted((x for x in links if re.search(r"(rotor|prop|motor)\D*\d+", x.lower())), key=_digits)
+    for word in ("rotor", "prop", "motor"):
+        rotors = rotors or sorted((x for x in links if re.search(rf"{word}\D*\d+", x.lower())), key=_digits)
     if "" in rotors:
         raise UserValueError(f"{path}: the linkName of a motor is that of no link with an <inertial>. Add it.")
     found = _body(links, rotors)
     _add_motors(found, motors, str(path))
     if (said := root.find("properties")) is not None and root.tag == "robot":
-        numbers = Said({k: float(v) for k, v in said.attrib.items() if re.fullmatch(r"[-+.\deE]+", v)}, str(path))
+        numbers = Said({name: presets.parse(text.encode(), name) for name, text in said.attrib.items()}, str(path))
         _add_attributes(found, numbers, root.get("name", ""))
         return str(path), "URDF of gym-pybullet-drones", found, [x for x in said.attrib if x not in numbers.asked]
     return str(path), "URDF" if root.tag == "robot" else "SDF", found, []
@@ -66,6 +69,7 @@ def _digits(name: str | None) -> list[int]:
 
 def _xml(path: Path) -> ET.Element:
     text = read_text(path)
+    text = text[max(text.find("<?xml"), 0) :]  # before which Gazebo allows comments
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # a few lines of which can mean billions of characters
         raise UserValueError(f"{path}: it declares entities or a type. Write the values out instead.")
     try:
@@ -75,7 +79,7 @@ def _xml(path: Path) -> ET.Element:
 
 
 def _numbers(text: str | None, n: int, source: str) -> Array:
-    """So many numbers, of which zeros are left out as a whole."""
+    """So many numbers; zeros where there is nothing."""
     try:
         values = np.array((text or "").split() or [0.0] * n, float)
     except ValueError:
@@ -107,7 +111,7 @@ def _add_urdf(root: ET.Element, links: Links, source: str) -> None:
         above, frame = link.get("name", ""), np.eye(4)
         if (inertial := link.find("inertial")) is None:
             continue
-        for _ in joints:  # up to the root; no further where they make a circle
+        for _ in range(DEPTH):  # up to the root; no further where they make a circle
             if above in joints:
                 frame, above = origin(joints[above]) @ frame, end(joints[above], "parent")
         about = {x.tag: x.attrib for x in inertial}
@@ -125,17 +129,16 @@ def _add_sdf(
 
     def own(element: ET.Element) -> Array:
         pose = _numbers(element.findtext("pose"), 6, str(path))
-        return _frame(pose[:3], pose[3:])
+        in_degrees = any(x.get("degrees") in ("true", "1") for x in element.iterfind("pose"))
+        return _frame(pose[:3], np.radians(pose[3:]) if in_degrees else pose[3:])
 
     def standing(element: ET.Element, steps: int = 0) -> Array:
-        pose = element.find("pose")
-        base = "" if pose is None else pose.get("relative_to", "")
-        base = (
-            base
-            or element.get("attached_to", "")
-            or (element.findtext("child", "").strip() if element.tag == "joint" else "")
-        )
-        return (standing(names[base], steps + 1) if base in names and steps < 20 else outer) @ own(element)
+        pose, child = element.find("pose"), element.findtext("child", "").strip() if element.tag == "joint" else ""
+        base = ("" if pose is None else pose.get("relative_to", "")) or element.get("attached_to", "") or child
+        return (standing(names[base], steps + 1) if base in names and steps < DEPTH else outer) @ own(element)
+
+    if depth > DEPTH:
+        raise UserValueError(f"{path}: more than {DEPTH} models lie within each other. Write it flatter.")
 
     names = {x.get("name", ""): x for x in model if x.tag in ("link", "joint", "frame", "model")}
     plugins += model.iterfind("plugin")
@@ -144,17 +147,21 @@ def _add_sdf(
             mass, *moments = (
                 _numbers(inertial.findtext(x), 1, str(path))[0] for x in ("mass", *(f"inertia/i{a}" for a in AXES))
             )
-            links[link.get("name", "")] = mass, standing(link) @ own(inertial), symmetric(*moments)
+            name = link.get("name", "")
+            while name in links:  # of another model
+                name = f"other::{name}"
+            links[name] = mass, standing(link) @ own(inertial), symmetric(*moments)
     for inner in model.iterfind("model"):
-        _add_sdf(inner, standing(inner), path, links, plugins, depth)
+        _add_sdf(inner, standing(inner), path, links, plugins, depth + 1)
     for include in model.iterfind("include"):
         name = include.findtext("uri", "").strip().removeprefix("model://")
-        places = [path.parent.parent / name / "model.sdf", path.parent / f"{name}.sdf"]
-        file = next((x for x in places if re.fullmatch(r"[\w-]+", name) and x.is_file() and depth < 5), None)
+        beside = path.parent.parent / name
+        places = [beside / "model.sdf", beside / f"{name}.sdf", path.parent / f"{name}.sdf"]
+        file = next((x for x in places if re.fullmatch(r"[\w-]+", name) and x.is_file()), None)
         inner = None if file is None else _xml(file).find("model")
         if file is None or inner is None:
             raise UserValueError(
-                f"{path} includes the model {shown(name)}: put it at {places[0]} or {places[1]}, or take it out."
+                f"{path} includes the model {shown(name)}: put it at {places[0]} or {places[-1]}, or take it out."
             )
         _add_sdf(inner, standing(include), file, links, plugins, depth + 1)
 

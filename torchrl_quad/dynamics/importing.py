@@ -103,7 +103,7 @@ def _completed(source: str, kind: str, found: Found, fields: Mapping[str, Any]) 
     if missing := [name for name in ASKED if found.get(name, (None,))[0] is None]:
         why = [f": {found[x][1]}" if x in found and found[x][1] else "" for x in missing]
         names = ", ".join(f"{x} [{FIELDS[x]['unit'] or '1'}]{y}" for x, y in zip(missing, why, strict=True))
-        like = ", ".join(f"{x}={ASKED[x]}" for x in missing)
+        like = ", ".join(f"{x}={y}" for x, y in _examples(found).items() if x in missing)
         raise UserValueError(
             f"{source} ({kind}) does not say {names}. Give your own numbers, in SI units and our frame, such as "
             f"load_drone({source!r}, {like}), or the same as arguments of recipes/import_drone.py."
@@ -132,6 +132,20 @@ def _completed(source: str, kind: str, found: Found, fields: Mapping[str, Any]) 
     return {k: (v.numpy(), "chosen here: suggest_gains, for steps of 5 ms") for k, v in gains.items()} | found
 
 
+def _examples(found: Found) -> dict[str, str]:
+    """What could be given for each field: spins that alternate around the drone, and three times its weight."""
+    mass, speed, places = (found.get(x, (None,))[0] for x in ("mass", "rotor_speed_max", "rotor_positions"))
+    n, spin = 4, ASKED["rotor_spin"]
+    if places is not None:
+        around = np.arctan2(*np.asarray(places, float).T[1::-1]).argsort().argsort()
+        n, spin = len(around), str([1 - 2 * int(k % 2) for k in around])
+    heavy, fast = (
+        float(np.max(x)) if isinstance(x, float | int | np.ndarray) else y for x, y in ((mass, 0.5), (speed, 1500.0))
+    )
+    k2 = 3.0 * 9.81 * heavy / (n * max(fast, 1.0) ** 2)
+    return ASKED | {"rotor_spin": spin, "thrust_map": f"[{k2:.2g}, 0, 0]"}
+
+
 def _read(drone: Any, entry: str | None) -> tuple[str, str, Found, list[str]]:
     """Of a drone: its source, the kind of file if it is no drone of ours, what it says, and what of it was not read."""
     suffix = Path(drone).suffix.lower() if isinstance(drone, str | Path) else ""
@@ -153,13 +167,13 @@ def _read(drone: Any, entry: str | None) -> tuple[str, str, Found, list[str]]:
         for kind, (reader, *keys) in MAPPINGS.items()
         if isinstance(part, Mapping) and any(key in part for key in keys)
     }
+    if entry is not None and not drones:
+        raise UserValueError(f"{source}: has no drones by name. Leave out entry={shown(entry)}.")
     if (entry is None and len(drones) > 1) or (entry is not None and entry not in drones):
-        raise UserValueError(
-            f"{source}: choose one drone of the file, by entry={next(iter(drones), '')!r} or another of "
-            f"{shown(list(drones))}; got {shown(entry)}."
-        )
-    if not drones and suffix == ".json":
-        raise UserValueError(f"{source}: this JSON is of no kind that is known. {READABLE}")
+        names = f"entry={next(iter(drones))!r} or another of {shown(list(drones))}"
+        raise UserValueError(f"{source}: choose one drone of the file, by {names}; got {shown(entry)}.")
+    if not drones and not (isinstance(data, Mapping) and set(FIELDS) & set(data)) and not isinstance(drone, Mapping):
+        raise UserValueError(f"{source}: this file is of no kind that is known. {READABLE}")
     if not drones:
         return source, "", {k: (v, "") for k, v in data.items()}, []
     kind, reader, part = drones[entry] if entry is not None else next(iter(drones.values()))

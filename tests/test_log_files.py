@@ -261,8 +261,8 @@ def whole(tmp_path_factory):
         write_usd(folder / f"v{version}", usd_events(times(100), times(10)), version)
     table = write_csv(folder / "a.csv", own_table(times(100))).read_bytes()
     (folder / "a.csv.gz").write_bytes(gzip.compress(table))
-    write_bag(folder / "a.bag", ros2=False, share=0.4)
-    shutil.copy(write_bag(folder / "a", ros2=True, storage="SQLITE3", share=0.4) / "a.db3", folder)
+    write_bag(folder / "a.bag", ros2=False, share=0.25)
+    shutil.copy(write_bag(folder / "a", ros2=True, storage="SQLITE3", share=0.25) / "a.db3", folder)
     return {name: (folder / name).read_bytes() for name in KINDS}
 
 

@@ -9,8 +9,7 @@ import struct
 import zlib
 from array import array
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -31,14 +30,13 @@ _TICKS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}
 _VARIABLE = re.compile(r"(.+)\(([bBhHiIqQfd?])\)")
 
 
-@dataclass
-class _Subscription:
+class _Subscription(NamedTuple):
     """A message that is logged, and where in the file its samples are."""
 
     name: str
     instance: int
     record: np.dtype
-    starts: array = field(default_factory=lambda: array("Q"))
+    starts: array
 
 
 def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
@@ -55,7 +53,7 @@ def read_ulog(data: bytes, name: str) -> tuple[list[Stream], list[str]]:
     """
     log = _Log(data)
     log.scan()
-    used = sorted((s for s in log.subscriptions if s.starts), key=lambda s: (s.name, s.instance))
+    used = sorted((s for s in log.subscriptions if s.starts), key=lambda s: s[:2])
     if not used:
         raise UnreadableLog(f"{name} is not a readable ULog: it holds no sample of any message. Copy it again.")
     notes = []
@@ -89,7 +87,6 @@ _OUTPUTS = re.compile(r"actuator_outputs(#\d+)?")
 
 
 def _check_vehicle(streams: Mapping[str, Stream], parameters: Mapping[str, float], name: str) -> None:
-    """Refuse what was never armed, and what has other than four rotors."""
     column = {column: x for stream in streams.values() for column, x in stream.columns.items()}
     pulses = {c: x for c, x in column.items() if _OUTPUTS.match(c) and re.search(r"output\[\d+\]$", c) and x.any()}
     rest = parameters.get("PWM_DISARMED", 900)
@@ -209,7 +206,7 @@ class _Log:
                 if len(columns) > self.room:
                     del self.formats[message]  # so that it is not unfolded again and again
                     raise ValueError
-                self.current[number] = _Subscription(message, instance, np.dtype(columns))
+                self.current[number] = _Subscription(message, instance, np.dtype(columns), array("Q"))
                 self.subscriptions.append(self.current[number])
                 self.room -= len(columns)
         elif kind == ord("F") and not self.flying:

@@ -52,6 +52,7 @@ def _read(bag: Any, name: str, columns: Asked) -> tuple[list[Stream], Layout, li
     asked: dict[str, list[str]] = {}
     for column in sorted(layout.names):
         asked.setdefault(column.split(".")[0], []).append(column)
+    places = {column: re.findall(r"[^.\[\]]+", column.partition(".")[2]) for column in layout.names}
     missing = sorted(asked.keys() - topics.keys())
     if missing:
         raise MissingColumns(f"{name} has no topic {', '.join(missing)}. {_there(topics, missing)}")
@@ -62,13 +63,11 @@ def _read(bag: Any, name: str, columns: Asked) -> tuple[list[Stream], Layout, li
         topic = connection.topic
         message = bag.deserialize(raw, connection.msgtype)
         try:
-            rows[topic].extend([_number(message, column.partition(".")[2]) for column in asked[topic]])
+            rows[topic].extend([_number(message, places[column]) for column in asked[topic]])
         except (AttributeError, IndexError, TypeError, ValueError) as error:
             fields = ", ".join(field.name for field in dataclasses.fields(message))
-            raise MissingColumns(
-                f"{topic} lacks a field of {', '.join(asked[topic])}, or it is not a number: {error}. Its messages "
-                f"have: {fields}."
-            ) from error
+            said = f"{topic} lacks a field of {', '.join(asked[topic])}, or it is not a number: {error}."
+            raise MissingColumns(f"{said} Its messages have: {fields}.") from error
         received[topic].append((at - begin) * 1e-9)
         stamp = getattr(getattr(message, "header", None), "stamp", None)
         stamped[topic].append((stamp.sec * 10**9 + stamp.nanosec - begin) * 1e-9 if stamp else -begin * 1e-9)
@@ -90,9 +89,9 @@ def _is_clock(stamps: Array, zero: float) -> bool:
     return len(stamps) > 1 and bool((stamps[1:] > zero).all()) and stamps.max() > stamps.min()
 
 
-def _number(message: Any, place: str) -> float:
-    """What lies at a place of a message, such as ``pose.position.x`` or ``normalized[0]``."""
-    for part in re.findall(r"[^.\[\]]+", place):
+def _number(message: Any, place: Sequence[str]) -> float:
+    """What lies at a place of a message, such as pose, position, x, or normalized, 0."""
+    for part in place:
         message = message[int(part)] if part.isdecimal() else getattr(message, part)
     return float(message)
 

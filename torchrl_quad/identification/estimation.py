@@ -132,6 +132,7 @@ def identify(
     half = quantile * cover.diag()[n:].clamp_min(0.0).sqrt() * UNKNOWNS["stream"].scale
     ends = zip(state.streams.tolist(), (state.streams - half).tolist(), (state.streams + half).tolist(), strict=True)
     clocks = [Estimate(value=value, low=low, high=high, unit="s") for value, low, high in ends]
+    settings = {"past": past, "horizon": horizon, "seed": seed, "windows": len(kept), "held_out": int(held.sum())}
     return IdentificationResult(
         drone=fitted,
         prior=prior,
@@ -147,8 +148,7 @@ def identify(
         errors=errors,
         errors_by_flight=by_flight,
         trim=left,
-        settings=dict(past=past, horizon=horizon, seed=seed, windows=len(kept), held_out=len(windows) - len(kept))
-        | {"iterations": state.iteration, "cost": state.cost},
+        settings=settings | {"iterations": state.iteration, "cost": state.cost},
         logs=[log.name for log in logs],
         flights=logs,
     )
@@ -198,12 +198,13 @@ def _checked_trim(
     if left is None:
         return {}
     force, torque = left.force.tolist(), left.torque.tolist()
-    if math.hypot(*force) > _MOST_TRIM:
+    share = math.hypot(*force)
+    if share > _MOST_TRIM:
         more = "" if fits_thrust else ' Or fit its thrust, too: name "thrust_map" in fields.'
+        along = ", ".join(f"{x:+.2f}" for x in force)
         raise UserValueError(
-            f"identify: {math.hypot(*force):.0%} of the drone's weight is left over ({force[0]:+.2f}, {force[1]:+.2f}, "
-            f"{force[2]:+.2f} along x, y, z): its mass of {float(fitted.mass):.3g} kg or its thrust is not that of "
-            f"these flights. Weigh it with its battery.{more}"
+            f"identify: {share:.0%} of the drone's weight is left over ({along} along x, y, z): its mass of "
+            f"{float(fitted.mass):.3g} kg or its thrust is not that of these flights. Weigh it with its battery.{more}"
         )
     return {"force_per_weight": force, "torque": torque}
 

@@ -27,6 +27,7 @@ from torchrl_quad.rotations import from_euler
 _LONGEST = 3000  # letters of an error: it lists up to 60 columns
 LEAST_STEP, MAX_STEPS = 1e-3, 1_000_000  # [s] of a log, and how many: 17 minutes at 1 kHz, half a gigabyte
 FULL_SPEED = 4000.0  # [rad/s], of which rotor speeds are given as shares where a file has them instead of commands
+_OPTIONAL = ("battery_voltage", "setpoint.")
 _FIELDS = [name for name in QUANTITIES if name not in ("euler", "velocity_body", "rotor_speed")]
 
 
@@ -135,7 +136,14 @@ def read_log(
             moved = streams
             if mended.layout.time != layout.time:
                 moved = [replace(stream, time=stream.time * factor - late) for stream in streams]
-            return _read(path, moved, mended.layout, list(notes), **mended.options)
+            options = dict(mended.options)
+            if low_high := options.pop("span", None):
+                within = [(s.time >= low_high[0]) & (s.time <= low_high[1]) for s in moved]
+                moved = [
+                    Stream(s.name, s.time[kept], {name: x[kept] for name, x in s.columns.items()})
+                    for s, kept in zip(moved, within, strict=True)
+                ]
+            return _read(path, moved, mended.layout, list(notes), **options)
 
         try:
             return read(start)
@@ -156,16 +164,15 @@ def _read(
     clearance: float,
     max_gap: float,
     min_duration: float,
-    span: tuple[float, float] = (-np.inf, np.inf),
 ) -> FlightLog:
     """The flight in the streams of a file, as a layout says what they are."""
     fields = layout.onboard if onboard is None else tuple(onboard)
-    unknown = [field for field in fields if field not in (*_FIELDS, "setpoint")]
-    if unknown:
-        known = ", ".join([*_FIELDS, "setpoint"])
-        raise UserValueError(f"onboard: unknown field {shown(unknown[0])}. Choose from: {known}.")
-    signals = _signals(layout, [_within(stream, span) for stream in streams], path.name, notes)
-    main = [s for q, s in signals.items() if not _is_optional(q)]
+    known = [*_FIELDS, "setpoint"]
+    for field in fields:
+        if field not in known:
+            raise UserValueError(f"onboard: unknown field {shown(field)}. Choose from: {', '.join(known)}.")
+    signals = _signals(layout, streams, path.name, notes)
+    main = [signal for quantity, signal in signals.items() if not quantity.startswith(_OPTIONAL)]
     grid, step = _grid(signals, main, dt, path.name)
     valid = cover(main, grid, step, max_gap, notes)
     at = on_grid(signals, grid, step)
@@ -198,14 +205,6 @@ def _read(
     )
 
 
-def _within(stream: Stream, span: tuple[float, float]) -> Stream:
-    low, high = span
-    inside = (stream.time >= low) & (stream.time <= high)
-    if inside.all() or not np.isfinite(span).any():
-        return stream
-    return Stream(stream.name, stream.time[inside], {name: x[inside] for name, x in stream.columns.items()})
-
-
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
     """Put errors of a log in one line that names its file."""
@@ -215,10 +214,6 @@ def _naming(path: Path) -> Iterator[None]:
         said = str(error) if path.name in str(error) else f"{path.name}: {error}"
         said = " ".join("".join(x if x.isprintable() else " " for x in said).split())  # names may hold anything
         raise type(error)(said if len(said) <= _LONGEST else f"{said[:_LONGEST]} ...") from error
-
-
-def _is_optional(quantity: str) -> bool:
-    return quantity == "battery_voltage" or quantity.startswith("setpoint.")
 
 
 def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[str]) -> dict[str, Signal]:
@@ -246,7 +241,7 @@ def _signals(layout: Layout, streams: Sequence[Stream], name: str, notes: list[s
             norm = np.linalg.norm(signal.values, axis=-1, keepdims=True)
             unit = np.where(np.abs(norm - 1.0) < 0.05, signal.values / np.where(norm > 0.0, norm, 1.0), np.nan)
             signal = replace(signal, values=unit)
-        if _is_optional(quantity) and np.isfinite(signal.values).all(-1).sum() < 2:
+        if quantity.startswith(_OPTIONAL) and np.isfinite(signal.values).all(-1).sum() < 2:
             notes.append(f"{signal} holds no finite samples: left out")
             continue
         signals[quantity], dropped = clean(signal)

@@ -27,11 +27,6 @@ class Unknown:
     scale: float = 1.0
 
     @property
-    def field(self) -> str:
-        """The field of the drone."""
-        return self.number.partition(".")[0]
-
-    @property
     def is_log(self) -> bool:
         """Whether the coordinate is a logarithm, which has no limit."""
         return math.isinf(self.limit)
@@ -54,7 +49,8 @@ UNKNOWNS = {
 #: What ``fields`` of :func:`~torchrl_quad.identification.identify` may name, and the unknowns that each stands for.
 FIELDS: dict[str, tuple[str, ...]] = {}
 for _name, _unknown in UNKNOWNS.items():
-    FIELDS[_unknown.field] = (*FIELDS.get(_unknown.field, ()), _name)
+    _field = _unknown.number.partition(".")[0]
+    FIELDS[_field] = (*FIELDS.get(_field, ()), _name)
 
 
 _DRAG = ("drag_xy", "drag_xy", "drag_z")  # of each axis

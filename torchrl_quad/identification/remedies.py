@@ -71,14 +71,12 @@ class Mended:
             entries = (f'"{name}": {_said(value)}' for name, value in {**given, **self.columns}.items())
             parts.append(f"columns={{{', '.join(entries)}}}")
         for name, value in self.changes.items():
-            if name == "convention":
-                parts.append(f"convention=frames.{value.name.lower()}()")
-            elif name != "span":
-                parts.append(f"{name}={value:g}")
+            if name != "span":
+                said = f"frames.{value.name.lower()}()" if name == "convention" else f"{value:g}"
+                parts.append(f"{name}={said}")
         condition = f"If {' and '.join(dict.fromkeys(self.when))}, write " if self.when else "Write "
-        write = f"{condition}{', '.join(parts)}." if parts else ""
-        part = "" if span is None else f"Its part from {span[0]:.6g} to {span[1]:.6g} s reads: cut the file there."
-        return " ".join(filter(None, (part, write)))
+        told = [f"Its part from {span[0]:.6g} to {span[1]:.6g} s reads: cut the file there."] if span else []
+        return " ".join(told + ([f"{condition}{', '.join(parts)}."] if parts else []))
 
 
 def remedy_for(error: LogError, start: Mended, read: Callable[[Mended], object]) -> Mended | None:
@@ -127,12 +125,11 @@ def _changed(used: Columns, places: list[int], todo: Mapping[str, Any]) -> Colum
 
 
 def _said(value: object) -> str:
-    """As it is written in Python."""
     if not isinstance(value, Columns):
         return repr(value)
-    parts = [repr(value.names)]
+    said = repr(value.names)
     for name, usual in (("scale", 1.0), ("offset", 0.0)):
         x = getattr(value, name)
         if x != usual:
-            parts.append(f"{name}={f'{x:.10g}' if isinstance(x, float) else tuple(float(f'{y:.10g}') for y in x)}")
-    return f"Columns({', '.join(parts)})"
+            said += f", {name}={f'{x:.10g}' if isinstance(x, float) else tuple(float(f'{y:.10g}') for y in x)}"
+    return f"Columns({said})"

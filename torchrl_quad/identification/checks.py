@@ -209,12 +209,10 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
             raise WrongFrame(f"{told} if the gyro is in the world frame.", {"quantity": signal.field, "drop": True})
         flip = {"quantity": signal.field, "factor": tuple(FRD)}
         raise WrongFrame(f"{told} if the gyro is of a body with y right and z down.", _NED, flip)
+    said = f"{signal} is {factor:.3g} times the derivative of {given}: it is in"
     for unit, scale in (("degrees", np.pi / 180.0), ("milliradians", 1e-3)):
         if 1.0 / 3.0 < factor * scale < 3.0 and fit > 0.2:
-            raise WrongUnit(
-                f"{signal} is {factor:.3g} times the derivative of {given}: it is in {unit}/s.",
-                {"quantity": signal.field, "factor": scale},
-            )
+            raise WrongUnit(f"{said} {unit}/s.", {"quantity": signal.field, "factor": scale})
     if turning < CALM:
         return calm
     derive = {"quantity": signal.field, "drop": True, "when": "the rates shall follow from the attitude"}
@@ -225,8 +223,7 @@ def check_rates(at: Mapping[str, Array], signals: Mapping[str, Signal], dt: floa
             derive,
         )
     if not 1.0 / 3.0 < factor < 3.0:
-        said = f"{signal} is {factor:.3g} times the derivative of {given}: it is in an unknown unit."
-        raise WrongUnit(said, derive)
+        raise WrongUnit(f"{said} an unknown unit.", derive)
     return f"{signal} fits the attitude: correlation {fit:.2f}, {1000.0 * lag:+.0f} ms late"
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -124,11 +124,12 @@ def read_log(
         LogError: the log cannot be used. Its subclasses name the reason, and what its message tells to write was tried.
     """
     path = Path(path)
-    options = {"onboard": onboard, "dt": dt, "clearance": clearance, "max_gap": max_gap, "min_duration": min_duration}
+    options: dict[str, Any] = {"onboard": onboard, "dt": dt, "clearance": clearance}
+    options |= {"max_gap": max_gap, "min_duration": min_duration}
     with _naming(path):
         streams, layout, notes = read_streams(path, columns)
         layout = layout if convention is None else replace(layout, convention=convention)
-        start = Mended(layout, options, {column for stream in streams for column in stream.columns})
+        start = Mended(layout, {column for stream in streams for column in stream.columns})
 
         def read(mended: Mended) -> FlightLog:
             factor = np.divide(mended.layout.time.scale, layout.time.scale)
@@ -136,14 +137,12 @@ def read_log(
             moved = streams
             if mended.layout.time != layout.time:
                 moved = [replace(stream, time=stream.time * factor - late) for stream in streams]
-            options = dict(mended.options)
-            if low_high := options.pop("span", None):
-                within = [(s.time >= low_high[0]) & (s.time <= low_high[1]) for s in moved]
-                moved = [
-                    Stream(s.name, s.time[kept], {name: x[kept] for name, x in s.columns.items()})
-                    for s, kept in zip(moved, within, strict=True)
-                ]
-            return _read(path, moved, mended.layout, list(notes), **options)
+            given = {name: value for name, value in {**options, **mended.changes}.items() if name in options}
+            if "span" in mended.changes:
+                low, high = mended.changes["span"]
+                inside = [(stream.time >= low) & (stream.time <= high) for stream in moved]
+                moved = [stream.at(rows) for stream, rows in zip(moved, inside, strict=True)]
+            return _read(path, moved, mended.layout, list(notes), **given)
 
         try:
             return read(start)

@@ -23,13 +23,12 @@ _DEEPEST, _MOST = 4, 12  # faults of one log that are mended together, and how o
 
 @dataclass(frozen=True)
 class Mended:
-    """How a log is read: with which layout and options, and how they differ from what the caller gave."""
+    """How a log is read: with which layout, and how that and the options differ from what the caller gave."""
 
     layout: Layout
-    options: Mapping[str, Any]
     there: Collection[str]  #: the columns of the file
     columns: Mapping[str, Columns | None] = field(default_factory=dict)
-    changes: Mapping[str, Any] = field(default_factory=dict)
+    changes: Mapping[str, Any] = field(default_factory=dict)  #: of other arguments
     when: tuple[str, ...] = ()
     done: tuple[object, ...] = ()
 
@@ -44,8 +43,7 @@ class Mended:
         quantity = todo.pop("quantity", None)
         if quantity is None:
             layout = replace(layout, convention=todo.get("convention", layout.convention))
-            options = {name: value for name, value in {**self.options, **todo}.items() if name != "convention"}
-            return replace(self, layout=layout, options=options, changes={**self.changes, **todo}, when=when)
+            return replace(self, layout=layout, changes={**self.changes, **todo}, when=when)
         name = todo.get("name", quantity)
         if quantity == "time":
             columns = _changed(layout.time, [0], todo)

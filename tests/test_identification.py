@@ -39,6 +39,13 @@ def real():
     return read_log(REAL)
 
 
+@pytest.fixture
+def rough(monkeypatch):
+    """Fits read every other sample, and less of what was before a window."""
+    monkeypatch.setattr(prediction, "SAMPLE", 0.02)
+    monkeypatch.setattr(prediction, "WARM_UP", 0.2)
+
+
 def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(simulated, tmp_path, capsys):
     log, truth = simulated
     start = benchmark.start(0, truth)
@@ -80,6 +87,7 @@ def test_a_fit_finds_the_drone_of_a_simulated_flight_and_writes_files_that_fly(s
     assert report["parameters"]["inertia.x"]["value"] == found["inertia.x"]["value"]
 
 
+@pytest.mark.usefixtures("rough")
 def test_a_fit_that_was_stopped_goes_on_as_if_it_had_not(real, tmp_path, monkeypatch, capsys):
     file, write = tmp_path / "checkpoint.json", estimation.Checkpoint.write
     options = {"fields": ["linear_drag"], "draws": 0, "iterations": 9} | BRIEF
@@ -116,6 +124,7 @@ def test_a_checkpoint_is_of_one_flight_only(real):
     assert len(set(changed.values())) == len(changed)
 
 
+@pytest.mark.usefixtures("rough")
 def test_what_a_flight_does_not_tell_gets_no_number_but_a_reason(simulated):
     log, truth = simulated
     level = {"quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time), 1)), "onboard": ()}
@@ -227,6 +236,7 @@ def test_arguments_of_fits_and_predictions_are_refused_in_one_line_and_a_flight_
         refuses(name, dataclasses.replace, real, error=UserError, **{name: value})
 
 
+@pytest.mark.usefixtures("rough")
 def test_what_contradicts_the_drone_is_found_and_no_inertia_is_one_that_no_body_has(real):
     short, options = dataclasses.replace(real, segments=((300, 700),)), {"fields": ["linear_drag"], "draws": 0} | BRIEF
     turned = "the other way than the drone's.*Write rotor_spin: .1, -1, 1, -1. in the drone"
@@ -254,6 +264,7 @@ DRAG = {"free": ["drag_xy", "drag_z"]}
 BROKEN_STAGES = (5, {}, {"free": 5}, DRAG, DRAG | {"x": [0], "streams": [0]})
 
 
+@pytest.mark.usefixtures("rough")
 def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
     file, short = tmp_path / "checkpoint.json", dataclasses.replace(real, segments=((300, 700),))
     options = {"fields": ["linear_drag"], "draws": 0, "iterations": 1, "checkpoint": file} | BRIEF
@@ -269,6 +280,7 @@ def test_a_checkpoint_that_is_damaged_is_refused_and_named(real, tmp_path):
             identify(short, **options)
 
 
+@pytest.mark.usefixtures("rough")
 def test_the_recipe_fits_a_real_flight_and_draws_it(launch, refused, tmp_path):
     (tmp_path / "own.csv").write_text(gzip.decompress(REAL.read_bytes()).decode().replace("pwr_pm_vbat", "volts"))
     own = ["columns={battery_voltage: {names: [volts], scale: 1.0}}", "convention=crazyflie"]

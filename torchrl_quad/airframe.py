@@ -80,7 +80,7 @@ def quarters(positions: ArrayLike) -> list[int]:
     """
     x, y = np.asarray(positions, float).T[:2]
     found = np.where(x > 0.0, np.where(y > 0.0, 0, 3), np.where(y > 0.0, 1, 2))
-    return found.tolist() if sorted(found.tolist()) == [0, 1, 2, 3] and (x * y != 0.0).all() else []
+    return found.tolist() if sorted(found.tolist()) == [0, 1, 2, 3] and (abs(x * y) > 0.0).all() else []
 
 
 def uncontrolled(allocation: ArrayLike) -> str:

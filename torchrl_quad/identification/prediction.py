@@ -101,8 +101,7 @@ def trim(logs: Sequence[FlightLog], drone: QuadrotorParams, past: float = PAST) 
         windows = cut(logs, 0.1, past or PAST, 0.1, nominal_voltage=motors.nominal_voltage)
     except TooShort:
         return None
-    late = torch.tensor([stream_delay(log) for log in logs], dtype=torch.float64)[windows.log]
-    plant = plant_of(drone, motors, late)
+    plant = plant_of(drone, motors, torch.tensor([stream_delay(log) for log in logs], dtype=torch.float64)[windows.log])
     force, torque = windows.push(plant, windows.rotor_speed(plant))
     return Push(force.mean(0) / drone.gravity, torque.mean(0))
 
@@ -133,15 +132,8 @@ def rms_errors(
 
 def differences(flown: RigidBodyState, seen: RigidBodyState) -> Tensor:
     """Predictions minus measurements (W, n, 4, 3), in the order of ``ERRORS``."""
-    return torch.stack(
-        (
-            flown.position - seen.position,
-            flown.velocity - seen.velocity,
-            rotation_vector(flown.quaternion, seen.quaternion),
-            flown.angular_velocity - seen.angular_velocity,
-        ),
-        -2,
-    )
+    position, _, velocity, rate = (x - y for x, y in zip(flown, seen, strict=True))
+    return torch.stack((position, velocity, rotation_vector(flown.quaternion, seen.quaternion), rate), -2)
 
 
 def as_params(drone: Any) -> QuadrotorParams:
